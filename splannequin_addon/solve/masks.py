@@ -36,8 +36,8 @@ def _source(scene: bpy.types.Scene, shot: Path | None, kind: str) -> str:
             raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
         backend.python()  # before anything is written: without a backend nothing would read it
         return str(drawn_masks.render(drawn, shot, kind))
-    if chosen == "NONE":
-        return ""
+    if chosen in ("NONE", "FOUND"):
+        return contract.MASK_FOUND if chosen == "FOUND" else ""
     raise contract.JobError(
         f"Nothing is chosen for the mask {LABELS[kind]}.",
         "Choose a picture, a sequence, a video or a drawn mask, or set the mask to None.",

@@ -7,9 +7,10 @@ import bpy
 from ...torch_backend import contract
 from ..access import layout_of, scene_in, settings_of
 from ..process import steps
+from ..shot import inventory, selection
 from ..ui import icons, step_panel
 from ..ui.sentences import wrap
-from . import align_operators, cameras, mask_operators, matte_operators
+from . import align_operators, cameras, matte_operators
 
 
 def can_load_camera(running: str | None) -> bool:
@@ -72,8 +73,14 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
 
     def _masks(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """What is ignored, and what alone may move."""
-        props = settings_of(scene_in(context))
-        mask_operators.draw(layout, context)
+        scene = scene_in(context)
+        props, shot = settings_of(scene), selection.shot_folder(scene)
+        if props.ignore_from in ("NONE", "FOUND") and shot is not None and inventory.burnt_in(shot) is not None:
+            wrap(layout, context, "Something is burnt into the clip: a logo, a caption.", "INFO")
+            if props.ignore_from == "FOUND":
+                wrap(layout, context, "It is ignored.")
+            else:
+                wrap(layout, context, "It is not ignored, and will smear in frozen frames.")
         for kind in contract.MASK_KINDS:
             layout.prop(props, f"{kind}_from")
             shown = {"FILE": "path", "DRAWN": "drawn"}.get(getattr(props, f"{kind}_from"))

@@ -15,6 +15,8 @@ MASK_SOURCES = [
     ("DRAWN", "Drawn", "A mask of this file, drawn over the clip in the Movie Clip editor"),
 ]
 """Where a mask may come from. In the order that .blend files keep: new ones go last."""
+BURNT_IN = ("FOUND", "Burnt In", "A logo or a caption, if the import found one burnt into the clip; else nothing")
+"""Where the mask of what is ignored may come from besides."""
 
 
 class SolveSettings:
@@ -74,8 +76,8 @@ class SolveSettings:
         options=compat.PATH_OPTIONS,
     )
     ignore_from = EnumProperty(
-        **contract.panel(contract.SolveParams, "ignore_mask", "NONE"),
-        items=MASK_SOURCES,
+        **contract.panel(contract.SolveParams, "ignore_mask", BURNT_IN[0]),
+        items=[*MASK_SOURCES, BURNT_IN],
         options=set(),
     )
     ignore_path = StringProperty(

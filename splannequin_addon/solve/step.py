@@ -17,7 +17,6 @@ from . import (
     cameras,
     exchange,
     guesses,
-    mask_operators,
     masks,
     matte_operators,
     operators,
@@ -41,7 +40,6 @@ class Solve(Step):
     classes = (
         *operators.CLASSES,
         *align_operators.CLASSES,
-        *mask_operators.CLASSES,
         *matte_operators.CLASSES,
         *panel.CLASSES,
     )

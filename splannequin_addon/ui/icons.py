@@ -17,7 +17,6 @@ OF: dict[str, Icon] = {
     "splannequin.export_cameras": "EXPORT",
     "splannequin.export_for_farm": "NETWORK_DRIVE",
     "splannequin.freeze": "FREEZE",
-    "splannequin.ignore_burnt_in": "MOD_MASK",
     "splannequin.import_clip": "IMPORT",
     "splannequin.freeze_as_warp": "MOD_WARP",
     "splannequin.insert_freeze": "NODE_COMPOSITING",

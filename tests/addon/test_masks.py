@@ -43,7 +43,7 @@ def test_the_solve_is_asked_for_the_masks_that_are_chosen(addon, contract, scene
     asked = step.params(scene)
     assert (asked.ignore_mask, asked.people_mask) == (str(tmp_path / "logo.png"), "alpha")
     props.ignore_from = props.people_from = "NONE"
-    assert step.params(scene) == contract.SolveParams()
+    assert step.params(scene) == contract.SolveParams(ignore_mask="")
     props.people_from = "DRAWN"
     with pytest.raises(contract.JobError, match="Nothing is chosen for the mask People"):
         step.params(scene)
@@ -94,17 +94,14 @@ def test_a_mask_follows_the_frames_that_its_clip_shows(addon, scene, shot, drawn
     assert shift(folder) == 0
 
 
-def test_what_the_import_found_to_be_burnt_in_is_ignored_at_the_press_of_a_button(addon, contract, scene, shot):
+def test_what_the_import_finds_to_be_burnt_in_is_ignored_unless_the_artist_says_otherwise(addon, contract, scene, shot):
     props, step = scene.splannequin, addon("process.steps").STEPS["solve"]
     props.shot_path = str(shot)
-    with pytest.raises(RuntimeError, match="poll"):
-        bpy.ops.splannequin.ignore_burnt_in()
-    mask = contract.ShotFolder(shot).burnt_in
-    mask.parent.mkdir(exist_ok=True)
-    mask.write_bytes(b"a picture")
+    assert props.ignore_from == "FOUND" and step.params(scene).ignore_mask == contract.MASK_FOUND
     try:
-        assert bpy.ops.splannequin.ignore_burnt_in() == {"FINISHED"}
-        assert step.params(scene).ignore_mask == str(mask)
+        props.ignore_from = "NONE"
+        assert step.params(scene).ignore_mask == ""
+        with pytest.raises(TypeError, match="FOUND"):
+            props.people_from = "FOUND"
     finally:
-        mask.unlink()
-        props.ignore_from, props.ignore_path = "NONE", ""
+        props.property_unset("ignore_from")

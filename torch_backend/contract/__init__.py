@@ -118,6 +118,7 @@ from .lock import (
 )
 from .option_table import (
     MASK_ALPHA,
+    MASK_FOUND,
     SWITCH,
     Limit,
     Option,
@@ -306,6 +307,7 @@ __all__ = [
     "LONGEST_JSON",
     "LONGEST_LINE",
     "MASK_ALPHA",
+    "MASK_FOUND",
     "MASK_KINDS",
     "METHODS",
     "METRICS_FILE",

@@ -132,9 +132,18 @@ MASK_ALPHA = "alpha"
 """Of a mask: the alpha of the footage, in the place of a file."""
 
 
+MASK_FOUND = "found"
+"""Of the mask of what is ignored: what the import found to be burnt into the clip; nothing where it found nothing."""
+
+
 def mask_path(text: str) -> str:
-    """A mask as a command line gives it: an absolute path, or `MASK_ALPHA`."""
-    return text if text in ("", MASK_ALPHA) else os.path.abspath(text)
+    """A mask as a command line gives it: an absolute path, `MASK_ALPHA`, or empty for none."""
+    return "" if text == "none" else text if text in ("", MASK_ALPHA) else os.path.abspath(text)
+
+
+def ignored_path(text: str) -> str:
+    """The same, of what is ignored: that may be `MASK_FOUND`."""
+    return text if text == MASK_FOUND else mask_path(text)
 
 
 SWITCH = ("on", "off")

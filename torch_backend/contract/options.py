@@ -8,7 +8,7 @@ from typing import Any
 
 from .files import frame_number, is_json_object
 from .hosts import host_names
-from .option_table import SWITCH, Limit, Option, limits_of, mask_path, option, overscan
+from .option_table import MASK_FOUND, SWITCH, Limit, Option, ignored_path, limits_of, mask_path, option, overscan
 
 LAST_FRAME = 1_048_574
 """Blender's last frame number: no scene reaches further."""
@@ -279,18 +279,18 @@ class SolveParams:
     )
     """Try again in other ways where the solve fails or is poor."""
     ignore_mask: str = option(
-        "",
+        MASK_FOUND,
         flag="--ignore-mask",
         metavar="MASK",
-        parse=mask_path,
+        parse=ignored_path,
         help="what is no part of the scene (a logo, dirt, the crew), white: a picture for all frames, a sequence, "
-        "a video, or `alpha`: where the footage is transparent",
-        words="none",
+        "a video, `alpha`: where the footage is transparent, `found`: what the import found to be burnt in, or `none`",
+        words="found",
         label="Ignore",
         tip="Mask of what is no part of the scene, white: a logo, dirt, the hands of the crew. It is not matched, not "
         "learnt and not used to fill. One picture for all frames, a picture of a sequence, or a video",
     )
-    """Mask of what is ignored, in white: a picture, a sequence, a video, or `MASK_ALPHA`. Empty: none."""
+    """Mask of what is ignored, in white: a picture, a sequence, a video, `MASK_ALPHA` or `MASK_FOUND`. Empty: none."""
     people_mask: str = option(
         "",
         flag="--people-mask",

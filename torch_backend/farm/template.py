@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..contract import PARAMS, ExitCode, JobError, write_json
-from ..contract.option_table import MASK_ALPHA, mask_path, options_of
+from ..contract.option_table import MASK_ALPHA, MASK_FOUND, ignored_path, mask_path, options_of
 from .request import VERSION as REQUEST_VERSION
 from .shots import FarmShot
 from .work import STEPS, Step
@@ -111,17 +111,20 @@ def paths_of(shots: Sequence[FarmShot]) -> dict[str, str]:
     for shot in shots:
         for kind, values in shot.requests.items():
             for field in _path_fields(kind):
-                if values[field] and values[field] != MASK_ALPHA and (kind, field) not in _ITS_OWN:
+                if values[field] not in _NO_FILES and (kind, field) not in _ITS_OWN:
                     found[_parameter_name(kind, field)] = values[field]
     return found
 
 
+_MASKS = mask_path, ignored_path
+_NO_FILES = "", MASK_ALPHA, MASK_FOUND
+"""What options that name files may say instead."""
 _ITS_OWN = {("import", "source"), ("freeze", "camera_path")}
 """Paths that each shot has its own of: a task parameter, and a file in the shot."""
 
 
 def _path_fields(kind: str) -> list[str]:
-    return [one.name for one, spec in options_of(PARAMS[kind]) if spec.is_path or spec.parse is mask_path]
+    return [one.name for one, spec in options_of(PARAMS[kind]) if spec.is_path or spec.parse in _MASKS]
 
 
 def _parameter_name(kind: str, field: str) -> str:
@@ -205,7 +208,7 @@ def _request(step: Step) -> str:
     asked = kind if kind in PARAMS else "freeze"
     values = dict(shot.requests[asked])
     for field in _path_fields(asked):
-        if values[field] and values[field] != MASK_ALPHA and (asked, field) != ("freeze", "camera_path"):
+        if values[field] not in _NO_FILES and (asked, field) != ("freeze", "camera_path"):
             values[field] = ""
     amounts = {str(start): round(amount, 4) for start, amount in step.amounts.items()}
     request: dict[str, Any] = {"version": REQUEST_VERSION, "name": shot.name, "amounts": amounts, asked: values}

@@ -385,8 +385,8 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
     share = float(mark.mean())
     report.warning(
         f"{100 * share:.1f} % of the picture stands still while the world goes by: a logo, a caption? "
-        "It would smear in frozen frames.",
-        f"If it is no part of the scene, have it ignored (Masks, or --ignore-mask {shot.burnt_in}).",
+        "It is ignored, and frozen frames show what is behind it.",
+        "If it is part of the scene, set Ignore to None before the solve (Masks, or --ignore-mask none).",
     )
     return {"burnt_in": {"file": BURNT_IN_FILE, "share": round(share, 5)}}
 

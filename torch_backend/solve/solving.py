@@ -18,6 +18,7 @@ from ..contract import (
     CAMERA_MODELS,
     CAMERAS_FILE,
     COLMAP_FOLDER,
+    MASK_FOUND,
     MASK_KINDS,
     PICTURE,
     POINTS_FILE,
@@ -75,7 +76,7 @@ class SolveConfig:
     neighbours: int = 2
     """A frame to be placed is matched with this many registered frames on either side of it."""
     ignore_mask: str = ""
-    """Mask of what is no part of the scene, as `footage.masks.read_masks` takes it; empty: none."""
+    """Mask of what is no part of the scene, as `footage.masks.read_masks` takes it, or `MASK_FOUND`; empty: none."""
     people_mask: str = ""
     """Mask of what alone may move; empty: everything may."""
     focal_mm: float = 0.0
@@ -149,7 +150,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     frames = load_frames(shot)
     source = [foreign.fingerprint(cameras)] if cameras else []
     source += [map_reading.fingerprint(config.st_map)] if config.st_map else []
-    masks = read_masks(shot, _mask_sources(config), report)
+    masks = read_masks(shot, _mask_sources(shot, config), report)
     key = _key(config, frames, source, masks)
     done = _finished(shot, frames, key)
     if done is not None:
@@ -195,9 +196,12 @@ def _lens_of_map(config: SolveConfig, frames: dict[str, Any], report: Reporter) 
     return map_reading.read_lens(config.st_map, config.st_map_way, config.st_map_layer, frames, report)
 
 
-def _mask_sources(config: SolveConfig) -> dict[str, str]:
-    """Kind of mask -> where it comes from."""
-    return dict(zip(MASK_KINDS, (config.ignore_mask, config.people_mask), strict=True))
+def _mask_sources(shot: Shot, config: SolveConfig) -> dict[str, str]:
+    """Kind of mask -> where it comes from; empty: there is none."""
+    ignored = config.ignore_mask
+    if ignored == MASK_FOUND:
+        ignored = str(shot.burnt_in) if shot.burnt_in.is_file() else ""
+    return dict(zip(MASK_KINDS, (ignored, config.people_mask), strict=True))
 
 
 def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: dict[str, Mask]) -> str:
@@ -392,7 +396,7 @@ def _finish(
         "tries": answer.get("tries", []),
         "agreement": answer.get("agreement"),
         "floor": floor_of(path, points["xyz"]),
-        "masks": facts_of(masks, _mask_sources(config)),
+        "masks": facts_of(masks, _mask_sources(shot, config)),
         "st_map": [config.st_map, config.st_map_way, config.st_map_layer] if config.st_map else None,
         "warnings": [" ".join(w).strip() for w in warnings],
         "result": result,

@@ -211,3 +211,17 @@ def test_limits_are_said_as_they_are():
         contract.check_params(contract.ImportParams(source="clip.mp4", pixel_aspect=5.0))
     with pytest.raises(ValueError, match="'--5': it should be the number of a frame"):
         contract.check_params(contract.FreezeParams(t_star_per_frame={"--5": 3.0}))
+
+
+def test_masks_are_files_or_words(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def asked(*words: str) -> tuple[str, str]:
+        args = cli.parser().parse_args(["solve", "s.splannequin", *words])
+        solve = contract.requested_params(args)["solve"]
+        return solve.ignore_mask, solve.people_mask
+
+    assert asked() == ("found", "")
+    assert asked("--ignore-mask", "none", "--people-mask", "none") == ("", "")
+    assert asked("--ignore-mask", "alpha", "--people-mask", "alpha") == ("alpha", "alpha")
+    assert asked("--ignore-mask", "./found", "--people-mask", "found") == (str(tmp_path / "found"),) * 2

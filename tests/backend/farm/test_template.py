@@ -52,6 +52,12 @@ def test_the_kept_library_finds_nothing_wrong(job):
     assert "'hall: freeze' (4 total Tasks)" in done.stdout
 
 
+def test_what_an_import_finds_is_no_file_of_the_farm(job):
+    template, *_ = job("--ignore-mask", "found")
+    assert not any("Mask" in one["name"] for one in template.get("parameterDefinitions", []))
+    assert '"ignore_mask": "found"' in str(named(template, "hall: solve"))
+
+
 def test_each_shot_has_a_chain_of_its_own(job):
     template, *_ = job("--t-star", "4,12", "--bake")
     kinds = ["solve", "train", "open", "freeze", "finish", "bake", "deliver"]

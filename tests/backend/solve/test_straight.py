@@ -4,7 +4,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from torch_backend.contract import CameraPath, ExitCode, JobError, read_json
+from torch_backend.contract import MASK_FOUND, CameraPath, ExitCode, JobError, read_json
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.shot import Shot
@@ -32,21 +32,21 @@ def clip(tmp_path_factory, tools):
     write_map(folder / "redistort.exr", redistort_map(TRUTH, WIDTH, HEIGHT))
     logo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     logo[4:30, 4:60] = 255
-    write_png(folder / "logo.png", logo)
     shot = Shot.create(folder / "a.splannequin")
     import_footage(shot, str(folder / "f.001.png"), FootageConfig(step=1), tools.recorder())
+    write_png(shot.burnt_in, logo)
     return shot, poses, folder
 
 
 def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
     """Points of the scene, through the solved cameras and the map's lens, lie where the real lens showed them: to a
-    quarter of a pixel, at the corners too. A mask goes through the map as the frames do."""
+    quarter of a pixel, at the corners too. What the import found burnt in goes through the map as frames do."""
     shot, poses, folder = clip
     config = SolveConfig(
         features=1200,
         st_map=str(folder / "redistort.exr"),
         st_map_way="redistort",
-        ignore_mask=str(folder / "logo.png"),
+        ignore_mask=MASK_FOUND,
     )
     report = tools.recorder()
     result = solve_shot(shot, config, report)
@@ -60,6 +60,7 @@ def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
         poses[4], (*(2 * [220.0 * scale]), WIDTH / 2, HEIGHT / 2), 0.0
     )  # the room through no lens at all
     assert np.abs(frame.astype(float) - expected)[8:-8, 8:-8].mean() < 3.0
+    assert record["masks"]["ignore"]["source"] == str(shot.burnt_in)
     mask = read_png(shot.mask("ignore", 5))[..., 0] > 127
     assert mask[12, 30] and not mask[60, 100] and 0.5 < mask.sum() / (26 * 56) < 1.3
 
