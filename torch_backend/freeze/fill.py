@@ -13,7 +13,8 @@ from .detail_config import DetailConfig
 from .instant_pixels import InstantPixels, instant_pixels
 from .posed import PosedFrame, displacements, parallax
 from .reproject import blurred, look_up, narrowed, project, resized, unproject, widened
-from .sightings import Sighting, Sightings
+from .sighted import Sighting
+from .sightings import Sightings
 
 WHOLE = 1.0 - 0.5 / 1024.0
 """Matte from which on the leading plate gives the whole pixel: it is rounded to 1024 steps, this one to 1."""

@@ -21,7 +21,8 @@ from .instant_view import InstantView, bridged, exposed
 from .posed import PosedFrame
 from .regions import closed, components, opened
 from .reproject import blurred, look_up, narrowed
-from .sightings import Sighting, Sightings
+from .sighted import Sighting
+from .sightings import Sightings
 
 
 @dataclass

@@ -13,7 +13,8 @@ from ..torch_types import from_numpy, norm
 from .detail_config import DetailConfig
 from .posed import PosedFrame
 from .reproject import blurred, inside, look_up, pixel_centres, project, unproject
-from .sightings import Sighting, Sightings
+from .sighted import Sighting
+from .sightings import Sightings
 
 _SMALL = 0.75
 """Pixels of decisions to one of 640, up to which a picture is small."""

@@ -15,7 +15,8 @@ from .held import BothPlates, held, with_holes
 from .posed import PosedFrame, displacements, parallax
 from .regions import closed, grown, larger, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
-from .sightings import Sighting, Sightings
+from .sighted import Sighting
+from .sightings import Sightings
 from .warp import snap
 
 

@@ -60,12 +60,6 @@ def inside(pixels: Tensor, width: int, height: int, soft: float = 2.0) -> Tensor
     return (border / soft).clamp(0.0, 1.0)
 
 
-def same_surface(depth: Tensor, shown: Tensor, tolerance: float) -> Tensor:
-    """[...] 1 where a point at `depth` is what a view `shown` has there, to 0 where it is hidden or nothing is."""
-    off = (depth - shown) / (tolerance * depth.clamp_min(1e-6))
-    return torch.exp(-off.square())
-
-
 def resized(picture: Tensor, width: int, height: int) -> Tensor:
     """[h, w] or [h, w, C] at another size: averaged where it shrinks, bilinear where it grows."""
     if picture.shape[:2] == (height, width):

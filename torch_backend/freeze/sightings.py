@@ -23,7 +23,8 @@ from ..train import LoadedRun
 from .frozen import FrozenGaussians, FrozenImage, render_frozen
 from .ignored import ignore_mattes
 from .regions import grown
-from .reproject import blurred, inside, look_up, pixel_centres, project, resized, same_surface, widened
+from .reproject import blurred, look_up, pixel_centres, resized, widened
+from .sighted import Sighting, sighted
 from .travel import Stage
 
 MovingOf = Callable[[int], "Tensor | None"]
@@ -83,22 +84,6 @@ class PlateView:
     """[h, w, 3] float16, the model's own render of it, where plates are no larger than decisions; else None."""
     ignored: Tensor | None
     """[h, w, 1] in 0..1: what of it is no part of the scene, as if something stood in front; None: nothing."""
-
-
-@dataclass
-class Sighting:
-    """Where and how points are seen in one plate; leading dimensions are those of the points."""
-
-    pixels: Tensor
-    """[..., 2] in pixels of the size of decisions."""
-    depth: Tensor
-    """[...]"""
-    visible: Tensor
-    """[...] in 0..1: within the picture, and nothing in front."""
-    moving: Tensor
-    """[...] in 0..1, of the plate there."""
-    explained: Tensor
-    """[...] in 0..1, of the plate there."""
 
 
 @dataclass(frozen=True)
@@ -220,13 +205,7 @@ class Sightings:
     def seen(self, frame: int, points: Tensor) -> Sighting:
         """Where plate `frame` shows world points [..., 3]."""
         view = self.view(frame)
-        pixels, depth = project(points, view.viewmat, view.K)
-        within = inside(pixels, *self.size)
-        shown, moving, explained = look_up(view.surface, pixels).unbind(-1)
-        visible = same_surface(depth, shown, self.config.depth_tolerance) * within
-        if view.ignored is not None:
-            visible = visible * (1.0 - look_up(view.ignored, pixels)[..., 0])
-        return Sighting(pixels, depth, visible, moving, explained)
+        return sighted(points, view.viewmat, view.K, view.surface, view.ignored, self.config.depth_tolerance)
 
     def whole(self, moving: Tensor, off: Tensor, least: float = 0.0) -> Tensor:
         """[h, w] bool: `moving`, bool, and the regions that touch it in which plate and model differ, by `off` [h, w].

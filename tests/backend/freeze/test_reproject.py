@@ -13,7 +13,6 @@ from torch_backend.freeze.reproject import (
     pixel_centres,
     project,
     resized,
-    same_surface,
     unproject,
     widened,
 )
@@ -87,12 +86,6 @@ def test_a_look_up_at_the_centres_is_the_picture(picture, mode):
 def test_inside_rises_from_the_border_over_two_pixels():
     pixels = torch.tensor([[-0.1, 9.0], [0.0, 9.0], [1.0, 9.0], [9.0, 28.5], [9.0, 9.0], [37.0, 9.0]])
     np.testing.assert_allclose(inside(pixels, W, H), [0, 0, 0.5, 0.25, 1, 0], atol=1e-6)
-
-
-def test_a_surface_is_the_same_within_a_share_of_its_depth():
-    depth = torch.tensor([4.0, 4.0, 4.0, 4.0])
-    shown = torch.tensor([4.0, 4.12, 3.88, 1e10])
-    np.testing.assert_allclose(same_surface(depth, shown, 0.03), [1, np.exp(-1), np.exp(-1), 0], atol=1e-5)
 
 
 def test_a_blur_is_a_gaussian_that_keeps_the_mean_and_the_border(picture):
