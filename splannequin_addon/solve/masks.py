@@ -14,6 +14,8 @@ from . import drawn_masks
 
 LABELS = {"ignore": "Ignore", "people": "People"}
 """Kind of mask -> its name on the panel."""
+_WORDS = {"NONE": "", "ALPHA": contract.MASK_ALPHA, "FOUND": contract.MASK_FOUND}
+"""What is chosen -> what the backend takes for it, where that is no file."""
 
 
 def sources(scene: bpy.types.Scene, shot: Path | None) -> list[str]:
@@ -27,8 +29,8 @@ def sources(scene: bpy.types.Scene, shot: Path | None) -> list[str]:
 def _source(scene: bpy.types.Scene, shot: Path | None, kind: str) -> str:
     props = settings_of(scene)
     chosen, path, drawn = (getattr(props, f"{kind}_{part}") for part in ("from", "path", "drawn"))
-    if chosen == "ALPHA":
-        return contract.MASK_ALPHA
+    if chosen in _WORDS:
+        return _WORDS[chosen]
     if chosen == "FILE" and path:
         return os.path.abspath(bpy.path.abspath(path))
     if chosen == "DRAWN" and drawn is not None:
@@ -36,8 +38,6 @@ def _source(scene: bpy.types.Scene, shot: Path | None, kind: str) -> str:
             raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
         backend.python()  # before anything is written: without a backend nothing would read it
         return str(drawn_masks.render(drawn, shot, kind))
-    if chosen in ("NONE", "FOUND"):
-        return contract.MASK_FOUND if chosen == "FOUND" else ""
     raise contract.JobError(
         f"Nothing is chosen for the mask {LABELS[kind]}.",
         "Choose a picture, a sequence, a video or a drawn mask, or set the mask to None.",
