@@ -285,7 +285,6 @@ class SolveParams:
         parse=ignored_path,
         help="what is no part of the scene (a logo, dirt, the crew), white: a picture for all frames, a sequence, "
         "a video, `alpha`: where the footage is transparent, `found`: what the import found to be burnt in, or `none`",
-        words="found",
         label="Ignore",
         tip="Mask of what is no part of the scene, white: a logo, dirt, the hands of the crew. It is not matched, not "
         "learnt and not used to fill. One picture for all frames, a picture of a sequence, or a video",
