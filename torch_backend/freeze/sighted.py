@@ -57,7 +57,7 @@ def warm_up() -> None:
 def sighted(
     points: Tensor, viewmat: Tensor, K: Tensor, surface: Tensor, ignored: Tensor | None, tolerance: float
 ) -> Sighting:
-    """How a plate shows world points [..., 3]. All on the CPU, float32; no gradient.
+    """How a plate shows world points [..., 3]. All on the CPU, float32; no gradient. ValueError for others.
 
     Args:
         viewmat: [4, 4] world-to-camera; K: [3, 3] in pixels of `surface`.
@@ -70,8 +70,9 @@ def sighted(
     ignored = None if ignored is None else ignored.contiguous()
     camera = torch.cat([viewmat[:3].flatten(), torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])]).float().contiguous()
     settings = torch.tensor([tolerance, _SOFT], device="cpu")
-    if any(value is not None and value.dtype != torch.float32 for value in (points, surface, ignored)):
-        raise ValueError("points, surface and ignored must be float32")
+    given = [value for value in (points, surface, ignored, camera) if value is not None]
+    if any(value.dtype != torch.float32 or value.device.type != "cpu" for value in given):
+        raise ValueError("points, cameras, surface and ignored must be float32 and on the CPU")
     pixels = torch.empty(*shape, 2, device="cpu")
     depth, visible, moving, explained = (torch.empty(shape, device="cpu") for _ in range(4))
     count = depth.numel()

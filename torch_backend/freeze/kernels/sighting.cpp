@@ -3,7 +3,7 @@
 // points: [count][3]; camera: rows 0 to 2 of the view matrix, fx, fy, cx, cy; surface: [height][width][3], median depth,
 // motion, explained; ignored: [height][width] or null; pixels: [count][2]; depth, visible, moving, explained: [count].
 using I = int __attribute__((ext_vector_type(16)));
-auto fma = FN(F a, F b, F c) -> F { return a * b + c; };
+auto fma = FN(F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
 #include "../../kernels/exp2.cpp"
 const long long N = P.count, W = P.width, H = P.height;
 const float* V = P.camera;
