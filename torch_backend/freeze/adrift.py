@@ -26,9 +26,6 @@ from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed
 from .instant_depth import weighted_median
 from .missing_layer import fade
 
-_REPLACED = 0.6
-"""Share of what was adrift that a layer of plate t* has to cover to stand for it."""
-
 
 @dataclass(frozen=True)
 class AdriftConfig:
@@ -87,10 +84,6 @@ class Adrift:
     """The scene without it: plate t* has it, and sharper."""
     inverse: NDArray[np.float32]
     """[h, w] its inverse depth at its place, at the size of the bench; 0 elsewhere."""
-
-    def replaced_by(self, mask: Tensor) -> bool:
-        """True if a layer of opacity `mask` [h, w] stands for it."""
-        return bool((mask.numpy()[self.inverse > 0.0] > 0.5).mean() >= _REPLACED)
 
 
 @torch.no_grad()
@@ -166,7 +159,7 @@ def _adrift(
         core, ring = _around(mask, bench.unit, config)
         if not ring.any() or (depth[ring] < config.near * near).mean() > config.ahead:
             continue
-        piece = _Piece(mask, near, _painters(bench, frozen, core, near, config), 0.0)
+        piece = _Piece(mask, near, bench.painters(frozen, core, config.near * near), 0.0)
         piece = _belonging(bench, frozen, image, piece, config)
         if piece is not None:
             return piece
@@ -183,18 +176,6 @@ def _grown(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
     import cv2
 
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc(radius)) > 0, np.bool_)
-
-
-def _painters(
-    bench: InstantBench, frozen: FrozenGaussians, core: NDArray[np.bool_], near: float, config: AdriftConfig
-) -> Tensor:
-    """int64 [M]: what is about as `near` and is seen inside `core` [h, w] for the most part, also where the run holds
-    it for still; and what moves and is hidden behind that. Left behind, it would hang in the air."""
-    inside, whole = bench.seen_inside(frozen, core)
-    seen = whole > 1e-3
-    hidden = ~seen & (frozen.motion > 0.5).cpu() & bench.within(frozen, core)
-    paints = ((seen & (inside >= 0.5 * whole)) | hidden) & (bench.depths(frozen) < config.near * near)
-    return torch.nonzero(paints).flatten()
 
 
 def _belonging(

@@ -30,7 +30,7 @@ from .static_twin import settled
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 16
+VERSION = 17
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -215,7 +215,7 @@ def _make(
     found = adrift(run, scene, frozen, t_star, labels)
     if found is not None:
         layer = instant_layer(run, scene, found.without, t_star, motion=labels, known=found.inverse)
-        if layer is not None and found.replaced_by(layer.mask):
+        if layer is not None and layer.stands_for(found.inverse > 0.0):
             return develop(run, scene, join(found.without, layer), t_star, moving, config, check)
         frozen = found.put_back
     layer = instant_layer(run, scene, frozen, t_star, motion=labels)

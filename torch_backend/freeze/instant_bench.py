@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -174,6 +175,16 @@ class InstantBench:
         pixels, _ = project(frozen.state["means"].cpu(), self.scene.viewmats[self.index], self.Ks[self.index])
         found = look_up(from_numpy(mask.astype(np.float32)), pixels, "nearest")
         return (found > 0.5) & (inside(pixels, self.width, self.height) > 0.0)
+
+    def painters(self, frozen: FrozenGaussians, mask: NDArray[np.bool_], nearer: float) -> Tensor:
+        """int64 [M]: what is `nearer` than so many scene units and is seen inside a mask [h, w] for the most part, also
+        where the run holds it for still; and what moves and is hidden behind that. Left behind, it would hang in the
+        air."""
+        inside, whole = self.seen_inside(frozen, mask)
+        seen = whole > 1e-3
+        hidden = ~seen & (frozen.motion > 0.5).cpu() & self.within(frozen, mask)
+        paints = ((seen & (inside >= 0.5 * whole)) | hidden) & (self.depths(frozen) < nearer)
+        return torch.nonzero(paints).flatten()
 
     def depths(self, frozen: FrozenGaussians) -> Tensor:
         """[N] scene units from camera t* to each Gaussian, along its axis."""

@@ -4,7 +4,9 @@ so that it stands where it stood from every pose, as a layer of small Gaussians 
 Whole regions are looked for, on a low-passed residual: a model trained at 320 px is soft everywhere, and softness is
 not disagreement. What it has painted onto the wall behind (`contradicted.py`) counts as missing, too. Depth is told by
 what a region hangs on (the arm), by the frames around t*, and by what it hides; where the field has the hand itself, if
-paler or softer than the plate, it is as deep as that.
+paler or softer than the plate, it is as deep as that. Unless the field has it far before the arm on which it hangs: no
+frame tells how far away a thing is that moves, and the price on motion prefers it near (`adrift.py`). What the field
+has there is taken out then.
 """
 
 from __future__ import annotations
@@ -33,6 +35,9 @@ _NOTHING = 0.15
 _KNOWN = 0.25
 """Share of a region whose depth is known from which on all of it is as deep as that."""
 
+_COVERED = 0.6
+"""Share of a piece's pixels that a layer has to cover to stand for it."""
+
 
 @dataclass
 class InstantLayer:
@@ -50,6 +55,16 @@ class InstantLayer:
     """[N] in 0..1: what is left of the opacity of each Gaussian of the frozen scene."""
     regions: list[Region]
     """What was found, with depths."""
+
+    @classmethod
+    def empty(cls, frozen: FrozenGaussians, frame: int, ghost: NDArray[np.bool_], kept: Tensor) -> InstantLayer:
+        """One that adds nothing."""
+        state = {name: value[:0] for name, value in frozen.state.items()}
+        return cls(state, frame, torch.zeros(ghost.shape, device="cpu"), from_numpy(ghost), kept, [])
+
+    def stands_for(self, where: NDArray[np.bool_]) -> bool:
+        """True if it shows what there is at the pixels `where` [h, w] of plate t*, so that others need not."""
+        return bool((self.mask.numpy()[where] > 0.5).mean() >= _COVERED)
 
 
 @torch.no_grad()
@@ -72,8 +87,6 @@ def instant_layer(
 
     Returns None if plate and scene agree.
     """
-    import cv2
-
     index = scene.nearest(t_star)
     bench = InstantBench(run, scene, index, config or InstantConfig(), motion)
     image = bench.render(frozen)
@@ -82,14 +95,18 @@ def instant_layer(
     if ghost.any():
         frozen = fade(frozen, kept)
         image = bench.render(frozen)
-    painted = _painted(bench, image)
-    state, mask, regions = _shell(bench, frozen, image, _regions(bench, image, painted), painted, things, known)
-    layer = InstantLayer(state, scene.frames[index], from_numpy(mask), from_numpy(ghost), kept, regions)
-    # Of what was painted the difference says nothing, it looked right; nor of pixels beside it, which are mixtures.
-    told = (mask > 0) & (cv2.dilate(painted.astype(np.uint8), disc(2.0 * bench.unit)) == 0)
-    if told.any() and not _helps(bench, bench.render(join(frozen, layer, faded=True)), image, told):
-        empty = {name: value[:0] for name, value in state.items()}
-        layer = replace(layer, state=empty, mask=torch.zeros_like(layer.mask), regions=[])
+    found = _found(bench, frozen, image, things, known)
+    if len(found.astray):
+        stays = torch.ones_like(kept).index_fill(0, found.astray, 0.0)
+        without = fade(frozen, stays)
+        again = _found(bench, without, bench.render(without), things, known)
+        layer = _drawn(
+            bench, without, image, again, InstantLayer.empty(frozen, scene.frames[index], ghost, kept * stays)
+        )
+        if layer.stands_for(np.any([part.soft >= 0.5 for part in found.parts], axis=0)):
+            return layer
+        found = _found(bench, frozen, image, things, known, believed=True)
+    layer = _drawn(bench, frozen, image, found, InstantLayer.empty(frozen, scene.frames[index], ghost, kept))
     return layer if len(layer.state["means"]) or ghost.any() else None
 
 
@@ -165,18 +182,34 @@ def _stuck(bench: InstantBench, region: NDArray[np.bool_], image: FrozenImage) -
     return bool(alike) and float(np.median(alike)) > bench.config.stuck
 
 
-def _shell(
+@dataclass
+class _Found:
+    """What is missing of a frozen scene, and how deep it is."""
+
+    image: FrozenImage
+    """The scene as t*'s camera sees it."""
+    painted: NDArray[np.bool_]
+    """[h, w]: what of it is painted onto something still behind."""
+    parts: list[_Part]
+    regions: list[Region]
+    """Of the parts."""
+    astray: Tensor
+    """int64 [M] rows of what the field has in their place, far before what they hang on."""
+
+
+def _found(
     bench: InstantBench,
     frozen: FrozenGaussians,
     image: FrozenImage,
-    regions: list[NDArray[np.bool_]],
-    painted: NDArray[np.bool_],
     things: list[Track],
     known: NDArray[np.float32] | None,
-) -> tuple[dict[str, Tensor], NDArray[np.float32], list[Region]]:
-    """The layer's Gaussians, its opacity over plate t* [h, w], and the regions with their depths."""
-    nothing, parts, facts_of_regions = np.zeros((bench.height, bench.width), np.float32), list[_Part](), list[Region]()
-    others = bench.neighbours() if regions or things else []
+    believed: bool = False,
+) -> _Found:
+    """What plate t* shows and `image` of a frozen scene does not; `believed`: the field, wherever it has it."""
+    painted = _painted(bench, image)
+    regions = _regions(bench, image, painted)
+    found = _Found(image, painted, [], [], torch.zeros(0, dtype=torch.int64, device="cpu"))
+    c, others = bench.config.depth, bench.neighbours() if regions or things else []
     explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9) & ~painted
     matte = bench.matte()
     mover = image.motion.numpy() if matte is None else np.maximum(matte, image.motion.numpy())
@@ -184,30 +217,30 @@ def _shell(
     covers: list[tuple[NDArray[np.float32], Track | None]]
     covers = [(_cover(bench, image, r, painted), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
     covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
-    fields = _fields_inverse(bench, frozen) if covers else nothing
+    covers = [(soft, thing) for soft, thing in covers if soft.max() >= 0.5]
+    fields = _fields_inverse(bench, frozen) if covers else np.zeros(0, np.float32)
     for soft, thing in covers:
-        if soft.max() < 0.5:
-            continue
+        core = soft >= 0.5
         depths, facts = inverse_depth(
-            bench.view, others, soft >= 0.5, explained & (soft < 0.1), image.depth.numpy(), mover, bench.config.depth,
-            bench.unit,
-        )  # fmt: skip
+            bench.view, others, core, explained & (soft < 0.1), image.depth.numpy(), mover, c, bench.unit
+        )
         swings = None if thing is None else swing(thing, bench.index, bench.camera, bench.config.track, bench.unit)
         if swings is not None:
             depths = np.full_like(depths, 1.0 / swings.depth)
             facts = replace(facts, depth=swings.depth, deviation=swings.deviation)
-        elif known is not None and (known[soft >= 0.5] > 0.0).mean() >= _KNOWN:
-            inverse = float(np.median(known[(soft >= 0.5) & (known > 0.0)]))
+        elif known is not None and (known[core] > 0.0).mean() >= _KNOWN:
+            inverse = float(np.median(known[core & (known > 0.0)]))
             depths, facts = np.full_like(depths, inverse), replace(facts, depth=1.0 / inverse)
-        elif (told := as_field(fields, soft >= 0.5, bench.config.depth, bench.unit)) is not None:
-            depths = told
-            facts = replace(facts, depth=1.0 / float(np.median(told[soft >= 0.5])))
-        parts.append(_Part(soft, depths, thing))
-        facts_of_regions.append(facts)
-    if not parts:
-        return {name: value[:0] for name, value in frozen.state.items()}, nothing, facts_of_regions
-    state, cover = _drawn(bench, frozen, image, parts)
-    return state, cover, facts_of_regions
+        elif (told := as_field(fields, core, c, bench.unit)) is not None:
+            depth, before = 1.0 / float(np.median(told[core])), facts.depth / (1.0 + c.deep)
+            if depth < before and facts.attached >= c.surely and not believed:
+                rows = bench.painters(frozen, _grown(core, bench.unit), before)
+                found.astray = torch.cat([found.astray, rows])
+            else:
+                depths, facts = told, replace(facts, depth=depth)
+        found.parts.append(_Part(soft, depths, thing))
+        found.regions.append(facts)
+    return found
 
 
 @dataclass
@@ -229,13 +262,31 @@ class _Part:
 
 
 def _drawn(
-    bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage, parts: list[_Part]
+    bench: InstantBench, frozen: FrozenGaussians, before: FrozenImage, found: _Found, layer: InstantLayer
+) -> InstantLayer:
+    """A layer that adds nothing, with the Gaussians of what was `found` to be missing of a frozen scene; as it is, if
+    that does not help beside what t*'s camera saw `before`."""
+    import cv2
+
+    if not found.parts:
+        return layer
+    state, mask = _gaussians_of(bench, frozen, found)
+    layer, empty = replace(layer, state=state, mask=from_numpy(mask), regions=found.regions), layer
+    # Of what was painted the difference says nothing, it looked right; nor of pixels beside it, which are mixtures.
+    told = (mask > 0) & (cv2.dilate(found.painted.astype(np.uint8), disc(2.0 * bench.unit)) == 0)
+    if told.any() and not _helps(bench, bench.render(join(frozen, layer, faded=True)), before, told):
+        return empty
+    return layer
+
+
+def _gaussians_of(
+    bench: InstantBench, frozen: FrozenGaussians, found: _Found
 ) -> tuple[dict[str, Tensor], NDArray[np.float32]]:
     """The Gaussians of a layer of parts, and its opacity [h, w], outlines taken apart.
 
     It is found at the size that the run was trained at, and drawn from the plate's pixels, as many as are delivered.
     """
-    fine = bench.as_plate()
+    fine, image, parts = bench.as_plate(), found.image, found.parts
     if fine is not bench:
         image = fine.render(frozen)
         parts = [part.enlarged(fine, image) for part in parts]
@@ -415,6 +466,12 @@ def _helps(bench: InstantBench, after: FrozenImage, before: FrozenImage, where: 
     fine, finer = bench.single(before), bench.single(after)
     sharper = finer[where].mean() <= (1.0 - c.detail) * fine[where].mean()
     return bool(sharper and finer[around].mean() <= fine[around].mean() and new[where].mean() <= old[where].mean())
+
+
+def _grown(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    import cv2
+
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc(radius)) > 0, np.bool_)
 
 
 def _large(mask: NDArray[np.bool_], seeds: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:

@@ -58,8 +58,8 @@ def skin(x, y):
     return torch.tensor([0.9, 0.6, 0.5]) + shade[:, None]
 
 
-def arm():
-    return sheet((0.1, 0.9), (-0.12, 0.12), ARM, 0.02, skin)
+def arm(half=0.12):
+    return sheet((0.1, 0.9), (-half, half), ARM, 0.02, skin)
 
 
 def hand(n, drift=(0.02, 0.05), start=(-0.28, 0.0), z=ARM):
@@ -301,6 +301,30 @@ def test_a_hand_that_the_field_has_but_too_pale_is_as_deep_as_the_field_has_it(t
     truth_state = together(static, hand(T_STAR, **behind))
     for n in (1, FRAMES):
         truth, without = made.image(truth_state, n), made.image(known, n)
+        changed = np.abs(truth - without).max(-1) > 0.1
+        off = np.square(made.image(join(made.frozen, layer).state, n) - truth)[changed].mean()
+        assert off < 0.25 * np.square(without - truth)[changed].mean()
+
+
+def test_a_hand_that_the_field_has_far_before_its_arm_stands_at_its_arm(tmp_path):
+    share = 1 / 1.35
+    view = scene_at(tmp_path).viewmats[T_STAR - 1]
+    centre = -view[:3, :3].mT @ view[:3, 3]
+    true, behind = hand(T_STAR), together(wall(), arm(half=0.5))
+    near = {
+        **true,
+        "means": centre + share * (true["means"] - centre),  # to t*'s camera the same
+        "log_scales": true["log_scales"] + math.log(share),
+    }
+    known = together(behind, pale(near, -2.2))
+    motion = (torch.arange(len(known["means"])) >= len(behind["means"])).float()
+    made = world(tmp_path, known, lambda n: together(behind, hand(n)), motion=motion)
+    layer = made.found()
+    assert abs(np.median(layer.state["means"][:, 2].numpy()) / ARM - 1) < 0.05
+    assert bool((layer.kept[motion == 0] == 1).all())
+    assert float((layer.kept[motion > 0] == 0).float().mean()) > 0.9
+    for n in (1, FRAMES):
+        truth, without = made.image(together(behind, true), n), made.image(known, n)
         changed = np.abs(truth - without).max(-1) > 0.1
         off = np.square(made.image(join(made.frozen, layer).state, n) - truth)[changed].mean()
         assert off < 0.25 * np.square(without - truth)[changed].mean()
