@@ -22,7 +22,7 @@ from ..array_types import connected
 from ..scene import Scene
 from ..train import LoadedRun
 from .frozen import FrozenGaussians, FrozenImage
-from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed
+from .instant_bench import InstantBench, InstantConfig, Motion, grown, low_passed
 from .instant_depth import weighted_median
 from .missing_layer import fade
 
@@ -52,8 +52,6 @@ class AdriftConfig:
     held: float = 0.05
     """As many alike pixels must tell of what it belongs to, as a share of its own; and more by a half than those
     beside it that move as near as itself."""
-    veil: float = 16.0
-    """As far beside a piece that was put back its veil reaches."""
     front: float = 0.02
     """It is put before that by this share."""
     rounds: int = 12
@@ -117,27 +115,9 @@ def adrift(
         now = moved_along(bench, now, piece.rows, torch.full_like(piece.rows, place / piece.depth, dtype=torch.float32))
     if not inverse.any():
         return None
-    now = _cleared(bench, now, inverse > 0.0, config)
+    now = moved_along(bench, now, *bench.veils(now, inverse > 0.0))
     stays = (now.state["means"] == frozen.state["means"]).all(1).float()
     return Adrift(now, fade(frozen, stays), inverse)
-
-
-def _cleared(
-    bench: InstantBench, frozen: FrozenGaussians, done: NDArray[np.bool_], config: AdriftConfig
-) -> FrozenGaussians:
-    """The scene with the veil of pieces `done` [h, w] put back, too: what moves, is seen about them, and stands far
-    before what is seen there for the most part, so that no median shows it."""
-    about = _grown(done, config.veil * bench.unit)
-    image = bench.render(frozen)
-    covered = (image.alpha.numpy() > 0.5).astype(np.float32)
-    log_depth = np.log(np.maximum(image.depth.numpy(), 1e-6)) * covered
-    asked = about.astype(np.float32), np.ones_like(covered), log_depth, covered
-    inside, whole, log_sum, count = bench.gathered(frozen, *asked).unbind(1)
-    behind = log_sum / count.clamp_min(1e-6)
-    factor = behind.exp() / (1.0 + config.front) / bench.depths(frozen).clamp_min(1e-6)
-    veils = (whole > 1e-3) & (inside >= 0.5 * whole) & (factor > config.near) & (frozen.motion > 0.5).cpu()
-    rows = torch.nonzero(veils).flatten()
-    return moved_along(bench, frozen, rows, factor[rows])
 
 
 def _adrift(
@@ -168,14 +148,8 @@ def _adrift(
 
 def _around(mask: NDArray[np.bool_], unit: float, config: AdriftConfig) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """A piece with its rim, and the ring about them, [h, w] each."""
-    core = _grown(mask, config.rim * unit)
-    return core, _grown(mask, config.ring * unit) & ~core
-
-
-def _grown(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    import cv2
-
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc(radius)) > 0, np.bool_)
+    core = grown(mask, config.rim * unit)
+    return core, grown(mask, config.ring * unit) & ~core
 
 
 def _belonging(
@@ -190,7 +164,7 @@ def _belonging(
     others, holds = (mask.index_fill(0, rows, value=False).float() for mask in (moves, ~moves))
     rest, still = bench.render(fade(frozen, others)), bench.render(fade(frozen, holds))
     core, _ = _around(piece.mask, bench.unit, config)
-    about = _grown(piece.mask, config.reach * bench.unit)
+    about = grown(piece.mask, config.reach * bench.unit)
     behind, alpha, least = rest.depth.numpy(), rest.alpha.numpy(), config.near * piece.depth
     smooth = low_passed(bench.view.picture, bench.unit)
     through = rest.color.numpy() / np.maximum(alpha, 0.1)[..., None]

@@ -64,6 +64,10 @@ class InstantConfig:
     detail: float = 0.3
     """or the difference of single pixels by this share, and the low-passed one at all: a hand that the field has but
     blurred is where plate t* has it, and has no fingers."""
+    veil: float = 16.0
+    """So far about a piece that stands too near its veil reaches,"""
+    before: float = 1.25
+    """and what is seen there for the most part is at least so many times as far away as the veil."""
     stuck: float = 0.5
     """Detail that correlates this well with that at the same pixels of other frames is on the picture (a logo)."""
     depth: DepthConfig = field(default_factory=DepthConfig)
@@ -186,6 +190,23 @@ class InstantBench:
         paints = ((seen & (inside >= 0.5 * whole)) | hidden) & (self.depths(frozen) < nearer)
         return torch.nonzero(paints).flatten()
 
+    def veils(self, frozen: FrozenGaussians, pieces: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+        """(rows int64 [M], times [M]): the veil of pieces [h, w] that are at their place now: what moves, is seen about
+        them, and stands far before what is seen there for the most part, so that no median shows it; and so many times
+        farther away it would be just before that."""
+        about = grown(pieces, self.config.veil * self.unit).astype(np.float32)
+        image = self.render(frozen)
+        covered = (image.alpha.numpy() > 0.5).astype(np.float32)
+        log_depth = np.log(np.maximum(image.depth.numpy(), 1e-6)) * covered
+        asked = about, np.ones_like(covered), log_depth, covered
+        inside, whole, log_sum, count = self.gathered(frozen, *asked).unbind(1)
+        behind = (log_sum / count.clamp_min(1e-6)).exp() / (1.0 + self.config.depth.front)
+        times = behind / self.depths(frozen).clamp_min(1e-6)
+        moves = (frozen.motion > 0.5).cpu()
+        veils = moves & (whole > 1e-3) & (inside >= 0.5 * whole) & (times > self.config.before)
+        rows = torch.nonzero(veils).flatten()
+        return rows, times[rows]
+
     def depths(self, frozen: FrozenGaussians) -> Tensor:
         """[N] scene units from camera t* to each Gaussian, along its axis."""
         view = self.scene.viewmats[self.index].to(frozen.support.device)
@@ -236,6 +257,13 @@ def disc(radius: float) -> NDArray[np.uint8]:
 
     side = 2 * max(1, math.ceil(radius)) + 1
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)).astype(np.uint8)
+
+
+def grown(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """A mask [h, w], larger by a radius in pixels, at least 1."""
+    import cv2
+
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc(radius)) > 0, np.bool_)
 
 
 def resized_array(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:

@@ -25,7 +25,7 @@ from ..train import LoadedRun
 from ..train.exposure import Exposure
 from .contradicted import contradicted
 from .frozen import FrozenGaussians, FrozenImage
-from .instant_bench import InstantBench, InstantConfig, Motion, disc, low_passed, resized_array
+from .instant_bench import InstantBench, InstantConfig, Motion, disc, grown, low_passed, resized_array
 from .instant_depth import Region, as_field, inverse_depth, own_motion
 from .instant_track import Track, swing, tracks
 
@@ -98,12 +98,13 @@ def instant_layer(
     found = _found(bench, frozen, image, things, known)
     if len(found.astray):
         stays = torch.ones_like(kept).index_fill(0, found.astray, 0.0)
-        without = fade(frozen, stays)
+        veils, _ = bench.veils(fade(frozen, stays), found.misplaced)
+        without = fade(frozen, stays.index_fill_(0, veils, 0.0))
         again = _found(bench, without, bench.render(without), things, known)
         layer = _drawn(
             bench, without, image, again, InstantLayer.empty(frozen, scene.frames[index], ghost, kept * stays)
         )
-        if layer.stands_for(np.any([part.soft >= 0.5 for part in found.parts], axis=0)):
+        if layer.stands_for(found.misplaced):
             return layer
         found = _found(bench, frozen, image, things, known, believed=True)
     layer = _drawn(bench, frozen, image, found, InstantLayer.empty(frozen, scene.frames[index], ghost, kept))
@@ -193,8 +194,10 @@ class _Found:
     parts: list[_Part]
     regions: list[Region]
     """Of the parts."""
+    misplaced: NDArray[np.bool_]
+    """[h, w]: parts that the field has far before what they hang on,"""
     astray: Tensor
-    """int64 [M] rows of what the field has in their place, far before what they hang on."""
+    """int64 [M]: and the rows of what it has there."""
 
 
 def _found(
@@ -208,7 +211,8 @@ def _found(
     """What plate t* shows and `image` of a frozen scene does not; `believed`: the field, wherever it has it."""
     painted = _painted(bench, image)
     regions = _regions(bench, image, painted)
-    found = _Found(image, painted, [], [], torch.zeros(0, dtype=torch.int64, device="cpu"))
+    nothing, nobody = np.zeros_like(painted), torch.zeros(0, dtype=torch.int64, device="cpu")
+    found = _Found(image, painted, [], [], nothing, nobody)
     c, others = bench.config.depth, bench.neighbours() if regions or things else []
     explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9) & ~painted
     matte = bench.matte()
@@ -234,8 +238,8 @@ def _found(
         elif (told := as_field(fields, core, c, bench.unit)) is not None:
             depth, before = 1.0 / float(np.median(told[core])), facts.depth / (1.0 + c.deep)
             if depth < before and facts.attached >= c.surely and not believed:
-                rows = bench.painters(frozen, _grown(core, bench.unit), before)
-                found.astray = torch.cat([found.astray, rows])
+                rows = bench.painters(frozen, grown(core, bench.unit), before)
+                found.misplaced, found.astray = found.misplaced | core, torch.cat([found.astray, rows])
             else:
                 depths, facts = told, replace(facts, depth=depth)
         found.parts.append(_Part(soft, depths, thing))
@@ -266,14 +270,13 @@ def _drawn(
 ) -> InstantLayer:
     """A layer that adds nothing, with the Gaussians of what was `found` to be missing of a frozen scene; as it is, if
     that does not help beside what t*'s camera saw `before`."""
-    import cv2
 
     if not found.parts:
         return layer
     state, mask = _gaussians_of(bench, frozen, found)
     layer, empty = replace(layer, state=state, mask=from_numpy(mask), regions=found.regions), layer
     # Of what was painted the difference says nothing, it looked right; nor of pixels beside it, which are mixtures.
-    told = (mask > 0) & (cv2.dilate(found.painted.astype(np.uint8), disc(2.0 * bench.unit)) == 0)
+    told = (mask > 0) & ~grown(found.painted, 2.0 * bench.unit)
     if told.any() and not _helps(bench, bench.render(join(frozen, layer, faded=True)), before, told):
         return empty
     return layer
@@ -348,7 +351,7 @@ def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArr
     """
     import cv2
 
-    near = cv2.dilate(thing.pixels.astype(np.uint8), disc(1.0)) > 0
+    near = grown(thing.pixels, 1.0)
     covered = np.where(near, np.clip(_share(bench, image, thing), 0.0, 1.0), 0.0).astype(np.float32)
     return np.asarray(cv2.morphologyEx(covered, cv2.MORPH_OPEN, disc(1.0 * bench.unit)), np.float32)
 
@@ -420,7 +423,7 @@ def _cover(
     down, right = np.gradient(low_passed(shown, 0.7 * unit), axis=(0, 1))
     off = np.abs(low_passed(plate - shown, 0.7 * unit)) - 0.5 * c.shift * unit * np.hypot(down, right)
     ramp = np.clip(2.0 * off.max(-1) / c.solid - 1.0, 0.0, 1.0).astype(np.float32)
-    near = cv2.dilate(region.astype(np.uint8), disc(2.0 * unit)) > 0
+    near = grown(region, 2.0 * unit)
     ramp = np.where(near, np.maximum(ramp, painted & region), 0.0).astype(np.float32)
     closed = cv2.morphologyEx(ramp, cv2.MORPH_CLOSE, disc(2.5 * unit))
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc(1.0 * unit))
@@ -456,22 +459,15 @@ def _ghosts(bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage) ->
 def _helps(bench: InstantBench, after: FrozenImage, before: FrozenImage, where: NDArray[np.bool_]) -> bool:
     """True if the difference, low-passed or of single pixels, falls enough where something was done, and does not rise
     around it."""
-    import cv2
 
     c = bench.config
-    around = cv2.dilate(where.astype(np.uint8), disc(2.0 * c.blur * bench.unit)) > 0
+    around = grown(where, 2.0 * c.blur * bench.unit)
     old, new = bench.difference(before), bench.difference(after)
     if new[where].mean() <= (1.0 - c.gain) * old[where].mean() and new[around].mean() <= old[around].mean():
         return True
     fine, finer = bench.single(before), bench.single(after)
     sharper = finer[where].mean() <= (1.0 - c.detail) * fine[where].mean()
     return bool(sharper and finer[around].mean() <= fine[around].mean() and new[where].mean() <= old[where].mean())
-
-
-def _grown(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    import cv2
-
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc(radius)) > 0, np.bool_)
 
 
 def _large(mask: NDArray[np.bool_], seeds: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
