@@ -58,9 +58,9 @@ class DepthConfig:
     """What lies off its median by more than this share of inverse depth is something else."""
     field_reach: float = 2.0
     """Standard deviation of the mean of the field's depth that is taken."""
-    surely: float = 0.6
-    """What hangs on something as surely as that (`Region.attached`) is as deep as it: a field that has it nearer by
-    more than `deep` is wrong."""
+    surely: float = 0.5
+    """What hangs on something as surely as that (`Region.attached`) once what the field has there is taken out is as
+    deep as it: a field that has it nearer by more than `deep` is wrong."""
 
 
 @dataclass

@@ -98,8 +98,7 @@ def instant_layer(
     found = _found(bench, frozen, image, things, known)
     if len(found.astray):
         stays = torch.ones_like(kept).index_fill(0, found.astray, 0.0)
-        veils, _ = bench.veils(fade(frozen, stays), found.misplaced)
-        without = fade(frozen, stays.index_fill_(0, veils, 0.0))
+        without = fade(frozen, stays)
         again = _found(bench, without, bench.render(without), things, known)
         layer = _drawn(
             bench, without, image, again, InstantLayer.empty(frozen, scene.frames[index], ghost, kept * stays)
@@ -197,7 +196,7 @@ class _Found:
     misplaced: NDArray[np.bool_]
     """[h, w]: parts that the field has far before what they hang on,"""
     astray: Tensor
-    """int64 [M]: and the rows of what it has there."""
+    """int64 [M]: and the rows of what it has there, with its veil."""
 
 
 def _found(
@@ -214,10 +213,17 @@ def _found(
     nothing, nobody = np.zeros_like(painted), torch.zeros(0, dtype=torch.int64, device="cpu")
     found = _Found(image, painted, [], [], nothing, nobody)
     c, others = bench.config.depth, bench.neighbours() if regions or things else []
-    explained = (bench.difference(image) < bench.config.grow) & (image.alpha.numpy() > 0.9) & ~painted
     matte = bench.matte()
-    mover = image.motion.numpy() if matte is None else np.maximum(matte, image.motion.numpy())
-    alone = np.zeros_like(explained) if not things else np.any([t.pixels for t in things], axis=0)
+
+    def told_by(shown: FrozenImage, soft: NDArray[np.float32]) -> tuple[NDArray[np.float32], Region]:
+        """Inverse depth [h, w] of a region, and what is known of it, by what is shown about it."""
+        explained = (bench.difference(shown) < bench.config.grow) & (shown.alpha.numpy() > 0.9) & ~painted
+        mover = shown.motion.numpy() if matte is None else np.maximum(matte, shown.motion.numpy())
+        return inverse_depth(
+            bench.view, others, soft >= 0.5, explained & (soft < 0.1), shown.depth.numpy(), mover, c, bench.unit
+        )
+
+    alone = np.zeros_like(painted) if not things else np.any([t.pixels for t in things], axis=0)
     covers: list[tuple[NDArray[np.float32], Track | None]]
     covers = [(_cover(bench, image, r, painted), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
     covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
@@ -225,9 +231,7 @@ def _found(
     fields = _fields_inverse(bench, frozen) if covers else np.zeros(0, np.float32)
     for soft, thing in covers:
         core = soft >= 0.5
-        depths, facts = inverse_depth(
-            bench.view, others, core, explained & (soft < 0.1), image.depth.numpy(), mover, c, bench.unit
-        )
+        depths, facts = told_by(image, soft)
         swings = None if thing is None else swing(thing, bench.index, bench.camera, bench.config.track, bench.unit)
         if swings is not None:
             depths = np.full_like(depths, 1.0 / swings.depth)
@@ -236,15 +240,32 @@ def _found(
             inverse = float(np.median(known[core & (known > 0.0)]))
             depths, facts = np.full_like(depths, inverse), replace(facts, depth=1.0 / inverse)
         elif (told := as_field(fields, core, c, bench.unit)) is not None:
-            depth, before = 1.0 / float(np.median(told[core])), facts.depth / (1.0 + c.deep)
-            if depth < before and facts.attached >= c.surely and not believed:
-                rows = bench.painters(frozen, grown(core, bench.unit), before)
-                found.misplaced, found.astray = found.misplaced | core, torch.cat([found.astray, rows])
-            else:
-                depths, facts = told, replace(facts, depth=depth)
+            depth = 1.0 / float(np.median(told[core]))
+            depths, facts = told, replace(facts, depth=depth)
+            if not believed:
+                rows = _in_its_place(bench, frozen, core, depth * (1.0 + c.deep))
+                _, hangs = told_by(bench.render(_less(frozen, rows)), soft)
+                nearest = hangs.depth / (1.0 + c.deep)
+                if depth < nearest and hangs.attached >= c.surely:
+                    found.misplaced |= core
+                    rows = _in_its_place(bench, frozen, core, nearest)
+                    found.astray = torch.cat([found.astray, rows])
         found.parts.append(_Part(soft, depths, thing))
         found.regions.append(facts)
     return found
+
+
+def _in_its_place(bench: InstantBench, frozen: FrozenGaussians, core: NDArray[np.bool_], nearer: float) -> Tensor:
+    """int64 [M]: rows of what the field has `nearer` than so many scene units where a region [h, w] is, and of its
+    veil."""
+    rows = bench.painters(frozen, grown(core, bench.unit), nearer)
+    veils, _ = bench.veils(_less(frozen, rows), core)
+    return torch.cat([rows, veils])
+
+
+def _less(frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
+    """A frozen scene without Gaussians `rows` int64 [M]."""
+    return fade(frozen, torch.ones(len(frozen.motion), device="cpu").index_fill(0, rows, 0.0))
 
 
 @dataclass
