@@ -291,7 +291,6 @@ def _drawn(
 ) -> InstantLayer:
     """A layer that adds nothing, with the Gaussians of what was `found` to be missing of a frozen scene; as it is, if
     that does not help beside what t*'s camera saw `before`."""
-
     if not found.parts:
         return layer
     state, mask = _gaussians_of(bench, frozen, found)
@@ -480,7 +479,6 @@ def _ghosts(bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage) ->
 def _helps(bench: InstantBench, after: FrozenImage, before: FrozenImage, where: NDArray[np.bool_]) -> bool:
     """True if the difference, low-passed or of single pixels, falls enough where something was done, and does not rise
     around it."""
-
     c = bench.config
     around = grown(where, 2.0 * c.blur * bench.unit)
     old, new = bench.difference(before), bench.difference(after)
