@@ -328,6 +328,8 @@ def test_a_hand_that_the_field_has_far_before_its_arm_stands_at_its_arm(tmp_path
         changed = np.abs(truth - without).max(-1) > 0.1
         off = np.square(made.image(join(made.frozen, layer).state, n) - truth)[changed].mean()
         assert off < 0.25 * np.square(without - truth)[changed].mean()
+    # Where no layer is good enough nothing is taken out either.
+    assert made.layer(config=InstantConfig(gain=1.1, detail=1.1)) is None
 
 
 def test_a_trace_of_what_the_field_moves_tells_no_depth():
