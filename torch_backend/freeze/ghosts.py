@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from .detail_config import DetailConfig
-from .held import BothPlates, left_by_shifts, light_between
-from .instant_view import InstantView, bridged, exposed
+from .held import BothPlates, Light, left_by_shifts, light_on
+from .instant_view import InstantView, bridged, continued, exposed, together
 from .posed import PosedFrame
 from .regions import closed, components, opened
 from .reproject import blurred, look_up, narrowed
@@ -33,8 +33,8 @@ class Ghosts:
     """bool."""
     places: Tensor
     """[h, w, 2] where plate t* shows what is behind them, in its pixels."""
-    light: Tensor
-    """[h, w, 3] to be added to what it shows, display-referred: light falls otherwise on what the frame sees."""
+    light: Light
+    """Light falls otherwise on what the frame sees than on what it shows."""
 
 
 def ghosts(
@@ -64,9 +64,9 @@ def ghosts(
     told = view.told(view.sighting.pixels)
     both, sighting = _both(sightings, posed, leading, view, told)
     alike = replace(both, seen=torch.minimum(both.seen, sighting.visible))
-    light = light_between(alike, let_go, config.held.light * unit)
+    light = light_on(alike, let_go, config.held.light * unit)
     counted = counts[..., None]
-    instant = (told + light) * counted
+    instant = light.on(told) * counted
     off, most = (sightings.difference(instant, other * counted) for other in (shown, both.own))
     some, more = config.ghost_of
     spots = opened((off > config.ghost) & (off < some * most), round(config.thin * unit))
@@ -74,7 +74,11 @@ def ghosts(
     if not bool((found & clear).any()):
         return None
     places, steady = bridged(view.sighting.pixels, counts > 0.5, gap, config.unsteady * unit)
-    found &= clear & steady & ~_behind_rims(sightings, config, posed, places)
+    found = closed(found, round(gap)) & clear
+    plain = found & steady & ~_behind_rims(sightings, config, posed, places)
+    # Depth is a ghost's there, too: what that and its rims cut out goes on as beside them.
+    found &= closed(plain, round(gap))
+    places = together(continued(places, plain, round(gap) + rim), unit)
     known = torch.maximum(sighting.moving, posed.held)
     where = _passed(config, both, light, known, opened(found, round(config.sliver * unit)), unit)
     return Ghosts(where, places, light) if bool(where.any()) else None
@@ -91,13 +95,14 @@ def _both(
     return BothPlates(lead, told * sees[..., None], sees), sighting
 
 
-def _passed(config: DetailConfig, both: BothPlates, light: Tensor, known: Tensor, where: Tensor, unit: float) -> Tensor:
+def _passed(config: DetailConfig, both: BothPlates, light: Light, known: Tensor, where: Tensor, unit: float) -> Tensor:
     """[h, w] bool: the regions of `where` in which the leading plate shows something that was elsewhere at t*.
 
     That is `known`, [h, w] in 0..1, by mattes or by what is held, or plate t* shows its like nowhere near.
     """
     grain = config.held.grain * unit
-    own, instant = (blurred(of, grain) for of in (both.own, both.instant + light * both.seen[..., None]))
+    lit = light.on(both.instant) * (both.seen > 0.0)[..., None]
+    own, instant = blurred(both.own, grain), blurred(lit, grain)
     soft, out = BothPlates(own, instant, both.seen), torch.zeros_like(where)
     for region in components(where):
         if float(known[region].mean()) > 0.5 or left_by_shifts(soft, region, unit, config.held) > config.held.left:

@@ -20,6 +20,10 @@ _CLIPPED = 0.98
 """Display-referred, from which on a plate may hide anything brighter."""
 _COARSE = 8
 """Light is looked at in so many times fewer pixels a side."""
+_FLAT = 0.003
+"""Variance, display-referred, of colours around up to which light adds rather than multiplies: a wall tells no gain."""
+_STEEPEST = 2.0
+"""Times by which light multiplies at most."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,20 @@ class BothPlates:
     """[h, w] in 0..1: how well plate t* sees it."""
 
 
+@dataclass
+class Light:
+    """Light that falls otherwise in a frame than in plate t*."""
+
+    gain: Tensor
+    """[h, w, 3] by which display-referred colours of plate t* are multiplied, and"""
+    offset: Tensor
+    """[h, w, 3] that is added."""
+
+    def on(self, colors: Tensor) -> Tensor:
+        """[h, w, 3] colours of plate t* as the frame's light has them."""
+        return colors * self.gain + self.offset
+
+
 def held(
     both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, denied: Tensor, unit: float, config: HeldConfig
 ) -> Tensor:
@@ -138,12 +156,33 @@ def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlat
 def light_between(both: BothPlates, wrong: Tensor, sigma: float) -> Tensor:
     """[h, w, 3] by how much the own plate is brighter, smoothly; see `in_the_same_light`."""
     h, w = wrong.shape
-    clipped = torch.maximum(both.own, both.instant).amax(dim=-1) > _CLIPPED
-    counts = ((both.seen > 0.5) & ~wrong & ~clipped).float()[..., None]
-    size = (w + _COARSE - 1) // _COARSE, (h + _COARSE - 1) // _COARSE
-    told = torch.cat([(both.own - both.instant) * counts, counts], dim=-1)
-    light = blurred(resized(told, *size), sigma / _COARSE)
+    counts = _told_of_light(both, wrong)
+    light = _smooth(torch.cat([(both.own - both.instant) * counts, counts], dim=-1), sigma)
     return resized(light[..., :3] / light[..., 3:].clamp_min(1e-3), w, h)
+
+
+def light_on(both: BothPlates, wrong: Tensor, sigma: float) -> Light:
+    """The same as a straight line through the colours around: a dark foot on a pale desk loses less than the desk."""
+    h, w = wrong.shape
+    counts = _told_of_light(both, wrong)
+    own, instant = both.own * counts, both.instant * counts
+    told = _smooth(torch.cat([own, instant, own * instant, instant * instant, counts], dim=-1), sigma)
+    own, instant, product, square = (told[..., :12] / told[..., 12:].clamp_min(1e-3)).split(3, dim=-1)
+    gain = (product - own * instant + _FLAT) / (square - instant * instant + _FLAT)
+    gain = gain.clamp(1.0 / _STEEPEST, _STEEPEST)
+    return Light(resized(gain, w, h), resized(own - gain * instant, w, h))
+
+
+def _told_of_light(both: BothPlates, wrong: Tensor) -> Tensor:
+    """[h, w, 1] 1 where both plates tell what light there is."""
+    clipped = torch.maximum(both.own, both.instant).amax(dim=-1) > _CLIPPED
+    return ((both.seen > 0.5) & ~wrong & ~clipped).float()[..., None]
+
+
+def _smooth(told: Tensor, sigma: float) -> Tensor:
+    """[h / 8, w / 8, C] under a Gaussian of `sigma` pixels."""
+    h, w = told.shape[:2]
+    return blurred(resized(told, (w + _COARSE - 1) // _COARSE, (h + _COARSE - 1) // _COARSE), sigma / _COARSE)
 
 
 def with_holes(wrong: Tensor, found: Tensor, off: Tensor, unit: float, config: HeldConfig) -> tuple[Tensor, Tensor]:

@@ -19,6 +19,7 @@ from ..torch_types import norm
 from .bands import look_up_near
 from .detail_config import DetailConfig
 from .ghosts import ghosts
+from .held import Light
 from .instant_view import InstantView, bridged, continued, instant_view, smooth_depth
 from .posed import PosedFrame
 from .regions import closed, opened
@@ -42,8 +43,8 @@ class InstantPixels:
     """[3] by which its colours are multiplied, and"""
     offset: Tensor
     """[3] that is added, to expose them as the frame is."""
-    light: Tensor
-    """[h, w, 3] that is added: light that falls otherwise; 0 for what moves."""
+    light: Light | None
+    """Light that falls otherwise, where it is haunted; None: nowhere."""
     together: float
     """Pixels of decisions by which neighbours of one surface are displaced differently at most."""
 
@@ -55,7 +56,10 @@ class InstantPixels:
         apart = norm(smooth - nearest, -1) > self.together  # between two surfaces the mean is at neither
         places = pixels + torch.where(apart[:, None], nearest, smooth)
         shown = look_up_near(self.plate, places * larger, "bicubic")
-        return shown * self.gain + self.offset + look_up(self.light, pixels)
+        shown = shown * self.gain + self.offset
+        if self.light is None:
+            return shown
+        return shown * look_up(self.light.gain, pixels) + look_up(self.light.offset, pixels)
 
 
 @dataclass
@@ -91,11 +95,12 @@ def instant_pixels(
     movers = let_go & (moves > config.moves)
     taken, places = _of_movers(sightings, config, posed, view, shown, moves, view.shows(movers))
     behind = ghosts(sightings, config, posed, leading, view, shown, let_go, view.shows(let_go & ~movers))
-    light, haunted = torch.zeros_like(shown), torch.zeros_like(view.depth)
+    light, haunted = None, torch.zeros_like(view.depth)
     if behind is not None:
         near = (widened(behind.where, _feather(config, sightings)) > 0.5) & ~taken
         places = torch.where(near[..., None], behind.places, places)
-        light = torch.where(near[..., None], behind.light, light)
+        lit, light = near[..., None], behind.light
+        light = Light(torch.where(lit, light.gain, 1.0), torch.where(lit, light.offset, 0.0))
         taken, haunted = taken | behind.where, near.float()
     if not bool(taken.any()):
         return None

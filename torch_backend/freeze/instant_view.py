@@ -102,6 +102,13 @@ def continued(places: Tensor, taken: Tensor, reach: int) -> Tensor:
     return torch.where(on[..., None], pixel_centres(w, h) + by_label[nearest], places)
 
 
+def together(places: Tensor, unit: float) -> Tensor:
+    """[h, w, 2] places in plate t*, each displaced as the middle one of those around it: none on its own."""
+    here = pixel_centres(*reversed(places.shape[:2]))
+    moved = (places - here).clamp(-1e4, 1e4)
+    return here + torch.stack([_median(part, unit) for part in moved.unbind(-1)], dim=-1)
+
+
 def _returns(sightings: Sightings, config: DetailConfig, posed: PosedFrame, sighting: Sighting) -> Tensor:
     """[h, w] in 0..1: what plate t* has at its places is seen by the frame where these were asked for, or so near that
     nobody sees it. Of an arm that comes towards the camera depth is rough by more than a surface may be, and no pixel
@@ -133,13 +140,17 @@ def smooth_depth(config: DetailConfig, depth: Tensor, unit: float) -> Tensor:
 
     Of small pictures fewer pixels: an apple of five would be as deep as the wall.
     """
+    smooth = depth.clamp_max(1e6)
+    for _ in range(config.medians):
+        smooth = _median(smooth, unit)
+    return smooth
+
+
+def _median(values: Tensor, unit: float) -> Tensor:
+    """[h, w] the median of 5 x 5 pixels around each, of 3 x 3 in small pictures."""
     import cv2
 
-    side = 5 if unit > _SMALL else 3
-    smooth = np.ascontiguousarray(depth.clamp_max(1e6).numpy())
-    for _ in range(config.medians):
-        smooth = np.asarray(cv2.medianBlur(smooth, side))
-    return from_numpy(smooth)
+    return from_numpy(np.asarray(cv2.medianBlur(np.ascontiguousarray(values.numpy()), 5 if unit > _SMALL else 3)))
 
 
 def _points(posed: PosedFrame, depth: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ from .warp import FOLDER as WARPS
 
 TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
-DETAIL_VERSION = 18
+DETAIL_VERSION = 19
 """The same, of frames made of plates."""
 
 

@@ -30,8 +30,11 @@ def passed(world):
     return ~widened(frozen | ~own, 8)
 
 
-def delivered(world, config, share, changed=lambda plates: plates):
-    """(frame, truth [H, W, 3]): splats show so much of the board where it was at the frame's own time."""
+def delivered(world, config, share, changed=lambda plates: plates, nearer=None):
+    """(frame, truth [H, W, 3]): splats show so much of the board where it was at the frame's own time.
+
+    And they are a quarter nearer where `nearer`, bool [H, W], says so.
+    """
     output = world.output(POSE, T_STAR)
     truth, there = world.truth(output)
     own, on = world.seen_at(POSE)
@@ -39,6 +42,8 @@ def delivered(world, config, share, changed=lambda plates: plates):
     image = render_frozen(frozen, output.viewmat, output.K, W, H)
     where = torch.from_numpy(on & ~there)
     image.color[where] = torch.lerp(image.color, torch.from_numpy(own).float(), share)[where]
+    if nearer is not None:
+        image.depth[torch.from_numpy(nearer)] *= 0.75
     made = Detailer(world.run, world.scene, changed(world.plates()), config).frame(output, frozen, image, W, H)
     return made, truth
 
@@ -50,6 +55,16 @@ def test_what_the_splats_keep_of_a_board_that_went_by_is_the_wall_of_plate_t_sta
     assert (mended.source.numpy()[passed] == T_STAR).mean() > 0.9
     beyond = ~widened(world.seen_at(POSE)[1] | world.truth(world.output(POSE, T_STAR))[1], 12)
     assert torch.equal(mended.color[torch.from_numpy(beyond)], haunted.color[torch.from_numpy(beyond)])
+
+
+def test_a_ghost_whose_depth_is_wrong_in_a_bar_is_mended_there_too(world, passed):
+    bar = passed.copy()
+    bar[[y for y in range(H) if not 90 <= y < 93]] = False
+    assert bar.sum() > 100
+    made, truth = delivered(world, SHARP, 0.5, nearer=bar)
+    haunted, _ = delivered(world, BELIEVED, 0.5, nearer=bar)
+    assert off(made.color, truth, bar) < 0.25 * off(haunted.color, truth, bar)
+    assert (made.source.numpy()[bar] == T_STAR).mean() > 0.9
 
 
 def test_a_shine_is_all_that_the_leading_plate_shows_and_stays(world):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from torch_backend.freeze.held import BothPlates, HeldConfig, held, in_the_same_light, with_holes
+from torch_backend.freeze.held import BothPlates, HeldConfig, held, in_the_same_light, light_on, with_holes
 from torch_backend.freeze.reproject import blurred
 
 H, W = 160, 240
@@ -178,3 +178,21 @@ def test_a_fist_of_the_faces_colour_is_no_shift_of_the_face_if_the_render_shows_
     fist = hand & ~face
     assert found(both, sleeve, off=0.2, render=instant)[fist].float().mean() > 0.8
     assert not found(both, sleeve, off=0.2, render=own)[fist].any(), "what the splats have as well is there"
+
+
+def test_in_a_dimmer_light_what_is_dark_stays_dark_and_no_blacker_than_black():
+    """A foot of 0.05 on a desk of 0.8 that is 0.6 in the frame's light: by the desk's loss it would be -0.15."""
+    at = torch.arange(160) // 20
+    dark = (at[:, None] + at) % 2 == 0
+    instant = torch.where(dark[..., None], 0.05, 0.8).expand(160, 160, 3)
+    wrong = torch.zeros(160, 160, dtype=torch.bool)
+    wrong[60:100, 60:100] = True
+    both = BothPlates(torch.where(wrong[..., None], 0.9, 0.75 * instant), instant, torch.ones(160, 160))
+    made = light_on(both, wrong, 48.0).on(instant)
+    assert (made - 0.75 * instant).abs().max() < 0.01
+
+
+def test_of_a_plain_wall_light_is_added():
+    instant, wrong = torch.full((160, 160, 3), 0.5), torch.zeros(160, 160, dtype=torch.bool)
+    light = light_on(BothPlates(instant + 0.1, instant, torch.ones(160, 160)), wrong, 48.0)
+    assert (light.gain - 1.0).abs().max() < 1e-3 and (light.offset - 0.1).abs().max() < 1e-3

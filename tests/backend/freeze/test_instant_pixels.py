@@ -170,9 +170,7 @@ def test_between_two_surfaces_a_plate_larger_than_decisions_is_read_at_either_an
     places = here.clone()
     places[:, :20, 0], places[:, 20:, 0] = 0.4 * here[:, :20, 0], 40.0 - 0.4 * (40.0 - here[:, 20:, 0])
     none = torch.zeros(20, 40)
-    made = InstantPixels(
-        none, none, places, plate.half(), torch.ones(3), torch.zeros(3), torch.zeros(20, 40, 3), 1.5
-    )  # fmt: skip
+    made = InstantPixels(none, none, places, plate.half(), torch.ones(3), torch.zeros(3), None, 1.5)
     fine = pixel_centres(160, 80).reshape(-1, 2) / 4.0
     row = made.at(fine, torch.tensor([4.0, 4.0])).reshape(80, 160, 3)[40]
     assert row[:78, 0].min() > 0.9 and row[82:, 2].min() > 0.9
