@@ -167,7 +167,8 @@ def light_on(both: BothPlates, wrong: Tensor, sigma: float) -> Light:
     counts = _told_of_light(both, wrong)
     own, instant = both.own * counts, both.instant * counts
     told = _smooth(torch.cat([own, instant, own * instant, instant * instant, counts], dim=-1), sigma)
-    own, instant, product, square = (told[..., :12] / told[..., 12:].clamp_min(1e-3)).split(3, dim=-1)
+    mean = told[..., :12] / told[..., 12:].clamp_min(1e-3)
+    own, instant, product, square = (mean[..., at : at + 3] for at in (0, 3, 6, 9))
     gain = (product - own * instant + _FLAT) / (square - instant * instant + _FLAT)
     gain = gain.clamp(1.0 / _STEEPEST, _STEEPEST)
     return Light(resized(gain, w, h), resized(own - gain * instant, w, h))

@@ -104,7 +104,8 @@ def continued(places: Tensor, taken: Tensor, reach: int) -> Tensor:
 
 def together(places: Tensor, unit: float) -> Tensor:
     """[h, w, 2] places in plate t*, each displaced as the middle one of those around it: none on its own."""
-    here = pixel_centres(*reversed(places.shape[:2]))
+    h, w = places.shape[:2]
+    here = pixel_centres(w, h)
     moved = (places - here).clamp(-1e4, 1e4)
     return here + torch.stack([_median(part, unit) for part in moved.unbind(-1)], dim=-1)
 
