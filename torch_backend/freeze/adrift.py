@@ -21,10 +21,9 @@ from torch import Tensor
 from ..array_types import connected
 from ..scene import Scene
 from ..train import LoadedRun
-from .frozen import FrozenGaussians, FrozenImage
+from .frozen import FrozenGaussians, FrozenImage, fade
 from .instant_bench import InstantBench, InstantConfig, Motion, grown, low_passed
 from .instant_depth import weighted_median
-from .missing_layer import fade
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -153,6 +153,15 @@ def render_frozen(
         made.color[rows], made.alpha[rows] = color, alpha
         made.support[rows], made.motion[rows] = support, motion
     return made
+
+
+def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
+    """A frozen scene whose Gaussians have the share `kept` [N] of their opacity left."""
+    logits = frozen.state["opacity_logits"]
+    kept = kept.to(logits)
+    less = torch.logit((torch.sigmoid(logits) * kept).clamp(1e-6, 1.0 - 1e-6))
+    state = {**frozen.state, "opacity_logits": torch.where(kept < 1.0, less, logits)}
+    return replace(frozen, state=state)
 
 
 def _shown(

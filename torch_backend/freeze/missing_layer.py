@@ -18,19 +18,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..gaussians.model import SH_C0
 from ..scene import Scene
 from ..torch_types import from_numpy
 from ..train import LoadedRun
-from ..train.exposure import Exposure
 from .contradicted import contradicted
-from .frozen import FrozenGaussians, FrozenImage
-from .instant_bench import InstantBench, InstantConfig, Motion, disc, grown, low_passed, resized_array
+from .frozen import FrozenGaussians, FrozenImage, fade
+from .instant_bench import InstantBench, InstantConfig, Motion, disc, grown, low_passed
 from .instant_depth import Region, as_field, inverse_depth, own_motion
 from .instant_track import Track, swing, tracks
-
-_NOTHING = 0.15
-"""Share of the way from what is behind to a thing's colour below which a pixel has nothing of it."""
+from .layer_gaussians import Part, gaussians_of, share_of
 
 _KNOWN = 0.25
 """Share of a region whose depth is known from which on all of it is as deep as that."""
@@ -119,15 +115,6 @@ def join(frozen: FrozenGaussians, layer: InstantLayer, faded: bool = False) -> F
     return FrozenGaussians(state, frozen.sh_degree, torch.cat([frozen.support, ones]), torch.cat([frozen.motion, ones]))
 
 
-def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
-    """A frozen scene whose Gaussians have the share `kept` [N] of their opacity left."""
-    logits = frozen.state["opacity_logits"]
-    kept = kept.to(logits)
-    less = torch.logit((torch.sigmoid(logits) * kept).clamp(1e-6, 1.0 - 1e-6))
-    state = {**frozen.state, "opacity_logits": torch.where(kept < 1.0, less, logits)}
-    return replace(frozen, state=state)
-
-
 def _painted(bench: InstantBench, image: FrozenImage) -> NDArray[np.bool_]:
     """bool [h, w]: what moves at t* and looks right, but is on something still behind, where it cannot be."""
     import cv2
@@ -190,7 +177,7 @@ class _Found:
     """The scene as t*'s camera sees it."""
     painted: NDArray[np.bool_]
     """[h, w]: what of it is painted onto something still behind."""
-    parts: list[_Part]
+    parts: list[Part]
     regions: list[Region]
     """Of the parts."""
     misplaced: NDArray[np.bool_]
@@ -250,7 +237,7 @@ def _found(
                     found.misplaced |= core
                     rows = _in_its_place(bench, frozen, core, nearest)
                     found.astray = torch.cat([found.astray, rows])
-        found.parts.append(_Part(soft, depths, thing))
+        found.parts.append(Part(soft, depths, thing))
         found.regions.append(facts)
     return found
 
@@ -268,24 +255,6 @@ def _less(frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
     return fade(frozen, torch.ones(len(frozen.motion), device="cpu").index_fill(0, rows, 0.0))
 
 
-@dataclass
-class _Part:
-    """What one region or thing adds to the layer, at the size at which it was found."""
-
-    soft: NDArray[np.float32]
-    """[h, w] in 0..1: how much of each pixel it covers."""
-    inverse: NDArray[np.float32]
-    """[h, w] inverse depths where it does."""
-    thing: Track | None
-
-    def enlarged(self, fine: InstantBench, image: FrozenImage) -> _Part:
-        """The same at the size of `image`, less what there has nothing of a small thing's colour."""
-        inverse, soft = _enlarged(self.inverse, self.soft, fine.width, fine.height)
-        if self.thing is not None:
-            soft = np.where(_share(fine, image, self.thing) > _NOTHING, soft, np.float32(0.0))
-        return _Part(soft, inverse, self.thing)
-
-
 def _drawn(
     bench: InstantBench, frozen: FrozenGaussians, before: FrozenImage, found: _Found, layer: InstantLayer
 ) -> InstantLayer:
@@ -293,50 +262,13 @@ def _drawn(
     that does not help beside what t*'s camera saw `before`."""
     if not found.parts:
         return layer
-    state, mask = _gaussians_of(bench, frozen, found)
+    state, mask = gaussians_of(bench, frozen, found.image, found.parts)
     layer, empty = replace(layer, state=state, mask=from_numpy(mask), regions=found.regions), layer
     # Of what was painted the difference says nothing, it looked right; nor of pixels beside it, which are mixtures.
     told = (mask > 0) & ~grown(found.painted, 2.0 * bench.unit)
     if told.any() and not _helps(bench, bench.render(join(frozen, layer, faded=True)), before, told):
         return empty
     return layer
-
-
-def _gaussians_of(
-    bench: InstantBench, frozen: FrozenGaussians, found: _Found
-) -> tuple[dict[str, Tensor], NDArray[np.float32]]:
-    """The Gaussians of a layer of parts, and its opacity [h, w], outlines taken apart.
-
-    It is found at the size that the run was trained at, and drawn from the plate's pixels, as many as are delivered.
-    """
-    fine, image, parts = bench.as_plate(), found.image, found.parts
-    if fine is not bench:
-        image = fine.render(frozen)
-        parts = [part.enlarged(fine, image) for part in parts]
-    cover, inverse = np.zeros((2, fine.height, fine.width), np.float32)
-    for part in parts:
-        stronger = part.soft > cover
-        inverse[stronger], cover[stronger] = part.inverse[stronger], part.soft[stronger]
-    colors, cover = _matted(fine.view.picture, image.color.numpy(), cover, fine.unit)
-    rows, columns = np.nonzero(cover > 0.1)
-    means = fine.view.unproject(columns + 0.5, rows + 0.5, 1.0 / np.maximum(inverse[rows, columns], 1e-9))
-    state = _gaussians(fine, frozen, means, rows, columns, inverse, cover, colors)
-    return state, resized_array(cover, bench.width, bench.height)
-
-
-def _enlarged(
-    inverse: NDArray[np.float32], cover: NDArray[np.float32], width: int, height: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(inverse depths, cover) [h, w] at a larger size; depths are those of what is covered alone."""
-    import cv2
-
-    known = ((inverse > 0.0) & (cover > 0.0)).astype(np.float32)
-    inverse = inverse * known
-    soft, depths, weight = (
-        cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR) for values in (cover, inverse, known)
-    )
-    depths = np.where(weight > 1e-3, depths / np.maximum(weight, 1e-3), 0.0)
-    return depths.astype(np.float32), np.where(weight > 1e-3, soft, 0.0).astype(np.float32)
 
 
 def _fields_inverse(bench: InstantBench, frozen: FrozenGaussians) -> NDArray[np.float32]:
@@ -356,13 +288,6 @@ def _small_things(bench: InstantBench, image: FrozenImage) -> list[Track]:
     return tracks(bench.frame, bench.index, image.color.numpy(), c.track, bench.unit)
 
 
-def _share(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArray[np.float32]:
-    """How far each pixel [h, w] of plate t* is on the way from what is behind to a small thing's colour."""
-    plate, behind = bench.view.picture, image.color.numpy()
-    way = thing.color - behind
-    return ((plate - behind) * way).sum(-1) / np.maximum(np.square(way).sum(-1), 1e-4)
-
-
 def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArray[np.float32]:
     """How much of each pixel [h, w] a small thing covers: how far it is on the way from what is behind to its colour.
 
@@ -372,60 +297,8 @@ def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArr
     import cv2
 
     near = grown(thing.pixels, 1.0)
-    covered = np.where(near, np.clip(_share(bench, image, thing), 0.0, 1.0), 0.0).astype(np.float32)
+    covered = np.where(near, np.clip(share_of(bench, image, thing), 0.0, 1.0), 0.0).astype(np.float32)
     return np.asarray(cv2.morphologyEx(covered, cv2.MORPH_OPEN, disc(1.0 * bench.unit)), np.float32)
-
-
-def _gaussians(
-    bench: InstantBench, frozen: FrozenGaussians, means: NDArray[np.float64], rows: NDArray[np.intp],
-    columns: NDArray[np.intp], inverse: NDArray[np.float32], cover: NDArray[np.float32], colors: NDArray[np.float32],
-) -> dict[str, Tensor]:  # fmt: skip
-    """Gaussians [M] at `means`, coloured by the pixels (rows, columns) of plate t*, one pixel apart on the screen."""
-    like, c = frozen.state, bench.config
-    count = len(means)
-    size = c.sigma / (bench.view.K[0, 0] * np.maximum(inverse[rows, columns], 1e-9))
-    opacity = from_numpy(np.clip(c.opacity * cover[rows, columns], 1e-4, 1.0 - 1e-4))
-    color = _unexposed(from_numpy(colors[rows, columns]), bench.exposure, bench.time)
-    quats = torch.zeros(count, 4, device="cpu")
-    quats[:, 0] = 1.0
-    state = {
-        "means": from_numpy(means),
-        "quats": quats,
-        "log_scales": from_numpy(np.log(np.repeat(size[:, None], 3, axis=1))),
-        "opacity_logits": torch.logit(opacity),
-        "sh0": ((color - 0.5) / SH_C0)[:, None, :],
-        "shN": torch.zeros(count, like["shN"].shape[1], 3, device="cpu"),
-    }
-    return {name: state[name].to(value) for name, value in like.items()}
-
-
-def _matted(
-    picture: NDArray[np.float32], behind: NDArray[np.float32], cover: NDArray[np.float32], unit: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(colours [h, w, 3], cover [h, w]) of a layer, its outline taken apart into its own colour and what is behind.
-
-    A pixel of the outline is a mixture: how far it is on the way from the model's colour there to that of the inside
-    beside it is what the layer covers. From another pose what it has of the wall would be a rim around the hand.
-    """
-    import cv2
-
-    inside = np.asarray(cv2.erode((cover > 0.9).astype(np.float32), disc(1.0 * unit)), np.float32)
-    weight = low_passed(inside, 1.5 * unit)
-    own = low_passed(picture * inside[..., None], 1.5 * unit) / np.maximum(weight, 1e-6)[..., None]
-    way, length = own - behind, np.square(own - behind).sum(-1)
-    share = np.clip(((picture - behind) * way).sum(-1) / np.maximum(length, 1e-6), 0.0, 1.0)
-    rim = (cover > 0.0) & (inside < 0.5) & (weight > 0.02) & (length > 0.15**2)
-    mixed = share[..., None] * picture + (1.0 - share[..., None]) * own
-    color = np.where(rim[..., None], mixed, picture).astype(np.float32)
-    return color, np.where(rim, np.minimum(cover, share), cover).astype(np.float32)
-
-
-def _unexposed(color: Tensor, exposure: Exposure, time: float) -> Tensor:
-    """The colour [M, 3] that the camera shows as `color` at a time."""
-    if not exposure.config.on:
-        return color
-    gain, offset = exposure.at(time)
-    return (color - offset.cpu()) / gain.cpu()
 
 
 def _cover(

@@ -17,9 +17,8 @@ import torch
 from ..scene import Scene
 from ..train import LoadedRun
 from .adrift import moved_along
-from .frozen import FrozenGaussians
+from .frozen import FrozenGaussians, fade
 from .instant_bench import InstantBench, InstantConfig, disc
-from .missing_layer import fade
 
 
 @dataclass(frozen=True)
