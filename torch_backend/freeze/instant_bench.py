@@ -266,6 +266,18 @@ def grown(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc(radius)) > 0, np.bool_)
 
 
+def large(mask: NDArray[np.bool_], seeds: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+    """The connected parts of a mask [h, w] with at least `least` pixels and one of `seeds`."""
+    import cv2
+
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    sizes = np.bincount(labels.ravel(), minlength=count)
+    seeded = np.bincount(labels[seeds], minlength=count) > 0
+    good = (sizes >= least) & seeded
+    good[0] = False
+    return good[np.asarray(labels, np.int32)]
+
+
 def resized_array(values: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """[H, W] or [H, W, C] at another size: averaged where it shrinks."""
     import cv2

@@ -23,10 +23,11 @@ from ..torch_types import from_numpy
 from ..train import LoadedRun
 from .contradicted import contradicted
 from .frozen import FrozenGaussians, FrozenImage, fade
-from .instant_bench import InstantBench, InstantConfig, Motion, disc, grown, low_passed
+from .instant_bench import InstantBench, InstantConfig, Motion, disc, grown, large, low_passed
 from .instant_depth import Region, as_field, inverse_depth, own_motion
 from .instant_track import Track, swing, tracks
 from .layer_gaussians import Part, gaussians_of, share_of
+from .torn import mends, torn
 
 _KNOWN = 0.25
 """Share of a region whose depth is known from which on all of it is as deep as that."""
@@ -91,17 +92,23 @@ def instant_layer(
     if ghost.any():
         frozen = fade(frozen, kept)
         image = bench.render(frozen)
-    found = _found(bench, frozen, image, things, known)
-    if len(found.astray):
+    apart = torn(bench, frozen, image)
+    # Taken together first; if what has fallen apart cannot be mended with the rest, the rest may be, as it is.
+    for where in [apart.where, None] if apart.where.any() else [None]:
+        found = _found(bench, frozen, image, things, known, where)
+        if not len(found.astray):
+            continue
         stays = torch.ones_like(kept).index_fill(0, found.astray, 0.0)
         without = fade(frozen, stays)
-        again = _found(bench, without, bench.render(without), things, known)
-        layer = _drawn(
-            bench, without, image, again, InstantLayer.empty(frozen, scene.frames[index], ghost, kept * stays)
-        )
-        if layer.stands_for(found.misplaced):
+        bare = bench.render(without)
+        again = _found(bench, without, bare, things, known, where, taken_out=True)
+        fallen = found.misplaced & (apart.where if where is not None else False)
+        empty = InstantLayer.empty(frozen, scene.frames[index], ghost, kept * stays)
+        # From t*'s own camera nothing was missing of what has fallen apart.
+        layer = _drawn(bench, without, bare if fallen.any() else image, again, empty)
+        if layer.stands_for(found.misplaced) and mends(bench, join(without, layer, faded=True), apart, fallen):
             return layer
-        found = _found(bench, frozen, image, things, known, believed=True)
+    found = _found(bench, frozen, image, things, known, believed=True)
     layer = _drawn(bench, frozen, image, found, InstantLayer.empty(frozen, scene.frames[index], ghost, kept))
     return layer if len(layer.state["means"]) or ghost.any() else None
 
@@ -192,11 +199,22 @@ def _found(
     image: FrozenImage,
     things: list[Track],
     known: NDArray[np.float32] | None,
+    apart: NDArray[np.bool_] | None = None,
+    taken_out: bool = False,
     believed: bool = False,
 ) -> _Found:
-    """What plate t* shows and `image` of a frozen scene does not; `believed`: the field, wherever it has it."""
+    """What plate t* shows and `image` of a frozen scene does not.
+
+    Args:
+        apart: [h, w] what has fallen apart (`torn.py`), which is not believed either.
+        taken_out: of that, and of what stood far before its arm, the scene has nothing any more.
+        believed: the field, wherever it has it.
+    """
     painted = _painted(bench, image)
-    regions = _regions(bench, image, painted)
+    apart = np.zeros_like(painted) if apart is None else apart
+    doubted = painted | apart
+    things = [thing for thing in things if apart[thing.pixels].mean() < _KNOWN]
+    regions = _regions(bench, image, doubted)
     nothing, nobody = np.zeros_like(painted), torch.zeros(0, dtype=torch.int64, device="cpu")
     found = _Found(image, painted, [], [], nothing, nobody)
     c, others = bench.config.depth, bench.neighbours() if regions or things else []
@@ -204,7 +222,7 @@ def _found(
 
     def told_by(shown: FrozenImage, soft: NDArray[np.float32]) -> tuple[NDArray[np.float32], Region]:
         """Inverse depth [h, w] of a region, and what is known of it, by what is shown about it."""
-        explained = (bench.difference(shown) < bench.config.grow) & (shown.alpha.numpy() > 0.9) & ~painted
+        explained = (bench.difference(shown) < bench.config.grow) & (shown.alpha.numpy() > 0.9) & ~doubted
         mover = shown.motion.numpy() if matte is None else np.maximum(matte, shown.motion.numpy())
         return inverse_depth(
             bench.view, others, soft >= 0.5, explained & (soft < 0.1), shown.depth.numpy(), mover, c, bench.unit
@@ -212,13 +230,14 @@ def _found(
 
     alone = np.zeros_like(painted) if not things else np.any([t.pixels for t in things], axis=0)
     covers: list[tuple[NDArray[np.float32], Track | None]]
-    covers = [(_cover(bench, image, r, painted), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
+    covers = [(_cover(bench, image, r, doubted), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
     covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
     covers = [(soft, thing) for soft, thing in covers if soft.max() >= 0.5]
     fields = _fields_inverse(bench, frozen) if covers else np.zeros(0, np.float32)
     for soft, thing in covers:
         core = soft >= 0.5
         depths, facts = told_by(image, soft)
+        fallen = bool(apart[core].mean() > 0.5)
         swings = None if thing is None else swing(thing, bench.index, bench.camera, bench.config.track, bench.unit)
         if swings is not None:
             depths = np.full_like(depths, 1.0 / swings.depth)
@@ -226,17 +245,20 @@ def _found(
         elif known is not None and (known[core] > 0.0).mean() >= _KNOWN:
             inverse = float(np.median(known[core & (known > 0.0)]))
             depths, facts = np.full_like(depths, inverse), replace(facts, depth=1.0 / inverse)
+        elif fallen and taken_out and facts.attached >= c.surely:
+            pass  # what it hangs on tells; what the field has left there are shards
         elif (told := as_field(fields, core, c, bench.unit)) is not None:
             depth = 1.0 / float(np.median(told[core]))
             depths, facts = told, replace(facts, depth=depth)
-            if not believed:
-                rows = _in_its_place(bench, frozen, core, depth * (1.0 + c.deep))
+            nearest = depth * (1.0 + c.deep)
+            if not (believed or taken_out) and not fallen:
+                rows = _in_its_place(bench, frozen, core, nearest)
                 _, hangs = told_by(bench.render(_less(frozen, rows)), soft)
                 nearest = hangs.depth / (1.0 + c.deep)
-                if depth < nearest and hangs.attached >= c.surely:
-                    found.misplaced |= core
-                    rows = _in_its_place(bench, frozen, core, nearest)
-                    found.astray = torch.cat([found.astray, rows])
+                fallen = depth < nearest and hangs.attached >= c.surely
+            if not (believed or taken_out) and fallen:
+                found.misplaced |= core
+                found.astray = torch.cat([found.astray, _in_its_place(bench, frozen, core, nearest)])
         found.parts.append(Part(soft, depths, thing))
         found.regions.append(facts)
     return found
@@ -337,7 +359,7 @@ def _ghosts(bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage) ->
     before, after = bench.difference(image), bench.difference(without)
     bare = without.alpha.numpy() < 0.9
     ghost = (before >= bench.config.grow) & (after < 0.5 * before) & ~bare
-    ghost = _large(ghost, before >= bench.config.seed, bench.config.least * bench.unit**2)
+    ghost = large(ghost, before >= bench.config.seed, bench.config.least * bench.unit**2)
     if not ghost.any():
         return kept, nothing
     inside, whole = bench.seen_inside(frozen, ghost)
@@ -360,15 +382,3 @@ def _helps(bench: InstantBench, after: FrozenImage, before: FrozenImage, where: 
     fine, finer = bench.single(before), bench.single(after)
     sharper = finer[where].mean() <= (1.0 - c.detail) * fine[where].mean()
     return bool(sharper and finer[around].mean() <= fine[around].mean() and new[where].mean() <= old[where].mean())
-
-
-def _large(mask: NDArray[np.bool_], seeds: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
-    """The connected parts of a mask [h, w] with at least `least` pixels and one of `seeds`."""
-    import cv2
-
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
-    sizes = np.bincount(labels.ravel(), minlength=count)
-    seeded = np.bincount(labels[seeds], minlength=count) > 0
-    good = (sizes >= least) & seeded
-    good[0] = False
-    return good[np.asarray(labels, np.int32)]
