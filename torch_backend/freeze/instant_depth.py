@@ -61,6 +61,8 @@ class DepthConfig:
     surely: float = 0.5
     """What hangs on something as surely as that (`Region.attached`) once what the field has there is taken out is as
     deep as it: a field that has it nearer by more than `deep` is wrong."""
+    behind: float = 0.05
+    """And so is one that has it farther by more than this share, if it falls apart from aside (`torn.py`)."""
 
 
 @dataclass

@@ -92,25 +92,53 @@ def instant_layer(
     if ghost.any():
         frozen = fade(frozen, kept)
         image = bench.render(frozen)
-    apart = torn(bench, frozen, image)
-    # Taken together first; if what has fallen apart cannot be mended with the rest, the rest may be, as it is.
-    for where in [apart.where, None] if apart.where.any() else [None]:
-        found = _found(bench, frozen, image, things, known, where)
-        if not len(found.astray):
-            continue
-        stays = torch.ones_like(kept).index_fill(0, found.astray, 0.0)
+    asked = _Asked(bench, frozen, image, things, known, InstantLayer.empty(frozen, scene.frames[index], ghost, kept))
+    joined, layer, _ = _taken(asked, None)
+    apart = torn(bench, joined, bench.render(joined))
+    if apart.where.any():
+        joined, again, anew = _taken(asked, apart.where)
+        if mends(bench, joined, apart, anew):
+            layer = again
+    return layer if len(layer.state["means"]) or ghost.any() else None
+
+
+@dataclass
+class _Asked:
+    """What is asked for what it lacks."""
+
+    bench: InstantBench
+    frozen: FrozenGaussians
+    """The scene, less ghosts."""
+    image: FrozenImage
+    """Of it, by t*'s camera."""
+    things: list[Track]
+    known: NDArray[np.float32] | None
+    """As in `instant_layer`."""
+    empty: InstantLayer
+    """A layer that adds nothing to it."""
+
+
+def _taken(asked: _Asked, apart: NDArray[np.bool_] | None) -> tuple[FrozenGaussians, InstantLayer, NDArray[np.bool_]]:
+    """(the scene with what it lacks, that alone, where [h, w] what it had was taken out for that).
+
+    `apart` [h, w] has fallen apart, and is not believed either.
+    """
+    bench, frozen, image, empty = asked.bench, asked.frozen, asked.image, asked.empty
+    found = _found(asked, frozen, image, apart)
+    if len(found.astray):
+        stays = torch.ones_like(empty.kept).index_fill(0, found.astray, 0.0)
         without = fade(frozen, stays)
         bare = bench.render(without)
-        again = _found(bench, without, bare, things, known, where, taken_out=True)
-        fallen = found.misplaced & (apart.where if where is not None else False)
-        empty = InstantLayer.empty(frozen, scene.frames[index], ghost, kept * stays)
-        # From t*'s own camera nothing was missing of what has fallen apart.
-        layer = _drawn(bench, without, bare if fallen.any() else image, again, empty)
-        if layer.stands_for(found.misplaced) and mends(bench, join(without, layer, faded=True), apart, fallen):
-            return layer
-    found = _found(bench, frozen, image, things, known, believed=True)
-    layer = _drawn(bench, frozen, image, found, InstantLayer.empty(frozen, scene.frames[index], ghost, kept))
-    return layer if len(layer.state["means"]) or ghost.any() else None
+        shards = None if apart is None else apart & found.misplaced
+        again = _found(asked, without, bare, shards, taken_out=True)
+        # From t*'s own camera nothing is missing of what falls apart only from aside.
+        before = image if shards is None or not shards.any() else bare
+        layer = _drawn(bench, without, before, again, replace(empty, kept=empty.kept * stays))
+        if layer.stands_for(found.misplaced):
+            return join(without, layer, faded=True), layer, found.misplaced
+        found = _found(asked, frozen, image, None, believed=True)
+    layer = _drawn(bench, frozen, image, found, empty)
+    return join(frozen, layer, faded=True), layer, found.misplaced & False
 
 
 def join(frozen: FrozenGaussians, layer: InstantLayer, faded: bool = False) -> FrozenGaussians:
@@ -136,21 +164,35 @@ def _painted(bench: InstantBench, image: FrozenImage) -> NDArray[np.bool_]:
     return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc(1.0 * bench.unit)) > 0, np.bool_)
 
 
-def _regions(bench: InstantBench, image: FrozenImage, painted: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+def _regions(
+    bench: InstantBench, image: FrozenImage, painted: NDArray[np.bool_], apart: NDArray[np.bool_]
+) -> list[NDArray[np.bool_]]:
     """Masks [h, w] of the regions in which plate t* shows something that moves and the render does not, or has
-    `painted` [h, w] onto what is behind."""
-    import cv2
+    `painted` [h, w] onto what is behind, or has fallen `apart` [h, w].
 
-    c, unit = bench.config, bench.unit
+    A region of which most has fallen apart is of that; else it is one of its own, that may touch: the other hand.
+    """
+    c, least = bench.config, bench.config.least * bench.unit**2
     difference = bench.difference(image)
-    count, labels = cv2.connectedComponents(((difference >= c.grow) | painted).astype(np.uint8))
+    lacking = _pieces((difference >= c.grow) | painted)
+    for region in lacking:
+        if apart[region].mean() > 0.5:
+            apart = apart | region
+    lacking = [piece for region in lacking for piece in _pieces(region & ~apart)]
     found: list[NDArray[np.bool_]] = []
-    for label in range(1, count):
-        region, least = labels == label, c.least * unit**2
-        missing = difference[region].max() >= c.seed or painted[region].sum() >= least
+    for region in [*lacking, *_pieces(apart)]:
+        missing = difference[region].max() >= c.seed or (painted | apart)[region].sum() >= least
         if missing and region.sum() >= least:
             found.append(region)
     return [region for region in found if _moves(bench, region) and not _stuck(bench, region, image)]
+
+
+def _pieces(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
+    """Connected parts [h, w] of a mask [h, w]."""
+    import cv2
+
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    return [labels == label for label in range(1, count)]
 
 
 def _moves(bench: InstantBench, region: NDArray[np.bool_]) -> bool:
@@ -194,12 +236,10 @@ class _Found:
 
 
 def _found(
-    bench: InstantBench,
+    asked: _Asked,
     frozen: FrozenGaussians,
     image: FrozenImage,
-    things: list[Track],
-    known: NDArray[np.float32] | None,
-    apart: NDArray[np.bool_] | None = None,
+    apart: NDArray[np.bool_] | None,
     taken_out: bool = False,
     believed: bool = False,
 ) -> _Found:
@@ -210,11 +250,12 @@ def _found(
         taken_out: of that, and of what stood far before its arm, the scene has nothing any more.
         believed: the field, wherever it has it.
     """
+    bench, known = asked.bench, asked.known
     painted = _painted(bench, image)
     apart = np.zeros_like(painted) if apart is None else apart
     doubted = painted | apart
-    things = [thing for thing in things if apart[thing.pixels].mean() < _KNOWN]
-    regions = _regions(bench, image, doubted)
+    things = [thing for thing in asked.things if apart[thing.pixels].mean() < _KNOWN]
+    regions = _regions(bench, image, painted, apart)
     nothing, nobody = np.zeros_like(painted), torch.zeros(0, dtype=torch.int64, device="cpu")
     found = _Found(image, painted, [], [], nothing, nobody)
     c, others = bench.config.depth, bench.neighbours() if regions or things else []
@@ -251,14 +292,14 @@ def _found(
             depth = 1.0 / float(np.median(told[core]))
             depths, facts = told, replace(facts, depth=depth)
             nearest = depth * (1.0 + c.deep)
-            if not (believed or taken_out) and not fallen:
+            if not (believed or taken_out):
                 rows = _in_its_place(bench, frozen, core, nearest)
                 _, hangs = told_by(bench.render(_less(frozen, rows)), soft)
-                nearest = hangs.depth / (1.0 + c.deep)
-                fallen = depth < nearest and hangs.attached >= c.surely
-            if not (believed or taken_out) and fallen:
-                found.misplaced |= core
-                found.astray = torch.cat([found.astray, _in_its_place(bench, frozen, core, nearest)])
+                before = depth * (1.0 + c.deep) < hangs.depth
+                if hangs.attached >= c.surely and (before or (fallen and depth > (1.0 + c.behind) * hangs.depth)):
+                    found.misplaced |= core
+                    nearest = hangs.depth / (1.0 + c.deep) if before else nearest
+                    found.astray = torch.cat([found.astray, _in_its_place(bench, frozen, core, nearest)])
         found.parts.append(Part(soft, depths, thing))
         found.regions.append(facts)
     return found

@@ -43,7 +43,7 @@ class TornConfig:
     """Mean difference, display-referred, from which on a place has fallen apart,"""
     off_too: float = 0.05
     """and from which on what hangs together with such a one has."""
-    least_area: float = 60.0
+    least_area: float = 100.0
     """Square pixels of such a region; a smaller one is left alone."""
     gap: float = 2.0
     """Half the width of gaps in it."""
@@ -78,13 +78,14 @@ def torn(bench: InstantBench, frozen: FrozenGaussians, image: FrozenImage, confi
 
 
 def mends(
-    bench: InstantBench, frozen: FrozenGaussians, before: Torn, where: NDArray[np.bool_],
+    bench: InstantBench, frozen: FrozenGaussians, before: Torn, anew: NDArray[np.bool_],
     config: TornConfig | None = None,
 ) -> bool:  # fmt: skip
-    """True if a scene holds together much better than `before`, `where` [h, w] it had fallen apart; or nowhere had."""
+    """True if a scene holds together much better than one `before` it, where that had fallen apart and this has it
+    `anew` [h, w]."""
+    config, where = config or TornConfig(), before.where & anew
     if not where.any():
-        return True
-    config = config or TornConfig()
+        return False
     after = fallen_apart(bench, frozen, bench.render(frozen), config)
     return bool(after[where].mean() <= config.mended * before.off[where].mean())
 
