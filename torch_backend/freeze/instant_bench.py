@@ -50,6 +50,8 @@ class InstantConfig:
     """Least share of a region that the motion matte calls moving, if there is one."""
     own_motion: float = 0.12
     """Least distance of a region's flow from its epipolar lines, per frame; twice that where there is no matte."""
+    surely_own: float = 3.0
+    """Times that of what has fallen apart from aside (`torn.py`): t*'s camera sees nothing amiss there."""
     solid: float = 0.14
     """Difference at a pixel from which on it is wholly the layer's; below half of it, the model's."""
     sigma: float = 0.6

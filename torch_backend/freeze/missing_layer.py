@@ -184,7 +184,10 @@ def _regions(
         missing = difference[region].max() >= c.seed or (painted | apart)[region].sum() >= least
         if missing and region.sum() >= least:
             found.append(region)
-    return [region for region in found if _moves(bench, region) and not _stuck(bench, region, image)]
+    # Something still that a mover's matte covers may fall apart as well, and is none of what moves.
+    surely = [c.surely_own if apart[region].mean() > 0.5 else 1.0 for region in found]
+    moving = [region for region, least in zip(found, surely, strict=True) if _moves(bench, region, least)]
+    return [region for region in moving if not _stuck(bench, region, image)]
 
 
 def _pieces(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
@@ -195,14 +198,17 @@ def _pieces(mask: NDArray[np.bool_]) -> list[NDArray[np.bool_]]:
     return [labels == label for label in range(1, count)]
 
 
-def _moves(bench: InstantBench, region: NDArray[np.bool_]) -> bool:
-    """True if what plate t* shows in a region moves. What is merely modelled badly stays on its epipolar lines."""
+def _moves(bench: InstantBench, region: NDArray[np.bool_], surely: float = 1.0) -> bool:
+    """True if what plate t* shows in a region moves. What is merely modelled badly stays on its epipolar lines.
+
+    `surely`: times as much of its own motion as usual is asked for.
+    """
     c, matte = bench.config, bench.matte()
     share = 1.0 if matte is None else float(matte[region].mean())
     own = own_motion(bench.view, bench.neighbours(), region, c.depth, bench.unit)
     if own is None:  # a hand too fast for its flow is known by its matte alone, and that has to be sure
         return matte is not None and share >= 0.5 * (1.0 + c.moving)
-    return share >= c.moving and own >= (1.0 if matte is not None else 2.0) * c.own_motion * bench.unit
+    return share >= c.moving and own >= surely * (1.0 if matte is not None else 2.0) * c.own_motion * bench.unit
 
 
 def _stuck(bench: InstantBench, region: NDArray[np.bool_], image: FrozenImage) -> bool:

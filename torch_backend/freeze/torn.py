@@ -43,7 +43,7 @@ class TornConfig:
     """Mean difference, display-referred, from which on a place has fallen apart,"""
     off_too: float = 0.05
     """and from which on what hangs together with such a one has."""
-    least_area: float = 100.0
+    least_area: float = 250.0
     """Square pixels of such a region; a smaller one is left alone."""
     gap: float = 2.0
     """Half the width of gaps in it."""
@@ -127,7 +127,7 @@ def _aside(bench: InstantBench, movers: Tensor, config: TornConfig) -> list[int]
     cosine = torch.nn.functional.normalize(centres - middle, dim=1) @ own
     angle = torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
     first, last = config.aside
-    good = torch.nonzero((angle >= first) & (angle <= last)).flatten().tolist()
+    good = [n for n, degrees in enumerate(angle.numpy()) if first <= degrees <= last]
     return [good[n] for n in evenly_spaced(len(good), config.views)]
 
 
@@ -146,7 +146,10 @@ def _differs(
     picture = low_passed(shown.color.numpy(), config.blur * unit)
     side = 2 * max(1, round(config.shift * unit)) + 1
     around = np.ones((side, side), np.uint8)
-    most, least = there(np.asarray(cv2.dilate(picture, around))), there(np.asarray(cv2.erode(picture, around)))
+    most, least = (
+        there(np.asarray(cv2.dilate(picture, around), np.float32)),
+        there(np.asarray(cv2.erode(picture, around), np.float32)),
+    )
     off = np.maximum(np.maximum(plate - most, least - plate).max(axis=-1), 0.0)
     nearer = there(shown.depth.numpy().clip(0.0, 1e6)) < (1.0 - config.before) * away
     hidden = (nearer & (there(shown.motion.numpy()) < 0.5)) | (away <= 0.0)
