@@ -6,7 +6,7 @@ not disagreement. What it has painted onto the wall behind (`contradicted.py`) c
 what a region hangs on (the arm), by the frames around t*, and by what it hides; where the field has the hand itself, if
 paler or softer than the plate, it is as deep as that. Unless the field has it far before the arm on which it hangs: no
 frame tells how far away a thing is that moves, and the price on motion prefers it near (`adrift.py`). What the field
-has there is taken out then.
+has there is taken out then. So it is where a scene that looks right to t* falls apart from aside (`torn.py`).
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def instant_layer(
 
 @dataclass
 class _Asked:
-    """What is asked for what it lacks."""
+    """A scene at t*, and what is needed to find what it lacks."""
 
     bench: InstantBench
     frozen: FrozenGaussians
@@ -138,7 +138,7 @@ def _taken(asked: _Asked, apart: NDArray[np.bool_] | None) -> tuple[FrozenGaussi
             return join(without, layer, faded=True), layer, found.misplaced
         found = _found(asked, frozen, image, None, believed=True)
     layer = _drawn(bench, frozen, image, found, empty)
-    return join(frozen, layer, faded=True), layer, found.misplaced & False
+    return join(frozen, layer, faded=True), layer, np.zeros_like(found.misplaced)
 
 
 def join(frozen: FrozenGaussians, layer: InstantLayer, faded: bool = False) -> FrozenGaussians:
@@ -301,11 +301,12 @@ def _found(
             if not (believed or taken_out):
                 rows = _in_its_place(bench, frozen, core, nearest)
                 _, hangs = told_by(bench.render(_less(frozen, rows)), soft)
-                before = depth * (1.0 + c.deep) < hangs.depth
+                before = nearest < hangs.depth
                 if hangs.attached >= c.surely and (before or (fallen and depth > (1.0 + c.behind) * hangs.depth)):
                     found.misplaced |= core
-                    nearest = hangs.depth / (1.0 + c.deep) if before else nearest
-                    found.astray = torch.cat([found.astray, _in_its_place(bench, frozen, core, nearest)])
+                    if before:
+                        rows = _in_its_place(bench, frozen, core, hangs.depth / (1.0 + c.deep))
+                    found.astray = torch.cat([found.astray, rows])
         found.parts.append(Part(soft, depths, thing))
         found.regions.append(facts)
     return found

@@ -1,8 +1,8 @@
 """What is right as t*'s camera sees it and falls apart from aside: a hand of shards and of the screen behind it.
 
 A field that was trained for long explains every plate from that plate's own camera, by Gaussians at whatever depth: one
-camera sees an instant, and no other contradicts. So nothing is missing of such a hand, and no pixel of it is where it
-should be a step aside. Nor does it need another plate to tell: what plate t* shows, carried by the scene's own depth to
+camera sees an instant, and no other contradicts. So nothing is missing of such a hand, and a step aside it is none.
+Nor does it need another plate to tell: what plate t* shows, carried by the scene's own depth to
 where another camera has it, is to be what the scene shows there, or the scene contradicts itself.
 """
 
@@ -48,7 +48,7 @@ class TornConfig:
     gap: float = 2.0
     """Half the width of gaps in it."""
     thin: float = 1.0
-    """Half the width below which it is an outline: a finger is wider, where it is large enough to be seen."""
+    """Half the width below which it is an outline; the tip of a finger is lost by that, too."""
     mended: float = 0.5
     """Share of its difference that what stands for it has at most."""
 

@@ -62,8 +62,8 @@ def test_where_two_parts_meet_the_one_that_covers_more_has_the_pixel(tmp_path):
         Part(side.astype(np.float32), np.full_like(DISC, 1.0 / z), None) for side, z in ((left, 3.0), (right, 4.0))
     ]
     state, _ = drawn_by(bench, made, parts)
-    pixels = bench.view.picture.shape[1] / 2
+    middle = W / 2
     depth = bench.render(frozen_of(together(made.frozen.state, state))).depth.numpy()
     inside = DISC > 0.99
-    assert np.abs(depth[inside & (pixels - 2 > COLUMNS)] - 3.0).max() < 0.15
-    assert np.abs(depth[inside & (pixels + 2 < COLUMNS)] - 4.0).max() < 0.2
+    assert np.abs(depth[inside & (middle - 2 > COLUMNS)] - 3.0).max() < 0.15
+    assert np.abs(depth[inside & (middle + 2 < COLUMNS)] - 4.0).max() < 0.2
