@@ -147,8 +147,11 @@ class _Darkroom:
         self.afar[: len(means)] = seen_from_afar(run, scene, means, t_star, config.afar).float()
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in spread(self.frames, config.looks)])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
-        self.held = ((self.afar * opened > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
-        opened[len(run.model.gaussians) :] = 1.0
+        # What is behind the run's own and was not seen at t* (`unseen.py`) is as its plate had it.
+        unseen = (torch.arange(len(frozen.support), device=self.device) >= len(means)) & (frozen.support < 1.0)
+        self.afar[unseen] = 1.0
+        self.held = ((self.afar * opened > 0.5) & (moves.amax(0) > 0.5) | unseen).nonzero()[:, 0]
+        opened[len(run.model.gaussians) :] = (~unseen[len(means) :]).float()
         self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
         """Rows of what moves and stands, at t*, in what the plate says moves."""
 

@@ -27,10 +27,11 @@ from .missing_layer import instant_layer, join
 from .sightings import motion_mattes
 from .specks import without_specks
 from .static_twin import settled
+from .unseen import with_unseen
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 18
+VERSION = 19
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -159,7 +160,8 @@ def load_developed(
     closed = tensors["closed"].to(device)
     base = {name: tensors[f"base.{name}"].to(device) for name in PARAM_NAMES}
     support, motion = frozen.support.index_fill(0, closed, 1.0), frozen.motion.index_fill(0, closed, 0.0)
-    support, motion = (_grown(v, len(base["means"])) for v in (support, motion))
+    added = tensors["added.support"].to(device)
+    support, motion = torch.cat([support, added]), torch.cat([motion, torch.ones_like(added)])  # a layer moves
     before = FrozenGaussians(base, frozen.sh_degree, support, motion)
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
     return FrozenGaussians(state, frozen.sh_degree, support, motion, before)
@@ -176,6 +178,9 @@ def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
         like, value = frozen.state[name.partition(".")[2]], tensors[name]
         if value.dtype != like.dtype or value.shape != (count, *like.shape[1:]) or not bool(value.isfinite().all()):
             return False
+    added = tensors.get("added.support")
+    if added is None or added.dtype != frozen.support.dtype or added.shape != (max(0, count - known),):
+        return False
     rooted = not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
     return rooted and count >= known
 
@@ -211,16 +216,19 @@ def _make(
     def labels(frame: int) -> NDArray[np.uint8] | None:
         return load_motion(shot, frame)
 
+    def ready(joined: FrozenGaussians) -> FrozenGaussians:
+        whole = with_unseen(run, scene, joined, t_star, labels)
+        return develop(run, scene, whole, t_star, moving, config, check)
+
     frozen = without_specks(run, scene, settled(run, scene, frozen, t_star, moving), t_star)
     found = adrift(run, scene, frozen, t_star, labels)
     if found is not None:
         layer = instant_layer(run, scene, found.without, t_star, motion=labels, known=found.inverse)
         if layer is not None and layer.stands_for(found.inverse > 0.0):
-            return develop(run, scene, join(found.without, layer), t_star, moving, config, check)
+            return ready(join(found.without, layer))
         frozen = found.put_back
     layer = instant_layer(run, scene, frozen, t_star, motion=labels)
-    joined = frozen if layer is None else join(frozen, layer)
-    return develop(run, scene, joined, t_star, moving, config, check)
+    return ready(frozen if layer is None else join(frozen, layer))
 
 
 def _save(
@@ -236,6 +244,7 @@ def _save(
     before = made.descent.motion[: len(field.motion)]
     tensors = {"closed": torch.nonzero(before < field.motion).flatten()}
     # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
+    tensors["added.support"] = made.support[len(field.support) :].clone()
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
     tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
     sweep_half_written(folder)
@@ -245,8 +254,3 @@ def _save(
         with contextlib.suppress(OSError):  # known by its key, it does no harm but take room
             if frame_number(other.stem) is not None and other != path and read_meta(other).get("run") != run.stamp:
                 other.unlink()
-
-
-def _grown(values: Tensor, count: int) -> Tensor:
-    """[N] values with 1 behind them, [count]: what the layer adds is known at t*, and moves."""
-    return torch.cat([values, values.new_ones(max(0, count - len(values)))])

@@ -12,7 +12,7 @@ from .bands import bands
 from .detail_config import DetailConfig
 from .frozen import SUPPORT_SECONDS, OutputFrame
 from .held import BothPlates, held, with_holes
-from .posed import PosedFrame, displacements, parallax
+from .posed import PosedFrame, added_share, displacements, parallax
 from .regions import closed, grown, larger, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sighted import Sighting
@@ -52,6 +52,9 @@ def leading_matte(
     own = posed.own
     truth = sightings.seen(posed.t, posed.points) if posed.t in usable else None
     hidden = torch.minimum(posed.motion, lead.moving) if own else posed.motion
+    added = added_share(sightings, posed)
+    if added is not None:  # what stands where no plate had it while t* looked elsewhere
+        hidden = torch.maximum(hidden, added)
     if truth is not None:
         posed.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
     else:

@@ -32,6 +32,8 @@ from .torn import mends, torn
 _KNOWN = 0.25
 """Share of a region whose depth is known from which on all of it is as deep as that."""
 
+_WITHIN = 0.8
+"""Share of a piece that has to lie where something missing is looked for."""
 _COVERED = 0.6
 """Share of a piece's pixels that a layer has to cover to stand for it."""
 
@@ -87,23 +89,23 @@ def instant_layer(
     index = scene.nearest(t_star)
     bench = InstantBench(run, scene, index, config or InstantConfig(), motion)
     image = bench.render(frozen)
-    things = _small_things(bench, image)
+    things = small_things(bench, image)
     kept, ghost = _ghosts(bench, frozen, image)
     if ghost.any():
         frozen = fade(frozen, kept)
         image = bench.render(frozen)
-    asked = _Asked(bench, frozen, image, things, known, InstantLayer.empty(frozen, scene.frames[index], ghost, kept))
-    joined, layer, _ = _taken(asked, None)
+    asked = Asked(bench, frozen, image, things, known, InstantLayer.empty(frozen, scene.frames[index], ghost, kept))
+    joined, layer, _ = taken(asked, None)
     apart = torn(bench, joined, bench.render(joined))
     if apart.where.any():
-        joined, again, anew = _taken(asked, apart.where)
+        joined, again, anew = taken(asked, apart.where)
         if mends(bench, joined, apart, anew):
             layer = again
     return layer if len(layer.state["means"]) or ghost.any() else None
 
 
 @dataclass
-class _Asked:
+class Asked:
     """A scene at t*, and what is needed to find what it lacks."""
 
     bench: InstantBench
@@ -116,9 +118,11 @@ class _Asked:
     """As in `instant_layer`."""
     empty: InstantLayer
     """A layer that adds nothing to it."""
+    only: NDArray[np.bool_] | None = None
+    """[h, w] what is missing elsewhere is left alone; None: nowhere."""
 
 
-def _taken(asked: _Asked, apart: NDArray[np.bool_] | None) -> tuple[FrozenGaussians, InstantLayer, NDArray[np.bool_]]:
+def taken(asked: Asked, apart: NDArray[np.bool_] | None) -> tuple[FrozenGaussians, InstantLayer, NDArray[np.bool_]]:
     """(the scene with what it lacks, that alone, where [h, w] what it had was taken out for that).
 
     `apart` [h, w] has fallen apart, and is not believed either.
@@ -242,7 +246,7 @@ class _Found:
 
 
 def _found(
-    asked: _Asked,
+    asked: Asked,
     frozen: FrozenGaussians,
     image: FrozenImage,
     apart: NDArray[np.bool_] | None,
@@ -262,6 +266,9 @@ def _found(
     doubted = painted | apart
     things = [thing for thing in asked.things if apart[thing.pixels].mean() < _KNOWN]
     regions = _regions(bench, image, painted, apart)
+    if asked.only is not None:
+        regions = [region for region in regions if asked.only[region].mean() > _WITHIN]
+        things = [thing for thing in things if asked.only[thing.pixels].mean() > _WITHIN]
     nothing, nobody = np.zeros_like(painted), torch.zeros(0, dtype=torch.int64, device="cpu")
     found = _Found(image, painted, [], [], nothing, nobody)
     c, others = bench.config.depth, bench.neighbours() if regions or things else []
@@ -299,20 +306,20 @@ def _found(
             depths, facts = told, replace(facts, depth=depth)
             nearest = depth * (1.0 + c.deep)
             if not (believed or taken_out):
-                rows = _in_its_place(bench, frozen, core, nearest)
+                rows = in_its_place(bench, frozen, core, nearest)
                 _, hangs = told_by(bench.render(_less(frozen, rows)), soft)
                 before = nearest < hangs.depth
                 if hangs.attached >= c.surely and (before or (fallen and depth > (1.0 + c.behind) * hangs.depth)):
                     found.misplaced |= core
                     if before:
-                        rows = _in_its_place(bench, frozen, core, hangs.depth / (1.0 + c.deep))
+                        rows = in_its_place(bench, frozen, core, hangs.depth / (1.0 + c.deep))
                     found.astray = torch.cat([found.astray, rows])
         found.parts.append(Part(soft, depths, thing))
         found.regions.append(facts)
     return found
 
 
-def _in_its_place(bench: InstantBench, frozen: FrozenGaussians, core: NDArray[np.bool_], nearer: float) -> Tensor:
+def in_its_place(bench: InstantBench, frozen: FrozenGaussians, core: NDArray[np.bool_], nearer: float) -> Tensor:
     """int64 [M]: rows of what the field has `nearer` than so many scene units where a region [h, w] is, and of its
     veil."""
     rows = bench.painters(frozen, grown(core, bench.unit), nearer)
@@ -352,7 +359,7 @@ def _fields_inverse(bench: InstantBench, frozen: FrozenGaussians) -> NDArray[np.
     return np.where(there, 1.0 / np.maximum(depth, 1e-6), 0.0).astype(np.float32)
 
 
-def _small_things(bench: InstantBench, image: FrozenImage) -> list[Track]:
+def small_things(bench: InstantBench, image: FrozenImage) -> list[Track]:
     """Small things that move at t* and that the render does not show, however little a low-pass leaves of them."""
     c = bench.config
     return tracks(bench.frame, bench.index, image.color.numpy(), c.track, bench.unit)

@@ -138,6 +138,23 @@ def displacements(
     return [shown[..., 3 * n : 3 * n + 3] for n in range(len(chosen))], shown[..., -1]
 
 
+def added_share(sightings: Sightings, posed: PosedFrame) -> Tensor | None:
+    """[h, w] in 0..1: how much of what is seen is neither the run's nor was seen at t* (`unseen.py`); None: nothing."""
+    frozen = posed.frozen
+    added = sightings.stage.strangers(frozen) & (frozen.support < 1.0)
+    if not bool(added.any()):
+        return None
+    h, w = posed.depth.shape
+    rows, columns = posed.image.alpha.shape
+    viewmat, K = (
+        posed.viewmat.to(added.device),
+        resize_intrinsics(posed.K[None], columns, rows, w, h)[0].to(added.device),
+    )
+    out = render(frozen.state, 0, viewmat, K, w, h, colors=added.float()[:, None], with_contributions=False)
+    share = (out.colors[0, ..., 3] / out.alphas[0].clamp_min(1e-3)).cpu()
+    return torch.where(share > 0.5, 1.0, share)  # a trace of the wall behind it would bring that wall's plates in
+
+
 def with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Tensor:
     """[3, 3] the camera of a frame of `width` x `height` in pixels of its render, which may show more around it."""
     rows, columns = image.alpha.shape
