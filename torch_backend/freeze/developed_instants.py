@@ -181,6 +181,8 @@ def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
     added = tensors.get("added.support")
     if added is None or added.dtype != frozen.support.dtype or added.shape != (max(0, count - known),):
         return False
+    if not bool(((added >= 0.0) & (added <= 1.0)).all()):
+        return False
     rooted = not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
     return rooted and count >= known
 

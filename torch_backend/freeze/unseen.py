@@ -39,8 +39,10 @@ class UnseenConfig:
 
     frames: int = 24
     """Trained frames that are asked, at most, evenly over the clip."""
-    unseen: float = 0.9
-    """Share of a thing that no plate nearer to t* may see the place of."""
+    unseen: float = 0.1
+    """Share of a thing's place that plate t* may see, at most: of the rest it tells nothing."""
+    cut: float = 0.5
+    """The same of other plates nearer to t*: one that sees less, at its border, could not tell whether it is there."""
     before: tuple[float, ...] = (1.0, 0.8, 0.6)
     """A thing may be at these shares of the depth of what is behind it, until its own is told."""
     margin: float = 6.0
@@ -71,14 +73,19 @@ class _Witness:
     """The scene as it was then."""
     margin: float
     """Pixels along the border in which it says nothing."""
+    least: float
+    """Share of a thing's place from which on it has its say."""
 
     @functools.cached_property
     def image(self) -> FrozenImage:
         """The scene as its camera sees it."""
         return self.bench.render(self.frozen)
 
-    def sees(self, points: Tensor, tolerance: float) -> Tensor:
-        """bool [...]: world points [..., 3] are in view."""
+    def tells(self, points: Tensor, tolerance: float) -> bool:
+        """True if enough of world points [M, 3] is in view."""
+        return float(self._sees(points, tolerance).float().mean()) > self.least
+
+    def _sees(self, points: Tensor, tolerance: float) -> Tensor:
         bench, i = self.bench, self.bench.index
         pixels, away = project(points, bench.scene.viewmats[i], bench.Ks[i])
         size = torch.tensor([bench.width, bench.height], device="cpu")
@@ -104,7 +111,7 @@ def with_unseen(
     config = config or UnseenConfig()
     index = scene.frames.index(t_star)
     own = InstantBench(run, scene, index, InstantConfig(), motion)
-    witnesses = [_Witness(own, frozen, 0.0)]
+    witnesses = [_Witness(own, frozen, 0.0, config.unseen)]
     seconds = [float(scene.seconds[scene.frames.index(frame)]) for frame in run.train_frames]
     asked = [run.train_frames[n] for n in evenly_spaced(len(run.train_frames), config.frames)]
     away = {frame: abs(seconds[run.train_frames.index(frame)] - float(scene.seconds[index])) for frame in asked}
@@ -112,7 +119,7 @@ def with_unseen(
         if frame == t_star:
             continue
         bench = InstantBench(run, scene, scene.frames.index(frame), InstantConfig(), motion)
-        witness = _Witness(bench, frozen, config.margin * bench.unit)
+        witness = _Witness(bench, frozen, config.margin * bench.unit, config.cut)
         for layer in _missing(witness, witnesses, config):
             before = len(frozen.support)
             frozen = join(frozen, layer)
@@ -133,7 +140,11 @@ def _missing(own: _Witness, nearer: list[_Witness], config: UnseenConfig) -> Ite
     depth = image.depth.double().numpy()
     ways = [bench.view.unproject(grid[..., 0], grid[..., 1], share * depth) for share in config.before]
     points = [from_numpy(way).float() for way in ways]
-    places = [where for where in things if any(_unseen(way, where, nearer, config) for way in points)]
+    places = [
+        where
+        for where in things
+        if any(not any(w.tells(way[from_numpy(where)], config.depth) for w in nearer) for way in points)
+    ]
     if not places:
         return
     difference, then = bench.difference(image), bench.difference(bench.at_its_time(bench.index))
@@ -152,7 +163,7 @@ def _missing(own: _Witness, nearer: list[_Witness], config: UnseenConfig) -> Ite
         only = grown(where, config.around * bench.unit)
         _, layer, _ = taken(Asked(bench, frozen, image, things, None, empty, only), None)
         means = layer.state["means"].cpu()
-        if len(means) and not any(_share(w.sees(means, config.depth)) > 1.0 - config.unseen for w in nearer):
+        if len(means) and not any(witness.tells(means, config.depth) for witness in nearer):
             yield _as_plate(bench, frozen, _instead(bench, frozen, _solid(bench, layer)))
 
 
@@ -176,7 +187,7 @@ def _as_plate(bench: InstantBench, frozen: FrozenGaussians, layer: InstantLayer)
 
 
 def _solid(bench: InstantBench, layer: InstantLayer) -> InstantLayer:
-    """A layer whose inside lets nothing through: no plate develops it, and what is in shadow on it seemed half there."""
+    """A layer whose inside lets nothing through: nothing develops it, and what is in shadow on it seemed half there."""
     import cv2
 
     there = (layer.mask.numpy() > _THERE).astype(np.float32)
@@ -201,16 +212,6 @@ def _whole(moving: NDArray[np.bool_], config: UnseenConfig, unit: float) -> list
         if not cut and area >= config.least * unit**2:
             found.append(labels == label)
     return found
-
-
-def _unseen(points: Tensor, where: NDArray[np.bool_], witnesses: list[_Witness], config: UnseenConfig) -> bool:
-    """True if no witness sees the `points` [h, w, 3] of a thing [h, w]."""
-    there = points[from_numpy(where)]
-    return all(_share(witness.sees(there, config.depth)) <= 1.0 - config.unseen for witness in witnesses)
-
-
-def _share(mask: Tensor) -> float:
-    return float(mask.float().mean())
 
 
 def _stands_elsewhere(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 
 from torch_backend.contract import Cancelled, FreezeParams, LiveView, TrainParams
 from torch_backend.footage.images import read_png, write_png
-from torch_backend.freeze import freeze_at, freeze_shot
+from torch_backend.freeze import developed_instants, freeze_at, freeze_shot
 from torch_backend.freeze.develop import DevelopConfig, develop
 from torch_backend.freeze.developed_instants import (
     MOST,
@@ -23,7 +24,7 @@ from torch_backend.freeze.developed_instants import (
 from torch_backend.freeze.exr import read_key
 from torch_backend.freeze.from_afar import seen_from_afar
 from torch_backend.freeze.frozen import render_frozen, span_of
-from torch_backend.freeze.missing_layer import instant_layer, join
+from torch_backend.freeze.missing_layer import InstantLayer, instant_layer, join
 from torch_backend.freeze.sightings import motion_mattes
 from torch_backend.freeze.static_twin import TwinConfig, held_still, settled
 from torch_backend.freeze.travel import Stage, Travel
@@ -350,7 +351,10 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
     tensors, _ = load_checkpoint(path)
     wrong = [{"closed": torch.tensor([len(frozen.support)])}, {"closed": torch.zeros(2)}]
     wrong += [{"state.means": tensors["state.means"][:-1]}]
-    wrong += [{"base.quats": tensors["base.quats"] / 0.0}]
+    wrong += [
+        {"base.quats": tensors["base.quats"] / 0.0},
+        {"added.support": torch.ones(1 + len(tensors["added.support"]))},
+    ]
     for damage in (b"", whole[:1000], whole[:-9], b"x" * 99, *wrong):
         if isinstance(damage, bytes):
             path.write_bytes(damage)
@@ -360,6 +364,29 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
     assert same(make(), first)
     again = load_developed(shot, run, T_STAR, frozen, SHORT)
     assert again is not None and same(again, first)
+
+
+def with_more(frozen, rows, support):
+    """A scene with some of its Gaussians behind it once more, as seen at another time."""
+    grown = join(
+        frozen, InstantLayer({k: v[rows] for k, v in frozen.state.items()}, 0, *[torch.zeros(1)] * 3, []), True
+    )
+    return replace(
+        grown, support=grown.support.index_fill(0, torch.arange(len(frozen.support), len(grown.support)), support)
+    )
+
+
+def test_what_t_star_did_not_see_is_developed_by_no_plate_and_kept_as_that(apart, monkeypatch):
+    shot, run, scene, frozen = apart
+    added, config = torch.arange(40), DevelopConfig(steps=8, gain=-99.0)
+    monkeypatch.setattr(developed_instants, "with_unseen", lambda run, scene, frozen, *_: with_more(frozen, added, 0.4))
+    now = developed(shot, run, scene, T_STAR, frozen, config)
+    rows = slice(len(now.support) - len(added), len(now.support))
+    assert all(torch.equal(now.state[name][rows], value[rows]) for name, value in now.descent.state.items())
+    assert not torch.equal(now.state["sh0"], now.descent.state["sh0"])
+    assert bool((now.support[rows] == 0.4).all()) and bool((now.motion[rows] == 1.0).all())
+    again = load_developed(shot, run, T_STAR, frozen, config)
+    assert again is not None and same(again, now) and torch.equal(again.support, now.support)
 
 
 def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(apart):

@@ -42,15 +42,15 @@ def sheet(x, y, z, step, color):
     }
 
 
-def wall(fine=0.0):
-    """A wall of dull spots; `fine`: how strong a texture of 2 px squares is on it."""
+def wall(fine=0.0, half=4.5):
+    """A wall of dull spots; `fine`: how strong a texture of 2 px squares is on it; `half`: of its width."""
 
     def color(x, y):
         spots = 0.35 + 0.12 * torch.sin(2.1 * x + 0.7) * torch.cos(1.7 * y) + 0.08 * torch.sin(5.3 * x + 3.9 * y)
         squares = torch.where(((x / 0.07).floor() + (y / 0.07).floor()) % 2 > 0, fine, -fine)
         return (spots + squares)[:, None] * torch.tensor([0.8, 0.9, 1.0])
 
-    return sheet((-4.5, 4.5), (-3.2, 3.2), WALL, 0.07, color)
+    return sheet((-half, half), (-3.2, 3.2), WALL, 0.07, color)
 
 
 def skin(x, y):
@@ -99,10 +99,10 @@ class World:
         return layer
 
 
-def scene_at(folder):
+def scene_at(folder, far=0.7):
     viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
     # The camera sways on its way: a steady one cannot be told from a hand's steady motion.
-    viewmats[:, 0, 3] = torch.linspace(0.7, -0.7, FRAMES)
+    viewmats[:, 0, 3] = torch.linspace(far, -far, FRAMES)
     viewmats[:, 1, 3] = 0.06 * torch.sin(torch.arange(FRAMES) * 1.3)
     # Never through level: Gaussians of one depth would change their order, and the wall would jump by a pixel.
     tilt = 0.03 + 0.02 * torch.sin(torch.arange(FRAMES) * 0.9)
@@ -116,9 +116,10 @@ def scene_at(folder):
     )  # fmt: skip
 
 
-def world(folder, known, shown, drawn=None, exposed=(0.0, 0.0), motion=None):
-    """`drawn(picture, n)` changes plate n; `exposed`: log-gain and offset that plates and model have."""
-    scene = scene_at(folder)
+def world(folder, known, shown, drawn=None, exposed=(0.0, 0.0), motion=None, far=0.7):
+    """`drawn(picture, n)` changes plate n; `exposed`: log-gain and offset that plates and model have; `far`: the camera
+    goes so far to either side."""
+    scene = scene_at(folder, far)
     gaussians = Gaussians(known, FRAMES)
     gaussians.support[:] = True
     exposure = Exposure(torch.from_numpy(scene.times).float(), ExposureConfig())
