@@ -51,9 +51,11 @@ class UnseenConfig:
     """Square pixels; smaller things are left alone."""
     around: float = 4.0
     """A thing is looked for this far around its matte."""
+    off: float = 0.15
+    """Difference of single pixels between plate and frozen scene, display-referred, from which on one is of it,"""
     lacking: float = 0.7
-    """Share of the difference between plate and frozen scene that is there at the plate's own time, too: by less, the
-    run has the thing, and it stands elsewhere in the frozen scene."""
+    """and share of their mean difference that is there at the plate's own time, too: by less, the run has the thing, only
+    elsewhere at t*."""
     near: float = 1.5
     """So many times its size around a thing the frozen scene is searched for it,"""
     alike: float = 0.15
@@ -145,25 +147,23 @@ def _missing(own: _Witness, nearer: list[_Witness], config: UnseenConfig) -> Ite
         for where in things
         if any(not any(w.tells(way[from_numpy(where)], config.depth) for w in nearer) for way in points)
     ]
-    if not places:
+    off = bench.single(image)
+    lacking = [where & (off >= config.off) for where in places]
+    lacking = [where for where in lacking if where.sum() >= config.least * bench.unit**2]
+    if not lacking:
         return
-    difference, then = bench.difference(image), bench.difference(bench.at_its_time(bench.index))
-    things = small_things(bench, image)
-    for where in places:
-        thing_there = any(where[thing.pixels].mean() > 0.5 for thing in things)
-        if difference[where].max() < bench.config.seed and not thing_there:
-            continue
-        if then[where].mean() < config.lacking * difference[where].mean():
-            continue
-        if _stands_elsewhere(bench, image.color.numpy(), image.motion.numpy(), where, config):
-            continue
+    then = bench.single(bench.at_its_time(bench.index))
+    lacking = [where for where in lacking if then[where].mean() >= config.lacking * off[where].mean()]
+    lacking = [where for where in lacking if not _stands_elsewhere(bench, image, where, config)]
+    small = small_things(bench, image) if lacking else []
+    for where in lacking:
         empty = InstantLayer.empty(
             frozen, bench.scene.frames[bench.index], np.zeros_like(where), torch.ones(len(frozen.motion), device="cpu")
         )
         only = grown(where, config.around * bench.unit)
-        _, layer, _ = taken(Asked(bench, frozen, image, things, None, empty, only), None)
+        _, layer, _ = taken(Asked(bench, frozen, image, small, None, empty, only), None)
         means = layer.state["means"].cpu()
-        if len(means) and not any(witness.tells(means, config.depth) for witness in nearer):
+        if layer.stands_for(where) and not any(witness.tells(means, config.depth) for witness in nearer):
             yield _as_plate(bench, frozen, _instead(bench, frozen, _solid(bench, layer)))
 
 
@@ -214,16 +214,9 @@ def _whole(moving: NDArray[np.bool_], config: UnseenConfig, unit: float) -> list
     return found
 
 
-def _stands_elsewhere(
-    bench: InstantBench,
-    shown: NDArray[np.float32],
-    moves: NDArray[np.float32],
-    where: NDArray[np.bool_],
-    config: UnseenConfig,
-) -> bool:
+def _stands_elsewhere(bench: InstantBench, image: FrozenImage, where: NDArray[np.bool_], config: UnseenConfig) -> bool:
     """True if the frozen scene has a thing of the same colour that moves, near where the plate has it."""
-    color = np.median(bench.view.picture[where], axis=0)
-    area = float(where.sum())
-    near = grown(where, config.near * math.sqrt(area))
-    alike = near & (moves > 0.5) & (np.abs(shown - color).max(axis=-1) < config.alike)
-    return bool(alike.sum() >= config.stands * area)
+    color, area = np.median(bench.view.picture[where], axis=0), float(where.sum())
+    same = np.abs(image.color.numpy() - color).max(axis=-1) < config.alike
+    found = grown(where, config.near * math.sqrt(area)) & (image.motion.numpy() > 0.5) & same
+    return bool(found.sum() >= config.stands * area)
