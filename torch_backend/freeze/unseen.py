@@ -54,7 +54,7 @@ class UnseenConfig:
     off: float = 0.15
     """Difference of single pixels between plate and frozen scene, display-referred, from which on one is of it,"""
     lacking: float = 0.7
-    """and share of their mean difference that is there at the plate's own time, too: by less, the run has the thing, only
+    """and share of their mean difference that is there at the plate's own time, too: by less, the run has the thing,
     elsewhere at t*."""
     near: float = 1.5
     """So many times its size around a thing the frozen scene is searched for it,"""
