@@ -124,7 +124,8 @@ def with_unseen(
         witness = _Witness(bench, frozen, config.margin * bench.unit, config.cut)
         for layer in _missing(witness, witnesses, config):
             before = len(frozen.support)
-            frozen = join(frozen, layer)
+            others = torch.ones(before - len(layer.kept), device="cpu")  # of the same plate, which stay
+            frozen = join(frozen, replace(layer, kept=torch.cat([layer.kept, others])))
             support = frozen.support.clone()
             support[before:] = math.exp(-away[frame] / SUPPORT_SECONDS)
             frozen = replace(frozen, support=support)
@@ -179,10 +180,12 @@ def _as_plate(bench: InstantBench, frozen: FrozenGaussians, layer: InstantLayer)
     fine = bench.as_plate()
     pixels, _ = project(layer.state["means"].cpu(), bench.scene.viewmats[bench.index], fine.Ks[bench.index])
     plate = from_numpy(fine.view.picture)
+    most = max(1.0, float(plate.max()))
     for _ in range(_TURNS):
         shown = fine.render(join(frozen, layer)).color
         lacks = look_up(plate - shown, pixels, "nearest")[:, None].to(layer.state["sh0"])
-        layer = replace(layer, state={**layer.state, "sh0": layer.state["sh0"] + lacks / SH_C0})
+        color = (0.5 + SH_C0 * layer.state["sh0"] + lacks).clamp(0.0, most)
+        layer = replace(layer, state={**layer.state, "sh0": (color - 0.5) / SH_C0})
     return layer
 
 

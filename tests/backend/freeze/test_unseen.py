@@ -77,6 +77,17 @@ def test_only_one_is_added_though_other_plates_have_it_elsewhere(lost):
     assert float(y.max() - y.min()) < 0.45
 
 
+def test_two_things_in_one_plate_are_both_there(tmp_path):
+    two = lambda n: together(thing(n), lifted(thing(n), 1.1))  # noqa: E731
+    lifted = lambda state, up: {**state, "means": state["means"] + torch.tensor([0.0, up, 0.0])}  # noqa: E731
+    made = world(tmp_path, wall(half=7.0), lambda n: together(wall(half=7.0), two(n)), far=FAR)
+    whole, rows = added(made, lambda n: np.where(where(made, two(n), n), MOVING, 0).astype(np.uint8))
+    means = whole.state["means"][rows]
+    y = (means[:, 1] * AWAY / means[:, 2]).sort().values
+    assert float(y[-1] - y[0]) > 1.2, "the one and the other"
+    assert float((y[1:] - y[:-1]).max()) > 0.5, "and nothing between them"
+
+
 def test_where_plate_t_star_has_its_say_nothing_is_added(tmp_path):
     made, mattes = built(tmp_path, wall(half=7.0), x=0.0)
     whole, rows = added(made, mattes)
