@@ -93,9 +93,14 @@ class Instants:
         return load_developed(self.shot, self.run, int(t_star), self._field(t_star), self.config, self.query)
 
     def _develop(self, t_star: float, report: Reporter, n: int = 0, count: int = 1) -> FrozenGaussians:
+        told: set[int] = set()
+
         def check(done: int, steps: int) -> None:
             report.check_cancelled()
-            report.progress("developing", n * steps + done, count * steps, f"t* {int(t_star)}, step {done} of {steps}")
+            if done not in told:  # before the first step it is asked often
+                told.add(done)
+                text = f"t* {int(t_star)}, step {done} of {steps}"
+                report.progress("developing", n * steps + done, count * steps, text)
 
         frozen = self._field(t_star)
         made = _make(self.shot, self.run, self.scene, int(t_star), frozen, self.config, check)
@@ -218,8 +223,12 @@ def _make(
     def labels(frame: int) -> NDArray[np.uint8] | None:
         return load_motion(shot, frame)
 
+    def begun() -> None:
+        if check is not None:
+            check(0, config.steps)
+
     def ready(joined: FrozenGaussians) -> FrozenGaussians:
-        whole = with_unseen(run, scene, joined, t_star, labels)
+        whole = with_unseen(run, scene, joined, t_star, labels, check=begun)
         return develop(run, scene, whole, t_star, moving, config, check)
 
     frozen = without_specks(run, scene, settled(run, scene, frozen, t_star, moving), t_star)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,10 +105,12 @@ def with_unseen(
     t_star: int,
     motion: Motion,
     config: UnseenConfig | None = None,
+    check: Callable[[], None] | None = None,
 ) -> FrozenGaussians:
     """A scene frozen at frame `t_star`, with what plate t* does not see and the run does not have behind it in order.
 
-    What is added has the support of the time at which it was seen, below 1.
+    What is added has the support of the time at which it was seen, below 1. `check` is called before each plate, and
+    raises to cancel.
     """
     config = config or UnseenConfig()
     index = scene.frames.index(t_star)
@@ -118,6 +120,8 @@ def with_unseen(
     asked = [run.train_frames[n] for n in evenly_spaced(len(run.train_frames), config.frames)]
     away = {frame: abs(seconds[run.train_frames.index(frame)] - float(scene.seconds[index])) for frame in asked}
     for frame in sorted(asked, key=lambda frame: away[frame]):
+        if check is not None:
+            check()
         if frame == t_star:
             continue
         bench = InstantBench(run, scene, scene.frames.index(frame), InstantConfig(), motion)

@@ -379,7 +379,9 @@ def with_more(frozen, rows, support):
 def test_what_t_star_did_not_see_is_developed_by_no_plate_and_kept_as_that(apart, monkeypatch):
     shot, run, scene, frozen = apart
     added, config = torch.arange(40), DevelopConfig(steps=8, gain=-99.0)
-    monkeypatch.setattr(developed_instants, "with_unseen", lambda run, scene, frozen, *_: with_more(frozen, added, 0.4))
+    monkeypatch.setattr(
+        developed_instants, "with_unseen", lambda run, scene, frozen, *_, **__: with_more(frozen, added, 0.4)
+    )
     now = developed(shot, run, scene, T_STAR, frozen, config)
     rows = slice(len(now.support) - len(added), len(now.support))
     assert all(torch.equal(now.state[name][rows], value[rows]) for name, value in now.descent.state.items())

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from torch_backend.contract import Cancelled
 from torch_backend.freeze.frozen import SUPPORT_SECONDS
 from torch_backend.freeze.unseen import with_unseen
 from torch_backend.solve.motion import MOVING
@@ -101,6 +102,20 @@ def test_what_the_run_has_elsewhere_is_not_there_twice(tmp_path):
     )
     _, rows = added(made, mattes)
     assert rows.stop == rows.start
+
+
+def test_it_can_be_cancelled_before_any_plate(lost):
+    made, mattes = lost
+    asked = []
+
+    def check():
+        asked.append(1)
+        if len(asked) == 3:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        with_unseen(made.run, made.scene, made.frozen, T_STAR, mattes, check=check)
+    assert len(asked) == 3
 
 
 def test_without_mattes_nothing_is_added(lost):
