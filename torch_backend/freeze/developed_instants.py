@@ -254,8 +254,8 @@ def _save(
     folder = shot.own(path.parent)
     before = made.descent.motion[: len(field.motion)]
     tensors = {"closed": torch.nonzero(before < field.motion).flatten()}
-    # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors["added.support"] = made.support[len(field.support) :].clone()
+    # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
     tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
     sweep_half_written(folder)

@@ -34,6 +34,7 @@ _KNOWN = 0.25
 
 _WITHIN = 0.8
 """Share of a piece that has to lie where something missing is looked for."""
+
 _COVERED = 0.6
 """Share of a piece's pixels that a layer has to cover to stand for it."""
 

@@ -116,9 +116,8 @@ def with_unseen(
     index = scene.frames.index(t_star)
     own = InstantBench(run, scene, index, InstantConfig(), motion)
     witnesses = [_Witness(own, frozen, 0.0, config.unseen)]
-    seconds = [float(scene.seconds[scene.frames.index(frame)]) for frame in run.train_frames]
     asked = [run.train_frames[n] for n in evenly_spaced(len(run.train_frames), config.frames)]
-    away = {frame: abs(seconds[run.train_frames.index(frame)] - float(scene.seconds[index])) for frame in asked}
+    away = {frame: abs(float(scene.seconds[scene.frames.index(frame)] - scene.seconds[index])) for frame in asked}
     for frame in sorted(asked, key=lambda frame: away[frame]):
         if check is not None:
             check()
