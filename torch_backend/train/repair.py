@@ -12,6 +12,8 @@ seen again in any loss (docs/numerics.md). So
 - a number of the exposure or the poses becomes 0, which is no correction;
 - a field that throws what it moves out of its place goes back to what it was as a whole, at half the learning rates:
   whoever is out of the picture gets no gradient to come back by;
+- who is thrown so by a field in order is dropped at every round of growth: a field hides so, for all frames but a few,
+  what suits those few alone, and in a long run that becomes the tenth for which it would be put back, again and again;
 - Adam's moments start at 0 wherever a number was mended, and wherever they are not finite themselves.
 
 What would leave less than half of the Gaussians is no repair: the run ends in words.
@@ -30,9 +32,11 @@ from ..deformation import Deformation
 from ..deformation.protocol import Owned
 from ..gaussians import PARAM_NAMES, Densifier
 from ..raster.constants import QUAT_MIN
+from ..scene import evenly_spaced
 from ..torch_types import norm
 from .adam import all_finite
 from .model import DynamicModel
+from .movers import MOMENTS
 
 _FEW = 0.01
 """Share of the Gaussians up to which a gradient that is not finite is their own fault, and not the frame's or field's.
@@ -95,8 +99,11 @@ class FieldMemory:
     def heed(self, shift: Tensor) -> None:
         """A step's `shift` [M, 3] of the means it moves, scene units; what is not finite is for `repair`."""
         if len(shift):
-            thrown = (shift.abs().amax(1) > self._reach).float().mean()
-            self._worst.copy_(torch.maximum(self._worst, thrown))
+            self._worst.copy_(torch.maximum(self._worst, self.thrown(shift).float().mean()))
+
+    def thrown(self, shift: Tensor) -> Tensor:
+        """bool [M]: who of what it moves, by `shift` [M, 3] in scene units, is out of its place."""
+        return shift.abs().amax(1) > self._reach
 
     def of(self, name: str, p: Tensor) -> Tensor | None:
         """What parameter `name` was; None if not known."""
@@ -176,6 +183,23 @@ def drop_offenders(model: DynamicModel, optimizer: torch.optim.Optimizer, densif
     message = f"dropped {_counted(int(dropped.sum()), 'Gaussian')} (gradient of {_names(names)} not finite)"
     _drop(model, optimizer, densifier, dropped)
     return message
+
+
+@torch.no_grad()
+def drop_thrown(
+    model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, memory: FieldMemory
+) -> int:
+    """Drops the Gaussians that the field throws out of their place at one of `MOMENTS` times; returns how many."""
+    rows = model.open_rows()
+    dropped = torch.zeros(len(model.gaussians), dtype=torch.bool, device=model.device)
+    for n in evenly_spaced(len(model.centres), MOMENTS):
+        deltas = model.deltas(rows, model.centres[n : n + 1]) if len(rows) else None
+        if deltas is not None:
+            dropped[rows] |= memory.thrown(deltas.means)
+    count = int(dropped.sum())
+    if count:
+        _drop(model, optimizer, densifier, dropped)
+    return count
 
 
 def _sound(model: DynamicModel, optimizer: torch.optim.Optimizer) -> bool:

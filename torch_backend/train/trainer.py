@@ -47,6 +47,7 @@ from .optimizer import add_field, limit_harmonics, optimizer_of, schedule_rates
 from .paper import paper_step
 from .poses import Poses, corrected
 from .recorder import Recorder
+from .repair import drop_thrown
 from .residual import correlation_of_movers
 from .softened import SoftenedMovers
 from .soundness import INSPECT_EVERY, Soundness
@@ -466,6 +467,8 @@ class Trainer:
             if self.recorder is not None:
                 self.recorder.forget()  # growth takes the place of what they read, and needs the room
             self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress, self.policy.growing)
+            if self.policy.facts.hardened is not None:  # bare hosts are as they were published
+                drop_thrown(self.model, self.optimizer, self.densifier, self.soundness.memory)
         if c.method == "static":
             return
         if c.method == "auto":

@@ -17,7 +17,7 @@ from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
 from torch_backend.train.adam import FusedAdam
 from torch_backend.train.optimizer import add_field, schedule_rates
-from torch_backend.train.repair import repair
+from torch_backend.train.repair import drop_thrown, repair
 from torch_backend.train.trainer import Trainer
 
 HOSTS = METHODS[:-1]
@@ -245,6 +245,59 @@ def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(b
     trainer.soundness.memory.heed(torch.zeros_like(means))
     trainer.inspect_nonfinite()
     assert len(warnings(trainer)) == said
+
+
+def farthest(trainer: Trainer) -> torch.Tensor:
+    """[N] how far each Gaussian goes at most, 0 for those that stand still, in scene units along one axis."""
+    rows = trainer.model.open_rows()
+    far = torch.zeros(len(trainer.model.gaussians))
+    with torch.no_grad():
+        for time in trainer.model.centres:
+            deltas = trainer.model.deltas(rows, time[None])
+            far[rows] = torch.maximum(far[rows], deltas.means.abs().amax(1))
+    return far
+
+
+def bound_between(trainer: Trainer, count: int) -> torch.Tensor:
+    """Makes the `count` Gaussians that go farthest be out of their place; bool [N] who they are."""
+    far = farthest(trainer)
+    first, second = far.sort(descending=True).values[count - 1 : count + 1]
+    assert first > second
+    trainer.soundness.memory._reach.fill_(float(first + second) / 2)
+    return far >= first
+
+
+def test_who_is_thrown_out_of_its_place_is_dropped_and_nobody_else(begin):
+    trainer = begin("hexplane", 30)
+    model, memory = trainer.model, trainer.soundness.memory
+    assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 0
+    thrown = bound_between(trainer, 7)
+    expected = {name: p.detach()[~thrown].clone() for name, p in model.gaussians.params.items()}
+    gradient = trainer.densifier.gradient[~thrown].clone()
+    assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 7
+    for name, p in model.gaussians.params.items():
+        assert torch.equal(p, expected[name]), name
+    assert torch.equal(trainer.densifier.gradient, gradient)
+    assert drop_thrown(model, trainer.optimizer, trainer.densifier, memory) == 0
+    assert len(go_on(trainer, 20)) == 20
+    assert not warnings(trainer)
+
+
+@pytest.mark.parametrize("method", ["auto", "hexplane"])
+def test_a_round_of_growth_drops_what_is_thrown_behind_a_gate_alone(begin, method):
+    """A bare host stays as it was published."""
+    trainer = begin(method, 30)
+    if method == "auto":
+        trainer.policy.gate_hardened(trainer.iteration)  # so soon nothing would stay open
+    trainer.config.densify.every = trainer.iteration
+    trainer.densifier.config.budget = trainer.densifier.config.prune_opacity = 0  # nothing else comes or goes
+    count = len(trainer.model.gaussians)
+    thrown = bound_between(trainer, 3)
+    kept = trainer.model.gaussians.params["means"].detach()[~thrown].clone()
+    trainer.schedule_events()
+    assert len(trainer.model.gaussians) == count - 3 * (method == "auto")
+    if method == "auto":
+        assert torch.equal(trainer.model.gaussians.params["means"], kept)
 
 
 def test_a_small_thing_may_move_by_many_times_its_size(begin):
