@@ -108,7 +108,9 @@ def support_confidence(support: Tensor, is_open: Tensor, centres: Tensor, time: 
     1 for a Gaussian that does not move and was ever seen, or that was seen at that time; for a moving one it decays
     with the distance to its nearest supported bin as exp(-|dt| / decay), both in normalised time; 0 if never seen.
     """
-    distance = torch.where(support, (centres - time).abs(), torch.inf).amin(1)
+    known = support.view(torch.uint8).amax(1).float()  # a third of the time of any()
+    rows = torch.nonzero(is_open).flatten()
+    distance = torch.where(support[rows], (centres - time).abs(), torch.inf).amin(1)
     half_bin = 0.5 * float((centres[1:] - centres[:-1]).max())
-    known = torch.exp(-(distance - half_bin).clamp_min(0.0) / decay)
-    return torch.where(is_open, known, support.any(1).float())
+    known[rows] = torch.exp(-(distance - half_bin).clamp_min(0.0) / decay)
+    return known
