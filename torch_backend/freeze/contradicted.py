@@ -55,17 +55,19 @@ def contradicted(
     for index in evenly_spaced(len(bench.scene.frames), config.frames):
         found = None if index == bench.index else bench.frame(index)
         if found is not None:
-            off = _difference(bench, *found, places, own, config)
+            off, moving = difference_at(bench, *found, places, own, config)
+            off[moving] = np.nan
             sees, differs = sees + np.isfinite(off), differs + (np.nan_to_num(off) > config.differs)
     return np.asarray((sees >= config.least) & (2 * differs > sees), np.bool_)
 
 
-def _difference(
+def difference_at(
     bench: InstantBench, other: View, moving: NDArray[np.bool_], places: Tensor, own: NDArray[np.float32],
     config: ContradictedConfig,
-) -> NDArray[np.float32]:  # fmt: skip
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:  # fmt: skip
     """Difference [h, w] between `own` colours [h, w, 3] and those of another plate, in which `moving` [h, w] moves, at
-    `places` [h, w, 3], which t*'s camera sees; NaN where that plate does not see them, or something moves."""
+    `places` [h, w, 3], which t*'s camera sees; NaN where that plate does not see them. And bool [h, w]: where something
+    that moves is seen in it."""
     import cv2
 
     pixels, depth = project(places, bench.scene.viewmats[other.index], bench.Ks[other.index])
@@ -75,13 +77,14 @@ def _difference(
         return np.asarray(cv2.remap(values, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_CONSTANT), np.float32)
 
     then = bench.at_its_time(other.index)
-    still = ((then.motion.numpy() < 0.5) & ~moving).astype(np.float32)
+    moves = ((then.motion.numpy() >= 0.5) | moving).astype(np.float32)
     shown = there(then.depth.numpy().astype(np.float32), cv2.INTER_NEAREST)
-    seen = (away > 0.0) & (np.abs(shown - away) < config.surface * away) & (there(still, cv2.INTER_NEAREST) > 0.5)
+    seen = (away > 0.0) & (np.abs(shown - away) < config.surface * away)
     picture = bench.as_exposed(low_passed(other.picture, config.blur * bench.unit), other.index)
     side = 2 * max(1, round(config.shift * bench.unit)) + 1
     around = np.ones((side, side), np.uint8)
     most = there(np.asarray(cv2.dilate(picture, around), np.float32), cv2.INTER_LINEAR)
     least = there(np.asarray(cv2.erode(picture, around), np.float32), cv2.INTER_LINEAR)
     off = np.maximum(np.maximum(own - most, least - own).max(axis=-1), 0.0)
-    return np.where(seen, off, np.float32(np.nan)).astype(np.float32)
+    moved = seen & (there(moves, cv2.INTER_NEAREST) > 0.5)
+    return np.where(seen, off, np.float32(np.nan)).astype(np.float32), np.asarray(moved, np.bool_)

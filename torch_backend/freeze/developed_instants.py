@@ -22,16 +22,17 @@ from ..train import LoadedRun
 from ..train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from .adrift import adrift
 from .develop import DevelopConfig, develop
-from .frozen import FrozenGaussians, freeze_at, span_of
+from .frozen import FrozenGaussians, Turned, freeze_at, span_of
 from .missing_layer import instant_layer, join
 from .sightings import motion_mattes
 from .specks import without_specks
 from .static_twin import settled
+from .turned import turned
 from .unseen import with_unseen
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 19
+VERSION = 20
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -169,7 +170,7 @@ def load_developed(
     support, motion = torch.cat([support, added]), torch.cat([motion, torch.ones_like(added)])  # a layer moves
     before = FrozenGaussians(base, frozen.sh_degree, support, motion)
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
-    return FrozenGaussians(state, frozen.sh_degree, support, motion, before)
+    return FrozenGaussians(state, frozen.sh_degree, support, motion, before, _turned_of(tensors))
 
 
 def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
@@ -188,8 +189,21 @@ def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
         return False
     if not bool(((added >= 0.0) & (added <= 1.0)).all()):
         return False
+    maps = [tensors.get(f"turned.{name}") for name in ("first", "last")]
+    known_maps = [one for one in maps if one is not None]
+    if len(known_maps) == 1 or any(
+        one.dtype != torch.int32 or one.dim() != 2 or one.shape != known_maps[0].shape or not one.numel()
+        for one in known_maps
+    ):
+        return False
     rooted = not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
     return rooted and count >= known
+
+
+def _turned_of(tensors: dict[str, Tensor]) -> Turned | None:
+    """What a file says of it: both of its maps, or nothing."""
+    first, last = tensors.get("turned.first"), tensors.get("turned.last")
+    return None if first is None or last is None else Turned(first, last)
 
 
 def developed(
@@ -227,9 +241,14 @@ def _make(
         if check is not None:
             check(0, config.steps)
 
+    def ended() -> None:
+        if check is not None:
+            check(config.steps, config.steps)
+
     def ready(joined: FrozenGaussians) -> FrozenGaussians:
         whole = with_unseen(run, scene, joined, t_star, labels, check=begun)
-        return develop(run, scene, whole, t_star, moving, config, check)
+        made = develop(run, scene, whole, t_star, moving, config, check)
+        return dataclasses.replace(made, turned=turned(run, scene, made, t_star, labels, check=ended))
 
     frozen = without_specks(run, scene, settled(run, scene, frozen, t_star, moving), t_star)
     found = adrift(run, scene, frozen, t_star, labels)
@@ -258,6 +277,8 @@ def _save(
     # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
     tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
+    if made.turned is not None:
+        tensors |= {"turned.first": made.turned.first, "turned.last": made.turned.last}
     sweep_half_written(folder)
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)

@@ -23,6 +23,27 @@ SUPPORT_SECONDS = 2.0
 """The support matte of a moving Gaussian falls to 1/e at this distance from the nearest time it was seen."""
 
 
+ALWAYS = torch.iinfo(torch.int32).max
+"""A frame number later than any."""
+
+
+@dataclass(frozen=True)
+class Turned:
+    """Since when, and until when, plates show what plate t* shows, where no matte calls it moving: `turned.py`.
+
+    [h, w] of a small picture of plate t*, on the CPU.
+    """
+
+    first: Tensor
+    """[h, w] int32: number of the first frame that is known to show the same; 0: all before do, or nobody knows."""
+    last: Tensor
+    """[h, w] int32: number of the last; `ALWAYS`: all after do, or nobody knows."""
+
+    def otherwise(self, frame: int) -> Tensor:
+        """[h, w] bool: where a frame's plate may show something else than plate t*, though nothing moves there."""
+        return (frame < self.first) | (frame > self.last)
+
+
 @dataclass
 class FrozenGaussians:
     """A static scene: N Gaussians at one instant, in scene units, no gradients."""
@@ -38,6 +59,8 @@ class FrozenGaussians:
     descent: FrozenGaussians | None = None
     """What a developed instant was before, row by row: the run's Gaussians at t*, and behind them those that the run
     does not have. They still move as those do. None if it was not developed."""
+    turned: Turned | None = None
+    """What was otherwise before or after the instant without having been seen to move; None: nothing is known to."""
 
 
 @dataclass

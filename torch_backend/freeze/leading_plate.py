@@ -71,9 +71,13 @@ def leading_matte(
             within = within * resized(free, columns, rows)
         return within, st, own
     wrong = torch.maximum(posed.motion, lead.moving) > 0.5
+    otherwise = None if truth is None else _otherwise(sightings, config, posed, leading, lead, truth)
     if own:
-        wrong, found = _let_go(sightings, config, posed, leading, usable, wrong, truth)
+        wrong, found = _let_go(sightings, config, posed, leading, usable, wrong, truth, otherwise)
         posed.held = widened(found.float(), round(config.margin * sightings.unit))
+    elif otherwise is not None:
+        wrong = wrong | otherwise
+        posed.held = widened(otherwise.float(), round(config.margin * sightings.unit))
     posed.doubt = widened(wrong.float(), round(config.margin * sightings.unit))
     let_go = blurred(posed.doubt, config.feather * sightings.unit)
     matte = 1.0 - let_go
@@ -125,12 +129,15 @@ def _let_go(
     usable: list[int],
     moving: Tensor,
     truth: Sighting | None,
+    otherwise: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """([h, w] bool: where the frame's own plate shows another instant than t*, [h, w] bool: what of it `held` found).
+    """([h, w] bool: where the frame's own plate shows another instant than t*, [h, w] bool: what of it `held` found, or
+    was `otherwise`).
 
     Args:
         moving: [h, w] bool, by the mattes.
         truth: how plate t* sees what is seen; None if it may not be used.
+        otherwise: as `_otherwise`.
     """
     h, w = moving.shape
     render = resized(posed.image.color, w, h)
@@ -152,11 +159,32 @@ def _let_go(
         # Of what plate t* does not see the frozen render alone knows: an elbow that was further back.
         beyond = sightings.whole(wrong, torch.where(truth.visible < 0.5, off, 0.0)) & ~wrong
         wrong = wrong | larger(beyond, config.beyond * sightings.unit**2)
-    found = torch.zeros_like(wrong)
+    found = torch.zeros_like(wrong) if otherwise is None else otherwise
     if both is not None:
-        found = held(both, render, off, wrong, denied, sightings.unit, config.held)
+        found = found | held(both, render, off, wrong, denied, sightings.unit, config.held)
     wrong = closed(wrong | found, round(config.gap * sightings.unit))
     return with_holes(wrong, found, off, sightings.unit, config.held)
+
+
+def _otherwise(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, lead: Sighting, truth: Sighting
+) -> Tensor | None:
+    """[h, w] bool: where plate `frame`, which sees what is seen as `lead` says, shows what was otherwise then, by
+    `turned.py`, and what hangs together with it in which it differs from plate t* (`truth`); None if nothing was."""
+    turned = posed.frozen.turned
+    if turned is None or not bool((then := turned.otherwise(frame)).any()):
+        return None
+    h, w = then.shape
+    scale = torch.tensor([w / sightings.size[0], h / sightings.size[1]], device="cpu")
+    known = (look_up(then.float(), truth.pixels * scale, "nearest") > 0.5) & (truth.visible > 0.5)
+    seen = (lead.visible * truth.visible)[..., None]
+    own, instant = (
+        look_up(sightings.view(plate).picture.float(), sighting.pixels) * seen
+        for plate, sighting in ((frame, lead), (posed.t, truth))
+    )
+    apart = sightings.difference(own, instant)
+    found = sightings.whole(known & (apart > config.denied_too), apart, config.denied_too)
+    return found if bool(found.any()) else None
 
 
 def _off(sightings: Sightings, posed: PosedFrame, frame: int, render: Tensor) -> tuple[Tensor, Tensor]:
