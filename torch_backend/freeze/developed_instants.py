@@ -189,12 +189,10 @@ def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
         return False
     if not bool(((added >= 0.0) & (added <= 1.0)).all()):
         return False
-    maps = [tensors.get(f"turned.{name}") for name in ("first", "last")]
-    known_maps = [one for one in maps if one is not None]
-    if len(known_maps) == 1 or any(
-        one.dtype != torch.int32 or one.dim() != 2 or one.shape != known_maps[0].shape or not one.numel()
-        for one in known_maps
-    ):
+    maps = [tensors[name] for name in ("turned.first", "turned.last") if name in tensors]
+    if maps and (len(maps) != 2 or maps[0].shape != maps[1].shape):
+        return False
+    if any(each.dtype != torch.int32 or each.dim() != 2 or not each.numel() for each in maps):
         return False
     rooted = not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
     return rooted and count >= known
@@ -241,15 +239,12 @@ def _make(
         if check is not None:
             check(0, config.steps)
 
-    def ended() -> None:
-        if check is not None:
-            check(config.steps, config.steps)
-
     def ready(joined: FrozenGaussians) -> FrozenGaussians:
         whole = with_unseen(run, scene, joined, t_star, labels, check=begun)
         made = develop(run, scene, whole, t_star, moving, config, check)
-        return dataclasses.replace(made, turned=turned(run, scene, made, t_star, labels, check=ended))
+        return dataclasses.replace(made, turned=otherwise)
 
+    otherwise = turned(run, scene, frozen, t_star, labels, check=begun)
     frozen = without_specks(run, scene, settled(run, scene, frozen, t_star, moving), t_star)
     found = adrift(run, scene, frozen, t_star, labels)
     if found is not None:

@@ -95,7 +95,7 @@ class InstantBench:
         self._views: dict[int, View] = {}
         self.view = self.at(index)
         mask = ignore_mattes(Shot(scene.folder.parent))(scene.frames[index])
-        self._ignored = None if mask is None else resized(mask, self.width, self.height).numpy() > 0.0
+        self.ignored = None if mask is None else resized(mask, self.width, self.height).numpy() > 0.0
         """[h, w] bool what of plate t* is no part of the scene: nothing is missing there."""
 
     def as_plate(self) -> InstantBench:
@@ -227,7 +227,7 @@ class InstantBench:
     def _plate(self, shown: NDArray[np.float32]) -> NDArray[np.float32]:
         """[h, w, 3] plate t*, where it counts; elsewhere what is `shown`."""
         return (
-            self.view.picture if self._ignored is None else np.where(self._ignored[..., None], shown, self.view.picture)
+            self.view.picture if self.ignored is None else np.where(self.ignored[..., None], shown, self.view.picture)
         )
 
 

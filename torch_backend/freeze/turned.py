@@ -1,21 +1,19 @@
-"""What was otherwise before or after a moment, though no matte calls it moving: a head that turned while the camera
+"""What was otherwise until a moment, or since one, though no matte calls it moving: a head that turned while the camera
 swept past.
 
-The run takes it for still and shows a mixture of both, at any time; a frame's own plate would stay, and time would not
-stand still. From frame to frame flow tells no motion in it; but each plate that sees the place shows either what plate
-t* shows there, or something else, all of them that since one moment, and all the former until then. What only looks
-otherwise from elsewhere, a sheen or a badly placed edge, does so by and by.
+The run takes it for still, and has a mixture of both at any time. A frame's own plate would stay, and so time would not
+stand still. But of the plates that see such a place all until one moment show one thing, and all from then on another.
+What merely looks otherwise from elsewhere, a sheen or an edge at a wrong depth, changes by and by.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ..scene import Scene, evenly_spaced
 from ..torch_types import from_numpy
@@ -23,7 +21,7 @@ from ..train import LoadedRun
 from .contradicted import ContradictedConfig, difference_at
 from .frozen import ALWAYS, FrozenGaussians, Turned
 from .instant_bench import InstantBench, InstantConfig, Motion, large, low_passed
-from .reproject import project
+from .reproject import inside, project
 
 
 @dataclass(frozen=True)
@@ -33,22 +31,26 @@ class TurnedConfig:
     width: int = 320
     """Plates are compared at this width, at most."""
     frames: int = 48
-    """Solved frames that are asked, at most, evenly over the clip."""
+    """Solved frames that are asked, at most, evenly over the clip,"""
+    sees: float = 0.05
+    """if they see more than this share of plate t*."""
     same: float = 0.06
     """Up to this difference from plate t* a plate shows the same,"""
     other: float = 0.12
     """and from this on something else."""
     share: float = 0.9
-    """Of the plates that see a place on either side of the moment so many at least say so,"""
-    least: int = 3
-    """and so many at least see it."""
+    """Of the plates that see a place on either side of the moment so many at least say so:"""
+    spell: int = 8
+    """of so many that were asked, on the far side: later it may have been otherwise again;"""
+    least: tuple[int, int] = (2, 4)
+    """and so many at least see it: on this side, plate t* among them, and on the far side."""
     gap: int = 2
     """The last that shows the same and the first that shows something else are so far apart at most, of those asked."""
     scale: float = 2.0
     """Times as far or as near as from t*'s camera a plate may see a place: a fold of a shirt is none from afar."""
     area: float = 50.0
     """Square pixels; smaller places are left alone."""
-    seen: ContradictedConfig = ContradictedConfig()
+    seen: ContradictedConfig = field(default_factory=ContradictedConfig)
     """How plates are compared."""
 
 
@@ -81,16 +83,22 @@ def turned(
     asked = sorted({scene.solved[n] for n in evenly_spaced(len(scene.solved), config.frames)} | {index})
     off = np.full((len(asked), *depth.shape), np.nan, np.float32)
     moving = (moves > 0.5) | (image.motion.numpy() > 0.5)
+    if bench.ignored is not None:
+        moving |= bench.ignored
     for n, i in enumerate(asked):
         if check is not None:
             check()
-        found = bench.frame(i)
         if i == index:
             off[n] = 0.0
-        elif found is not None:
+            continue
+        pixels, away = project(places, scene.viewmats[i], bench.Ks[i])
+        times = away.numpy() / depth
+        known = (times < config.scale) & (times * config.scale > 1.0)
+        known &= inside(pixels, bench.width, bench.height).numpy() > 0.0
+        found = bench.frame(i) if known.mean() > config.sees else None
+        if found is not None:
             off[n], moves_there = difference_at(bench, *found, places, own, config.seen)
-            times = project(places, scene.viewmats[i], bench.Ks[i])[1].numpy() / depth
-            off[n][(times > config.scale) | (times * config.scale < 1.0)] = np.nan
+            off[n][~known] = np.nan
             moving |= moves_there
     at = asked.index(index)
     frames = np.array([scene.frames[i] for i in asked], np.int32)
@@ -111,14 +119,15 @@ def _switch(
     """
     seen = np.isfinite(off)
     filled = np.nan_to_num(off)
-    same, other = (seen & (filled < config.same)).cumsum(0), (seen & (filled > config.other)).cumsum(0)
-    known = seen.cumsum(0)
-    beyond = known[-1] - known
-    sure = np.minimum(same / np.maximum(known, 1), (other[-1] - other) / np.maximum(beyond, 1))
-    index = np.arange(len(off), dtype=np.int32)[:, None, None]
-    following = np.minimum.accumulate(np.where(seen, index, len(off) * 2)[::-1], axis=0)[::-1]
-    following = np.concatenate([following[1:], np.full_like(following[:1], len(off) * 2)])
-    sure[~seen | (known < config.least) | (beyond < config.least) | (following - index > config.gap)] = 0.0
+    of = seen, seen & (filled < config.same), seen & (filled > config.other)
+    known, same, other = (each.cumsum(0, dtype=np.int16) for each in of)
+    end = np.minimum(np.arange(len(off)) + config.spell, len(off) - 1)
+    beyond = known[end] - known
+    sure = np.minimum(same / np.maximum(known, 1), (other[end] - other) / np.maximum(beyond, 1))
+    index, never = np.arange(len(off), dtype=np.int16)[:, None, None], np.int16(2 * len(off))
+    following = np.minimum.accumulate(np.where(seen, index, never)[::-1], axis=0)[::-1]
+    following = np.concatenate([following[1:], np.full_like(following[:1], never)])
+    sure[~seen | (known < config.least[0]) | (beyond < config.least[1]) | (following - index > config.gap)] = 0.0
     best = sure.argmax(axis=0)
     return frames[best], np.take_along_axis(sure, best[None], axis=0)[0] >= config.share
 

@@ -133,10 +133,11 @@ class World:
         return seen(self.scene.viewmats[frame - 1], 99.0 if self.still else board_at(frame))
 
 
-def build(folder, report, still=False, logo=None):
+def build(folder, report, still=False, logo=None, drawn=None):
     """A shot on disk as import, solve and a painter leave it: plates of 16 bits, working frames half as large.
 
-    `logo` [H, W] bool is burnt into all plates, and the solve was given a mask of it.
+    `logo` [H, W] bool is burnt into all plates, and the solve was given a mask of it. `drawn(picture, n)` changes
+    plate n.
     """
     viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
     viewmats[:, 0, 3] = torch.linspace(0.35, -0.35, FRAMES)
@@ -147,6 +148,8 @@ def build(folder, report, still=False, logo=None):
         picture, on = seen(viewmats[n - 1], 99.0 if still else board_at(n))
         if logo is not None:
             picture = np.where(logo[..., None], [1.0, 0.0, 1.0], picture)
+        if drawn is not None:
+            picture = drawn(picture, n)
         write_png(source / f"{n:06d}.png", np.rint(picture * 65535).astype(np.uint16))
         matte = shot.root / PAINTED / f"{n:06d}.png"
         matte.parent.mkdir(exist_ok=True)

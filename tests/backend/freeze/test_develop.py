@@ -23,7 +23,7 @@ from torch_backend.freeze.developed_instants import (
 )
 from torch_backend.freeze.exr import read_key
 from torch_backend.freeze.from_afar import seen_from_afar
-from torch_backend.freeze.frozen import render_frozen, span_of
+from torch_backend.freeze.frozen import ALWAYS, Turned, render_frozen, span_of
 from torch_backend.freeze.missing_layer import InstantLayer, instant_layer, join
 from torch_backend.freeze.sightings import motion_mattes
 from torch_backend.freeze.static_twin import TwinConfig, held_still, settled
@@ -389,6 +389,28 @@ def test_what_t_star_did_not_see_is_developed_by_no_plate_and_kept_as_that(apart
     assert bool((now.support[rows] == 0.4).all()) and bool((now.motion[rows] == 1.0).all())
     again = load_developed(shot, run, T_STAR, frozen, config)
     assert again is not None and same(again, now) and torch.equal(again.support, now.support)
+
+
+def test_what_turned_is_kept_with_the_instant(apart):
+    shot, run, scene, frozen = apart
+    made = developed(shot, run, scene, T_STAR, frozen, SHORT)
+    assert made.turned is None, "nothing did"
+    first = torch.zeros(9, 12, dtype=torch.int32)
+    first[2:5, 3:7] = 99
+    turned = Turned(first, torch.full_like(first, ALWAYS))
+    key = developed_key(shot, run, T_STAR, SHORT)
+    developed_instants._save(shot, run, T_STAR, frozen, replace(made, turned=turned), key)
+    again = load_developed(shot, run, T_STAR, frozen, SHORT)
+    assert again is not None and same(again, made) and again.turned is not None
+    assert torch.equal(again.turned.first, turned.first) and torch.equal(again.turned.last, turned.last)
+    path = developed_path(run, T_STAR)
+    tensors, meta = load_checkpoint(path)
+    for damage in ({"turned.last": first[:-1]}, {"turned.first": first.float()}, {"turned.first": first[0]}):
+        save_checkpoint(path, {**tensors, **damage}, {k: v for k, v in meta.items() if k != "version"})
+        assert load_developed(shot, run, T_STAR, frozen, SHORT) is None
+    del tensors["turned.first"]
+    save_checkpoint(path, tensors, {k: v for k, v in meta.items() if k != "version"})
+    assert load_developed(shot, run, T_STAR, frozen, SHORT) is None
 
 
 def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(apart):

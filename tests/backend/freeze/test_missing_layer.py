@@ -396,7 +396,7 @@ def test_a_hand_that_the_field_has_without_fingers_is_given_those_of_the_plate()
     where[20:40, 30:50] = True
     plate[20:40, 30:50] += np.where(np.arange(20) % 4 < 2, 0.6, 0.2)[None, :, None].astype(np.float32)
     bench = object.__new__(InstantBench)
-    bench.config, bench.unit, bench._ignored, bench.view = InstantConfig(), 1.0, None, SimpleNamespace(picture=plate)
+    bench.config, bench.unit, bench.ignored, bench.view = InstantConfig(), 1.0, None, SimpleNamespace(picture=plate)
     bench.width, bench.height = 80, 60
 
     def image(color):
