@@ -9,7 +9,7 @@ What merely looks otherwise from elsewhere, a sheen or an edge at a wrong depth,
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -20,7 +20,9 @@ from ..torch_types import from_numpy
 from ..train import LoadedRun
 from .contradicted import ContradictedConfig, difference_at
 from .frozen import ALWAYS, FrozenGaussians, Turned
-from .instant_bench import InstantBench, InstantConfig, Motion, large, low_passed
+from .instant_bench import InstantBench, InstantConfig, Motion, grown, large, low_passed
+from .layer_gaussians import Part, gaussians_of
+from .missing_layer import InstantLayer, cover_of, join
 from .reproject import inside, project
 
 
@@ -50,6 +52,12 @@ class TurnedConfig:
     """Times as far or as near as from t*'s camera a plate may see a place: a fold of a shirt is none from afar."""
     area: float = 50.0
     """Square pixels; smaller places are left alone."""
+    reach: float = 12.0
+    """How far around such a place what belongs to it is looked for:"""
+    lacks: float = 0.05
+    """where the scene differs from plate t* by so much, low-passed,"""
+    front: float = 0.97
+    """and at so much of the depth that the place has: it stands before the mixture of both."""
     seen: ContradictedConfig = field(default_factory=ContradictedConfig)
     """How plates are compared."""
 
@@ -108,6 +116,51 @@ def turned(
     if not (before.any() or after.any()):
         return None
     return Turned(from_numpy(np.where(before, first, 0)), from_numpy(np.where(after, last, ALWAYS)))
+
+
+@torch.no_grad()
+def with_turned(
+    run: LoadedRun,
+    scene: Scene,
+    frozen: FrozenGaussians,
+    t_star: int,
+    motion: Motion,
+    found: Turned,
+    config: TurnedConfig | None = None,
+) -> FrozenGaussians:
+    """A scene frozen at frame `t_star`, with a layer of what plate t* shows where something turned, behind it in order.
+
+    The run has a mixture there; and where it has what is behind, since what turned is there at t* alone, plate t* would
+    be carried along with that. As it is where the layer shows no more of plate t* than it does.
+
+    Args:
+        motion: as in `InstantBench`.
+        found: by `turned`.
+    """
+    import cv2
+
+    config = config or TurnedConfig()
+    bench = InstantBench(run, scene, scene.frames.index(t_star), InstantConfig(), motion)
+    image, size = bench.render(frozen), (bench.width, bench.height)
+    places = ((found.first > 0) | (found.last < ALWAYS)).numpy().astype(np.uint8)
+    places = np.asarray(cv2.resize(places, size, interpolation=cv2.INTER_NEAREST) > 0, np.bool_)
+    before = bench.difference(image)
+    lacking = (before > config.lacks) & grown(places, config.reach * bench.unit)
+    region = large(lacking | places, places, config.area * bench.unit**2)
+    count, labels = cv2.connectedComponents(region.astype(np.uint8))
+    parts: list[Part] = []
+    for label in range(1, count):
+        one = np.asarray(labels == label, np.bool_)
+        inverse = np.float32(1.0 / (config.front * float(np.median(image.depth.numpy()[one & places]))))
+        cover = cover_of(bench, image, one, np.zeros_like(one))
+        parts.append(Part(cover, np.where(cover > 0.0, inverse, np.float32(0.0)), None))
+    if not parts:
+        return frozen
+    state, mask = gaussians_of(bench, frozen, image, parts)
+    nothing = InstantLayer.empty(frozen, t_star, np.zeros_like(region), torch.ones_like(frozen.support))
+    made = join(frozen, replace(nothing, state=state, mask=from_numpy(mask)), faded=True)
+    after = bench.difference(bench.render(made))
+    return made if after[region].mean() < before[region].mean() else frozen
 
 
 def _switch(
