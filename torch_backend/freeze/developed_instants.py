@@ -27,7 +27,7 @@ from .missing_layer import instant_layer, join
 from .sightings import motion_mattes
 from .specks import without_specks
 from .static_twin import settled
-from .turned import turned, with_turned
+from .turned import turned
 from .unseen import with_unseen
 
 FOLDER = DEVELOPED_FOLDER
@@ -240,8 +240,6 @@ def _make(
             check(0, config.steps)
 
     def ready(joined: FrozenGaussians) -> FrozenGaussians:
-        if otherwise is not None:
-            joined = with_turned(run, scene, joined, t_star, labels, otherwise)
         whole = with_unseen(run, scene, joined, t_star, labels, check=begun)
         made = develop(run, scene, whole, t_star, moving, config, check)
         return dataclasses.replace(made, turned=otherwise)

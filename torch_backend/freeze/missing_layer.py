@@ -285,7 +285,7 @@ def _found(
 
     alone = np.zeros_like(painted) if not things else np.any([t.pixels for t in things], axis=0)
     covers: list[tuple[NDArray[np.float32], Track | None]]
-    covers = [(cover_of(bench, image, r, doubted), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
+    covers = [(_cover(bench, image, r, doubted), None) for r in regions if (r & alone).sum() < 0.3 * r.sum()]
     covers += [(_thing_cover(bench, image, thing), thing) for thing in things]
     covers = [(soft, thing) for soft, thing in covers if soft.max() >= 0.5]
     fields = _fields_inverse(bench, frozen) if covers else np.zeros(0, np.float32)
@@ -379,7 +379,7 @@ def _thing_cover(bench: InstantBench, image: FrozenImage, thing: Track) -> NDArr
     return np.asarray(cv2.morphologyEx(covered, cv2.MORPH_OPEN, disc(1.0 * bench.unit)), np.float32)
 
 
-def cover_of(
+def _cover(
     bench: InstantBench, image: FrozenImage, region: NDArray[np.bool_], painted: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """How much of each pixel [h, w] around a region is what the model lacks, or has `painted` elsewhere, 0..1.

@@ -9,7 +9,7 @@ What merely looks otherwise from elsewhere, a sheen or an edge at a wrong depth,
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,9 +20,7 @@ from ..torch_types import from_numpy
 from ..train import LoadedRun
 from .contradicted import ContradictedConfig, difference_at
 from .frozen import ALWAYS, FrozenGaussians, Turned
-from .instant_bench import InstantBench, InstantConfig, Motion, grown, large, low_passed
-from .layer_gaussians import Part, gaussians_of
-from .missing_layer import InstantLayer, cover_of, join
+from .instant_bench import InstantBench, InstantConfig, Motion, large, low_passed
 from .reproject import inside, project
 
 
@@ -52,12 +50,6 @@ class TurnedConfig:
     """Times as far or as near as from t*'s camera a plate may see a place: a fold of a shirt is none from afar."""
     area: float = 50.0
     """Square pixels; smaller places are left alone."""
-    reach: float = 12.0
-    """How far around such a place what belongs to it is looked for:"""
-    lacks: float = 0.05
-    """where the scene differs from plate t* by so much, low-passed,"""
-    front: float = 0.97
-    """and at so much of the depth that the place has: it stands before the mixture of both."""
     seen: ContradictedConfig = field(default_factory=ContradictedConfig)
     """How plates are compared."""
 
@@ -118,51 +110,6 @@ def turned(
     return Turned(from_numpy(np.where(before, first, 0)), from_numpy(np.where(after, last, ALWAYS)))
 
 
-@torch.no_grad()
-def with_turned(
-    run: LoadedRun,
-    scene: Scene,
-    frozen: FrozenGaussians,
-    t_star: int,
-    motion: Motion,
-    found: Turned,
-    config: TurnedConfig | None = None,
-) -> FrozenGaussians:
-    """A scene frozen at frame `t_star`, with a layer of what plate t* shows where something turned, behind it in order.
-
-    The run has a mixture there; and where it has what is behind, since what turned is there at t* alone, plate t* would
-    be carried along with that. As it is where the layer shows no more of plate t* than it does.
-
-    Args:
-        motion: as in `InstantBench`.
-        found: by `turned`.
-    """
-    import cv2
-
-    config = config or TurnedConfig()
-    bench = InstantBench(run, scene, scene.frames.index(t_star), InstantConfig(), motion)
-    image, size = bench.render(frozen), (bench.width, bench.height)
-    places = ((found.first > 0) | (found.last < ALWAYS)).numpy().astype(np.uint8)
-    places = np.asarray(cv2.resize(places, size, interpolation=cv2.INTER_NEAREST) > 0, np.bool_)
-    before = bench.difference(image)
-    lacking = (before > config.lacks) & grown(places, config.reach * bench.unit)
-    region = large(lacking | places, places, config.area * bench.unit**2)
-    count, labels = cv2.connectedComponents(region.astype(np.uint8))
-    parts: list[Part] = []
-    for label in range(1, count):
-        one = np.asarray(labels == label, np.bool_)
-        inverse = np.float32(1.0 / (config.front * float(np.median(image.depth.numpy()[one & places]))))
-        cover = cover_of(bench, image, one, np.zeros_like(one))
-        parts.append(Part(cover, np.where(cover > 0.0, inverse, np.float32(0.0)), None))
-    if not parts:
-        return frozen
-    state, mask = gaussians_of(bench, frozen, image, parts)
-    nothing = InstantLayer.empty(frozen, t_star, np.zeros_like(region), torch.ones_like(frozen.support))
-    made = join(frozen, replace(nothing, state=state, mask=from_numpy(mask)), faded=True)
-    after = bench.difference(bench.render(made))
-    return made if after[region].mean() < before[region].mean() else frozen
-
-
 def _switch(
     off: NDArray[np.float32], frames: NDArray[np.int32], config: TurnedConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
@@ -174,12 +121,12 @@ def _switch(
     filled = np.nan_to_num(off)
     of = seen, seen & (filled < config.same), seen & (filled > config.other)
     known, same, other = (each.cumsum(0, dtype=np.int16) for each in of)
-    end = np.minimum(np.arange(len(off)) + config.spell, len(off) - 1)
-    beyond = known[end] - known
-    sure = np.minimum(same / np.maximum(known, 1), (other[end] - other) / np.maximum(beyond, 1))
     index, never = np.arange(len(off), dtype=np.int16)[:, None, None], np.int16(2 * len(off))
     following = np.minimum.accumulate(np.where(seen, index, never)[::-1], axis=0)[::-1]
     following = np.concatenate([following[1:], np.full_like(following[:1], never)])
+    end = np.minimum(following + config.spell - 1, len(off) - 1)
+    beyond, others = (np.take_along_axis(each, end, axis=0) - each for each in (known, other))
+    sure = np.minimum(same / np.maximum(known, 1), others / np.maximum(beyond, 1))
     sure[~seen | (known < config.least[0]) | (beyond < config.least[1]) | (following - index > config.gap)] = 0.0
     best = sure.argmax(axis=0)
     return frames[best], np.take_along_axis(sure, best[None], axis=0)[0] >= config.share

@@ -9,11 +9,11 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from torch_backend.contract import Cancelled
 from torch_backend.freeze.frozen import ALWAYS, Turned, freeze_at, render_frozen
-from torch_backend.freeze.turned import turned, with_turned
+from torch_backend.freeze.turned import turned
 from torch_backend.gaussians.model import SH_C0
 
 from . import test_detail as plates
-from .test_missing_layer import ARM, FRAMES, T_STAR, H, W, frozen_of, sheet, together, wall, where, world
+from .test_missing_layer import ARM, FRAMES, T_STAR, H, W, sheet, together, wall, where, world
 
 FACE, HAIR = (0.9, 0.6, 0.5), (0.25, 0.15, 0.12)
 
@@ -68,40 +68,6 @@ def test_and_until_when_though_it_turns_back_later(tmp_path, before):
 )
 def test_nothing_else_is_taken_for_it(tmp_path, share):
     assert found(clip(tmp_path, share)) is None
-
-
-def hair_beside():
-    """What of her hair is beside where her face was."""
-    colour = torch.tensor(HAIR)
-    return sheet((-0.32, -0.2), (-0.25, 0.25), ARM, 0.02, lambda x, y: colour.expand(len(x), 3))
-
-
-def test_it_stands_as_deep_as_the_run_has_it_also_where_that_has_the_wall(tmp_path):
-    def state(n):
-        return together(wall(), head(1.0)) if n < 5 else together(wall(), head(0.0), hair_beside())
-
-    made = world(tmp_path, together(wall(), head(4 / FRAMES)), state)
-    otherwise = found(made)
-    assert otherwise is not None
-    whole = with_turned(made.run, made.scene, made.frozen, T_STAR, still, otherwise)
-    layer = whole.state["means"][len(made.frozen.support) :]
-    assert len(layer) and abs(float(layer[:, 2].median()) / ARM - 1.0) < 0.05
-    truth = state(T_STAR)
-    for n in (1, T_STAR, FRAMES):
-        at = where(made, hair_beside(), n)
-        target, before, after = (made.image(each, n) for each in (truth, made.frozen.state, whole.state))
-        assert at.sum() > 100
-        assert np.abs(after - target)[at].mean() < 0.4 * np.abs(before - target)[at].mean(), n
-    bare = where(made, wall(), 1) & ~binary_dilation(
-        where(made, together(head(1.0), hair_beside()), 1), np.ones((15, 15))
-    )
-    assert np.abs(made.image(whole.state, 1) - made.image(made.frozen.state, 1))[bare].max() < 0.02
-
-
-def test_where_the_scene_shows_plate_t_star_already_no_layer_is_made(before):
-    made, otherwise = replace(before, frozen=frozen_of(together(wall(), head(0.0)))), found(before)
-    assert otherwise is not None
-    assert with_turned(made.run, made.scene, made.frozen, T_STAR, still, otherwise) is made.frozen
 
 
 def test_what_mattes_call_moving_is_left_to_them(before):
