@@ -137,5 +137,6 @@ def _solid(mask: NDArray[np.bool_], unit: float, config: TurnedConfig) -> NDArra
     import cv2
 
     side = 2 * max(1, round(unit)) + 1
-    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
-    return large(np.asarray(opened, np.bool_), np.asarray(opened, np.bool_), config.area * unit**2)
+    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
+    regions = np.asarray(opened > 0, np.bool_)
+    return large(regions, regions, config.area * unit**2)
