@@ -71,13 +71,13 @@ def leading_matte(
             within = within * resized(free, columns, rows)
         return within, st, own
     wrong = torch.maximum(posed.motion, lead.moving) > 0.5
-    otherwise = None if truth is None else _otherwise(sightings, config, posed, leading, lead, truth)
+    found = None if truth is None else _otherwise(sightings, config, posed, leading, lead, truth)
     if own:
-        wrong, found = _let_go(sightings, config, posed, leading, usable, wrong, truth, otherwise)
+        wrong, found = _let_go(sightings, config, posed, leading, usable, wrong, truth, found)
+    elif found is not None:
+        wrong = wrong | found
+    if found is not None:
         posed.held = widened(found.float(), round(config.margin * sightings.unit))
-    elif otherwise is not None:
-        wrong = wrong | otherwise
-        posed.held = widened(otherwise.float(), round(config.margin * sightings.unit))
     posed.doubt = widened(wrong.float(), round(config.margin * sightings.unit))
     let_go = blurred(posed.doubt, config.feather * sightings.unit)
     matte = 1.0 - let_go

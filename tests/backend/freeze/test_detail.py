@@ -133,15 +133,21 @@ class World:
         return seen(self.scene.viewmats[frame - 1], 99.0 if self.still else board_at(frame))
 
 
+def path():
+    """[FRAMES, 4, 4] the clip's cameras: none is turned."""
+    viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
+    viewmats[:, 0, 3] = torch.linspace(0.35, -0.35, FRAMES)
+    viewmats[:, 1, 3] = 0.05 * torch.sin(torch.arange(FRAMES) * 1.3)
+    return viewmats
+
+
 def build(folder, report, still=False, logo=None, drawn=None):
     """A shot on disk as import, solve and a painter leave it: plates of 16 bits, working frames half as large.
 
     `logo` [H, W] bool is burnt into all plates, and the solve was given a mask of it. `drawn(picture, n)` changes
     plate n.
     """
-    viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
-    viewmats[:, 0, 3] = torch.linspace(0.35, -0.35, FRAMES)
-    viewmats[:, 1, 3] = 0.05 * torch.sin(torch.arange(FRAMES) * 1.3)
+    viewmats = path()
     shot, source = Shot.create(folder / "board.splannequin"), folder / "source"
     source.mkdir()
     for n in range(1, FRAMES + 1):

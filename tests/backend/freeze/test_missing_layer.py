@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from torch_backend.contract import Cancelled
 from torch_backend.footage.images import write_png
 from torch_backend.freeze.frozen import FrozenGaussians, freeze_at, render_frozen
 from torch_backend.freeze.instant_bench import InstantBench, InstantConfig, low_difference
@@ -147,6 +148,20 @@ def where(made, state, n=T_STAR):
     """Pixels [H, W] of plate n that show a state, wholly."""
     frozen = frozen_of(state)
     return render_frozen(frozen, made.scene.viewmats[n - 1], made.scene.Ks[0], W, H).alpha.numpy() > 0.9
+
+
+def stops_when_asked(work, times=3):
+    """`work(check)` is cancelled by the `times`-th call of check, and calls it no more."""
+    asked = []
+
+    def check():
+        asked.append(1)
+        if len(asked) == times:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        work(check)
+    return len(asked) == times
 
 
 def test_a_hand_that_the_model_lacks_is_found_as_deep_as_the_arm_it_hangs_on(waving):

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.contract import Cancelled
 from torch_backend.freeze.frozen import SUPPORT_SECONDS
 from torch_backend.freeze.unseen import with_unseen
 from torch_backend.solve.motion import MOVING
 
-from .test_missing_layer import T_STAR, sheet, skin, together, wall, where, world
+from .test_missing_layer import T_STAR, sheet, skin, stops_when_asked, together, wall, where, world
 
 FAR = 2.5
 AWAY = 4.0
@@ -106,16 +105,7 @@ def test_what_the_run_has_elsewhere_is_not_there_twice(tmp_path):
 
 def test_it_can_be_cancelled_before_any_plate(lost):
     made, mattes = lost
-    asked = []
-
-    def check():
-        asked.append(1)
-        if len(asked) == 3:
-            raise Cancelled
-
-    with pytest.raises(Cancelled):
-        with_unseen(made.run, made.scene, made.frozen, T_STAR, mattes, check=check)
-    assert len(asked) == 3
+    assert stops_when_asked(lambda check: with_unseen(made.run, made.scene, made.frozen, T_STAR, mattes, check=check))
 
 
 def test_without_mattes_nothing_is_added(lost):
