@@ -28,6 +28,7 @@ from torch_backend.contract import read_json
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key
 from torch_backend.solve.motion import find_motion
+from torch_backend.train import static_views
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -61,7 +62,8 @@ class SyntheticTruth:
         self.name = f"{self._scene.size} {self._scene.name}"
         place = shots / f"{self._scene.size}-{self._scene.name}-{cameras}{SHOT_SUFFIX}"
         self.shot = (exact_shot if cameras == "exact" else solved_shot)(self._scene, place, Log())
-        find_motion(self.shot, Log())  # exact cameras come without; the motion mattes drive the training
+        # Exact cameras come without; the motion mattes drive the training.
+        find_motion(self.shot, Log(), static_model=static_views)
         self._pixels = SolvedPixels(self.shot)
         self.t_stars, self._poses = list(self._scene.t_stars), list(self._scene.poses)
         steps = np.diff(self._poses)

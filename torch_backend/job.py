@@ -326,7 +326,13 @@ def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
     from .solve import SolveConfig, solve_shot
 
     config = SolveConfig(**{name: value for name, value in vars(params).items() if name != "cameras"})
-    return solve_shot(shot, config, report, params.cameras)
+
+    def static_model(shot: Shot, report: Reporter) -> Any:
+        from .train import static_views
+
+        return static_views(shot, report)
+
+    return solve_shot(shot, config, report, params.cameras, static_model)
 
 
 def _train(shot: Shot, params: contract.TrainParams, report: Reporter) -> Any:

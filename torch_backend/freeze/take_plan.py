@@ -28,7 +28,7 @@ from ..shot import Shot, content_key
 from ..solve.motion import find_motion, motion_key
 from ..solve.stmap import margin
 from ..torch_types import floats
-from ..train import LoadedRun, choose_device, load_run
+from ..train import LoadedRun, choose_device, load_run, static_views
 from .detail import Detailer
 from .developed_instants import Instants
 from .footage_facts import footage_light
@@ -145,7 +145,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
     plate = (shot.info().width, round(shot.info().width * height / width))
     if params.detail == "on" or params.develop == "on":
-        find_motion(shot, report)  # of shots solved before the solve looked for it
+        find_motion(shot, report, static_model=static_views)  # of shots solved before the solve looked for it
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
     spec = FrameSpec(

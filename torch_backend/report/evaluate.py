@@ -22,7 +22,7 @@ from ..freeze.frozen import FrozenGaussians, FrozenImage, OutputFrame, freeze_at
 from ..scene import Scene, evenly_spaced, load_scene, read_image, split_frames
 from ..shot import Shot
 from ..solve.motion import find_motion
-from ..train import LoadedRun, load_run
+from ..train import LoadedRun, load_run, static_views
 from ..train.checkpoint import load_checkpoint
 from ..train.model import render
 from .colorvideovdp import sequence_jod
@@ -82,7 +82,7 @@ def plate_detail(shot: Shot, run: LoadedRun, scene: Scene, report: Reporter) -> 
 
     JobError if the footage cannot be read.
     """
-    find_motion(shot, report)
+    find_motion(shot, report, static_model=static_views)
     return Detailer(run, scene, Plates(shot, (run.width, run.height)))
 
 

@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from ..shot import Shot
 from ..solve.motion import MOVING, STILL, find_motion, load_motion
 from ..torch_types import from_numpy
+from ..train import static_views
 
 MARGIN = 8.0
 """A still pixel this near to a mover, in pixels of a picture 640 wide, is no truth: outlines of movers are soft, and so
@@ -23,7 +24,7 @@ are their mattes."""
 
 def ensure_motion(shot: Shot) -> None:
     """Finds the motion matte of a shot solved before there was one. JobError if the shot is not solved."""
-    find_motion(shot, _Mute())
+    find_motion(shot, _Mute(), static_model=static_views)
 
 
 def motion_shares(shot: Shot, frame: int, width: int, height: int) -> dict[str, Tensor]:

@@ -5,6 +5,10 @@ not agree: laid over a frame by the depth of still points, most of the key frame
 frame shows something else. Where one depth explains that, it is a thing that stands still and was given a wrong depth,
 as at outlines; what is left moves. A picture is compared with all that another one shows within a point of the grid
 (its least and greatest values there), so that matches may be off by that much.
+
+Nor does flow find an arm that swings slowly before a wall, and the key frames around do not agree about it. A static
+model of the whole clip knows the wall: what a frame shows and such a model cannot moves, unless the key frames around
+show the same at the still point's depth, where it is the model that is poor.
 """
 
 from __future__ import annotations
@@ -27,6 +31,8 @@ _MOST = 0.1
 _SPARSE = 4
 """Every so manieth point tells how bright a picture is."""
 _ROW = 1024
+_AROUND = 5
+"""Points a side over which it is asked together whether key frames bear out what a static model does not show."""
 _HIDDEN = 1.15
 """A surface that is nearer by this factor hides what is behind it."""
 _MOST_OF = 0.7
@@ -43,6 +49,13 @@ class Shades:
         self.colors = colors
         block = np.ones((3, 3), np.uint8)
         self._least, self._greatest = cv2.erode(colors, block), cv2.dilate(colors, block)
+
+    def apart(self, other: Shades) -> Map:
+        """[h, w] uint8: how far each picture is out of the range that the other shows there, greatest channel."""
+        below = [cv2.subtract(a._least, b.colors) for a, b in ((self, other), (other, self))]
+        above = [cv2.subtract(a.colors, b._greatest) for a, b in ((self, other), (other, self))]
+        most: Map = np.max([*below, *above], axis=(0, 3))
+        return cv2.medianBlur(most, 3)
 
     def at(self, x: Map, y: Map) -> NDArray[np.float32]:
         """[..., 3] colours at positions [a, b] of the grid."""
@@ -103,18 +116,48 @@ class Fleeting:
         self._grid, self._config = grid, config
         self._least = max(2, round((config.speck * unit / 2.0) ** 2))
 
-    def mask(self, frame: Sight, others: Sequence[Other], inverse: Map, depth: float) -> Mask:
+    def mask(
+        self, frame: Sight, others: Sequence[Other], inverse: Map, depth: float, static: Shades | None = None
+    ) -> Mask:
         """[h, w]: what moves by itself in a frame.
 
         `others` are key frames around it, `inverse` [h, w] the depths of its still points, `depth` the typical one,
-        solve units.
+        solve units; `static` is what a static model of the clip shows there, if there is one.
         """
-        c, shape = self._config, inverse.shape
-        nothing = np.zeros(shape, bool)
         others = [self._fitted(frame, other, inverse) for other in others]
         chosen = self._first(others)
         if len(others) < 3 or not chosen:
-            return nothing
+            return np.zeros(inverse.shape, bool)
+        found = self._elsewhere(frame, others, chosen, inverse, depth)
+        return found if static is None else found | self._unexplained(frame, others, inverse, static)
+
+    def _unexplained(self, frame: Sight, others: Sequence[Other], inverse: Map, static: Shades) -> Mask:
+        """[h, w]: what a frame shows and a static model does not, though the key frames around do not bear it out.
+
+        The nearest do not count: what moves slowly is still there in them.
+        """
+        c, apart = self._config, frame.shades.apart(static)
+        strong = _opened(apart > c.unexplained[1])
+        weak = seeded(apart > c.unexplained[0], strong, self._least)
+        if not weak.any() or weak.mean() > _MOST:
+            return np.zeros(inverse.shape, bool)
+        rows, columns = np.nonzero(weak)
+        points, at = self._points(rows, columns), inverse[rows, columns][None]
+        alike, seen = np.zeros(inverse.shape, np.float32), np.zeros(inverse.shape, np.float32)
+        for other in (other for other in others if other.step > 1):
+            found, within = self._compared(frame, other, points, at, frame.shades.colors[rows, columns][None])
+            alike[rows, columns] += ((found <= c.unlike) & within)[0]
+            seen[rows, columns] += within[0]
+        near = _AROUND, _AROUND
+        weak &= (cv2.blur(alike, near) < c.borne_out * cv2.blur(seen, near)) | (cv2.blur(seen, near) == 0)
+        return seeded(weak, weak & strong, self._least)
+
+    def _elsewhere(
+        self, frame: Sight, others: Sequence[Other], chosen: Sequence[Other], inverse: Map, depth: float
+    ) -> Mask:
+        """[h, w]: what is elsewhere in the key frames around, which agree about what is there instead."""
+        c, shape = self._config, inverse.shape
+        nothing = np.zeros(shape, bool)
         unlike = nothing.copy()
         for other in chosen:
             found, within = self._compared(frame, other, self._grid, inverse, frame.shades.colors)
@@ -126,7 +169,7 @@ class Fleeting:
         weak, strong = nothing.copy(), nothing.copy()
         weak[rows, columns], strong[rows, columns] = share >= c.fleeting[0], share >= c.fleeting[1]
         # Outlines are lines of one point: depths and pictures are off there.
-        strong = cv2.morphologyEx(strong.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
+        strong = _opened(strong)
         weak = seeded(weak, strong, self._least)
         if not weak.any() or weak.mean() > _MOST:
             return nothing
@@ -234,6 +277,11 @@ class Fleeting:
         result = np.zeros(mask.shape, bool)
         result[every] = np.any(explained, axis=0)[whole]
         return result
+
+
+def _opened(mask: Mask) -> Mask:
+    """A mask without lines of one point."""
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
 
 
 def seeded(mask: Mask, seeds: Mask, least: int, connectivity: int = 8) -> Mask:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypedDict, cast
 
@@ -34,18 +35,22 @@ from ..footage.images import is_whole_png
 from ..shot import Shot, content_key, make_folder, need_disk, write_json
 from .flow import FlowConfig, Map
 from .masks import IGNORE, PEOPLE, limited, load_mask, masks_key, write_grey
-from .moving import Clip, mattes
+from .moving import Clip, StaticViews, mattes
 from .still import Evidence
 from .stored import load_cameras
 from .surface import AWAY, NO_SURFACE, KeyEvidence, SurfacePoints, read_surface, surface_points, write_surface
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
-MOTION_VERSION = 4
+MOTION_VERSION = 5
 PAINTED = PAINTED_FOLDER
 """Of painted mattes, in the shot's folder."""
 _RECORD, _UNFINISHED = MOTION_FILE, MOTION_UNFINISHED_FILE
 _LABELS = np.array([STILL, UNKNOWN, MOVING], np.uint8)
+
+
+StaticModel = Callable[[Shot, Reporter], StaticViews]
+"""Learns the clip as a world that stands still, of the cameras that it has. JobError if that cannot be done."""
 
 
 class MotionResult(TypedDict):
@@ -57,15 +62,18 @@ class MotionResult(TypedDict):
     """Share of them of which nothing is known."""
 
 
-def find_motion(shot: Shot, report: Reporter, with_points: bool = False) -> MotionResult:
-    """Writes the motion matte of every delivered frame, from optical flow against the camera's own motion, and points
-    of what stands still.
+def find_motion(
+    shot: Shot, report: Reporter, with_points: bool = False, static_model: StaticModel | None = None
+) -> MotionResult:
+    """Writes the motion matte of every delivered frame, from optical flow against the camera's own motion and from what
+    a static model of the clip cannot show; and points of what stands still.
 
     Mattes that are there and belong to these cameras are left alone; a run that was stopped is gone on with. JobError
     if the shot is not solved or a frame is damaged, and Cancelled.
 
     Args:
         with_points: mattes without points, of a solve before those were kept, are found once more.
+        static_model: makes that model, `train.static_views`; None: flow alone tells, and misses arms.
     """
     config = FlowConfig()
     key = _solve_key(shot, config)
@@ -78,7 +86,7 @@ def find_motion(shot: Shot, report: Reporter, with_points: bool = False) -> Moti
         return MotionResult(**done["result"])
     need_disk(shot.root, 0.1 * path.width * path.height * len(files), "The motion matte")
     _begin(folder, key)
-    clip = Clip(shot)
+    clip = Clip(shot, _static_views(shot, static_model, report))
     written = {n for n, frame in enumerate(clip.frames) if not anew and is_whole_png(files[frame])}
     shares = np.zeros((len(files), 3))
     for n in written:
@@ -106,6 +114,17 @@ def find_motion(shot: Shot, report: Reporter, with_points: bool = False) -> Moti
     write_json(folder / _RECORD, {"version": MOTION_VERSION, "key": key, "result": result})
     (folder / _UNFINISHED).unlink(missing_ok=True)
     return result
+
+
+def _static_views(shot: Shot, static_model: StaticModel | None, report: Reporter) -> StaticViews | None:
+    """What a static model shows; None without one, or if a clip cannot be learnt: flow has to do then."""
+    if static_model is None:
+        return None
+    try:
+        return static_model(shot, report)
+    except JobError as error:
+        report.warning(f"What moves is told by optical flow alone: {error}", error.hint)
+        return None
 
 
 def _keep_surface(

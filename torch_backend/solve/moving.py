@@ -36,14 +36,18 @@ _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 
 
+StaticViews = Callable[[int], NDArray[np.uint8] | None]
+"""Frame number -> what a static model of the clip shows from its camera, [h, w, 3] as the frames are; None: nothing."""
+
+
 class Clip:
     """Frames and cameras of a solved shot, in the flow's size."""
 
-    def __init__(self, shot: Shot) -> None:
+    def __init__(self, shot: Shot, static: StaticViews | None = None) -> None:
         """JobError if it is not solved."""
         path = load_cameras(shot)
         seconds = {int(row["frame"]): float(row["seconds"]) for row in load_frames(shot)["frames"]}
-        self._shot = shot
+        self._shot, self._static = shot, static
         self.frames = [camera.frame for camera in path.frames]
         """Numbers of the delivered frames, ascending."""
         self.width, self.height = path.width, path.height
@@ -98,6 +102,11 @@ class Clip:
         grey = _sized(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8), self.flow_size)
         colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))
         return grey, Sight(Shades(colors), self._cameras[0][index], self._cameras[1][index])
+
+    def static(self, index: int) -> Shades | None:
+        """What a static model of the clip shows in a frame, on the grid; None if there is none."""
+        shown = None if self._static is None else self._static(self.frames[index])
+        return None if shown is None else Shades(_sized(shown, (self.flow_size[0] // 2, self.flow_size[1] // 2)))
 
     def is_guessed(self, index: int) -> bool:
         """True if the pose of a frame was not solved."""
@@ -239,7 +248,8 @@ def _fleeting(
     clip: Clip, fleeting: Fleeting, n: int, key: int, sight: Sight | None, inverse: Map,
     own: dict[int, tuple[Map, Map, Map]], config: FlowConfig,
 ) -> Mask:  # fmt: skip
-    """What is elsewhere in the keys around frame `n`, which is key `key` or lies between it and the one before."""
+    """What is elsewhere in the keys around frame `n`, which is key `key` or lies between it and the one before, or is
+    not in a static model."""
     if sight is None or clip.is_guessed(n):
         return np.zeros(inverse.shape, bool)
     nearest = {-1: key - 1, 1: key + (n == clip.keys[key])}
@@ -250,7 +260,7 @@ def _fleeting(
             found = clip.sight(other) if 0 <= other < len(clip.keys) else None
             if found is not None:
                 around.append(Other(side, step, found, own[other][2]))
-    return fleeting.mask(sight, around, inverse, clip.depths[key])
+    return fleeting.mask(sight, around, inverse, clip.depths[key], clip.static(n))
 
 
 def _labels(

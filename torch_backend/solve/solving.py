@@ -8,7 +8,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,9 @@ from .stored import load_cameras, load_points, load_record
 from .straight import Straight
 from .undistort import Undistorter, of_frames
 from .verdict import FAIR_ERROR_PX, doubt_of, quality_words
+
+if TYPE_CHECKING:
+    from .motion import StaticModel
 
 SOLVE_VERSION = 1
 _WRITERS = 2
@@ -122,7 +125,9 @@ class SolveResult(TypedDict):
     """Share of them of which that is not known."""
 
 
-def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str = "") -> SolveResult:
+def solve_shot(
+    shot: Shot, config: SolveConfig, report: Reporter, cameras: str = "", static_model: StaticModel | None = None
+) -> SolveResult:
     """Finds the camera of every frame of `shot` and writes the undistorted frames.
 
     Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
@@ -135,7 +140,8 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
     its world, frames without one interpolated.
 
-    Then the motion matte of every frame is found (`motion.find_motion`); the solve holds without it.
+    Then the motion matte of every frame is found (`motion.find_motion`, which `static_model` is for); the solve holds
+    without it.
 
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
@@ -155,7 +161,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     done = _finished(shot, frames, key)
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
-        return _with_motion(shot, done["result"], report)
+        return _with_motion(shot, done["result"], report, static_model)
     taken = prepare(frames, cameras, report) if cameras else None
     lens = _lens_of_map(config, frames, report)
     _refuse_damaged(shot, frames)
@@ -184,7 +190,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
         raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    result = _with_motion(shot, result, report)
+    result = _with_motion(shot, result, report, static_model)
     report.metric("solve", dict(result))
     return result
 
@@ -216,12 +222,14 @@ def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: 
     return content_key(SOLVE_VERSION, settings, frames.get("key"), *source, *(mask.key for mask in masks.values()))
 
 
-def _with_motion(shot: Shot, result: SolveResult, report: Reporter) -> SolveResult:
+def _with_motion(
+    shot: Shot, result: SolveResult, report: Reporter, static_model: StaticModel | None = None
+) -> SolveResult:
     """`result` with what moves in the clip. Cameras took minutes: whatever keeps the matte from them is a warning."""
     try:
         from .motion import find_motion
 
-        found = find_motion(shot, report, with_points=True)
+        found = find_motion(shot, report, with_points=True, static_model=static_model)
         if (doubt := doubt_of(found["motion_pixels_share"])) is not None:
             report.warning(*doubt)
         return {**result, **found}

@@ -110,7 +110,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
             "The run's settings, cameras or motion mattes changed: it is trained anew.",
             "The run that is there stays until the new one is done.",
         )
-    _warm_up(config, device)
+    warm_up(config, device)
     pictures = pictures_of(shot, scene, config, report)
     width, height = pictures.size
     images = pictures.load(train + test, report, folder)
@@ -170,7 +170,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         raise JobError(message, "Train it again: it cannot be extended.", ExitCode.TRAIN)
     config, scene = config_from_json(facts["config"]), load_scene(shot)
     device = choose_device(params.device, report, "Training")
-    _warm_up(config, device)
+    warm_up(config, device)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     pictures = pictures_of(shot, scene, config, report)
     size = pictures.size
@@ -243,7 +243,8 @@ def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig) -> tuple
     return key, None
 
 
-def _warm_up(config: TrainConfig, device: torch.device) -> None:
+def warm_up(config: TrainConfig, device: torch.device) -> None:
+    """Sets the threads and compiles what a run on that device needs."""
     torch.set_num_threads(default_threads())
     if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
         for module in (raster_cpu, ssim, adam):

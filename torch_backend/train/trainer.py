@@ -170,8 +170,11 @@ class Trainer:
         self.extensions.append(Extension(self.iteration, steps, heldout_psnr_db, self.trained_seconds))
         self.policy.joined = True  # a run that ended early may still hold its probe frames back
 
-    def run(self, checkpoint: Path, evaluate: Callable[[Trainer], None]) -> None:
-        """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured."""
+    def run(self, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
+        """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured.
+
+        Without a checkpoint nothing is written.
+        """
         begin, length = 0, self.config.iterations
         if self.extensions:
             begin, length = self.extensions[-1].from_iteration, self.extensions[-1].steps
@@ -254,7 +257,7 @@ class Trainer:
         except torch.OutOfMemoryError:
             return None  # the frames that hold the step's tensors go with the error
 
-    def _make_room(self, checkpoint: Path) -> None:
+    def _make_room(self, checkpoint: Path | None) -> None:
         """After the card's memory ended: saves, and makes the run smaller. JobError if there is nothing left to take.
 
         First go the recordings of steps, which nobody misses; then the field works in pieces; then a fifth of the
@@ -691,8 +694,10 @@ class Trainer:
             named.update({f"field.{n}": p for n, p in self.model.field.named_parameters()})
         return named
 
-    def save(self, path: Path) -> None:
-        """Writes everything that `restore` needs."""
+    def save(self, path: Path | None) -> None:
+        """Writes everything that `restore` needs; nothing to no path."""
+        if path is None:
+            return
         tensors = {**self.model.gaussians.state(), **optimizer_state(self._named(), self.optimizer)}
         if self.model.field is not None:
             tensors.update(self.model.field.state())

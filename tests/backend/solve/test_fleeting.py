@@ -42,15 +42,15 @@ def disc(at: tuple[float, float]) -> np.ndarray:
     return np.hypot(X - u, Y - v) < RADIUS
 
 
-def found(place, gain: float = 1.0) -> np.ndarray:
-    """The mask of the middle frame; `place(key)` is where the disc is."""
+def found(place, gain: float = 1.0, static: Shades | None = None) -> np.ndarray:
+    """The mask of the middle frame; `place(key)` is where the disc is, `static` what a static model shows there."""
     inverse = np.full((HEIGHT, WIDTH), 1.0 / WALL, np.float32)  # flow has seen the wall only
     others = [
         Other(side, step, sight(KEY + side * step, [place(KEY + side * step)], gain), inverse)
         for side in (-1, 1)
         for step in STEPS
     ]
-    return Fleeting((X, Y), 0.5, FlowConfig()).mask(sight(KEY, [place(KEY)]), others, inverse, WALL)
+    return Fleeting((X, Y), 0.5, FlowConfig()).mask(sight(KEY, [place(KEY)]), others, inverse, WALL, static)
 
 
 def swings(key: int) -> tuple[float, float]:
@@ -80,3 +80,27 @@ def test_too_few_frames_around_say_nothing() -> None:
     inverse = np.full((HEIGHT, WIDTH), 1.0 / WALL, np.float32)
     others = [Other(1, n, sight(KEY + n, []), inverse) for n in STEPS[:2]]
     assert not Fleeting((X, Y), 0.5, FlowConfig()).mask(sight(KEY, [swings(KEY)]), others, inverse, WALL).any()
+
+
+def comes(key: int) -> tuple[float, float]:
+    """Out of the picture, and from the middle frame on at rest."""
+    return (0.55, 0.1) if key >= KEY else (99.0, 99.0)
+
+
+def test_what_came_and_stays_moves_if_a_static_model_shows_what_was_there_before() -> None:
+    """The key frames before and after do not agree about what is behind it; a model of the whole clip knows."""
+    truth = disc(comes(KEY))
+    assert not (found(comes) & truth).any()
+    mask = found(comes, static=sight(KEY, []).shades)
+    assert (mask & truth).sum() >= 0.8 * truth.sum()
+    assert not (mask & ~cv2.dilate(truth.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)).any()
+
+
+def test_where_a_static_model_is_poor_nothing_moves_that_the_frames_around_show_as_well() -> None:
+    shown = sight(KEY, []).shades.colors.copy()
+    shown[20:35, 30:60] = 255 - shown[20:35, 30:60]
+    assert not found(lambda key: (99.0, 99.0), static=Shades(shown)).any()
+
+
+def test_a_static_model_that_is_wrong_about_the_whole_frame_says_nothing() -> None:
+    assert not found(comes, static=Shades(255 - sight(KEY, []).shades.colors)).any()

@@ -1,0 +1,67 @@
+"""What a static model of a clip shows, and what mattes have of it."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, World
+from torch_backend.contract import Cancelled, JobError
+from torch_backend.footage.images import read_png
+from torch_backend.raster import rasterize
+from torch_backend.shot import Shot
+from torch_backend.train import static_views
+from torch_backend.train.static_world import STAGE, steps_for
+
+
+def patch_of(world: World, n: int, time: float) -> np.ndarray:
+    """[H, W] in 0..1: how much of each pixel of frame `n` the patch that sways would cover at a time."""
+    state = {name: value[world.moving] for name, value in world.at(time).items()}
+    out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=WIDTH, height=HEIGHT)
+    return out.alphas[0].numpy()
+
+
+@pytest.fixture(scope="module")
+def learnt(world, quiet):
+    report, before = quiet(), sorted(world.shot.root.rglob("*"))
+    shown = static_views(world.shot, report)
+    assert sorted(world.shot.root.rglob("*")) == before
+    return shown, report
+
+
+def test_it_shows_the_wall_at_every_frame_and_not_the_patch_where_it_is_for_a_moment(world, learnt):
+    shown, _ = learnt
+    away, went = [], []
+    for n in range(FRAMES):
+        picture = shown(FIRST + n)
+        assert picture.shape == (HEIGHT, WIDTH, 3) and picture.dtype == np.uint8
+        error = np.abs(picture.astype(int) - read_png(world.shot.plate(FIRST + n))).max(-1)
+        now, other = (patch_of(world, n, time) for time in (n / (FRAMES - 1), 1.0 - n / (FRAMES - 1)))
+        away.append(error[(now < 0.01) & (other < 0.01)])
+        went.append(error[(now > 0.9) & (other < 0.1)])
+    away, went = np.concatenate(away), np.concatenate(went)
+    assert np.median(away) < 4 and np.quantile(away, 0.95) < 20
+    assert len(went) > 200 and np.median(went) > 32
+
+
+def test_its_training_is_a_stage_of_the_solve_and_says_nothing_else(learnt):
+    _, report = learnt
+    assert {event[0] for event in report.events} == {"progress"}
+    assert {event[1] for event in report.events} == {STAGE}
+    assert report.events[-1][2:4] == (steps_for(FRAMES), steps_for(FRAMES))
+
+
+def test_it_is_the_same_each_time_and_whatever_was_drawn_before(world, learnt, quiet):
+    torch.manual_seed(5)
+    again = static_views(world.shot, quiet())
+    for frame in (FIRST, FIRST + 7):
+        assert (again(frame) == learnt[0](frame)).all()
+
+
+def test_it_can_be_cancelled(world, quiet):
+    with pytest.raises(Cancelled):
+        static_views(world.shot, quiet(cancel_at=(STAGE, 0.2)))
+
+
+def test_a_shot_that_is_not_solved_is_one_sentence(tmp_path, quiet):
+    with pytest.raises(JobError, match="has no cameras yet"):
+        static_views(Shot.create(tmp_path / "empty.splannequin"), quiet())

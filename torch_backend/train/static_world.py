@@ -1,0 +1,93 @@
+"""What a static model of a clip shows: the clip learnt in a few hundred steps as a world in which nothing moves.
+
+What a frame shows and such a model cannot, moves, or is hard to learn (`solve/fleeting.py` tells them apart). It is as
+the first part of every run, whose residual opened the gate once and was a poor judge of Gaussians; of pixels, held
+against the key frames around, it is a good one (docs/benchmarks.md, "What mattes miss").
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..contract import Reporter, TrainParams
+from ..scene import evenly_spaced, load_images, load_scene
+from ..shot import Shot
+from ..solve.masks import IGNORE, load_mask
+from ..solve.moving import StaticViews
+from .config import config_from_params
+from .ignored import load_ignored
+from .pictures import training_size
+from .run import warm_up
+from .trainer import Trainer
+
+STAGE = "solve: still world"
+STEPS = 400
+"""Of training, but at most `PER_FRAME[1]` for each frame: a model that looks longer at few frames learns the movers of
+each of them as well, near its camera. Of many frames each is looked at `PER_FRAME[0]` times."""
+PER_FRAME = 2, 8
+GAUSSIANS = 20_000
+"""At most: coarse, and soon learnt."""
+FRAMES = 600
+"""Frames that are learnt from, at most, evenly over the clip: more are as their neighbours are."""
+
+
+def static_views(shot: Shot, report: Reporter) -> StaticViews:
+    """Learns a solved shot as a static world, on the processor; nothing is written.
+
+    Returns what it shows at any delivered frame, [h, w, 3] uint8 of a preview's size, with that frame's exposure.
+    JobError if the shot cannot be learnt, Cancelled.
+    """
+    scene = load_scene(shot)
+    train = [scene.solved[n] for n in evenly_spaced(len(scene.solved), FRAMES)]
+    config = config_from_params(TrainParams(method="static", iterations=steps_for(len(train)), holdout=0, device="cpu"))
+    config.densify.budget = GAUSSIANS
+    warm_up(config, torch.device("cpu"))
+    width, height = training_size(scene, config.width)
+    ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train, width, height)
+    heard = _Heard(report)
+    trainer = Trainer(scene, load_images(scene, train, width, height), train, config, heard, ignored=ignored)
+    trainer.run(None, lambda _: None)
+    index = {frame: n for n, frame in enumerate(scene.frames)}
+
+    @torch.no_grad()
+    def shown(frame: int) -> NDArray[np.uint8]:
+        return (trainer.render_frame(index[frame]).clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+
+    return shown
+
+
+def steps_for(frames: int) -> int:
+    """Steps in which a static model of so many frames is trained."""
+    least, most = (each * frames for each in PER_FRAME)
+    return min(max(STEPS, least), most)
+
+
+class _Heard:
+    """Hands on how far a training is, and that it is to stop; its figures and advice are of no run."""
+
+    def __init__(self, report: Reporter) -> None:
+        self._report = report
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
+        """As a stage of the solve."""
+        self._report.progress(STAGE, done, total, message)
+
+    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
+        """Nothing."""
+
+    def image(self, label: str, path: str | Path) -> None:
+        """Nothing."""
+
+    def warning(self, message: str, hint: str = "") -> None:
+        """Nothing."""
+
+    def check_cancelled(self) -> None:
+        """As the one that is told."""
+        self._report.check_cancelled()
