@@ -150,7 +150,7 @@ class _Darkroom:
         # What is behind the run's own and was not seen at t* (`unseen.py`) is as its plate had it.
         unseen = (torch.arange(len(frozen.support), device=self.device) >= len(means)) & (frozen.support < 1.0)
         self.afar[unseen] = 1.0
-        self.held = (((self.afar * opened > 0.5) & (moves.amax(0) > 0.5)) | unseen).nonzero()[:, 0]
+        self.held = (((self.afar > 0.5) & (moves.amax(0) > 0.5)) | unseen).nonzero()[:, 0]
         opened[len(run.model.gaussians) :] = (~unseen[len(means) :]).float()
         self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
         """Rows of what moves and stands, at t*, in what the plate says moves."""

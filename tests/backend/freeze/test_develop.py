@@ -28,6 +28,7 @@ from torch_backend.freeze.missing_layer import InstantLayer, instant_layer, join
 from torch_backend.freeze.sightings import motion_mattes
 from torch_backend.freeze.static_twin import TwinConfig, held_still, settled
 from torch_backend.freeze.travel import Stage, Travel
+from torch_backend.freeze.working_plates import WorkingPlates
 from torch_backend.live import LiveSession
 from torch_backend.scene import load_scene, read_image
 from torch_backend.solve.motion import load_motion
@@ -229,6 +230,27 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_where_it_moves(trained)
     assert float(changed[near].float().mean()) > 0.9
     assert float(changed[far].float().mean()) < 0.3, "those that no matte calls moving"
     assert float(changed[frozen.motion < 0.5].float().mean()) > 0.9, "others show it as it is, too"
+
+
+def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(trained):
+    """A face that is closed, and that one frame calls moving: others teach it what they see beside it."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen, once = field(run, scene), run.train_frames[-2]
+
+    def moving(frame: int) -> torch.Tensor:
+        return torch.full((scene.height, scene.width), float(frame == once))
+
+    config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005, probes=0, looks=1000)
+    made = develop(run, scene, frozen, T_STAR, moving, config)
+    changed = (made.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
+    plates = WorkingPlates(scene, config.width, moving, config.margin, frozen.support.device)
+    moves = plates.moving_share(frozen, once) > 0.5
+    afar = seen_from_afar(run, scene, frozen.state["means"], T_STAR, 1.005)
+    closed = frozen.motion < 0.5
+    assert int((closed & afar & moves).sum()) > 8 and int((closed & ~afar & moves).sum()) > 8, "or the test says nothing"
+    assert not changed[afar & moves].any()
+    assert float(changed[closed & ~afar & moves].float().mean()) > 0.9
 
 
 def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(tmp_path, quiet):
