@@ -248,7 +248,9 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(tr
     moves = plates.moving_share(frozen, once) > 0.5
     afar = seen_from_afar(run, scene, frozen.state["means"], T_STAR, 1.005)
     closed = frozen.motion < 0.5
-    assert int((closed & afar & moves).sum()) > 8 and int((closed & ~afar & moves).sum()) > 8, "or the test says nothing"
+    assert int((closed & afar & moves).sum()) > 8 and int((closed & ~afar & moves).sum()) > 8, (
+        "or the test says nothing"
+    )
     assert not changed[afar & moves].any()
     assert float(changed[closed & ~afar & moves].float().mean()) > 0.9
 
