@@ -216,6 +216,32 @@ def test_mattes_that_are_there_are_left_alone(swaying, quiet):
     assert stamps(shot) == before
 
 
+def test_a_clip_that_cannot_be_learnt_is_left_to_flow_with_a_word(swaying, tmp_path, quiet):
+    def refuse(shot, report):
+        raise JobError("The camera hardly moves.", "Walk.")
+
+    shot, report = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin")), quiet()
+    find_motion(shot, report, static_model=refuse)
+    assert not report.events, "mattes that are there need no model"
+    shutil.rmtree(shot.motion)
+    assert find_motion(shot, report, static_model=refuse) == swaying[2]
+    told = [event[1:] for event in report.events if event[0] == "warning"]
+    assert told == [("What moves is told by optical flow alone: The camera hardly moves.", "Walk.")]
+
+
+def test_what_a_static_model_lacks_is_in_the_matte_between_keys_as_well(tmp_path, quiet):
+    """A board that comes and stays: flow takes it for a wall. The model is handed over: the world without a board."""
+    numbers = list(range(1, 33))
+    where = lambda share: (0.0, 0.0) if 0.4 < share < 0.6 else (9.0, 9.0)  # noqa: E731
+    shot, board = build(tmp_path / "with", where, numbers=numbers, fps=40)
+    wall, _ = build(tmp_path / "without", lambda share: (9.0, 9.0), numbers=numbers, fps=40)
+    find_motion(shot, quiet(), static_model=lambda shot, report: lambda frame: read_png(wall.plate(frame)))
+    labels, there = mattes(shot, numbers) == MOVING, board.any((1, 2))
+    assert set(np.flatnonzero(there)) - set(Clip(shot).keys), "or the test says nothing of frames between keys"
+    assert min(labels[n][inner(board)[n]].mean() for n in np.flatnonzero(there)) > 0.8
+    assert labels[~grown(board, 8)].mean() < 0.01
+
+
 def test_a_damaged_matte_is_named_and_made_anew(swaying, quiet):
     shot, *_ = swaying
     victim = shot.solve / "motion" / f"{NUMBERS[3]:06d}.png"
