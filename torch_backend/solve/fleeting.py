@@ -116,20 +116,21 @@ class Fleeting:
         self._grid, self._config = grid, config
         self._least = max(2, round((config.speck * unit / 2.0) ** 2))
 
-    def mask(
+    def masks(
         self, frame: Sight, others: Sequence[Other], inverse: Map, depth: float, static: Shades | None = None
-    ) -> Mask:
-        """[h, w]: what moves by itself in a frame.
+    ) -> tuple[Mask, Mask]:
+        """([h, w], [h, w]): what moves by itself in a frame, and what is likely to, since no static model shows it.
 
         `others` are key frames around it, `inverse` [h, w] the depths of its still points, `depth` the typical one,
         solve units; `static` is what a static model of the clip shows there, if there is one.
         """
         others = [self._fitted(frame, other, inverse) for other in others]
         chosen = self._first(others)
+        nothing = np.zeros(inverse.shape, bool)
         if len(others) < 3 or not chosen:
-            return np.zeros(inverse.shape, bool)
+            return nothing, nothing
         found = self._elsewhere(frame, others, chosen, inverse, depth)
-        return found if static is None else found | self._unexplained(frame, others, inverse, static)
+        return found, nothing if static is None else self._unexplained(frame, others, inverse, static)
 
     def _unexplained(self, frame: Sight, others: Sequence[Other], inverse: Map, static: Shades) -> Mask:
         """[h, w]: what a frame shows and a static model does not, though the key frames around do not bear it out.

@@ -1,9 +1,12 @@
 """The motion matte of a shot: per delivered frame what stands still, what moves by itself, and what is not known.
 
-SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size: STILL, UNKNOWN or MOVING. motion.json beside them says
-which cameras they belong to; mattes of a solve of before are not read, nor are the points of still surfaces that lie
-with them (`surface`). What an artist paints goes before what is found:
-SHOT/motion_paint/NNNNNN.png, which no solve touches.
+SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size: STILL, LIKELY, UNKNOWN or MOVING. motion.json beside
+them says which cameras they belong to; mattes of a solve of before are not read, nor are the points of still surfaces
+that lie with them (`surface`). What an artist paints goes before what is found: SHOT/motion_paint/NNNNNN.png, which no
+solve touches.
+
+What is likely to move a training offers its field. Whoever freezes takes it for still, so that other plates may say
+what is wrong about it: taken for moving, delivered frames lost 0.4 to 0.7 dB against truth (docs/history/solving.md).
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ from ..footage.images import is_whole_png
 from ..shot import Shot, content_key, make_folder, need_disk, write_json
 from .flow import FlowConfig, Map
 from .masks import IGNORE, PEOPLE, limited, load_mask, masks_key, write_grey
-from .moving import Clip, StaticViews, mattes
+from .moving import LIKELY, Clip, StaticViews, mattes
 from .still import Evidence
 from .stored import load_cameras
 from .surface import AWAY, NO_SURFACE, KeyEvidence, SurfacePoints, read_surface, surface_points, write_surface
@@ -204,11 +207,20 @@ def motion_key(shot: Shot, with_found: bool = True) -> str:
     return content_key(found, [[p.name, hashlib.sha256(p.read_bytes()).hexdigest()] for p in painted])
 
 
-def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
+def load_motion(shot: Shot, frame: int, likely: bool = False) -> NDArray[np.uint8] | None:
     """The matte of a frame: STILL, UNKNOWN or MOVING, [h, w] of the working frames; None if there is none.
 
     Where an artist painted, that is it. JobError if a file of it is damaged.
+
+    Args:
+        likely: what is likely to move does.
     """
+    found = _matte(shot, frame)
+    return None if found is None else np.where(found == LIKELY, np.uint8(MOVING if likely else STILL), found)
+
+
+def _matte(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
+    """As it lies in the files."""
     path = shot.matte(frame)
     painted = shot.painted_matte(frame)
     found = _read_found(path) if path.is_file() and is_found(shot) else None

@@ -32,6 +32,8 @@ _LEFT_EVERY = 2
 """In every so manieth key frame what is left of motion is looked for: sways are slow."""
 _PART = 0.25
 """A pixel is fleeting if so much of what is around it is."""
+LIKELY = 96
+"""In the files: a static model of the clip cannot show it, but no flow sees it move."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 
@@ -146,7 +148,8 @@ def mattes(
     clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter,
     tell: Callable[[int, tuple[Map, Map], Evidence], None] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:  # fmt: skip
-    """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order.
+    """(index, labels [H, W] uint8: 0 still, 96 likely to move, 128 unknown, 255 moving) of all frames but the `written`
+    ones, in order.
 
     `tell` hears each key's evidence and the grid it is on, before the key's matte comes.
     """
@@ -181,7 +184,7 @@ def mattes(
                 else:
                     score, inverse = _between(clip, matches, picture, key, final, own)
                 gone = _fleeting(clip, fleeting, n, key, sight, inverse, own, config)
-                yield n, _labels(clip, picture, *score, gone, config)
+                yield n, _labels(clip, picture, *score, *gone, config)
         for store in (own, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
@@ -247,11 +250,10 @@ def _between(
 def _fleeting(
     clip: Clip, fleeting: Fleeting, n: int, key: int, sight: Sight | None, inverse: Map,
     own: dict[int, tuple[Map, Map, Map]], config: FlowConfig,
-) -> Mask:  # fmt: skip
-    """What is elsewhere in the keys around frame `n`, which is key `key` or lies between it and the one before, or is
-    not in a static model."""
+) -> tuple[Mask, Mask]:  # fmt: skip
+    """`Fleeting.masks` of frame `n`, which is key `key` or lies between it and the one before."""
     if sight is None or clip.is_guessed(n):
-        return np.zeros(inverse.shape, bool)
+        return np.zeros(inverse.shape, bool), np.zeros(inverse.shape, bool)
     nearest = {-1: key - 1, 1: key + (n == clip.keys[key])}
     around: list[Other] = []
     for side, first in nearest.items():
@@ -260,13 +262,13 @@ def _fleeting(
             found = clip.sight(other) if 0 <= other < len(clip.keys) else None
             if found is not None:
                 around.append(Other(side, step, found, own[other][2]))
-    return fleeting.mask(sight, around, inverse, clip.depths[key], clip.static(n))
+    return fleeting.masks(sight, around, inverse, clip.depths[key], clip.static(n))
 
 
 def _labels(
-    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, fleeting: Mask, config: FlowConfig
+    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, fleeting: Mask, likely: Mask, config: FlowConfig
 ) -> NDArray[np.uint8]:
-    """The labels [H, W] of a frame's score and weight on the grid, and of what is fleeting there."""
+    """The labels [H, W] of a frame's score and weight on the grid, of what is fleeting there and likely to move."""
     grey = cv2.resize(picture, score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
     spread = _Spread(grey, config.radius, config.edge)
     weight = np.minimum(weight, _ENOUGH)
@@ -276,11 +278,15 @@ def _labels(
     score, known = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (score, known))
     least = round((config.blob * clip.width / 640) ** 2)
     moving = seeded(score > config.grow, score > config.seed, least, connectivity=4)
-    moving |= cv2.resize(fleeting.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > _PART
+    gone, perhaps = (
+        cv2.resize(p.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > _PART for p in (fleeting, likely)
+    )
+    moving |= gone
     moving = ~seeded(~moving, ~moving, least, connectivity=4)
     unknown = known < _UNKNOWN
     unknown = seeded(unknown, unknown, least, connectivity=4)
-    return np.where(moving, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
+    labels = np.where(unknown, np.uint8(128), np.uint8(0))
+    return np.where(moving, np.uint8(255), np.where(perhaps, np.uint8(LIKELY), labels))
 
 
 class _Spread:
