@@ -32,8 +32,9 @@ _LEFT_EVERY = 2
 """In every so manieth key frame what is left of motion is looked for: sways are slow."""
 _PART = 0.25
 """A pixel is fleeting if so much of what is around it is."""
-LIKELY = 96
-"""In the files: a static model of the clip cannot show it, but no flow sees it move."""
+LIKELY = 48
+"""In the files: a static model of the clip cannot show it, but no flow sees it move. Nearest to still, which it is for
+whoever does not know it, and where it is copied into a painted matte."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 
@@ -148,7 +149,7 @@ def mattes(
     clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter,
     tell: Callable[[int, tuple[Map, Map], Evidence], None] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:  # fmt: skip
-    """(index, labels [H, W] uint8: 0 still, 96 likely to move, 128 unknown, 255 moving) of all frames but the `written`
+    """(index, labels [H, W] uint8: 0 still, 48 likely to move, 128 unknown, 255 moving) of all frames but the `written`
     ones, in order.
 
     `tell` hears each key's evidence and the grid it is on, before the key's matte comes.
