@@ -1,7 +1,7 @@
 """The motion matte in Blender: what the solve found to move, shown in the Image Editor, and painted over by the artist.
 
 Black stands still, white moves, grey is not known, dark grey is likely to move (a training is offered it). What is
-painted lies in the shot, SHOT/motion_paint/NNNNNN.png, and goes before what the solve finds, now and after another solve.
+painted lies in the shot, SHOT/motion_paint/NNNNNN.png, and goes before what the solve finds, now and after another one.
 """
 
 from __future__ import annotations
