@@ -282,8 +282,8 @@ def _labels(
     gone, perhaps = (
         cv2.resize(p.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > _PART for p in (fleeting, likely)
     )
-    moving |= gone
-    moving = ~seeded(~moving, ~moving, least, connectivity=4)
+    # Holes are filled in either.
+    perhaps, moving = (~seeded(~p, ~p, least, connectivity=4) for p in (moving | gone | perhaps, moving | gone))
     unknown = known < _UNKNOWN
     unknown = seeded(unknown, unknown, least, connectivity=4)
     labels = np.where(unknown, np.uint8(128), np.uint8(0))
