@@ -7,8 +7,8 @@ as at outlines; what is left moves. A picture is compared with all that another 
 (its least and greatest values there), so that matches may be off by that much.
 
 Nor does flow find an arm that swings slowly before a wall, and the key frames around do not agree about it. A static
-model of the whole clip knows the wall: what a frame shows and such a model cannot moves, unless the key frames around
-show the same at the still point's depth, where it is the model that is poor.
+model of the whole clip knows the wall: what a frame shows and such a model cannot is likely to move, unless the key
+frames around show the same at the still point's depth, where it is the model that is poor.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ class FlowConfig:
     speck: float = 4.0
     """What is fleeting and smaller than this squared is noise."""
     unexplained: tuple[float, float] = (16.0, 32.0)
-    """What is so far from all that a static model of the clip shows around it may move, and moves for certain,"""
+    """An area so far from all that a static model of the clip shows there, and somewhere so far, is likely to move,"""
     borne_out: float = 0.6
     """unless so many of the key frames around show the same at the still point's depth: the model is poor there."""
     reach: int = 2
