@@ -336,8 +336,11 @@ def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
 
 
 def _train(shot: Shot, params: contract.TrainParams, report: Reporter) -> Any:
-    from .train import train_shot
+    from .solve.motion import find_motion, is_outdated
+    from .train import static_views, train_shot
 
+    if is_outdated(shot) and not params.extend:  # without mattes what moves would be guessed
+        find_motion(shot, report, with_points=True, static_model=static_views)
     return train_shot(shot, params, report)
 
 

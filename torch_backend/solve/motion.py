@@ -197,6 +197,11 @@ def is_found(shot: Shot) -> bool:
     return _record(shot.motion / _RECORD).get("key") == _solve_key(shot, FlowConfig())
 
 
+def is_outdated(shot: Shot) -> bool:
+    """True if the shot has mattes that are not read: of an earlier version of this program, or of other cameras."""
+    return (shot.motion / _RECORD).is_file() and not is_found(shot)
+
+
 def motion_key(shot: Shot, with_found: bool = True) -> str:
     """Changes when any matte does, found or painted; without those that were found, only when a painted one does.
 

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, World
-from torch_backend.contract import Cancelled, JobError
+from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, World, build_world
+from torch_backend.contract import Cancelled, JobError, TrainParams, read_json
 from torch_backend.footage.images import read_png
+from torch_backend.job import RUNNERS
 from torch_backend.raster import rasterize
-from torch_backend.shot import Shot
+from torch_backend.shot import Shot, write_json
+from torch_backend.solve.motion import find_motion, is_found, is_outdated
 from torch_backend.train import static_views
 from torch_backend.train.static_world import STAGE, steps_for
 
@@ -65,3 +67,17 @@ def test_it_can_be_cancelled(world, quiet):
 def test_a_shot_that_is_not_solved_is_one_sentence(tmp_path, quiet):
     with pytest.raises(JobError, match="has no cameras yet"):
         static_views(Shot.create(tmp_path / "empty.splannequin"), quiet())
+
+
+def test_a_training_finds_mattes_of_an_earlier_version_again(tmp_path, quiet):
+    """It would guess what moves without them, and say nothing."""
+    shot = build_world(tmp_path).shot
+    find_motion(shot, quiet())
+    record = shot.motion / "motion.json"
+    write_json(record, {**read_json(record), "version": 4})
+    assert is_outdated(shot)
+    report = quiet()
+    RUNNERS["train"](shot, TrainParams(iterations=20, max_gaussians=900), report)
+    assert is_found(shot) and not is_outdated(shot)
+    assert STAGE in {event[1] for event in report.events}
+    assert read_json(shot.run("main") / "config.json")["motion"]
