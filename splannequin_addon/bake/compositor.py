@@ -23,7 +23,7 @@ from ..scene import numbered, sequences
 from ..scene.ownership import TAG
 from . import fitting, freeze_group, group_inside, original_plate, placing, warp_nodes
 from .node_names import GAP, GROUP_NAME
-from .take_files import WARP_FOLDER, Take
+from .take_files import Take
 
 _CG = "cg"
 _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
@@ -206,7 +206,8 @@ def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Ite
 
 def _warp_picture(take: Take) -> tuple[Path, str, sequences.Encoding]:
     """File, name and encoding of a take's warp."""
-    return numbered.frame_path(take.folder / WARP_FOLDER, take.first), f"Warp {take.folder.name}", take.light
+    warps = contract.TakeFolder(take.folder).warps
+    return numbered.frame_path(warps, take.first), f"Warp {take.folder.name}", take.light
 
 
 _OUTPUTS = ("CompositorNodeComposite", "NodeGroupOutput", "NodeGroupInput")

@@ -64,7 +64,7 @@ class Plate:
 def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
     """The footage that a take was frozen from, or None and, if the take knows of it, why it cannot be shown."""
     try:
-        told: dict[str, Any] = dict(contract.read_json(take.folder / contract.TAKE_FILE).get("footage") or {})
+        told: dict[str, Any] = dict(contract.read_json(contract.TakeFolder(take.folder).facts).get("footage") or {})
         if not told:
             return None, ""
         name = Path(str(told["file"])).name

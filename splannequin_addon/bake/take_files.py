@@ -47,7 +47,7 @@ def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
 
 def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:
     """Width and height of the plate that a take's warp is for; (0, 0) if a frame lacks its warp."""
-    folder = take / WARP_FOLDER
+    folder = contract.TakeFolder(take).warps
     if set(numbers) - set(numbered.frame_numbers(folder)):
         return 0, 0
     header = _exr_header(numbered.frame_path(folder, numbers[0]))
@@ -89,7 +89,3 @@ def _exr_value(header: bytes, name: str, kind: str, form: str) -> tuple[Any, ...
     key = f"{name}\0{kind}\0".encode()
     at = header.find(key)
     return None if at < 0 else struct.unpack_from(form, header, at + len(key) + 4)
-
-
-WARP_FOLDER = "warp"
-"""Folder of the warps in a take's."""

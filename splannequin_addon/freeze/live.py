@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import subprocess
 import threading
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -36,8 +35,6 @@ class Frame:
     """[H, W, 4] float32, premultiplied, display-referred, first row on top."""
     depth: np.ndarray
     """[H, W] float32, along the camera's axis in solve units."""
-    arrived: float
-    """Monotonic seconds."""
 
 
 @dataclass
@@ -150,7 +147,7 @@ class Session:
             w, h = header["width"], header["height"]
             values = np.frombuffer(body, np.float32)
             rgba, depth = values[: 4 * w * h].reshape(h, w, 4), values[4 * w * h :].reshape(h, w)
-            self.frames[asked.view] = Frame(asked, header["t_star"], rgba, depth, time.monotonic())
+            self.frames[asked.view] = Frame(asked, header["t_star"], rgba, depth)
             self.drawn += 1
 
     def _answered(self, seq: int) -> contract.LiveView:

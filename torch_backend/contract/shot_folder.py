@@ -252,7 +252,12 @@ class TakeFolder:
     """Paths in the folder of a take."""
 
     root: Path
-    """takes/NAME."""
+    """takes/NAME, or what `next` is."""
+
+    @property
+    def next(self) -> TakeFolder:
+        """Frames that will take the place of those of before when all are done."""
+        return TakeFolder(self.root / TAKE_NEXT_FOLDER)
 
     @property
     def facts(self) -> Path:

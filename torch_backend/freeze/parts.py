@@ -15,20 +15,18 @@ from pathlib import Path
 from typing import Any
 
 from ..contract import (
-    TAKE_FILE,
-    TAKE_STATE_FILE,
     ExitCode,
     FreezeParams,
     JobError,
     Reporter,
-    frame_file,
+    TakeFolder,
     read_json,
 )
 from ..shot import Shot, content_key, write_json
 from .exr import read_key
 from .take import finish
 from .take_cameras import in_range
-from .take_folder import files_of, frames_in, is_whole, make_folders
+from .take_folder import files_of, frames_of, is_whole, make_folders
 from .take_frames import render_frames
 from .take_plan import PlannedTake, planned
 
@@ -43,11 +41,11 @@ def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, A
     take.spec.instants.prepare((f.t_star for f in take.whole), report)
     _refuse_undeveloped(take)
     chosen = in_range(take.whole, params)
-    told = take.folder / TAKE_FILE
+    told = take.folder.facts
     if told.is_file() and not _same_take(told, take):
         told.unlink(missing_ok=True)  # what it tells of goes, frame by frame
     state = {"version": 1, "key": take.key, "t_star": take.t_star, "frames": _all_keys(take)}
-    write_json(take.folder / TAKE_STATE_FILE, state)
+    write_json(take.folder.state, state)
     return {"t_star": take.t_star, "first": chosen[0].frame, "last": chosen[-1].frame, "frames": len(chosen)}
 
 
@@ -89,7 +87,7 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
             "Run the part that it belongs to again.",
             ExitCode.FREEZE,
         )
-    for number in frames_in(take.folder.glob("*.exr")):
+    for number in frames_of(take.folder):
         if number not in right:
             for old in files_of(take.folder, number):
                 old.unlink(missing_ok=True)
@@ -98,7 +96,7 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
 
 def is_right(take: PlannedTake, frame: int) -> bool:
     """True if a frame of the take is on disk as it would be rendered now."""
-    key = read_key(take.folder / frame_file(frame, ".exr")) if frame in take.keys else None
+    key = read_key(take.folder.frame(frame)) if frame in take.keys else None
     return key is not None and key == take.keys[frame] and is_whole(take.folder, frame, take.spec.detail is not None)
 
 
@@ -110,7 +108,7 @@ def _all_keys(take: PlannedTake) -> str:
 def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
     """The take as `open_take` settled it. JobError if it did not, or if this computer would render something else."""
     try:
-        state = read_json(shot.take(params.take) / TAKE_STATE_FILE)
+        state = read_json(TakeFolder(shot.take(params.take)).state)
         t_star = int(state["t_star"])
     except (OSError, ValueError, KeyError, TypeError):
         raise JobError(

@@ -11,18 +11,12 @@ import torch
 from torch import Tensor
 
 from ..contract import (
-    CONTACT_SHEET_FILE,
-    PLY_FILE,
-    TAKE_FILE,
-    TAKE_PREVIEW_FOLDER,
-    TAKE_REDISTORT,
-    VIDEO_FILE,
     ExitCode,
     FreezeParams,
     JobError,
     Reporter,
+    TakeFolder,
     Verdict,
-    frame_file,
     read_json,
     verdict_of,
 )
@@ -44,7 +38,6 @@ from .take_frames import make_ready, render_frames, small_share
 from .take_plan import FrameSpec, PlannedTake, planned
 from .verdict import judge_take, unsure
 from .video import write_video
-from .warp import FOLDER as WARPS
 
 
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
@@ -83,7 +76,7 @@ def finish(
     try:
         return _finish(shot, params, take, frames, shares, report)
     except OSError as error:
-        raise (disk_error(take.folder) if is_disk_full(error) else error) from error
+        raise (disk_error(take.folder.root) if is_disk_full(error) else error) from error
 
 
 def _finish(
@@ -94,7 +87,7 @@ def _finish(
     run, size = spec.run, spec.size
     numbers = [f.frame for f in frames]
     report.progress("finishing the take", 0, 3, "contact sheet")
-    previews = [folder / TAKE_PREVIEW_FOLDER / frame_file(n, ".png") for n in numbers]
+    previews = [folder.preview(n) for n in numbers]
     made_of = _made_of(folder, numbers, spec, shares)
     inputs = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
     verdict = judge_take({"t_star_frame": t_star, **inputs, "detail": made_of.get("detail")}, run_verdict(run))
@@ -103,11 +96,11 @@ def _finish(
     sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
     report.check_cancelled()
     report.progress("finishing the take", 1, 3, "video")
-    note = write_video(folder / VIDEO_FILE, (read_png(p) for p in previews), info.fps or 24.0)
+    note = write_video(folder.video, (read_png(p) for p in previews), info.fps or 24.0)
     if note:
         report.warning(note)
     report.progress("finishing the take", 2, 3, "PLY")
-    _write_ply(folder / PLY_FILE, spec.instants.at(float(t_star), report), scene)
+    _write_ply(folder.ply, spec.instants.at(float(t_star), report), scene)
     redistort = _redistort(shot, folder, size, spec.beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
@@ -130,15 +123,15 @@ def _finish(
         "fps": shot.info().fps,
         "scale": scene.scale,
         "grain": None if spec.grain is None else spec.grain.to_json(),
-        "footage": footage_facts(shot, folder),
-        "exr_dir": str(folder),
+        "footage": footage_facts(shot, folder.root),
+        "exr_dir": str(folder.root),
         "contact_sheet": str(sheet),
-        "video": str(folder / VIDEO_FILE),
-        "ply": str(folder / PLY_FILE),
+        "video": str(folder.video),
+        "ply": str(folder.ply),
         **made_of,
         **({} if verdict is None else {"verdict": vars(verdict)}),
     }
-    write_json(folder / TAKE_FILE, facts)
+    write_json(folder.facts, facts)
     report.image("contact sheet", sheet)
     report.progress("finishing the take", 3, 3, "done")
     return facts
@@ -152,27 +145,27 @@ def run_verdict(run: LoadedRun) -> Verdict | None:
         return None
 
 
-def _made_of(folder: Path, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]) -> dict[str, Any]:
+def _made_of(folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]) -> dict[str, Any]:
     """What take.json says of plate detail; {} without it. `shares` are of the frames that this job rendered."""
     if spec.detail is None:
         return {}
     for n in (n for n in numbers if n not in shares):
-        frame = read_frozen_exr(folder / frame_file(n, ".exr"))
+        frame = read_frozen_exr(folder.frame(n))
         if frame.detail is not None:
             plate, support = (np.asarray(layer, np.float32) for layer in (frame.detail.plate, frame.support))
             shares[n] = small_share(from_numpy(plate), from_numpy(support))
-    return {"detail": detail_facts(shares), "warp_dir": str(folder / WARPS)}
+    return {"detail": detail_facts(shares), "warp_dir": str(folder.warps)}
 
 
 def _redistort(
-    shot: Shot, folder: Path, size: tuple[int, int], beyond: tuple[int, int], Ks: np.ndarray, report: Reporter
+    shot: Shot, folder: TakeFolder, size: tuple[int, int], beyond: tuple[int, int], Ks: np.ndarray, report: Reporter
 ) -> Path | None:
     """The map back through the lens over overscanned frames; None where the shot's own map fits, or none does."""
-    (folder / TAKE_REDISTORT).unlink(missing_ok=True)
+    folder.redistort.unlink(missing_ok=True)
     if not any(beyond):
         return None
     try:
-        return write_take_map(shot, folder, *size, beyond, Ks)
+        return write_take_map(shot, folder.redistort, *size, beyond, Ks)
     except JobError as error:
         if error.exit_code != ExitCode.SOLVE:
             raise
@@ -189,7 +182,7 @@ def _contact_sheet(
     if own_poses:
         previews, numbers = [previews[i] for i in seen], [numbers[i] for i in seen]
     plates = [shot.plate(n) for n in numbers]
-    path = shot.take(params.take) / CONTACT_SHEET_FILE
+    path = TakeFolder(shot.take(params.take)).contact_sheet
     note, doubt = ("", set[int]()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
     write_contact_sheet(
         path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..contract import (
-    TAKE_FILE,
-    TAKE_NEXT_FOLDER,
-    TAKE_PREVIEW_FOLDER,
-    TAKE_STATE_FILE,
+    LAYERS,
+    PICTURE,
     ExitCode,
     FreezeParams,
     JobError,
-    frame_file,
+    TakeFolder,
     frame_number,
     read_json,
     replace_file,
@@ -24,16 +22,15 @@ from ..contract import (
 from ..shot import make_folder, write_json
 from .exr import read_key
 from .take_plan import PlannedTake
-from .warp import FOLDER as WARPS
 
 
 @dataclass(frozen=True)
 class Place:
     """Where a take's frames are rendered to."""
 
-    folder: Path
+    folder: TakeFolder
     """The take's own; or `beside`."""
-    beside: Path | None
+    beside: TakeFolder | None
     """A folder in it, as long as another take of that name stands there whole: that one stays until this is done."""
     right_here: set[int]
     """Frames in the take's own folder that are as they would be rendered now."""
@@ -48,32 +45,30 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
     """
     folder, with_warps = take.folder, take.spec.detail is not None
     make_folders(folder, with_warps)
-    here, beside = _right_frames(take, folder, params), folder / TAKE_NEXT_FOLDER
-    there = _right_frames(take, beside, params) if beside.is_dir() else set[int]()
-    for n in set(frames_in([*beside.glob("*.exr"), *(beside / TAKE_PREVIEW_FOLDER).glob("*.png")])) - there:
+    here, beside = _right_frames(take, folder, params), folder.next
+    there = _right_frames(take, beside, params) if beside.root.is_dir() else set[int]()
+    for n in set(_numbers(beside)) - there:
         for file in files_of(beside, n):
             file.unlink(missing_ok=True)
-    stands = (folder / TAKE_FILE).is_file() and bool(set(frames_in(folder.glob("*.exr"))) - here)
+    stands = folder.facts.is_file() and bool(set(frames_of(folder)) - here)
     if not stands:
         place = Place(folder, beside, here, there)
-        if beside.is_dir():  # killed while it took over
+        if beside.root.is_dir():  # killed while it took over
             take_over(take, place)
         return Place(folder, None, here | there, set())
-    for used in (beside, beside / TAKE_PREVIEW_FOLDER, *([beside / WARPS] if with_warps else [])):
-        make_folder(used)
-        sweep_half_written(used)
+    _sweep(beside, with_warps)
     return Place(beside, beside, here, there)
 
 
-def _right_frames(take: PlannedTake, folder: Path, params: FreezeParams) -> set[int]:
+def _right_frames(take: PlannedTake, folder: TakeFolder, params: FreezeParams) -> set[int]:
     """The frames in a folder that are as they would be rendered now, and whole; none if all are to be made anew."""
     keys, with_warps = take.keys, take.spec.detail is not None
-    state = folder / TAKE_STATE_FILE
+    state = folder.state
     # Frames without a key of their own are of before grain, too.
     old_are_right = not params.grain and not with_warps and state.is_file() and read_json(state).get("key") == take.key
     right: set[int] = set()
-    for n in frames_in(folder.glob("*.exr")) if params.only_missing else ():
-        stored_key = read_key(folder / frame_file(n, ".exr"))
+    for n in frames_of(folder) if params.only_missing else ():
+        stored_key = read_key(folder.frame(n))
         known = n in keys and (stored_key == keys[n] or (stored_key == "" and old_are_right))
         if known and is_whole(folder, n, with_warps):
             right.add(n)
@@ -83,50 +78,61 @@ def _right_frames(take: PlannedTake, folder: Path, params: FreezeParams) -> set[
 def clear(take: PlannedTake, done: Set[int]) -> None:
     """Removes all frames of before but those that are `done`: nobody shall take old ones for a part of this take."""
     folder = take.folder
-    pictures = [*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]
-    stale = set(frames_in(pictures)) - done
-    for old in [folder / TAKE_FILE, *(file for n in stale for file in files_of(folder, n))] if stale else ():
+    stale = set(_numbers(folder)) - done
+    for old in [folder.facts, *(file for n in stale for file in files_of(folder, n))] if stale else ():
         old.unlink(missing_ok=True)
-    write_json(folder / TAKE_STATE_FILE, {"version": 1, "key": take.key})
+    write_json(folder.state, {"version": 1, "key": take.key})
 
 
 def take_over(take: PlannedTake, place: Place) -> None:
     """The frames rendered beside a take of before stand in its place. Killed meanwhile, the next freeze goes on."""
     assert place.beside is not None
     clear(take, place.right_here)
-    for n in frames_in(place.beside.glob("*.exr")):
+    for n in frames_of(place.beside):
         for file, target in zip(reversed(files_of(place.beside, n)), reversed(files_of(take.folder, n)), strict=True):
             if file.is_file():  # the EXR last: a frame that has one has the others
                 replace_file(file, target)
-    shutil.rmtree(place.beside, ignore_errors=True)
+    shutil.rmtree(place.beside.root, ignore_errors=True)
 
 
-def files_of(folder: Path, frame: int) -> list[Path]:
+def files_of(folder: TakeFolder, frame: int) -> list[Path]:
     """All files that a frame of a take has: EXR, warp, preview."""
-    exr, preview = frame_file(frame, ".exr"), frame_file(frame, ".png")
-    return [folder / exr, folder / WARPS / exr, folder / TAKE_PREVIEW_FOLDER / preview]
+    return [folder.frame(frame), folder.warp(frame), folder.preview(frame)]
 
 
-def make_folders(folder: Path, with_warps: bool) -> None:
+def make_folders(folder: TakeFolder, with_warps: bool) -> None:
     """Makes a take's folder. JobError if it holds frames of someone else's."""
-    pictures = [*folder.glob("*.exr"), *(folder / TAKE_PREVIEW_FOLDER).glob("*.png")]
-    if not (folder / TAKE_STATE_FILE).is_file() and frames_in(pictures):
+    if not folder.state.is_file() and _numbers(folder):
         raise JobError(
-            f"{folder} holds numbered pictures that were not made here.",
+            f"{folder.root} holds numbered pictures that were not made here.",
             "Name another take, or move them away.",
             ExitCode.FREEZE,
         )
-    for used in (folder, folder / TAKE_PREVIEW_FOLDER, *([folder / WARPS] if with_warps else [])):
+    _sweep(folder, with_warps)
+
+
+def _sweep(folder: TakeFolder, with_warps: bool) -> None:
+    """Makes the folders of a take's frames, and removes what was half written to them."""
+    for used in (folder.root, folder.previews, *([folder.warps] if with_warps else [])):
         make_folder(used)
         sweep_half_written(used)
 
 
-def is_whole(folder: Path, frame: int, with_warps: bool) -> bool:
+def is_whole(folder: TakeFolder, frame: int, with_warps: bool) -> bool:
     """True if what belongs beside a frame of a take is there."""
-    warped = not with_warps or (folder / WARPS / frame_file(frame, ".exr")).is_file()
-    return warped and (folder / TAKE_PREVIEW_FOLDER / frame_file(frame, ".png")).is_file()
+    return (not with_warps or folder.warp(frame).is_file()) and folder.preview(frame).is_file()
 
 
-def frames_in(paths: Iterable[Path]) -> list[int]:
+def frames_of(folder: TakeFolder) -> list[int]:
+    """Numbers of the frames that a take's folder has, ascending."""
+    return _frames_in(folder.root.glob("*" + LAYERS))
+
+
+def _numbers(folder: TakeFolder) -> list[int]:
+    """Those of frames and previews."""
+    return _frames_in([*folder.root.glob("*" + LAYERS), *folder.previews.glob("*" + PICTURE)])
+
+
+def _frames_in(paths: Iterable[Path]) -> list[int]:
     """Numbers of those files that are frames, ascending."""
     return sorted(n for p in paths if (n := frame_number(p.stem)) is not None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Set
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,9 +11,8 @@ from torch import Tensor
 
 from ..contract import (
     NO_DEPTH,
-    TAKE_PREVIEW_FOLDER,
     Reporter,
-    frame_file,
+    TakeFolder,
 )
 from ..footage.color import on_straight_colour
 from ..footage.display import PLAIN, Display
@@ -30,7 +28,6 @@ from .grain import Brush, Grain
 from .reproject import resized
 from .take_plan import FrameSpec, PlannedTake
 from .transfer import to_display
-from .warp import FOLDER as WARPS
 from .warp import WarpMetadata, write_warp
 from .write_beside import WriteBeside
 
@@ -39,7 +36,7 @@ def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], rep
     """Develops the instants of those of `frames` that are not done. JobError if the disk has no room for the frames."""
     spec, missing = take.spec, [f for f in frames if f.frame not in done]
     each = spec.whole[0] * spec.whole[1] * (20.0 + (6.0 if spec.grain else 0.0) + (24.0 if spec.detail else 0.0))
-    need_disk(take.folder, len(missing) * each, "the take")
+    need_disk(take.folder.root, len(missing) * each, "the take")
     spec.instants.prepare((f.t_star for f in missing), report)
 
 
@@ -54,7 +51,7 @@ def render_frames(
     try:
         return _render_all(take, frames, done, report)
     except OSError as error:
-        raise (disk_error(take.folder) if is_disk_full(error) else error) from error
+        raise (disk_error(take.folder.root) if is_disk_full(error) else error) from error
 
 
 def _render_all(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> dict[int, Tensor]:
@@ -87,7 +84,7 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
 
 
 def _write(
-    folder: Path, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
+    folder: TakeFolder, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
 ) -> None:
     """All files of a frame, the EXR last: a frame that has one has the others."""
     if isinstance(image, DetailedFrame):
@@ -96,10 +93,10 @@ def _write(
 
 
 def _write_frame(
-    folder: Path, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
+    folder: TakeFolder, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
 ) -> None:
     """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
-    write_png(folder / TAKE_PREVIEW_FOLDER / frame_file(output.frame, ".png"), _preview(image, spec))
+    write_png(folder.preview(output.frame), _preview(image, spec))
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ from_numpy(scene.centre)
     size = tuple(image.alpha.shape)
@@ -119,7 +116,7 @@ def _write_frame(
         shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows], scene.display))
         layers = DetailLayers(shown, image.plate, image.source)
     write_frozen_exr(
-        folder / frame_file(output.frame, ".exr"),
+        folder.frame(output.frame),
         Made((*size, 4), rgba),
         Made(size, depth),
         image.support.numpy(),
@@ -176,12 +173,12 @@ def _preview(image: FrozenImage | DetailedFrame, spec: FrameSpec) -> np.ndarray:
     return out
 
 
-def _write_warp(folder: Path, output: OutputFrame, made: DetailedFrame, spec: FrameSpec, key: str) -> None:
+def _write_warp(folder: TakeFolder, output: OutputFrame, made: DetailedFrame, spec: FrameSpec, key: str) -> None:
     """Before its frame: a frame that is there has its warp."""
     assert spec.detail is not None
     plates = spec.detail.plates
     write_warp(
-        folder / WARPS / frame_file(output.frame, ".exr"),
+        folder.warp(output.frame),
         made.st,
         made.matte,
         made.fill,

@@ -10,13 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ..contract import (
-    TAKE_NEXT_FOLDER,
-    TAKE_PREVIEW_FOLDER,
-    TAKE_REDISTORT,
     ExitCode,
     FreezeParams,
     JobError,
     Reporter,
+    TakeFolder,
     later,
     parse_timecode,
 )
@@ -35,7 +33,6 @@ from .footage_facts import footage_light
 from .frozen import OutputFrame, suggest_t_star
 from .grain import Grain, measure_plate
 from .take_cameras import intrinsics, output_size, plan
-from .warp import FOLDER as WARPS
 
 TAKE_VERSION = 1
 """Rises when frames rendered before must not stand beside new ones."""
@@ -109,8 +106,8 @@ class FrameSpec:
 class PlannedTake:
     """What a take will show, before any of it is rendered."""
 
-    folder: Path
-    """takes/NAME."""
+    folder: TakeFolder
+    """takes/NAME; or where its frames are rendered to."""
     scene: Scene
     """Of the shot."""
     t_star: int
@@ -137,9 +134,9 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
         t_star = choose_t_star(shot, scene, run, params, report)
     width, height = output_size(shot, scene, params)
     whole = plan(scene, params, t_star, width, height)
-    folder = shot.own(shot.take(params.take))
-    for inner in (TAKE_PREVIEW_FOLDER, TAKE_REDISTORT.parent, WARPS, TAKE_NEXT_FOLDER):
-        shot.own(folder / inner)
+    folder = TakeFolder(shot.own(shot.take(params.take)))
+    for inner in (folder.previews, folder.redistort.parent, folder.warps, folder.next.root):
+        shot.own(inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
     grain = plate_grain(shot, scene) if params.grain else None
     # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.

@@ -30,13 +30,10 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from ..contract import WARP_FOLDER
 from ..footage.color import LIGHTS, in_light, light_matrix
 from ..torch_types import from_numpy
 from .exr import check_finite, linear_spec, read_layers, read_light, set_margin, write_exr
 
-FOLDER = WARP_FOLDER
-"""Folder of the warps in a take's."""
 CHANNELS = ("R", "G", "B", "A", "ST.X", "ST.Y", "ST.Z", "Matte.V")
 """Fill and alpha of the whole frame; s, t and 1; matte."""
 WARP_VERSION = 1

@@ -16,7 +16,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from ..contract import STMAP_FILES, TAKE_REDISTORT, ExitCode, FreezeParams, JobError
+from ..contract import STMAP_FILES, ExitCode, FreezeParams, JobError
 from ..footage.oiio_types import open_output
 from ..shot import Shot, atomic_path, disk_error, is_disk_full, need_disk
 from .lens import Lens, load_lens
@@ -148,9 +148,10 @@ def write_maps(shot: Shot, width: int = 0) -> dict[str, Any]:
 
 
 def write_take_map(
-    shot: Shot, take: Path, width: int, height: int, beyond: tuple[int, int], Ks: NDArray[np.float64]
+    shot: Shot, path: Path, width: int, height: int, beyond: tuple[int, int], Ks: NDArray[np.float64]
 ) -> Path | None:
-    """The redistortion map over the whole overscanned frames of a take: `width` x `height` and `beyond` around it.
+    """The redistortion map over the whole overscanned frames of a take, at `path`: `width` x `height` and `beyond`
+    around it.
 
     As large as the working frames, so that it gives back the original picture. None if the take's intrinsics `Ks`
     [F, 4] are not the plate's: a camera of the artist's own has no lens. JobError (SOLVE) as `Lens.check`.
@@ -159,7 +160,6 @@ def write_take_map(
     if not same_camera(lens, width, height, Ks):
         return None
     lens.check()
-    path = take / TAKE_REDISTORT
     path.parent.mkdir(exist_ok=True)
     pixels = redistort_map(lens, lens.width, lens.height, (beyond[0] / width, beyond[1] / height))
     return write_map(path, pixels)

@@ -10,12 +10,12 @@ import torch
 
 from torch_backend.contract import (
     NO_DEPTH,
-    TAKE_NEXT_FOLDER,
     CameraFrame,
     CameraPath,
     Cancelled,
     FreezeParams,
     JobError,
+    TakeFolder,
     TrainParams,
     disk_error,
     later,
@@ -246,28 +246,27 @@ def test_a_take_stays_until_the_one_that_replaces_it_is_done(trained, quiet):
     ask = dict(take="again", develop="off", first=103, last=108)
     freeze_shot(world.shot, FreezeParams(**ask, t_star=104), quiet())
     folder = world.shot.take("again")
+    beside = TakeFolder(folder).next.root
 
     def contents():
         return {
-            p.relative_to(folder): p.read_bytes()
-            for p in folder.rglob("*")
-            if p.is_file() and TAKE_NEXT_FOLDER not in p.parts
+            p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file() and beside not in p.parents
         }
 
     before = contents()
     with pytest.raises(Cancelled):
         freeze_shot(world.shot, FreezeParams(**ask, t_star=106), quiet(cancel_at=("freezing", 0.5)))
     assert contents() == before, "cancelled: the old take is whole"
-    begun = {p.name: p.stat().st_mtime_ns for p in (folder / TAKE_NEXT_FOLDER).glob("*.exr")}
+    begun = {p.name: p.stat().st_mtime_ns for p in beside.glob("*.exr")}
     assert 0 < len(begun) < 6
     other = dict(ask, take="beside")
     freeze_shot(world.shot, FreezeParams(**other, t_star=106), quiet())
     (folder / "take.json").unlink()  # as a kill at the worst moment leaves it: some frames old, some new, one moved
     first = min(begun)
     for name in (f"preview/{first[:6]}.png", f"warp/{first}", first):
-        (folder / TAKE_NEXT_FOLDER / name).rename(folder / name)
+        (beside / name).rename(folder / name)
     facts = freeze_shot(world.shot, FreezeParams(**ask, t_star=106, only_missing=True), quiet())
-    assert facts["t_star_frame"] == 106 and facts["frames"] == 6 and not (folder / TAKE_NEXT_FOLDER).exists()
+    assert facts["t_star_frame"] == 106 and facts["frames"] == 6 and not beside.exists()
     assert all((folder / name).stat().st_mtime_ns == at for name, at in begun.items()), "what was begun is used"
     for number in range(103, 109):
         names = (f"{number:06d}.exr", f"warp/{number:06d}.exr", f"preview/{number:06d}.png")

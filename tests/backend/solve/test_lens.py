@@ -10,7 +10,7 @@ import OpenImageIO as oiio
 import pytest
 
 from torch_backend.cli import main, parser
-from torch_backend.contract import CameraFrame, CameraPath, ExitCode, FreezeParams, JobError
+from torch_backend.contract import CameraFrame, CameraPath, ExitCode, FreezeParams, JobError, TakeFolder
 from torch_backend.shot import Shot, write_json
 from torch_backend.solve.lens import Lens, doubtful, load_lens
 from torch_backend.solve.stmap import (
@@ -268,11 +268,10 @@ def test_overscan_in_percent_and_as_the_lens_needs(shot_of, tmp_path):
         of(150.0)
     with pytest.raises(JobError, match="nan percent"):
         of(float("nan"))
-    take = tmp_path / "take"
-    take.mkdir()
-    assert write_take_map(shot, take, 80, 60, (8, 6), other) is None and not list(take.rglob("*.exr"))
-    written = write_take_map(shot, take, 80, 60, (8, 6), own)
-    assert written == take / "stmap" / "redistort.exr"
+    path = TakeFolder(tmp_path).redistort
+    assert write_take_map(shot, path, 80, 60, (8, 6), other) is None and not path.exists()
+    written = write_take_map(shot, path, 80, 60, (8, 6), own)
+    assert written == path
     np.testing.assert_array_equal(
         oiio.ImageBuf(str(written)).get_pixels(oiio.FLOAT), redistort_map(lens, 160, 120, (0.1, 0.1))
     )
