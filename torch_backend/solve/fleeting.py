@@ -135,7 +135,8 @@ class Fleeting:
     def _unexplained(self, frame: Sight, others: Sequence[Other], inverse: Map, static: Shades) -> Mask:
         """[h, w]: what a frame shows and a static model does not, though the key frames around do not bear it out.
 
-        The nearest do not count: what moves slowly is still there in them.
+        The nearest do not count: what moves slowly is still there in them. Where too few of the others look at all, at
+        the rim of a clip's view, the model had little to learn from, and is poor.
         """
         c, apart = self._config, frame.shades.apart(static)
         strong = _opened(apart > c.unexplained[1])
@@ -144,12 +145,14 @@ class Fleeting:
             return np.zeros(inverse.shape, bool)
         rows, columns = np.nonzero(weak)
         points, at = self._points(rows, columns), inverse[rows, columns][None]
-        alike, seen = np.zeros(inverse.shape, np.float32), np.zeros(inverse.shape, np.float32)
+        alike, seen, asked = np.zeros((3, *inverse.shape), np.float32)
         for other in (other for other in others if other.step > 1):
+            asked[rows, columns] += self._projected(frame, other, points, at)[2][0]
             found, within = self._compared(frame, other, points, at, frame.shades.colors[rows, columns][None])
             alike[rows, columns] += ((found <= c.unlike) & within)[0]
             seen[rows, columns] += within[0]
         near = _AROUND, _AROUND
+        weak &= asked >= c.asked
         weak &= (cv2.blur(alike, near) < c.borne_out * cv2.blur(seen, near)) | (cv2.blur(seen, near) == 0)
         return seeded(weak, weak & strong, self._least)
 
@@ -228,12 +231,19 @@ class Fleeting:
 
     def _places(self, frame: Sight, other: Other, points: tuple[Map, Map], inverse: Map) -> tuple[Map, Map, Mask]:
         """Where still points are on another's grid, and whether they are in the picture and not hidden: [a, b] each."""
+        x, y, inside, over = self._projected(frame, other, points, inverse)
+        return x, y, inside & (_sampled(other.inverse, x, y)[..., 0] <= _HIDDEN * inverse * over)
+
+    def _projected(
+        self, frame: Sight, other: Other, points: tuple[Map, Map], inverse: Map
+    ) -> tuple[Map, Map, Mask, Map]:
+        """Where still points are on another's grid, whether that is in the picture, and how many times as near they are to
+        it as to the frame: [a, b] each."""
         ray = Ray(points, (frame.viewmat, other.sight.viewmat), (frame.K, other.sight.K))
         at, over = ray.project(inverse)
         x, y = (np.clip(0.5 * p - 0.5, -1e4, 1e4).astype(np.float32) for p in at)
         height, width = self._grid[0].shape
-        within = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        return x, y, within & (_sampled(other.inverse, x, y)[..., 0] <= _HIDDEN * inverse * over)
+        return x, y, (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1), over
 
     def _compared(
         self, frame: Sight, other: Other, points: tuple[Map, Map], inverse: Map, values: NDArray[np.uint8]

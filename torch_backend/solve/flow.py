@@ -103,6 +103,8 @@ class FlowConfig:
     """An area so far from all that a static model of the clip shows there, and somewhere so far, is likely to move,"""
     borne_out: float = 0.6
     """unless so many of the key frames around show the same at the still point's depth: the model is poor there."""
+    asked: int = 3
+    """So many of them have to have that point in their picture, hidden or not."""
     reach: int = 2
     """Over so many of the longest baselines a surface's scores are gathered along it."""
     radius: int = 4

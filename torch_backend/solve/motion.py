@@ -45,7 +45,7 @@ from .surface import AWAY, NO_SURFACE, KeyEvidence, SurfacePoints, read_surface,
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
-MOTION_VERSION = 5
+MOTION_VERSION = 6
 PAINTED = PAINTED_FOLDER
 """Of painted mattes, in the shot's folder."""
 _RECORD, _UNFINISHED = MOTION_FILE, MOTION_UNFINISHED_FILE

@@ -105,3 +105,15 @@ def test_where_a_static_model_is_poor_nothing_moves_that_the_frames_around_show_
 
 def test_a_static_model_that_is_wrong_about_the_whole_frame_says_nothing() -> None:
     assert not found(comes, static=Shades(255 - sight(KEY, []).shades.colors)).any()
+
+
+def test_where_hardly_another_frame_looks_a_static_model_is_not_believed() -> None:
+    """At the rim of a clip's view: the model saw it once or twice, and learnt it badly."""
+    inverse = np.full((HEIGHT, WIDTH), 1.0 / WALL, np.float32)
+    others = [Other(1, n, sight(KEY + n, []), inverse) for n in STEPS]
+    shown = sight(KEY, []).shades.colors.copy()
+    shown[20:50, :4] = 255 - shown[20:50, :4]
+    frame = sight(KEY, [])
+    assert not np.any(Fleeting((X, Y), 0.5, FlowConfig()).masks(frame, others, inverse, WALL, Shades(shown)))
+    careless = FlowConfig(asked=0)
+    assert np.any(Fleeting((X, Y), 0.5, careless).masks(frame, others, inverse, WALL, Shades(shown)))
