@@ -145,7 +145,7 @@ class Fleeting:
             return np.zeros(inverse.shape, bool)
         rows, columns = np.nonzero(weak)
         points, at = self._points(rows, columns), inverse[rows, columns][None]
-        alike, seen, asked = np.zeros((3, *inverse.shape), np.float32)
+        alike, seen, asked = (np.zeros(inverse.shape, np.float32) for _ in range(3))
         for other in (other for other in others if other.step > 1):
             asked[rows, columns] += self._projected(frame, other, points, at)[2][0]
             found, within = self._compared(frame, other, points, at, frame.shades.colors[rows, columns][None])
@@ -237,8 +237,8 @@ class Fleeting:
     def _projected(
         self, frame: Sight, other: Other, points: tuple[Map, Map], inverse: Map
     ) -> tuple[Map, Map, Mask, Map]:
-        """Where still points are on another's grid, whether that is in the picture, and how many times as near they are to
-        it as to the frame: [a, b] each."""
+        """Where still points are on another's grid, whether that is in the picture, and how many times as near they are
+        to it as to the frame: [a, b] each."""
         ray = Ray(points, (frame.viewmat, other.sight.viewmat), (frame.K, other.sight.K))
         at, over = ray.project(inverse)
         x, y = (np.clip(0.5 * p - 0.5, -1e4, 1e4).astype(np.float32) for p in at)
