@@ -56,7 +56,7 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
         if beside.root.is_dir():  # killed while it took over
             take_over(take, place)
         return Place(folder, None, here | there, set())
-    _sweep(beside, with_warps)
+    _prepare(beside, with_warps)
     return Place(beside, beside, here, there)
 
 
@@ -108,10 +108,10 @@ def make_folders(folder: TakeFolder, with_warps: bool) -> None:
             "Name another take, or move them away.",
             ExitCode.FREEZE,
         )
-    _sweep(folder, with_warps)
+    _prepare(folder, with_warps)
 
 
-def _sweep(folder: TakeFolder, with_warps: bool) -> None:
+def _prepare(folder: TakeFolder, with_warps: bool) -> None:
     """Makes the folders of a take's frames, and removes what was half written to them."""
     for used in (folder.root, folder.previews, *([folder.warps] if with_warps else [])):
         make_folder(used)
