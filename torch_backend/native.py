@@ -17,9 +17,9 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Generator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, cast
 
 import torch
@@ -31,8 +31,6 @@ from .kernel_text import kernel_text
 
 Launch = Callable[[int, int, int], None]
 """A compiled snippet, called as f(address of the block, stage, worker)."""
-_lock = threading.RLock()
-_pools: dict[int, ThreadPoolExecutor] = {}
 _raw_stream: Any = getattr(importlib.import_module("torch._C"), "_cuda_getCurrentRawStream", None)
 """The handle of torch's current stream of a card, without an object around it: what torch's own compiler asks."""
 _recorded = threading.local()
@@ -111,33 +109,77 @@ def build(name: str, text: str) -> Launch:
     wp.load_module(module, device="cpu")
 
     warp: Any = wp
+    recorded = threading.local()
 
     def launch(block: int, stage: int, worker: int) -> None:
-        warp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu")
+        # Workers launch one after another, holding the GIL: recorded, that takes a seventh of the time.
+        command = recorded.__dict__.get("command")
+        if command is None:
+            command = warp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu", record_cmd=True)
+            recorded.command = command
+        for index, value in enumerate((block, stage, worker)):
+            command.set_param_at_index_from_ctype(index, value)
+        command.launch()
 
     return launch
 
 
-def _pool(threads: int) -> ThreadPoolExecutor:
-    with _lock:
-        if threads not in _pools:
-            _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="native")
-        return _pools[threads]
+class _Crew:
+    """Threads that carry out what they are asked to. A pool of futures takes several times as long."""
+
+    def __init__(self) -> None:
+        self._lock, self._threads = threading.Lock(), 0
+        self._asked: SimpleQueue[tuple[Launch, int, int, int, SimpleQueue[BaseException | None]]] = SimpleQueue()
+
+    def ask(self, run: Launch, address: int, stage: int, workers: int) -> "SimpleQueue[BaseException | None]":
+        """Runs a stage as workers 1 to `workers` - 1; the queue gets what each of them ended with, in any order."""
+        if self._threads < workers - 1:
+            with self._lock:
+                while self._threads < workers - 1:
+                    threading.Thread(target=self._work, name=f"native-{self._threads}", daemon=True).start()
+                    self._threads += 1
+        ended: SimpleQueue[BaseException | None] = SimpleQueue()
+        for worker in range(1, workers):
+            self._asked.put((run, address, stage, worker, ended))
+        return ended
+
+    def _work(self) -> None:
+        while True:
+            run, address, stage, worker, ended = self._asked.get()
+            error: BaseException | None = None
+            try:
+                run(address, stage, worker)
+            except BaseException as raised:  # whoever asked raises it
+                error = raised
+            ended.put(error)
+
+
+_crew = _Crew()
+
+
+def _new_crew() -> None:
+    global _crew
+    _crew = _Crew()
 
 
 if hasattr(os, "register_at_fork"):
-    # Threads do not survive a fork; the child makes its own.
-    os.register_at_fork(after_in_child=_pools.clear)
+    os.register_at_fork(after_in_child=_new_crew)  # threads do not survive a fork
 
 
 def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
     """Run one stage of a block (a ctypes structure with a field `counter`) on `workers` threads, the caller's too."""
     block.counter = 0
     address = ctypes.addressof(block)
-    waiting = [_pool(workers - 1).submit(run, address, stage, w) for w in range(1, workers)] if workers > 1 else []
-    run(address, stage, 0)
-    for future in waiting:
-        future.result()
+    if workers == 1:
+        run(address, stage, 0)
+        return
+    ended = _crew.ask(run, address, stage, workers)
+    try:
+        run(address, stage, 0)
+    finally:  # as long as one of them runs the block has to stay
+        errors = [error for error in (ended.get() for _ in range(1, workers)) if error is not None]
+    if errors:
+        raise errors[0]
 
 
 class Snippet:

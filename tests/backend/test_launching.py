@@ -1,12 +1,16 @@
-"""What a recorded launch takes anew each time: threads, numbers, structures; and that threads do not share it."""
+"""What a recorded launch takes anew each time: threads, numbers, structures; that threads do not share it; and what the
+workers of a processor's stage do together."""
 
 import ctypes
+import os
+import sys
 import threading
 
+import pytest
 import torch
 import warp as wp
 
-from torch_backend.native import func_native, initialised_warp, launch_on
+from torch_backend.native import INTEGER, POINTER, Snippet, func_native, initialised_warp, launch_on, run_workers
 
 
 def adding():
@@ -74,3 +78,67 @@ def test_a_bare_structure_stands_for_a_warp_structure():
         bare.out, bare.value = out.data_ptr(), value
         launch_on(kernel, count, [bare], CPU)
     assert out.tolist() == [7.0, 7.0, 5.0, 0.0]
+
+
+COUNTING = Snippet(
+    "launching_count", {"out": POINTER, "units": INTEGER},
+    "for (long long u; (u = __atomic_fetch_add(&P.counter, 1, __ATOMIC_RELAXED)) < P.units;) P.out[u] += stage + 1;",
+)  # fmt: skip
+
+
+def counted(threads, stages, units=5000):
+    out = torch.zeros(units)
+    for stage in range(stages):
+        COUNTING.run(threads, stage, out=out.data_ptr(), units=units)
+    return out
+
+
+@pytest.mark.parametrize("threads", [1, 2, 9])
+def test_workers_do_every_unit_of_every_stage_once(threads):
+    assert (counted(threads, 3) == 6.0).all()
+
+
+def test_callers_that_run_workers_at_once_do_not_mix():
+    outs = {}
+
+    def work(n):
+        outs[n] = [counted(4, n + 1, 700) for _ in range(30)]
+
+    callers = [threading.Thread(target=work, args=(n,)) for n in range(4)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    for n, found in outs.items():
+        assert all((out == (n + 1) * (n + 2) / 2).all() for out in found)
+
+
+class Block(ctypes.Structure):
+    _fields_ = [("counter", ctypes.c_int64)]
+
+
+@pytest.mark.parametrize("failing", [0, 2])
+def test_an_error_of_a_worker_is_the_callers_once_all_have_ended(failing):
+    ended = []
+
+    def run(_address, stage, worker):
+        if worker == failing:
+            raise ArithmeticError(f"worker {worker} of stage {stage}")
+        ended.append(worker)
+
+    with pytest.raises(ArithmeticError, match=f"worker {failing} of stage 7"):
+        run_workers(run, Block(), 7, 4)
+    assert sorted([*ended, failing]) == [0, 1, 2, 3]
+    ended.clear()
+    run_workers(lambda _address, _stage, worker: ended.append(worker), Block(), 0, 4)
+    assert sorted(ended) == [0, 1, 2, 3]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not fork")
+def test_a_forked_child_has_workers_of_its_own():
+    counted(3, 1)
+    child = os.fork()
+    if child == 0:
+        whole = bool((counted(3, 2) == 3.0).all())
+        os._exit(0 if whole else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

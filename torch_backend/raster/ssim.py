@@ -1,4 +1,5 @@
-"""Mean SSIM of float32 images on the CPU with its gradient, in two passes over rows; C++ compiled by Warp.
+"""Mean SSIM of float32 images on the CPU, alone or in the photometric loss, with its gradient, in two passes over rows;
+C++ compiled by Warp.
 
 The mathematics is that of `train.losses` (Wang et al. 2004; 11 x 11 Gaussian window, sigma 1.5, data_range 1, cut at
 the border and renormalised per axis). The renormalised blur of an axis is B = diag(r) S, with S the symmetric blur of
@@ -46,9 +47,11 @@ _FIELDS: list[tuple[str, type, str]] = [
             "counter",
         )
     ],
+    *[(n, ctypes.c_float, "float") for n in ("share", "plain")],
 ]
 """`length` = width * channels floats of a row, `padded` the same up to full vectors, `pitch` with `margin` zeros either
-side; `blurred` [3, height, padded] holds the gradient's fields between the passes, `scratch` a worker's rows."""
+side; `blurred` [3, height, padded] holds the gradient's fields between the passes, `scratch` a worker's rows. What is
+summed up is share * SSIM + plain * |x - y|."""
 
 _SOURCE = Path(__file__).with_name("kernels") / "ssim.cpp"
 
@@ -115,8 +118,11 @@ class _Local(threading.local):
 _local = _Local()
 
 
-def _run(image: Tensor, target: Tensor, want_gradient: bool, threads: int) -> tuple[Tensor, Tensor | None]:
-    """Mean SSIM (0-dim) and its gradient by `image`, of contiguous float32 [H, W, C]."""
+def _run(
+    image: Tensor, target: Tensor, mix: tuple[float, float], want_gradient: bool, threads: int
+) -> tuple[Tensor, Tensor | None]:
+    """Mean of share * SSIM + plain * |x - y| (0-dim), mix = (share, plain), and its gradient by `image`, of contiguous
+    float32 [H, W, C]."""
     launch = _compile()
     height, width, channels = image.shape
     length = width * channels
@@ -147,6 +153,8 @@ def _run(image: Tensor, target: Tensor, want_gradient: bool, threads: int) -> tu
         pitch=pitch,
         scratch_stride=stride,
         want_gradient=int(want_gradient),
+        share=mix[0],
+        plain=mix[1],
     )
     run_workers(launch, block, 0, threads)
     if want_gradient:
@@ -158,16 +166,24 @@ class _Ssim(torch.autograd.Function):
     """Autograd's view; only the first image has a gradient."""
 
     @staticmethod
-    def forward(ctx: AutogradContext, image: Tensor, target: Tensor, threads: int) -> Tensor:
-        value, gradient = _run(image.contiguous(), target.contiguous(), ctx.needs_input_grad[0], threads)
+    def forward(
+        ctx: AutogradContext, image: Tensor, target: Tensor, ignored: Tensor | None, mix: tuple[float, float],
+        threads: int,
+    ) -> Tensor:  # fmt: skip
+        image, target = image.contiguous(), target.contiguous()
+        if ignored is not None:
+            target = torch.where(ignored[..., None], image, target)
+        value, gradient = _run(image, target, mix, ctx.needs_input_grad[0], threads)
+        if ignored is not None and gradient is not None:
+            gradient.masked_fill_(ignored[..., None], 0.0)  # their neighbours' windows reach into them
         ctx.save_for_backward(gradient)
         return value
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: AutogradContext, *grads: Tensor) -> tuple[Tensor, None, None, None, None]:
         gradient: Tensor = ctx.saved_tensors[0]
-        return grads[0] * gradient, None, None
+        return grads[0] * gradient, None, None, None, None
 
 
 def supports(image: Tensor, target: Tensor) -> bool:
@@ -184,6 +200,22 @@ def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
     quality assessment", with the window and borders described in this module. ValueError if the shapes differ, a side
     is smaller than the window, or `supports` says no.
     """
+    return applied(_Ssim, image, target, None, (1.0, 0.0), _checked(image, target, threads))
+
+
+def photometric(
+    image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None = None, threads: int | None = None
+) -> Tensor:
+    """`train.losses.photometric` of two float32 CPU images [H, W, C], in the passes of `ssim`; ignored: bool [H, W].
+
+    ValueError as `ssim`.
+    """
+    workers = _checked(image, target, threads)
+    return dssim + applied(_Ssim, image, target, ignored, (-dssim, 1.0 - dssim), workers)
+
+
+def _checked(image: Tensor, target: Tensor, threads: int | None) -> int:
+    """How many workers. ValueError for what cannot be compared."""
     if image.ndim != 3 or image.shape != target.shape or min(image.shape[:2]) < WINDOW or image.shape[2] < 1:
         raise ValueError(
             f"SSIM needs two [H, W, C] images of one shape and at least {WINDOW} px, "
@@ -197,4 +229,4 @@ def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
     workers = default_threads() if threads is None else threads
     if workers < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
-    return applied(_Ssim, image, target, workers)
+    return workers

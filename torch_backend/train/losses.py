@@ -22,13 +22,16 @@ def photometric(image: Tensor, target: Tensor, dssim: float, ignored: Tensor | N
     Pixels `ignored`, bool [H, W], teach nothing: the image stands there in the place of the target, and no gradient
     leaves it.
     """
-    if min(image.shape[:2]) >= _WINDOW and dssim > 0 and image.is_cuda and ssim_cuda.supports(image, target):
+    structured = dssim > 0 and min(image.shape[:2]) >= _WINDOW
+    if structured and compiled_ssim.supports(image, target):
+        return compiled_ssim.photometric(image, target, dssim, ignored)
+    if structured and image.is_cuda and ssim_cuda.supports(image, target):
         return ssim_cuda.photometric(image, target, dssim, ignored)
     if ignored is not None:
         shown = image.detach()
         image, target = (torch.where(ignored[..., None], shown, one) for one in (image, target))
     loss = (image - target).abs().mean()
-    if dssim > 0 and min(image.shape[:2]) >= _WINDOW:
+    if structured:
         loss = (1.0 - dssim) * loss + dssim * (1.0 - ssim(image, target))
     return loss
 

@@ -13,7 +13,7 @@ REMEDIES = [
     ),
     Remedy(
         "SSIM refuses images below its window",
-        "ssim.py/ssim",
+        "ssim.py/_checked",
         " or min(image.shape[:2]) < WINDOW",
         "",
         "test_ssim.py::test_refuses_what_it_cannot_do",

@@ -61,6 +61,21 @@ def test_harmonics_depth_and_pose(tools, degree, antialiased):
     assert ((cpu.depth_expected == 1e10) == (cpu.alphas == 0)).all()
 
 
+def test_a_median_depth_is_where_half_is_crossed_or_that_of_the_largest_weight(tools):
+    """A tile has pixels of both kinds: 37 x 21 px of 60 Gaussians, the top contributor asked too and not."""
+    for with_top in (False, True):
+        scene = tools.cloud(60, 37, 21, seed=11, with_depth=True, with_top=with_top)
+        cpu, ref = scene.run("cpu"), scene.run("reference")
+        seen = ref.alphas > 0.01
+        crossed, never = seen & (ref.alphas > 0.52), seen & (ref.alphas < 0.48)
+        assert min(int(crossed.sum()), int(never.sum())) > 100
+        for kind in (crossed, never):
+            assert ((cpu.depth_median - ref.depth_median).abs()[kind] > 1e-3).float().mean() < 0.01
+        if with_top:
+            assert (cpu.top_ids[seen] != ref.top_ids[seen]).float().mean() < 0.01
+            assert (cpu.top_weights - ref.top_weights).abs().max() < 1e-3
+
+
 @pytest.mark.parametrize("channels", [1, 8, 21])
 def test_any_number_of_channels(tools, channels):
     scene = tools.cloud(120, 33, 20, seed=channels, channels=channels)

@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from torch_backend.raster.ssim import ssim
+from torch_backend.raster.ssim import photometric, ssim
 from torch_backend.train import losses
 
 
@@ -46,6 +46,23 @@ def test_value_and_gradient_match_float64(height, width, channels):
     (got,) = torch.autograd.grad(3.0 * value, x)
     (want,) = torch.autograd.grad(3.0 * expected, x64)
     assert float((got - want).norm() / want.norm()) <= 1e-5
+
+
+@pytest.mark.parametrize("hides", [False, True])
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_the_loss_and_its_gradient_match_float64(height, width, hides):
+    image, target = pair(height, width, 3)
+    image[3, 4] = target[3, 4]  # the slope of |x - y| is 0 there
+    generator = torch.Generator().manual_seed(6)
+    ignored = torch.rand(height, width, generator=generator) > 0.8 if hides else None
+    x, x64 = image.clone().requires_grad_(), image.double().requires_grad_()
+    value, expected = photometric(x, target, 0.2, ignored), losses.photometric(x64, target.double(), 0.2, ignored)
+    assert float(losses.photometric(image, target, 0.2, ignored)) == float(value.detach())
+    assert float(value.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
+    (got,) = torch.autograd.grad(3.0 * value, x)
+    (want,) = torch.autograd.grad(3.0 * expected, x64)
+    assert float((got - want).norm() / want.norm()) <= 1e-5
+    assert ignored is None or not got[ignored].any()
 
 
 def test_torch_path_agrees():

@@ -1,4 +1,5 @@
-// Mean SSIM and its gradient on the CPU, in two passes over rows; `ssim.py` has the mathematics and the fields of P.
+// share * SSIM + plain * |x - y|, its mean and its gradient on the CPU, in two passes over rows; `ssim.py` has the
+// mathematics and the fields of P.
 
 typedef float F __attribute__((ext_vector_type(16)));
 typedef int I __attribute__((ext_vector_type(16)));
@@ -68,7 +69,16 @@ for (long long first; (first = take()) < H;) {
         }
         double total = 0;
         for (int l = 0; l < 16; l++) total += sum[l];
-        P.row_score[first + i] = (float)total;
+        double apart = 0;
+        if (P.plain != 0.f) {
+            const float* px = P.image + (first + i) * L; const float* py = P.target + (first + i) * L;
+            F sum = (F)0.f;
+            long long at = 0;
+            for (; at + 16 <= L; at += 16) sum += __builtin_elementwise_abs(load(px + at) - load(py + at));
+            for (int l = 0; l < 16; l++) apart += sum[l];
+            for (; at < L; at++) apart += __builtin_fabsf(px[at] - py[at]);
+        }
+        P.row_score[first + i] = (float)(P.share * total + P.plain * apart);
         if (!P.want_gradient) continue;
         float* to = P.blurred + (first + i) * S;
         for (long long at = 0; at < S; at += 16)
@@ -78,7 +88,7 @@ for (long long first; (first = take()) < H;) {
 }
 
 if (stage == 1) {
-float scale = 1.f / ((float)H * (float)L);
+const float each = 1.f / ((float)H * (float)L), scale = P.share * each, plain = P.plain * each;
 for (long long first; (first = take()) < H;) {
     int count = (int)(H - first < R ? H - first : R);
     for (long long at = 0; at < S; at += 16) {
@@ -98,8 +108,9 @@ for (long long first; (first = take()) < H;) {
             if (part) {
                 for (int l = 0; l < L - at; l++) { edge[0][0][l] = px[l]; edge[1][0][l] = py[l]; }
                 px = edge[0][0]; py = edge[1][0]; }
-            F x = load(px) - MID, y = load(py) - MID;
+            F x = load(px) - MID, y = load(py) - MID, apart = load(px) - load(py);
             F value = scale * (d[i][0] + 2.f * x * d[i][1] + y * d[i][2]);
+            value += apart > 0.f ? (F)plain : (apart < 0.f ? (F)-plain : (F)0.f);
             if (!part) { store(P.gradient + from, value); continue; }
             store(edge[0][0], value);
             for (int l = 0; l < L - at; l++) P.gradient[from + l] = edge[0][0][l];

@@ -19,6 +19,9 @@ for (long long tile; (tile = take()) < tiles;) {
     for (; b < stop; b += 16) {
 #include "batch.cpp"
 
+        // Rows in which some pixel's transmittance has not crossed a half yet, where its median depth is.
+        unsigned undecided = 0;
+        if (want_depth) for (int i = 0; i < 16; i++) undecided |= (unsigned)any(T[i] > 0.5f) << i;
         F totals[16], peaks[16];
         for (int l = m; l < 16; l++) { totals[l] = (F)0.f; peaks[l] = (F)0.f; }
         for (int l = 0; l < m; l++) {
@@ -31,13 +34,16 @@ for (long long tile; (tile = take()) < tiles;) {
 #include "rows.cpp"
 #include "forward_row.cpp"
 
-                if (want_depth | want_top) {
+                if (undecided >> row & 1) {
+                    I crossed = (before > 0.5f) & (T[row] <= 0.5f);
+                    if (any(crossed)) median[row] = crossed ? (F)depth : median[row];
+                }
+                if (want_top) {
                     I larger = w > best[row];
-                    // T before > 0.5 and T after <= 0.5: crossed here. Until then, the largest so far.
-                    I pick = (before > 0.5f) & ((T[row] <= 0.5f) | larger) & (w > 0.f);
-                    median[row] = pick ? (F)depth : median[row];
-                    top[row] = larger ? (I)id : top[row];
-                    best[row] = vmax(best[row], w);
+                    if (any(larger)) {
+                        top[row] = larger ? (I)id : top[row];
+                        best[row] = vmax(best[row], w);
+                    }
                 }
             }
             totals[l] = total; peaks[l] = peak;
@@ -54,6 +60,8 @@ for (long long tile; (tile = take()) < tiles;) {
     P.tile_end[tile] = (int)b;
     if (want_weights) for (; b < stop; b++) {
         float* to = P.hit_weight + 2 * (long long)P.hit_place[b]; to[0] = 0.f; to[1] = 0.f; }
+#include "uncrossed.cpp"
+
     for (int i = 0; i < rows; i++) {
         long long at = (ty * 16 + i) * W + tx * 16;
         alignas(64) float each[16], pixels[16 * NCH];
