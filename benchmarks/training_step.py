@@ -1,13 +1,15 @@
 """Breakdown of one training step before and after the gate opens: `python benchmarks/training_step.py SHOT`.
 
 SHOT is a solved shot folder; nothing is written into it. One run of the preset trains with the tuning split (every 8th
-frame held out, four frames off); `--steps` steps are timed at each share of the run in `--at`. Parts are means over
-these steps, in ms; a part inside another is taken off the outer one, and what no part covers is listed as the rest.
+frame held out, four frames off) and the shot's motion mattes; `--steps` steps are timed at each share of the run in
+`--at`. Parts are means over these steps, in ms; a part inside another is taken off the outer one, and what no part
+covers is listed as the rest.
 Parts of the backward pass are told apart by the moment at which the gradients of the images and of the Gaussians
 arrive: autograd works through the graph in the reverse order of its making.
 """
 
 import argparse
+import functools
 import json
 import os
 import pathlib
@@ -24,12 +26,16 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 import torch
 
 from torch_backend.contract import TrainParams
-from torch_backend.native import default_threads
+from torch_backend.native import default_threads, torch_threads
 from torch_backend.raster.cpu import warm_up
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot
+from torch_backend.solve.masks import IGNORE, load_mask
+from torch_backend.solve.motion import load_motion
 from torch_backend.train import config_from_params
 from torch_backend.train import trainer as trainer_module
+from torch_backend.train.ignored import load_ignored
+from torch_backend.train.movers import load_movers
 from torch_backend.train.run import training_size
 from torch_backend.train.trainer import Trainer
 
@@ -90,36 +96,37 @@ def watch(trainer: Trainer, parts: Parts) -> None:
             patched.add((id(owner), name))
 
     for owner, name, label in (
-        (model, "deltas", "field, forward"),
-        (module, "apply_deltas", "deltas applied"),
-        (model.exposure, "apply", "exposure, forward"),
-        (module, "photometric", "L1 + SSIM, forward"),
+        (trainer, "_deltas", "field, forward"),
+        (model, "moved", "deltas applied"),
+        (module, "anchored_pairs", "pairs to anchor drawn"),
+        (model.exposure, "apply_at", "exposure, forward"),
+        (trainer.softened, "loss", "L1 + SSIM, forward"),
         (trainer, "_regularisers", "penalties, forward"),
-        (module, "support_loss", "support loss, forward"),
+        (module, "stillness", "price of motion, forward"),
+        (trainer, "_support_loss", "support loss, forward"),
         (trainer.optimizer, "zero_grad", "gradients cleared"),
         (trainer.optimizer, "step", "Adam"),
-        (trainer.densifier, "observe", "densifier observes"),
-        (module, "mark_seen", "support marked"),
+        (trainer, "_observe", "what a frame tells of the Gaussians"),
         (trainer, "_schedule_rates", "learning rates"),
         (trainer, "schedule_events", "densification and gate"),
-        (trainer, "_next_frame", "frame drawn"),
+        (trainer, "_told", "what the step is told"),
     ):
-        if hasattr(owner, name):
-            patch(owner, name, label)
+        patch(owner, name, label)
     if model.field is not None:
         patch(model.field, "regularisation", "field's penalties, forward")
-    if (id(trainer), "render_trained") not in patched:
-        render = parts.timed("rasterise, forward", trainer.render_trained)
+    if (id(module), "render") not in patched:
+        render = parts.timed("rasterise, forward", module.render)
+        hooks: list[Any] = []  # a parameter that nothing moves is the same tensor in the next step
 
         def watched(state: dict[str, torch.Tensor], *args: Any, **options: Any) -> Any:
             out = render(state, *args, **options)
             leaf = state["means"]
-            if leaf.requires_grad:
+            if out.colors.requires_grad:
                 out.colors.register_hook(lambda _: parts.lap("losses, penalties and exposure, backward"))
-                leaf.register_hook(lambda _: parts.lap("rasterise, backward"))
+                hooks.append(leaf.register_hook(lambda _: parts.lap("rasterise, backward")))
             return out
 
-        trainer.render_trained = watched  # type: ignore[method-assign]
+        module.render = watched
         backward = torch.Tensor.backward
 
         def whole(self: torch.Tensor, *args: Any, **kwargs: Any) -> None:
@@ -127,9 +134,11 @@ def watch(trainer: Trainer, parts: Parts) -> None:
             backward(self, *args, **kwargs)
             parts.lap("field and Gaussians, backward")
             parts._inner[-1] += time.perf_counter() - since
+            while hooks:
+                hooks.pop().remove()
 
         torch.Tensor.backward = whole  # type: ignore[method-assign]
-        patched.add((id(trainer), "render_trained"))
+        patched.add((id(module), "render"))
     vars(trainer)["_timed"] = patched
 
 
@@ -157,29 +166,38 @@ def main() -> None:
     parser.add_argument("--preset", default="preview")
     parser.add_argument("--iterations", type=int, default=0)
     parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--at", type=float, nargs=2, default=(0.25, 0.7), help="shares of the run that are measured")
+    parser.add_argument("--at", type=float, nargs=2, default=(0.15, 0.7), help="shares of the run that are measured")
+    parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     parser.add_argument("--json", metavar="FILE")
     args = parser.parse_args()
     shot = Shot.open(args.shot)
     config = config_from_params(TrainParams(preset=args.preset, iterations=args.iterations, holdout=8))
     config.holdout_phase = 4
+    if args.threads:  # the backend takes all cores that it may use
+        if not hasattr(os, "sched_setaffinity"):
+            parser.error("--threads: this system does not let a program leave cores alone")
+        os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[: args.threads]))
     torch.set_num_threads(default_threads())
     warm_up()
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, _ = split_frames(scene.solved, config.holdout, config.holdout_phase)
-    trainer = Trainer(scene, load_images(scene, train, width, height), train, config, _Silent())  # type: ignore[arg-type]
+    movers = load_movers(functools.partial(load_motion, shot, likely=True), scene, train, width, height)
+    ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train, width, height)
+    images = load_images(scene, train, width, height)
+    trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)  # type: ignore[arg-type]
     parts, results = Parts(), {}
-    for share in args.at:
-        while trainer.progress < share:
-            trainer.schedule_events()
-            trainer.step()
-            trainer.iteration += 1
-        label = f"at {share:.0%}: {len(trainer.model.gaussians)} Gaussians, {len(trainer.model.open_rows())} open"
-        results[label] = measure(trainer, parts, args.steps)
-        print(f"\n{label}, {width}x{height}")
-        for name, value in results[label].items():
-            print(f"  {name:<44} {value:8.2f} ms")
+    with torch_threads(3 * width * height):  # as `Trainer.run`
+        for share in args.at:
+            while trainer.progress < share:
+                trainer.schedule_events()
+                trainer.step()
+                trainer.iteration += 1
+            label = f"at {share:.0%}: {len(trainer.model.gaussians)} Gaussians, {len(trainer.model.open_rows())} open"
+            results[label] = measure(trainer, parts, args.steps)
+            print(f"\n{label}, {width}x{height}")
+            for name, value in results[label].items():
+                print(f"  {name:<44} {value:8.2f} ms")
     if args.json:
         pathlib.Path(args.json).write_text(json.dumps(results, indent=1), encoding="utf-8")
 

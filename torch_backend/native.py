@@ -47,6 +47,25 @@ def default_threads() -> int:
     return max(1, min(cores, 16))
 
 
+_WORTH_A_THREAD = 460_000
+
+
+@contextlib.contextmanager
+def torch_threads(values: int) -> Generator[None]:
+    """Meanwhile torch's own operators, on tensors of so many numbers, run on as many threads as are worth waking, and
+    on no more than they had.
+
+    Between two operators torch's threads sleep (OMP_WAIT_POLICY): where each works on little, waking them takes longer
+    than they save (docs/benchmarks.md, "A training step"). Compiled snippets have threads of their own.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, min(before, round(values / _WORTH_A_THREAD))))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 @contextlib.contextmanager
 def _without_notice() -> Generator[None]:
     """Hold back what C code writes to standard error meanwhile; pass on all but Warp's notice of a missing GPU."""

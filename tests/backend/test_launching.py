@@ -10,7 +10,16 @@ import pytest
 import torch
 import warp as wp
 
-from torch_backend.native import INTEGER, POINTER, Snippet, func_native, initialised_warp, launch_on, run_workers
+from torch_backend.native import (
+    INTEGER,
+    POINTER,
+    Snippet,
+    func_native,
+    initialised_warp,
+    launch_on,
+    run_workers,
+    torch_threads,
+)
 
 
 def adding():
@@ -142,3 +151,16 @@ def test_a_forked_child_has_workers_of_its_own():
         whole = bool((counted(3, 2) == 3.0).all())
         os._exit(0 if whole else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_torch_works_on_small_pictures_with_one_thread_and_gets_its_threads_back():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        for values, threads in ((3 * 320 * 240, 1), (3 * 640 * 480, 2), (3 * 1920 * 1080, 3)):
+            with pytest.raises(ArithmeticError), torch_threads(values):
+                assert torch.get_num_threads() == threads
+                raise ArithmeticError
+            assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)

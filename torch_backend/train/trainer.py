@@ -17,6 +17,7 @@ from torch import Tensor
 from ..contract import FORECAST, Cancelled, ExitCode, JobError, Reporter
 from ..deformation import Deformation, Deltas, Rehearsal, Start, field_box, host, split_deltas
 from ..gaussians import Densifier, DensifyConfig, covering, initialise
+from ..native import torch_threads
 from ..raster import RasterOutput
 from ..raster.cuda import forget_demands
 from ..scene import Scene
@@ -175,6 +176,11 @@ class Trainer:
 
         Without a checkpoint nothing is written.
         """
+        on_cpu = self.device.type == "cpu"
+        with torch_threads(3 * self.width * self.height) if on_cpu else contextlib.nullcontext():
+            self._run(checkpoint, evaluate)
+
+    def _run(self, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
         begin, length = 0, self.config.iterations
         if self.extensions:
             begin, length = self.extensions[-1].from_iteration, self.extensions[-1].steps
