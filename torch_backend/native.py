@@ -33,6 +33,7 @@ Launch = Callable[[int, int, int], None]
 """A compiled snippet, called as f(address of the block, stage, worker)."""
 _raw_stream: Any = getattr(importlib.import_module("torch._C"), "_cuda_getCurrentRawStream", None)
 """The handle of torch's current stream of a card, without an object around it: what torch's own compiler asks."""
+_CPU = torch.device("cpu")
 _recorded = threading.local()
 """A thread's launches, by kernel, device and threads of a block."""
 
@@ -127,18 +128,8 @@ def build(name: str, text: str) -> Launch:
     kernel = wp.Kernel(entry, key=name, module=wp.get_module(module), options={"enable_backward": False})
     wp.load_module(module, device="cpu")
 
-    warp: Any = wp
-    recorded = threading.local()
-
     def launch(block: int, stage: int, worker: int) -> None:
-        # Workers launch one after another, holding the GIL: recorded, that takes a seventh of the time.
-        command = recorded.__dict__.get("command")
-        if command is None:
-            command = warp.launch(kernel, dim=1, inputs=[block, stage, worker], device="cpu", record_cmd=True)
-            recorded.command = command
-        for index, value in enumerate((block, stage, worker)):
-            command.set_param_at_index_from_ctype(index, value)
-        command.launch()
+        _relaunch(kernel, 1, [block, stage, worker], _CPU, None, None)
 
     return launch
 
