@@ -17,6 +17,7 @@ from torch_backend.contract import (
     command_line,
     is_shot,
     read_json,
+    take_figures,
     verdict_lines,
 )
 from torch_backend.shot import write_json
@@ -71,17 +72,22 @@ def freeze(given: str, output: Path, options: Sequence[str]) -> int:
     return 0
 
 
+def take_of(shot: str, options: Sequence[str]) -> str:
+    """Name of the take that `freeze SHOT` with these options makes."""
+    parser, _ = command_line("splannequin.py", BACKEND)
+    return str(parser.parse_known_args(["freeze", shot, *options])[0].take)
+
+
 def _of_a_shot(shot: str, options: Sequence[str], seconds: float) -> dict[str, Any]:
     """The figures of a shot folder that was frozen alone, in `seconds`: the take, and what it is worth."""
-    parser, _ = command_line("splannequin", BACKEND)
-    args, _ = parser.parse_known_args(["freeze", shot, *options])
     folder = ShotFolder(shot)
-    facts = read_json(TakeFolder(folder.take(args.take)).facts)
+    take = TakeFolder(folder.take(take_of(shot, options)))
+    facts = read_json(take.facts)
     return {
         "version": 1,
         "shot": str(folder.root),
-        "take": args.take,
-        "t_star_frame": facts.get("t_star_frame"),
+        **take_figures(facts, take),
+        "run": facts.get("run"),
         "verdict": verdict_lines(facts),
         "wall_seconds_by_stage": {"freeze": round(seconds, 2)},
     }

@@ -9,6 +9,7 @@ import os
 import queue
 import shutil
 import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torch_backend.cards import nvidia_cards
-from torch_backend.contract import ExitCode, python_child
+from torch_backend.contract import ExitCode, program, python_child
 from torch_backend.shot import is_disk_full, locked, write_json
 
 from .children import child_environ, close_input, say, start_child, stop_child, tied_command
@@ -37,6 +38,8 @@ HEARTBEAT_SECONDS = 15.0
 TORCH_INDEX = "SPLANNEQUIN_TORCH_INDEX"
 CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
 """Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
+CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+"""Where torch without CUDA comes from on Linux, whose PyPI build brings 4 GB for a card that is not there."""
 
 
 @dataclass(frozen=True)
@@ -220,14 +223,17 @@ for package in importlib.metadata.distributions():
 """pip writes a package's RECORD last: without one the package is not all there, and pip must not believe it is."""
 
 
-def torch_index(windows: bool = WINDOWS) -> str:
+def torch_index(system: str = sys.platform) -> str:
     """Package index, beside pip's own, that torch comes from; empty for none.
 
-    What the variable says; without it, on Windows, the one with CUDA where there is a card for it.
+    What the variable says; without it, on Windows, the one with CUDA where there is a card for it, and on Linux, the one
+    without where there is no NVIDIA driver.
     """
     if TORCH_INDEX in os.environ:
         return os.environ[TORCH_INDEX]
-    return CUDA_INDEX if windows and any(card.fits for card in nvidia_cards()[0]) else ""
+    if system == "win32":
+        return CUDA_INDEX if any(card.fits for card in nvidia_cards()[0]) else ""
+    return CPU_INDEX if system == "linux" and program("nvidia-smi") is None else ""
 
 
 def _reachable(index: str) -> bool:

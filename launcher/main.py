@@ -12,13 +12,13 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from torch_backend.contract import INPUT, ExitCode
+from torch_backend.contract import INPUT, ExitCode, is_shot
 from torch_backend.shot import is_disk_full, write_json
 
 from . import farm
 from .blender import BPY_WHEELS
 from .children import run_child
-from .commands import bench, freeze, setup
+from .commands import bench, freeze, setup, take_of
 from .doctor import doctor
 from .environments import backend_environment
 from .errors import LauncherError
@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), _interrupt)
-    default = re.sub(r"[^\w.-]+", "_", Path(args.clip).stem) if args.command == "freeze" else args.command
+    default = _place_of(args.clip, rest) if args.command == "freeze" else args.command
     try:
         output = Path(os.path.abspath(args.output or Path("output") / default))
     except OSError:
@@ -110,6 +110,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             failure = {"command": args.command, "exit_code": code, "error": error}
             write_json(output / "summary.json", {**read_summary(output), **failure})
     return code
+
+
+def _place_of(given: str, options: Sequence[str]) -> str:
+    """Folder in output/ for what `freeze` makes of a clip, or of a take of a shot: no two shots share one."""
+    place = Path(given)
+    name = place.stem
+    if "://" not in given and is_shot(given):
+        if name == "shot":  # `--shot-name` as it is unless said: the folder around it has the name
+            name = place.absolute().parent.name
+        name = f"{name}_{take_of(given, options)}"
+    return re.sub(r"[^\w.-]+", "_", name)
 
 
 def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:

@@ -107,6 +107,8 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
         print_reading(result, console)
     if kind in ("train", "freeze"):
         print_verdict(result, console)
+    if kind == "freeze":
+        print_places(result, console)
     return ExitCode.OK
 
 
@@ -159,12 +161,18 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
         f"{summary['registered']} of {summary['solved_frames']} solved frames registered.\n"
         f"{quality}, {summary['gaussians']} Gaussians, {100 * summary['moving_share']:.1f} % of them move, "
         f"trained in {summary['train_seconds']:.0f} s.\n"
-        + "".join(f"{line}\n" for line in summary["verdict"])
-        + f"EXR frames:    {summary['exr_dir']}\n"
-        f"Contact sheet: {summary['contact_sheet']}\nVideo:         {summary['video']}",
+        + "\n".join(summary["verdict"]),
         file=console.stream,
         flush=True,
     )
+    print_places(summary, console)
+
+
+def print_places(take: dict[str, Any], console: Console) -> None:
+    """Where the files of a take lie."""
+    if not console.as_json:
+        for name, key in (("EXR frames:", "exr_dir"), ("Contact sheet:", "contact_sheet"), ("Video:", "video")):
+            print(f"{name:<14} {take[key]}", file=console.stream, flush=True)
 
 
 def print_verdict(facts: dict[str, Any], console: Console) -> None:

@@ -77,11 +77,14 @@ def test_a_card_that_somebody_hid_is_not_missed(nvidia_smi, monkeypatch):
     assert why_unused(None) is None
 
 
-def test_windows_gets_torch_with_cuda_where_a_card_can_use_it(nvidia_smi, monkeypatch):
+def test_torch_comes_with_cuda_where_a_card_can_use_it(nvidia_smi, tmp_path: Path, monkeypatch):
     monkeypatch.delenv("SPLANNEQUIN_TORCH_INDEX", raising=False)
     for row, index in ((OLD_DRIVER, ""), (OLD_CARD, ""), (GOOD, environments.CUDA_INDEX)):
         nvidia_smi(row)
-        assert environments.torch_index(windows=True) == index
-        assert environments.torch_index(windows=False) == "", "PyPI's has CUDA"
+        assert environments.torch_index("win32") == index
+        assert environments.torch_index("linux") == environments.torch_index("darwin") == "", "PyPI's has CUDA"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert environments.torch_index("linux") == environments.CPU_INDEX, "no driver: 4 GB less"
+    assert environments.torch_index("win32") == environments.torch_index("darwin") == "", "PyPI's has none"
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "")
-    assert environments.torch_index(windows=True) == "", "somebody's wish"
+    assert environments.torch_index("linux") == "", "somebody's wish"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from launcher import commands, doctor, environments, interpreters
+from launcher import commands, doctor, environments, interpreters, main
 from launcher.summary import failed_job
 from torch_backend.cards import Card
 
@@ -137,8 +137,22 @@ def test_a_shot_that_is_frozen_anew_tells_of_the_take_that_was_named():
         found = commands._of_a_shot(str(shot), words, 2.0)
         assert (found["shot"], found["take"], found["t_star_frame"]) == (str(shot), "freeze", 8)
         assert found["verdict"][0].startswith("Poor.") and found["wall_seconds_by_stage"] == {"freeze": 2.0}
+        take = shot / "takes" / "freeze"
+        assert (found["exr_dir"], found["video"]) == (str(take), str(take / "video.mp4")), "where it lies now"
+        assert found["plate_share"] is None and found["run"] == "tiny", "a take of splats alone"
     with pytest.raises(OSError, match="other"):
         commands._of_a_shot(str(shot), ["--take", "other"], 2.0)
+
+
+def test_two_shots_and_two_takes_share_no_folder_unless_told_to(tmp_path: Path):
+    where = main._place_of
+    for name in ("a", "b"):
+        (tmp_path / name / "shot.splannequin").mkdir(parents=True)
+    (tmp_path / "walk.splannequin").mkdir()
+    assert where("in/a clip.mp4", []) == "a_clip"
+    assert where(str(tmp_path / "a" / "shot.splannequin"), []) == "a_freeze"
+    assert where(str(tmp_path / "b" / "shot.splannequin"), ["--t-star", "9", "--take", "at9"]) == "b_at9"
+    assert where(str(tmp_path / "walk.splannequin"), ["--take=x"]) == "walk_x"
 
 
 def test_what_only_a_clip_wants_is_refused_of_a_shot(tmp_path: Path):

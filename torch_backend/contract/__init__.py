@@ -173,6 +173,7 @@ from .results import (
     Verdict,
     measured,
     summarise,
+    take_figures,
     verdict_lines,
     verdict_of,
 )
@@ -433,6 +434,7 @@ __all__ = [
     "said_of",
     "summarise",
     "sweep_half_written",
+    "take_figures",
     "trains_anew",
     "try_lock",
     "verdict_lines",

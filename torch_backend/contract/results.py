@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .files import is_json_object, printable
+from .shot_folder import ShotFolder, TakeFolder
 from .typed import CONTRACT_VERSION, from_dict
 
 
@@ -69,6 +70,23 @@ def verdict_lines(*facts: Mapping[str, Any]) -> list[str]:
     return list(dict.fromkeys(lines))  # a take repeats what its run's verdict found amiss
 
 
+def take_figures(facts: Mapping[str, Any], folder: TakeFolder) -> dict[str, Any]:
+    """What DIR/summary.json says of a take.
+
+    Args:
+        facts: take.json, or what the job "freeze" answered.
+        folder: where the take lies now: a shot may have been moved since it was frozen.
+    """
+    detail: Mapping[str, Any] = facts.get("detail") or {}
+    places = {"exr_dir": folder.root, **{k: getattr(folder, k) for k in ("contact_sheet", "video", "ply")}}
+    return {
+        **{k: detail.get(k) for k in ("plate_share", "invented_share")},
+        "t_star_frame": facts.get("t_star_frame"),
+        **{k: str(place) for k, place in places.items()},
+        "take": facts.get("take"),
+    }
+
+
 def summarise(
     shot: str, source: str, results: Mapping[str, Mapping[str, Any]], stages: Mapping[str, float], wall_seconds: float
 ) -> dict[str, Any]:
@@ -82,7 +100,6 @@ def summarise(
         wall_seconds: seconds in all.
     """
     train, freeze, solve = results["train"], results["freeze"], results["solve"]
-    detail: Mapping[str, Any] = freeze.get("detail") or {}
     return {
         "version": CONTRACT_VERSION,
         "shot": shot,
@@ -93,8 +110,7 @@ def summarise(
         "modelled": train.get("modelled", []),
         "quality": train.get("quality", ""),
         "verdict": verdict_lines(train, freeze),
-        **{k: detail.get(k) for k in ("plate_share", "invented_share")},
-        **{k: freeze[k] for k in ("t_star_frame", "exr_dir", "contact_sheet", "video", "ply", "take")},
+        **take_figures(freeze, TakeFolder(ShotFolder(shot).take(freeze["take"]))),
         "run": train["run"],
         "wall_seconds_by_stage": dict(stages),
         "wall_seconds": round(wall_seconds, 2),
