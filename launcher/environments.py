@@ -226,7 +226,7 @@ for package in importlib.metadata.distributions():
 def torch_index(system: str = sys.platform) -> str:
     """Package index, beside pip's own, that torch comes from; empty for none.
 
-    What the variable says; without it, on Windows, the one with CUDA where there is a card for it, and on Linux, the one
+    What the variable says; without it, on Windows the one with CUDA where there is a card for it, and on Linux the one
     without where there is no NVIDIA driver.
     """
     if TORCH_INDEX in os.environ:

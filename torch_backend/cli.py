@@ -160,8 +160,7 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
         f"\nFrozen at frame {summary['t_star_frame']}: {summary['frames']} frames, "
         f"{summary['registered']} of {summary['solved_frames']} solved frames registered.\n"
         f"{quality}, {summary['gaussians']} Gaussians, {100 * summary['moving_share']:.1f} % of them move, "
-        f"trained in {summary['train_seconds']:.0f} s.\n"
-        + "\n".join(summary["verdict"]),
+        f"trained in {summary['train_seconds']:.0f} s.\n" + "\n".join(summary["verdict"]),
         file=console.stream,
         flush=True,
     )
