@@ -21,7 +21,7 @@ from types import FrameType
 from typing import Any
 
 from . import contract
-from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status
+from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status, Writer
 from .contract import new_job as new_job
 from .shot import Shot, disk_error, is_disk_full, path_error, working_on, write_json
 from .writer import only_writer, patient_writer
@@ -45,6 +45,8 @@ class JobReporter:
         self._cancelled = False
         self._last_poll = 0.0
         self._missed = 0
+        self._mine: Writer | None = None
+        self._taken_by: Writer | None = None
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
         self._foretold = ("", 0.0)
@@ -89,6 +91,9 @@ class JobReporter:
     def check_cancelled(self) -> None:
         if self._missed >= _MISSED_BEATS:
             raise FileNotFoundError(f"{self.folder} is gone")
+        if self._taken_by is not None:  # nothing more is written: it is another's now
+            message = f"The shot was taken over by {self._taken_by.host}: this computer had fallen silent."
+            raise JobError(message, "It goes on there.", ExitCode.USAGE)
         now = time.monotonic()
         if not self._cancelled and now - self._last_poll >= _CANCEL_POLL_SECONDS:
             self._last_poll = now
@@ -100,6 +105,10 @@ class JobReporter:
         """The job has not begun, and waits for its turn. Raises `Cancelled` as `check_cancelled`."""
         self.progress("waiting", 0, 1, why)
         self.check_cancelled()
+
+    def holds(self, mine: Writer) -> None:
+        """The job is the shot's only writer, as `mine` in its lock says: it ends if that comes to name another."""
+        self._mine = mine
 
     @property
     def heard(self) -> bool:
@@ -152,11 +161,22 @@ class JobReporter:
                     self._events.write(json.dumps(dataclasses.asdict(event)) + "\n")
                     self._events.flush()
         if self._listener:
-            self._listener(event)
+            try:
+                self._listener(event)
+            except (
+                OSError
+            ) as error:  # its terminal is gone, or its log's disk is full: the work is not to be lost by it
+                self._listener = None
+                if isinstance(error, BrokenPipeError):  # as `| head` does: nobody wants to know how it goes on
+                    self.cancel()
 
     def _heartbeat(self) -> None:
         while not self._stop.wait(contract.HEARTBEAT_SECONDS / 2):
             self._write_status()
+            if self._mine is not None:
+                with contextlib.suppress(OSError, ValueError):
+                    holder = contract.read_writer(self.folder.parent.parent)
+                    self._taken_by = holder if holder not in (None, self._mine) else None
 
     def _write_status(self) -> None:
         with self._lock:
@@ -207,7 +227,9 @@ def _run(
         shot = Shot.open(request.shot)
         words = shot.root, request.kind, reporter.folder.name
         if held is not None:
-            held.enter_context(patient_writer(*words, reporter.waiting) if patient else only_writer(*words))
+            mine = patient_writer(*words, reporter.waiting) if patient else only_writer(*words)
+            reporter.holds(held.enter_context(mine))
+            shot.publish_frames()
         reporter.check_cancelled()
         with _kept_in_place(shot, request.kind):
             result = RUNNERS[request.kind](shot, params, reporter)
@@ -287,7 +309,8 @@ def _about_a_path(error: Exception, shot: str) -> JobError | None:
 
 def _log(folder: Path, text: str) -> None:
     """Adds to the job's log, which *Open Log* shows: what a sentence leaves out."""
-    with contextlib.suppress(OSError), open(folder / contract.LOG_FILE, "a", encoding="utf-8") as log:
+    name = folder / contract.LOG_FILE  # names of files on Linux need not be text: they are written as well as may be
+    with contextlib.suppress(OSError), open(name, "a", encoding="utf-8", errors="backslashreplace") as log:
         log.write(text)
 
 

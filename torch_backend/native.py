@@ -184,10 +184,19 @@ def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
         run(address, stage, 0)
         return
     ended = _crew.ask(run, address, stage, workers)
+    errors: list[BaseException] = []
     try:
         run(address, stage, 0)
-    finally:  # as long as one of them runs the block has to stay
-        errors = [error for error in (ended.get() for _ in range(1, workers)) if error is not None]
+    except BaseException as raised:
+        errors.append(raised)
+    left = workers - 1
+    while left:  # as long as one of them runs the block has to stay, whatever Ctrl-C says
+        try:
+            error = ended.get()
+            left -= 1
+            errors += [] if error is None else [error]
+        except BaseException as raised:
+            errors.append(raised)
     if errors:
         raise errors[0]
 

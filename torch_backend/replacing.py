@@ -23,6 +23,7 @@ from .contract import (
     POINTS_FILE,
     SOLVE_FILE,
     SOLVE_FOLDER,
+    STMAP_FILES,
     ShotFolder,
     make_folder,
     replace_file,
@@ -63,6 +64,9 @@ def replacing_solve(shot: ShotFolder) -> Generator[Staged]:
         yield staged
         for name in _WHOLE:
             _drop_stale(shot.solve / name, staged.solve / name)
+        for name in STMAP_FILES:  # they are of the lens of before
+            if (shot.solve / name).is_file():
+                (staged.solve / name).touch()
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
+import shutil
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 
 from .contract import (
     SHOT_SUFFIX,
+    UNPUBLISHED_FILE,
     ExitCode,
     JobError,
     ShotFolder,
@@ -46,6 +49,8 @@ __all__ = [
 """With what of the contract the stations write into a shot."""
 
 SHOT_VERSION = 1
+IMPORTED = ("source", "first", "last", "step", "fps", "width", "height", "colour")
+"""Of shot.json, what an import tells."""
 
 
 @dataclass
@@ -121,6 +126,21 @@ class Shot(ShotFolder):
                     f"{path} is not a folder.", "Move it away: the shot keeps its files there.", ExitCode.USAGE
                 )
         return folder
+
+    def publish_frames(self) -> None:
+        """Removes the solve of frames that an import replaced, and tells shot.json of the new ones (UNPUBLISHED_FILE).
+
+        For the shot's only writer: an import that was killed between its two last steps is ended by the next job.
+        """
+        news = self.frames / UNPUBLISHED_FILE
+        if not news.is_file():
+            return
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # damaged by no hand of ours: frames.json holds
+            told = read_json(news)
+            info = from_dict(ShotInfo, {**dataclasses.asdict(self.info()), **{name: told[name] for name in IMPORTED}})
+            shutil.rmtree(self.own(self.solve), ignore_errors=True)
+            self.save(info)
+        news.unlink()
 
     def info(self) -> ShotInfo:
         """shot.json as it is now."""

@@ -132,8 +132,12 @@ def _take(root: Path, mine: Writer) -> None:
                     from error  # fmt: skip
             time.sleep(0.05)
             continue
-        if holder is None:
-            continue  # given back in between
+        if holder is None:  # given back in between, or a link to nowhere
+            if time.monotonic() > until:
+                what = f"{path} cannot be made, and names nobody who works on {root.name}."
+                raise JobError(what, "Delete it, then start again.", ExitCode.USAGE)
+            time.sleep(0.01)
+            continue
         if holder.works():
             if not contract.gives_back(root, holder) or time.monotonic() > until:
                 raise contract.busy(root, holder)

@@ -92,6 +92,34 @@ def test_errors_become_a_sentence(shot, monkeypatch, error, code, word):
     assert "Traceback" not in status.message + status.hint
 
 
+def test_a_name_that_is_no_text_is_told_as_well_as_may_be(shot, monkeypatch):
+    """File names on Linux are bytes: a clip from an old camera may have one in Latin-1."""
+
+    def station(shot, params, report):
+        raise JobError(f"There is nothing in {os.fsdecode(bytes([99, 97, 102, 233]))}.mp4.", "", ExitCode.FOOTAGE)
+
+    folder, (code, _) = run_with(shot, monkeypatch, station)
+    assert code == ExitCode.FOOTAGE and status_of(folder).state == "failed"
+    assert "caf" in (folder / contract.LOG_FILE).read_text() and events_of(folder)[-1]["type"] == "done"
+
+
+@pytest.mark.parametrize(("error", "state"), [(BrokenPipeError(), "cancelled"), (OSError(28, "No space"), "done")])
+def test_who_listens_no_more_ends_no_job_without_its_end(shot, monkeypatch, error, state):
+    def station(shot, params, report):
+        report.warning("careful")
+        report.check_cancelled()
+        return {"frames": 3}
+
+    def listener(event):
+        raise error
+
+    monkeypatch.setitem(job.RUNNERS, "import", station)
+    folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
+    job.run_job(folder, listener)
+    assert status_of(folder).state == state
+    assert [event["type"] for event in events_of(folder)] == ["warning", "done"]
+
+
 def test_cancel_file_stops_a_job(shot, monkeypatch):
     def station(shot, params, report):
         folder = next(shot.jobs.iterdir())

@@ -3,8 +3,10 @@ workers of a processor's stage do together."""
 
 import ctypes
 import os
+import signal
 import sys
 import threading
+import time
 
 import pytest
 import torch
@@ -141,6 +143,28 @@ def test_an_error_of_a_worker_is_the_callers_once_all_have_ended(failing):
     ended.clear()
     run_workers(lambda _address, _stage, worker: ended.append(worker), Block(), 0, 4)
     assert sorted(ended) == [0, 1, 2, 3]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a signal for one thread is POSIX")
+def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
+    at_work, ended = threading.Event(), []
+
+    def run(_address, _stage, worker):
+        if worker:
+            at_work.set()
+            time.sleep(0.3)
+            ended.append(worker)
+
+    def interrupt(main=threading.get_ident()):
+        at_work.wait()
+        signal.pthread_kill(main, signal.SIGINT)
+
+    other = threading.Thread(target=interrupt)
+    other.start()
+    with pytest.raises(KeyboardInterrupt):
+        run_workers(run, Block(), 0, 3)
+    assert sorted(ended) == [1, 2]
+    other.join()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows does not fork")

@@ -170,6 +170,34 @@ def test_a_lock_that_is_a_link_is_not_written_through(shot, tmp_path, monkeypatc
     assert (tmp_path / "mine").read_text() == text
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege there")
+def test_a_lock_that_is_a_link_to_nowhere_is_named(shot, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch_backend.writer._SECONDS", 0.1)
+    lock_of(shot).symlink_to(tmp_path / "nowhere")
+    with pytest.raises(JobError, match="cannot be made") as told, only_writer(shot.root, "import", "mine"):
+        raise AssertionError("it was taken")
+    assert str(lock_of(shot)) in told.value.message and not (tmp_path / "nowhere").exists()
+
+
+def test_a_job_whose_shot_was_taken_over_ends_and_leaves_it_to_the_other(shot, monkeypatch):
+    """It was suspended, or cut off from its disk, for longer than others wait for a sign of life."""
+    monkeypatch.setattr(contract, "HEARTBEAT_SECONDS", 0.02)
+    other = dataclasses.replace(dead_writer(), host=ELSEWHERE)
+
+    def station(shot, params, report):
+        report.check_cancelled()
+        put_lock(shot, other)
+        for _ in range(500):
+            time.sleep(0.01)
+            report.check_cancelled()
+
+    monkeypatch.setitem(job.RUNNERS, "import", station)
+    folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
+    assert job.run_job(folder)[0] == ExitCode.USAGE
+    assert status_of(folder).message.startswith(f"The shot was taken over by {ELSEWHERE}")
+    assert contract.read_writer(shot.root) == other
+
+
 CROWD = """
 import dataclasses, json, os, random, sys, time
 from pathlib import Path

@@ -27,6 +27,8 @@ SHOT_SUFFIX = ".splannequin"
 INFO_FILE, WRITER_FILE = "shot.json", "lock.json"
 FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER = "frames", "solve", "runs", "takes", "jobs"
 FRAMES_FILE, RAW_FOLDER, BURNT_IN_FILE = "frames.json", "raw", "burnt_in.png"
+UNPUBLISHED_FILE = "unpublished.json"
+"""In the frames folder: what shot.json is still to be told of these frames."""
 CAMERAS_FILE, SOLVE_FILE, POINTS_FILE = "cameras.json", "solve.json", "points.npz"
 COLMAP_FOLDER, COLMAP_LOG = "colmap", "colmap.log"
 STMAP_FILES = ("stmap_undistort.exr", "stmap_redistort.exr")

@@ -21,6 +21,7 @@ from ..contract import (
     LAST_FRAME,
     PICTURE,
     RAW_FOLDER,
+    UNPUBLISHED_FILE,
     ImportParams,
     JobError,
     Reporter,
@@ -86,6 +87,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     restore_folder(shot.frames)
     for folder in (shot.raw, shot.solve):
         shot.own(folder)
+    shot.publish_frames()
     done = _finished(shot, key) or _finished(shot, import_key(opened.info, config, PLAIN))
     if done is not None:
         report.progress("import", 1, 1, "already imported")
@@ -99,8 +101,9 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
         record["beside"] = _beside(shot, source)
         record |= _marked(shot, record, fresh, report)
         write_json(fresh / FRAMES_FILE, record)
+        write_json(fresh / UNPUBLISHED_FILE, _news(record, source))
         _keep_strangers(shot.frames, fresh, record)
-    _publish(shot, record, source)
+    shot.publish_frames()
     return _result(shot, record)
 
 
@@ -440,23 +443,20 @@ def _listed(listing: Path) -> set[Path]:
 def _names(record: dict[str, Any]) -> set[Path]:
     """Files of an import, relative to the frames folder, and the undistorted ones that a solve writes beside raw/."""
     files = [Path(str(row["file"])) for row in record["frames"]]
-    return {Path(FRAMES_FILE), Path(BURNT_IN_FILE), *files, *(Path(file.name) for file in files)}
+    return {
+        Path(FRAMES_FILE),
+        Path(BURNT_IN_FILE),
+        Path(UNPUBLISHED_FILE),
+        *files,
+        *(Path(file.name) for file in files),
+    }
 
 
-def _publish(shot: Shot, record: dict[str, Any], source: str) -> None:
-    """Removes the solve of the frames that were replaced, and tells shot.json of the new ones."""
-    shutil.rmtree(shot.solve, ignore_errors=True)
+def _news(record: dict[str, Any], source: str) -> dict[str, Any]:
+    """What shot.json is to be told: it stands beside the frames from the moment on at which they take their place."""
     frames = record["frames"]
-    shot.update(
-        source=str(source),
-        first=frames[0]["frame"],
-        last=frames[-1]["frame"],
-        step=record["step"],
-        fps=record["fps"],
-        width=record["width"],
-        height=record["height"],
-        colour=record["colour"],
-    )
+    taken = {name: record[name] for name in ("step", "fps", "width", "height", "colour")}
+    return {"source": str(source), "first": frames[0]["frame"], "last": frames[-1]["frame"], **taken}
 
 
 def _beside(shot: Shot, source: str) -> str:

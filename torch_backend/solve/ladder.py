@@ -120,8 +120,8 @@ def climb(
             tries.append(_told(rung.name, error.message))
             continue
         tries.append(_told(rung.name, attempt.words))
-        last, worse = attempt, min(best, attempt, key=lambda one: one.rank)
-        best = max(best, attempt, key=lambda one: one.rank)
+        last = attempt
+        best, worse = (attempt, best) if attempt.rank > best.rank else (best, attempt)
         for file in worse.folder.iterdir():
             if file.name != DATABASE_FILE:
                 shutil.rmtree(file) if file.is_dir() else file.unlink()

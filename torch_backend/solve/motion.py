@@ -198,8 +198,9 @@ def is_found(shot: Shot) -> bool:
 
 
 def is_outdated(shot: Shot) -> bool:
-    """True if the shot has mattes that are not read: of an earlier version of this program, or of other cameras."""
-    return (shot.motion / _RECORD).is_file() and not is_found(shot)
+    """True if the shot has mattes that are not read: of an earlier version of this program, of other cameras, or of a
+    search that was cancelled or killed."""
+    return any((shot.motion / name).is_file() for name in (_RECORD, _UNFINISHED)) and not is_found(shot)
 
 
 def motion_key(shot: Shot, with_found: bool = True) -> str:

@@ -24,6 +24,7 @@ from ..contract import (
     POINTS_FILE,
     SOLVE_FILE,
     ST_MAP_WAYS,
+    STMAP_FILES,
     CameraFrame,
     CameraPath,
     Cancelled,
@@ -183,6 +184,7 @@ def solve_shot(
         else:
             options = _matching(frames, config, masks, scratch)
             answer, left = take_over(shot, frames, taken, options, scratch, report), scratch
+        mapped = any((shot.solve / name).is_file() for name in STMAP_FILES)
         with replacing_solve(shot) as staged:
             result = _finish(shot, frames, answer, masks, config, left, staged, key, report)
     except JobError as error:
@@ -190,6 +192,8 @@ def solve_shot(
         raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    if mapped:
+        report.warning("The ST maps of the solve before were of its lens: they are gone.", "Write them again.")
     result = _with_motion(shot, result, report, static_model)
     report.metric("solve", dict(result))
     return result

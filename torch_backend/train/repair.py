@@ -49,6 +49,8 @@ somebody may walk as far as what moves reaches, and an apple swing by many times
 preview the upper tenth moves by at most 0.05 of that distance; one that came apart threw it hundreds of times as far
 at some instants, and that extent, in which far background counts, was no bound (docs/benchmarks.md)."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
+_STATE = "memory."
+"""What its names in a checkpoint begin with."""
 
 
 def unstable(step: int) -> JobError:
@@ -94,6 +96,26 @@ class FieldMemory:
         if len(means):
             around = norm(means - means.median(0).values, 1).median()
             self._reach.copy_((_FAR * around).clamp(min(_LEAST_FAR, self.extent), self.extent))
+
+    def state(self) -> dict[str, Tensor]:
+        """Tensors of a checkpoint: with them a run that was resumed puts back and drops what an unbroken one does."""
+        kept = {f"{_STATE}kept.{n}.{name}": p for n, one in enumerate(self._kept) for name, p in one.items()}
+        return {f"{_STATE}reach": self._reach, f"{_STATE}worst": self._worst, **kept}
+
+    @torch.no_grad()
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Takes over what `state` told; a checkpoint of before it has none: then the next look begins anew."""
+        own = {name.removeprefix(_STATE): t for name, t in tensors.items() if name.startswith(_STATE)}
+        if "reach" not in own:
+            return
+        self._reach.copy_(own["reach"])
+        self._worst.copy_(own["worst"])
+        device, kept = self._reach.device, [f"kept.{n}." for n in range(2)]
+        found = [
+            {name.removeprefix(start): t.to(device, copy=True) for name, t in own.items() if name.startswith(start)}
+            for start in kept
+        ]
+        self._kept = found if any(found) else []
 
     @torch.no_grad()
     def heed(self, shift: Tensor) -> None:

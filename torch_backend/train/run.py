@@ -24,6 +24,7 @@ from ..contract import (
     sweep_half_written,
 )
 from ..deformation import host
+from ..footage import load_frames
 from ..footage.images import write_png
 from ..native import default_threads
 from ..raster import cpu as raster_cpu
@@ -51,7 +52,7 @@ from .verdict import figures_of, verdict_fields, warn_if_poor
 
 _ATTEMPTS = 5
 """A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
-_FIELD_BYTES = 8e6
+_FIELD_BYTES = 14e6
 """Of a field with its moments, and of a run's small things (a preview's HexPlane: 4.4 MB)."""
 
 
@@ -116,7 +117,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     images = pictures.load(train + test, report, folder)
     plan = planned(config, (width, height), len(train), images, device, report)
     images = place_images(images, device, plan)
-    identity = {"key": key, "solve": solve_key(shot), "motion": motion}
+    identity = {"key": key, "solve": solve_key(shot), "motion": motion, "pictures": pictures_key(shot)}
     movers = load_movers(_likely(shot), scene, train, width, height) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, width, height)
     limits = () if plan is None else (plan.gaussians, plan.pieces)
@@ -163,6 +164,9 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if facts["solve"] != solve_key(shot):
         message = f"The run {params.run!r} was trained on other cameras than the shot has now: it cannot be extended."
         raise JobError(message, "Remove the run or name another one, then train.", ExitCode.TRAIN)
+    if _of_other_pictures(shot, facts):
+        message = f"The run {params.run!r} was trained on other pictures than the shot has now: it cannot be extended."
+        raise JobError(message, "Train it again.", ExitCode.TRAIN)
     motion = facts.get("motion")  # None too if it was trained before mattes counted
     # A freeze finds mattes where the solve did not: what was trained with painted ones alone can still be extended.
     if motion and motion not in (motion_key(shot), motion_key(shot, with_found=False)):
@@ -179,7 +183,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     images = place_images(images, device, plan)
     held_out = images[len(train) :]
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
-    identity = {"key": facts["key"], "solve": facts["solve"], "motion": motion}
+    identity = {**{name: facts[name] for name in ("key", "solve")}, "motion": motion, "pictures": pictures_key(shot)}
     movers = load_movers(_likely(shot), scene, train, *size) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, *size)
     limits = () if plan is None else (plan.gaussians, plan.pieces)
@@ -239,8 +243,14 @@ def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig) -> tuple
     motion = motion_of(shot, config)
     key = content_key(config_to_json(config), solve_key(shot), train, test, *masks_key(shot, IGNORE))
     if motion and not trained_without(shot, run, key):
-        return content_key(key, motion), motion
-    return key, None
+        key = content_key(key, motion)
+    else:
+        motion = None
+    # With cameras that were given, another grade of the footage is the same solve.
+    anew, there = content_key(key, pictures_key(shot)), begun(run, key)
+    if begun(run, anew) is not None or (there and _of_other_pictures(shot, read_meta(there / CHECKPOINT_FILE))):
+        key = anew
+    return key, motion
 
 
 def warm_up(config: TrainConfig, device: torch.device) -> None:
@@ -303,6 +313,16 @@ def solve_key(shot: Shot) -> str:
     return content_key(read_json(shot.cameras))
 
 
+def pictures_key(shot: Shot) -> str:
+    """Identifies the working frames: of which footage they were taken, and how."""
+    return str(load_frames(shot).get("key", ""))
+
+
+def _of_other_pictures(shot: Shot, facts: dict[str, Any]) -> bool:
+    """Was a checkpoint of these facts trained on other pictures than the shot has now? One of before does not say."""
+    return facts.get("pictures") not in (None, pictures_key(shot))
+
+
 def motion_of(shot: Shot, config: TrainConfig) -> str | None:
     """Identifies the motion mattes that a run of these settings is trained with; None if it is trained without."""
     frames = load_scene(shot).frames if config.decides else []
@@ -318,7 +338,7 @@ def trained_without(shot: Shot, run: Path, key: str) -> bool:
     checkpoint = run / CHECKPOINT_FILE
     if any(shot.painted.glob("*.png")) or not checkpoint.is_file():
         return False
-    return read_meta(checkpoint).get("key") == key
+    return read_meta(checkpoint).get("key") in (key, content_key(key, pictures_key(shot)))
 
 
 def _resume(trainer: Trainer, checkpoint: Path, resume: bool, report: Reporter) -> bool:
@@ -436,6 +456,9 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
         raise JobError(message, "Wait for its training to end.", ExitCode.FREEZE)
     if meta.get("solve") != solve_key(shot):
         message = f"The run {name!r} was trained on other cameras than the shot has now."
+        raise JobError(message, "Train it again.", ExitCode.FREEZE)
+    if _of_other_pictures(shot, meta):
+        message = f"The run {name!r} was trained on other pictures than the shot has now: they were imported again."
         raise JobError(message, "Train it again.", ExitCode.FREEZE)
     try:
         config = config_from_json(meta["config"])

@@ -708,6 +708,7 @@ class Trainer:
         if self.model.field is not None:
             tensors.update(self.model.field.state())
         tensors.update(self.mean.state())
+        tensors.update(self.soundness.memory.state())
         d = self.densifier
         tensors.update({"densify.gradient": d.gradient, "densify.seen": d.seen})
         tensors["generator"] = self.generator.get_state()
@@ -757,6 +758,7 @@ class Trainer:
             self.poses.values.data.copy_(tensors["poses"])
         restore_optimizer(self._named(), self.optimizer, tensors)
         self.mean.restore(tensors, self.device)
+        self.soundness.memory.restore(tensors)
         self.model.pieces = self.pieces
         self.densifier = Densifier(self._densify_config(), len(self.model.gaussians), self.device)
         for name in ("gradient", "seen"):

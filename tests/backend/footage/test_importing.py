@@ -2,17 +2,20 @@
 
 import dataclasses
 import json
+import os
 import shutil
+import signal
 
 import numpy as np
 import pytest
 
-from torch_backend.contract import Cancelled, ExitCode, JobError
+from torch_backend.contract import Cancelled, ExitCode, JobError, TrainParams
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.importing import import_key
 from torch_backend.footage.opening import open_source
 from torch_backend.footage.sources import SourceInfo
+from torch_backend.job import new_job, run_job
 from torch_backend.shot import Shot, content_key
 
 
@@ -356,3 +359,30 @@ def test_an_option_that_comes_later_leaves_finished_imports_alone():
 
     assert import_key(info, Later(first=1, step=2)) == import_key(info, old)
     assert import_key(info, Later(first=1, step=2, flop=True)) != import_key(info, old)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not fork")
+@pytest.mark.parametrize("station", ["the same import", "another job"])
+def test_an_import_killed_between_its_frames_and_shot_json_is_ended_by_the_next_job(shot, clip, recorder, station):
+    import_footage(shot, clip, FootageConfig(last=12), recorder())
+    shot.solve.mkdir()
+    shot.cameras.write_text("{}")
+    child = os.fork()
+    if not child:
+        Shot.save = lambda *_: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[method-assign]
+        import_footage(shot, clip, FootageConfig(first=5), recorder())
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    assert load_frames(shot)["frames"][0]["frame"] == 5 and shot.info().first == 1
+    if station == "the same import":
+        import_footage(shot, clip, FootageConfig(first=5), recorder())
+    else:
+        run_job(new_job(shot, "train", TrainParams()))
+    info = shot.info()
+    assert (info.first, info.last, info.source, info.fps, info.width) == (5, 20, clip, 10.0, 64)
+    assert not shot.cameras.exists(), "cameras of other frames"
+    assert files(shot.frames)[0] == "frames.json" and "unpublished.json" not in files(shot.frames)
+    shot.solve.mkdir(exist_ok=True)
+    shot.cameras.write_text("{}")
+    import_footage(shot, clip, FootageConfig(first=5), recorder())
+    assert shot.cameras.exists(), "once is enough"

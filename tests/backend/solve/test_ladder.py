@@ -97,6 +97,22 @@ def test_the_best_is_the_one_that_can_be_used_then_the_one_with_more_frames_then
     assert sorted(reversed(order), key=lambda one: one.rank) == order
 
 
+def test_of_two_tries_that_came_to_the_same_the_first_keeps_its_files(tmp_path, monkeypatch, tools):
+    def again(rung, request, frames, last, scratch, log, report):
+        folder = scratch / rung
+        folder.mkdir()
+        for name in ("poses.json", "database.db"):
+            (folder / name).write_text(rung)
+        return replace(attempt("poor"), rung=rung, folder=folder)
+
+    monkeypatch.setattr("torch_backend.solve.ladder._attempt", again)
+    climbed = climb(ASKED, {"frames": []}, True, tmp_path, tmp_path / "log", tools.recorder())
+    assert climbed.best.rung == "first" and len(climbed.tries) > 2
+    assert (tmp_path / "first" / "poses.json").read_text() == "first"
+    left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == {"first/poses.json", *(f"{told['rung']}/database.db" for told in climbed.tries)}
+
+
 @pytest.fixture(scope="module")
 def fog(tmp_path_factory, tools):
     """The room through fog, 6 % of its contrast: COLMAP's own threshold finds nothing in it."""

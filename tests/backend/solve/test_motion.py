@@ -23,6 +23,7 @@ from torch_backend.solve.motion import (
     UNKNOWN,
     find_motion,
     is_found,
+    is_outdated,
     load_motion,
     load_surface,
     motion_key,
@@ -216,6 +217,19 @@ def test_mattes_that_are_there_are_left_alone(swaying, quiet):
     before = stamps(shot)
     assert find_motion(shot, quiet()) == result
     assert stamps(shot) == before
+
+
+def test_mattes_whose_search_was_cancelled_are_looked_for_again(swaying, tmp_path, quiet):
+    """Else a training that found the old ones outdated, and was paused, would go on without any."""
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    record = json.loads((shot.motion / "motion.json").read_text())
+    write_json(shot.motion / "motion.json", {**record, "version": record["version"] - 1})
+    assert is_outdated(shot)
+    with pytest.raises(Cancelled):
+        find_motion(shot, quiet(cancel_at=("solve: motion", 0.5)))
+    assert is_outdated(shot) and not is_found(shot)
+    find_motion(shot, quiet())
+    assert is_found(shot) and not is_outdated(shot)
 
 
 def test_a_clip_that_cannot_be_learnt_is_left_to_flow_with_a_word(swaying, tmp_path, quiet):

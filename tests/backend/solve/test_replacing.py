@@ -100,6 +100,23 @@ def test_a_model_of_fewer_files_leaves_none_of_the_one_before_it(again, tools):
     assert {p.name for p in (shot.solve / "colmap").iterdir()} == {"cameras.bin", "images.bin", "points3D.bin"}
 
 
+def test_st_maps_of_the_lens_before_go_and_that_is_said(again, tools):
+    shot, cameras = again
+    maps = [shot.solve / name for name in ("stmap_undistort.exr", "stmap_redistort.exr")]
+    for path in maps:
+        path.write_bytes(b"of a solve of before")
+    with pytest.raises(Cancelled):
+        solve_shot(shot, SolveConfig(), tools.recorder(cancel_at="solve: undistort"), cameras)
+    assert all(path.is_file() for path in maps)
+    report = tools.recorder()
+    solve_shot(shot, SolveConfig(), report, cameras)
+    assert not any(path.exists() for path in maps)
+    assert "The ST maps of the solve before were of its lens: they are gone." in report.warnings
+    report = tools.recorder()
+    solve_shot(shot, SolveConfig(), report, cameras)
+    assert not any("ST maps" in told for told in report.warnings)
+
+
 @pytest.mark.parametrize("linked", ["frames", "solve/colmap", "solve/next", "solve/next/frames", "takes"])
 def test_opening_a_shot_moves_nothing_through_a_link(tmp_path, linked):
     shot, mine = Shot.create(tmp_path / "a.splannequin"), tmp_path / "mine"

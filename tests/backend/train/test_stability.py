@@ -322,6 +322,23 @@ def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin
     assert [0.5 * lr, 0.5 * lr * trainer.config.field.lr_end] in rates
 
 
+def test_a_resumed_run_drops_who_is_thrown_as_an_unbroken_one_does(begin, tmp_path):
+    """Until its next look it would know no bound, and a round of growth may come first."""
+    trainer = begin("hexplane", 30)
+    trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
+    worst = float(trainer.soundness.memory._worst)
+    thrown = bound_between(trainer, 5)
+    trainer.save(tmp_path / "checkpoint.safetensors")
+    resumed = begin("hexplane", 0)
+    resumed.restore(tmp_path / "checkpoint.safetensors")
+    memory = resumed.soundness.memory
+    assert drop_thrown(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(thrown.sum())
+    assert worst > 0 and "put the field back" in memory.put_back(resumed.model.field, resumed.optimizer)
+    assert trainer.soundness.memory.put_back(trainer.model.field, trainer.optimizer)
+    for (name, p), (_, other) in zip(trainer.model.field.named_parameters(), resumed.model.field.named_parameters()):
+        assert torch.equal(p, other), name
+
+
 def test_a_field_that_joins_sooner_starts_at_the_rates_of_a_third_of_the_run():
     rates = {}
     for preset in ("standard", "final"):

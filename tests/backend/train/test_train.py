@@ -13,7 +13,7 @@ import torch_backend.scene
 from torch_backend.contract import Cancelled, ExitCode, JobError, TrainParams
 from torch_backend.gaussians import PARAM_NAMES
 from torch_backend.scene import load_images, load_scene
-from torch_backend.shot import Shot
+from torch_backend.shot import Shot, write_json
 from torch_backend.train import PRESETS, config_from_params, load_run, train_shot
 from torch_backend.train.checkpoint import CHECKPOINT_FILE, MISFITS, load_checkpoint, misfit, read_meta, save_checkpoint
 from torch_backend.train.config import config_from_json, config_to_json
@@ -374,6 +374,41 @@ def test_a_run_of_other_cameras_is_refused(tmp_path, quiet):
     path.write_text(path.read_text().replace("registered", "localised", 1))
     with pytest.raises(JobError, match="other cameras"):
         load_run(world.shot, "main")
+
+
+def test_a_run_of_other_pictures_is_refused_and_trained_anew(tmp_path, quiet):
+    """Another grade of the same footage, with cameras that were given: they are the same to the byte."""
+    import sys
+
+    world = sys.modules[quiet.__module__].build_world(tmp_path)
+    record = json.loads(world.shot.listing.read_text())
+
+    def imported(key):
+        write_json(world.shot.listing, {**record, "key": key})
+
+    def trained():
+        report = quiet()
+        train_shot(world.shot, short(world, "main"), report)
+        return ("progress", "training", 1, 1, "already trained") not in report.events
+
+    imported("as filmed")
+    assert trained() and not trained()
+    before = load_run(world.shot, "main")
+    imported("graded")
+    with pytest.raises(JobError, match="other pictures"):
+        load_run(world.shot, "main")
+    with pytest.raises(JobError, match="other pictures"):
+        train_shot(world.shot, short(world, "main", extend=5), quiet())
+    assert trained() and not trained() and load_run(world.shot, "main").stamp != before.stamp
+    imported("as filmed")
+    assert trained()
+    _, meta = load_checkpoint(world.shot.run("main") / CHECKPOINT_FILE)
+    tensors, _ = load_checkpoint(world.shot.run("main") / CHECKPOINT_FILE)
+    save_checkpoint(
+        world.shot.run("main") / CHECKPOINT_FILE, tensors, {n: v for n, v in meta.items() if n != "pictures"}
+    )
+    imported("graded")
+    assert not trained(), "a run of before does not say what it was trained on, and stays"
 
 
 def test_damaged_checkpoint_is_an_error_in_words(world, quiet):
