@@ -155,7 +155,9 @@ def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
             time.sleep(0.3)
             ended.append(worker)
 
-    def interrupt(main=threading.get_ident()):
+    main = threading.get_ident()
+
+    def interrupt():
         at_work.wait()
         signal.pthread_kill(main, signal.SIGINT)
 
