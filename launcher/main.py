@@ -41,6 +41,7 @@ def parser() -> argparse.ArgumentParser:
         "bench": "the method against ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
         "doctor": "say what this machine can do",
         "setup": "make the environments and stop",
+        "farm": "shots as a job for a render farm, and what it will cost; its options are the backend's",
     }
     for name, text in helps.items():
         command = commands.add_parser(name, help=text, description=text, allow_abbrev=False)

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from torch_backend.contract import COMMANDS, FRAME_LAYERS, default_of, options_for
+from torch_backend.contract import BACKEND, BLENDER, COMMANDS, FRAME_LAYERS, VERBS, default_of, options_for
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "examples/README.md")]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 MANUAL = ROOT / "docs" / "manual"
+GUIDE = ROOT / "docs" / "user-guide.md"
 STEPS = ("import", "solve", "train", "freeze", "bake")
 ROOMS = ("footage", "solve", "train", "freeze", "bake")
 
@@ -111,6 +112,13 @@ def option_table(command: str) -> str:
 def test_the_user_guides_options_are_those_of_the_command_line():
     table = option_table("freeze")
     assert table in text_of(ROOT / "docs" / "user-guide.md"), f"put this table into docs/user-guide.md:\n\n{table}\n"
+
+
+def test_the_user_guide_says_which_command_line_has_which_verbs():
+    row = re.search(r"^\| `\.venv/bin/python -m torch_backend VERB`[^|]*\|([^|]+)", text_of(GUIDE), re.MULTILINE)
+    named = {name for name, verb in VERBS.items() if BLENDER in verb.sides}
+    assert row and set(re.findall(r"`([a-z]+)`", row[1])) == named - {"bake"}
+    assert all(BACKEND in VERBS[name].sides for name in named - {"bake"}) and BACKEND not in VERBS["bake"].sides
 
 
 def test_the_layers_of_a_frame_in_the_manual_are_those_of_the_table():

@@ -342,7 +342,7 @@ class TrainParams:
         tip="How much to spend on training",
         items={
             "preview": ("Preview", "320 pixels wide, 2000 steps: to see whether the shot holds, minutes on a laptop"),
-            "standard": ("Standard", "960 pixels wide, 9000 steps: for most shots"),
+            "standard": ("Standard", "960 pixels wide, 9000 steps: for what moves, and what no plate shows"),
             "final": (
                 "Final",
                 "As wide as the working frames, 30000 steps, most Gaussians: takes longest. On a graphics card as "
@@ -355,15 +355,16 @@ class TrainParams:
         "auto",
         flag="--method",
         choices=METHODS,
-        help="`auto` (a host behind the gate), `static` (nothing moves), or a host whose field moves everything: "
-        "`hexplane` (4DGaussians), `mlp` (Deformable 3DGS), `control_points` (SC-GS)",
+        help="how motion is learnt: `auto` (only where something moves; `--host` says with which model), `static` "
+        "(nothing moves), or one model for everything: `hexplane` (4DGaussians), `mlp` (Deformable 3DGS), "
+        "`control_points` (SC-GS)",
     )
     """auto (the host behind the gate), static, or a host whose field moves all: hexplane, mlp, control_points."""
     host: str = option(
         "hexplane",
         flag="--host",
         choices=HOSTS,
-        help="which host `auto` puts behind the gate",
+        help="motion model that `--method auto` uses",
         heeded_with=("method", ("auto",)),
     )
     """Which host `auto` puts behind the gate."""
@@ -371,22 +372,23 @@ class TrainParams:
         "default",
         flag="--host-config",
         choices=HOST_CONFIGS,
-        help="the host's numbers: `default` (ours), `reference` (published)",
+        help="the motion model's numbers: `default` (ours), `reference` (published)",
     )
     """default (ours) or reference (the published sizes, rates and schedules, as shares of the run)."""
     supervision: str = option(
         "support",
         flag="--supervision",
         choices=SUPERVISIONS,
-        help="`support`, `paper`, `none`: what anchors ill-seen Gaussians",
+        help="what holds Gaussians at times at which no frame shows them: `support` (ours), `paper` (the paper's "
+        "rule), `none`",
     )
     """support, paper or none: which anchoring losses hold ill-supervised Gaussians."""
     detector: str = option(
         "grad_norm",
         flag="--detector",
         choices=DETECTORS,
-        help="`paper` only, what tells an ill-seen one: `grad_norm` (the paper), `grad_signed` (the published code), "
-        "`weight`",
+        help="of `--supervision paper`, by what it knows such Gaussians: `grad_norm` (the paper), `grad_signed` (the "
+        "published code), `weight`",
         heeded_with=("supervision", ("paper",)),
     )
     """`paper`, who is ill-supervised: weight, grad_norm, or grad_signed (the published code's signed sum)."""
@@ -525,8 +527,8 @@ class FreezeParams:
         "on",
         flag="--develop",
         choices=SWITCH,
-        help="`on`: the instant is trained on as the still scene that it is, once for each t*, and what moves in the "
-        "model there only to the harm of other plates holds still; `off`: it stays as the run has it",
+        help="`on`: before it is rendered, the scene at t* is trained on as a still one, once for each t*, which "
+        "brings back what the run lost; motion that makes other frames worse is held still. `off`: as the run has it",
         label="Develop",
         tip="Train the frozen instant on as the still scene that it is, before it is rendered: what moves is "
         "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each "
