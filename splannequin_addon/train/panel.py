@@ -55,7 +55,10 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             for place, text in zip(columns[1:], (str(row.width or "-"), f"{row.steps / 1000:g}k", spent), strict=True):
                 place.label(text=text, translate=False)
         if told is None:
-            words = "Preview took 150 s on two cores without a graphics card. Times here come with the first run."
+            words = (
+                "Preview took 1.5 to 3.5 minutes on two cores without a graphics card. "
+                "Times here come with the first run."
+            )
         else:
             where = "graphics card" if told.get("device") == "cuda" else "processor"
             words = f"By what run {told.get('run', '')} took on the {where}. With a ?: an estimate by pixels and steps."
