@@ -2,10 +2,12 @@
 
 Black stands still, white moves, grey is not known, dark grey is likely to move (a training is offered it). What is
 painted lies in the shot, SHOT/motion_paint/NNNNNN.png, and goes before what the solve finds, now and after another one.
+Until it is saved there, the .blend keeps it: an image is packed, for Blender saves no pixels of one that was generated.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import zlib
@@ -14,6 +16,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
 from ..access import pixels_of, size_of
@@ -57,6 +60,18 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
     image = find_image(shot, frame)
     if image is not None:
         return image
+    pixels = _matte(shot, frame)
+    height, width = pixels.shape[:2]
+    image = next((i for i in bpy.data.images if _is_of(i, shot, frame)), None)
+    if image is None:
+        image = bpy.data.images.new(f"Motion {scene_objects.name_of(shot)} {frame}", width, height, alpha=True)
+        image[_FRAME], image[_SHOT] = frame, paths.blend_path(shot)
+    _fill(image, pixels)
+    return image
+
+
+def _matte(shot: Path, frame: int) -> np.ndarray:
+    """The matte of a frame as it stands in the shot, [H, W, 4] float32, bottom row first; JobError as `paint_image`."""
     path = next((p for p in (painted_file(shot, frame), found_file(shot, frame)) if p.is_file()), None)
     if path is None:
         raise contract.JobError(
@@ -70,23 +85,40 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
         if below.shape == pixels.shape:
             pixels = np.where(pixels[..., 3:] > 0.5, pixels, below)
     pixels[..., 3] = 1.0
+    return pixels
+
+
+def _fill(image: bpy.types.Image, pixels: np.ndarray) -> None:
+    """Gives an image pixels, and packs them."""
     height, width = pixels.shape[:2]
-    image = bpy.data.images.new(f"Motion {scene_objects.name_of(shot)} {frame}", width, height)
+    if image.source != "GENERATED":
+        image.source = "GENERATED"
+    if size_of(image) != (width, height):
+        image.generated_width, image.generated_height = width, height
     pixels_of(image).foreach_set(pixels.ravel())
     image.update()
-    image[_FRAME], image[_SHOT] = frame, paths.blend_path(shot)
-    return image
+    image.pack()
 
 
 def find_image(shot: Path, frame: int) -> bpy.types.Image | None:
-    """The image that the matte of a frame is painted on, if this file has one."""
-    return next((image for image in bpy.data.images if _of(image) == (os.path.abspath(shot), frame)), None)
+    """The image that the matte of a frame is painted on, if this file has one and its pixels are there."""
+    return next((i for i in bpy.data.images if _is_of(i, shot, frame) and not _lost(i)), None)
+
+
+def _is_of(image: bpy.types.Image, shot: Path, frame: int) -> bool:
+    return _of(image) == (os.path.abspath(shot), frame)
+
+
+def _lost(image: bpy.types.Image) -> bool:
+    """True if nothing of what was painted is in an image: its file is gone, or it was not packed when it was saved, as
+    none was at first, and has come back black."""
+    return image.source == "GENERATED" or not all(size_of(image))
 
 
 def _of(image: bpy.types.Image) -> tuple[str, int] | None:
-    """Shot folder and frame of an image that a matte is painted on."""
+    """Shot folder and frame of an image that a matte is painted on; of no other file's, which cannot be changed."""
     frame, folder = image.get(_FRAME), image.get(_SHOT)
-    if not isinstance(frame, int) or not isinstance(folder, str):
+    if image.library or not isinstance(frame, int) or not isinstance(folder, str):
         return None
     return os.path.abspath(bpy.path.abspath(folder)), frame
 
@@ -113,6 +145,8 @@ def save_paint(image: bpy.types.Image) -> Path:
         ) from error
     image.filepath_raw, image.file_format = paths.blend_path(path), "PNG"
     image.source = "FILE"
+    if image.packed_file is not None:
+        image.unpack(method="REMOVE")  # else it would be read again from there
     image.reload()
     return path
 
@@ -163,3 +197,34 @@ def _write(path: Path, data: bytes) -> None:
     if contract.is_link(path.parent):
         raise NotADirectoryError(20, "its folder is a link", str(path))
     contract.write_atomic(path, data, parents=False)
+
+
+@persistent
+def _before_save(*_: object) -> None:
+    """What was painted since is packed, too."""
+    for image in bpy.data.images:
+        if _of(image) is not None and image.is_dirty:
+            with contextlib.suppress(RuntimeError):  # nothing keeps the file from being saved
+                image.pack()
+
+
+@persistent
+def _after_load(*_: object) -> None:
+    """An image of an older file shows the matte of its shot instead of black."""
+    for image in bpy.data.images:
+        known = _of(image)
+        if known is not None and image.source == "GENERATED":
+            with contextlib.suppress(contract.JobError, RuntimeError):  # Paint Motion will say why
+                _fill(image, _matte(Path(known[0]), known[1]))
+
+
+def register() -> None:
+    """Listens to saving and loading."""
+    bpy.app.handlers.save_pre.append(_before_save)
+    bpy.app.handlers.load_post.append(_after_load)
+
+
+def unregister() -> None:
+    """Undoes `register`."""
+    bpy.app.handlers.load_post.remove(_after_load)
+    bpy.app.handlers.save_pre.remove(_before_save)

@@ -19,6 +19,7 @@ from . import (
     guesses,
     masks,
     matte_operators,
+    mattes,
     operators,
     panel,
     points,
@@ -43,7 +44,7 @@ class Solve(Step):
         *matte_operators.CLASSES,
         *panel.CLASSES,
     )
-    parts = (points, align_operators, operators)
+    parts = (points, align_operators, operators, mattes)
 
     def params(self, scene: bpy.types.Scene) -> contract.SolveParams:
         """The lens, where cameras come from, and what is masked."""

@@ -155,3 +155,99 @@ def test_paint_is_found_after_the_file_was_saved_and_opened(matted, addon, tmp_p
     bpy.ops.wm.open_mainfile(filepath=str(matted.parent / "scene.blend"))
     image = mattes.find_image(matted, 6)
     assert image is not None and (values(image) == labels(6)).all()
+
+
+def paint_below(image, value: float) -> None:
+    """Paints the three lowest rows."""
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    pixels.reshape(HEIGHT, WIDTH, 4)[:3, :, :3] = value
+    image.pixels.foreach_set(pixels)
+    image.update()
+
+
+def reopen(folder) -> None:
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "scene.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "scene.blend"))
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_paint_that_was_not_saved_yet_is_kept_by_the_blend(matted, addon, saved):
+    """Whether or not some of it was saved into the shot before; Save Paint then keeps it, and drops the copy."""
+    mattes = addon("solve.mattes")
+    bpy.ops.splannequin.paint_motion()
+    image = mattes.find_image(matted, 6)
+    image.use_fake_user = True  # as an Image Editor that shows it
+    if saved:
+        paint_below(image, 0.0)
+        bpy.ops.splannequin.save_motion()
+    paint_below(image, 1.0)
+    wanted = labels(6)
+    wanted[-3:] = 255
+    reopen(matted.parent)
+    image = mattes.find_image(matted, 6)
+    assert (values(image) == wanted).all()
+    assert mattes.paint_image(matted, 6) == image
+    assert bpy.ops.splannequin.save_motion() == {"FINISHED"}
+    assert (unpacked(mattes.painted_file(matted, 6).read_bytes())[..., 0] == wanted).all()
+    assert (values(image) == wanted).all() and image.packed_file is None
+    assert os.path.abspath(bpy.path.abspath(image.filepath)) == str(mattes.painted_file(matted, 6))
+    paint_below(image, 0.0)
+    bpy.ops.splannequin.save_motion()
+    wanted[-3:] = 0
+    assert (values(image) == wanted).all(), "what is saved next is not hidden by the copy of before"
+
+
+def test_what_was_rubbed_out_and_not_saved_stays_rubbed_out(matted, addon):
+    mattes = addon("solve.mattes")
+    image = mattes.paint_image(matted, 6)
+    image.use_fake_user = True
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    pixels.reshape(HEIGHT, WIDTH, 4)[:3, :, 3] = 0.0
+    image.pixels.foreach_set(pixels)
+    reopen(matted.parent)
+    mattes.save_paint(mattes.find_image(matted, 6))
+    written = unpacked(mattes.painted_file(matted, 6).read_bytes())
+    assert not written[-3:, :, 1].any() and (written[:-3, :, 1] == 255).all()
+
+
+def unpacked_image(shot):
+    """An image to paint frame 6 on, as older files have it: Blender opens it black."""
+    image = bpy.data.images.new("Motion", WIDTH, HEIGHT)
+    image["splannequin_matte"], image["splannequin_matte_shot"] = 6, str(shot)
+    image.use_fake_user = True
+    return image
+
+
+def test_the_black_image_of_an_older_file_is_the_matte_again(matted, addon):
+    mattes = addon("solve.mattes")
+    unpacked_image(matted)
+    reopen(matted.parent)
+    image = mattes.find_image(matted, 6)
+    assert image.name == "Motion" and (values(image) == labels(6)).all()
+    reopen(matted.parent)
+    assert (values(mattes.find_image(matted, 6)) == labels(6)).all()
+
+
+def test_a_black_image_is_never_taken_for_paint(matted, addon):
+    """One that came from another file, say: it is filled when its matte is to be painted, and not saved before."""
+    mattes = addon("solve.mattes")
+    image = unpacked_image(matted)
+    with pytest.raises(RuntimeError, match=r"Nothing is painted on frame 6"):
+        bpy.ops.splannequin.save_motion()
+    assert not mattes.painted_file(matted, 6).exists()
+    bpy.ops.splannequin.paint_motion()
+    assert mattes.find_image(matted, 6) == image and (values(image) == labels(6)).all()
+
+
+def test_an_image_whose_file_is_gone_is_filled_anew(matted, addon):
+    mattes = addon("solve.mattes")
+    bpy.ops.splannequin.paint_motion()
+    bpy.ops.splannequin.save_motion()
+    mattes.find_image(matted, 6).use_fake_user = True
+    mattes.clear_paint(matted, 6)
+    reopen(matted.parent)
+    bpy.ops.splannequin.paint_motion()
+    assert (values(mattes.find_image(matted, 6)) == labels(6)).all()
+    assert len([i for i in bpy.data.images if i.get("splannequin_matte") == 6]) == 1
