@@ -14,8 +14,8 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..scene import paths
+from ..scene.ownership import BAKES, DIGITS
 
-DIGITS = "######"
 COMPOSITED = "composited"
 """Folder of the pictures, in the output folder of a bake."""
 _BESIDE = ".part-"
@@ -30,7 +30,7 @@ def frames_of(scene: bpy.types.Scene) -> range:
 
 def default_output(shot: Path, take: str) -> Path:
     """Where a bake goes if the scene names no folder of its own."""
-    return shot / "bake" / take
+    return shot / BAKES / take
 
 
 def choose_output(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:

@@ -29,6 +29,7 @@ from ..bake import farm_job, insertion, rendering
 from ..freeze import takes
 from ..process import backend, begin, jobs, steps
 from ..scene import paths, scene_setup, sequences
+from ..scene.ownership import DIGITS
 from ..shot import inventory
 from ..solve import arrival, cameras, exchange, stmaps
 
@@ -395,7 +396,7 @@ def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
         files.save_version = 0
         scene = scene_in(bpy.context)
         sequences.relative_images()
-        scene.render.filepath = paths.blend_path(frames / rendering.DIGITS)
+        scene.render.filepath = paths.blend_path(frames / DIGITS)
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
     except RuntimeError as error:
         raise contract.JobError(

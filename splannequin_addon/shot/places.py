@@ -19,12 +19,14 @@ from bpy.app.handlers import persistent
 from ...torch_backend import contract
 from ..access import settings_of
 from ..scene import paths
-from ..scene.ownership import TAG
+from ..scene.ownership import BAKES, DIGITS, MATTE_SHOT, TAG
 from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
 _SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "ignore_path", "people_path", "shot_seen")
 """Settings of a shot that hold a path."""
+_OUTPUT = "filepath"
+"""Of a scene's render settings: the output path, which may be ours."""
 _saving: list[str] = []
 """What `_holders` held before the file that is being saved was given its own."""
 
@@ -60,6 +62,10 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
         path = Path(paths.absolute(image.filepath))
         if before is not None and image.get(TAG) and before in path.parents and not path.exists():
             image.filepath = paths.blend_path(folder / path.relative_to(before))
+    for owner, name in _outside():
+        path = Path(paths.absolute(_get(owner, name)))
+        if before is not None and before in (path, _rendered_of(path)) and not before.exists():
+            _set(owner, name, paths.blend_path(folder / path.relative_to(before)))
     held.shot_path = held.shot_seen = paths.blend_path(folder)
     source = source_of(state)
     if source and not (held.clip and _there(Path(paths.absolute(held.clip)))):
@@ -78,6 +84,32 @@ def _holders() -> Iterator[tuple[Any, str]]:
         for one in [held, *held.shots]:
             yield from ((one, name) for name in _SETTINGS)
         yield from ((entry, "folder") for entry in held.made)
+    yield from _outside()
+
+
+def _outside() -> Iterator[tuple[Any, str]]:
+    """`_holders` beside our settings: output paths, the artist's too, and images that are painted on."""
+    yield from ((scene.render, _OUTPUT) for scene in bpy.data.scenes)
+    yield from ((i, MATTE_SHOT) for i in bpy.data.images if not i.library and isinstance(i.get(MATTE_SHOT), str))
+
+
+def _get(owner: bpy.types.bpy_struct, name: str) -> str:
+    """A path that an owner holds."""
+    return str(owner[name] if isinstance(owner, bpy.types.Image) else getattr(owner, name))
+
+
+def _set(owner: bpy.types.bpy_struct, name: str, path: str) -> None:
+    """Has it hold another."""
+    if isinstance(owner, bpy.types.Image):
+        owner[name] = path
+    else:
+        setattr(owner, name, path)
+
+
+def _rendered_of(path: Path) -> Path | None:
+    """The shot whose take an output path of ours is for; None of the artist's own."""
+    ours = path.name == DIGITS and len(path.parents) > 2 and path.parents[1].name == BAKES
+    return path.parents[2] if ours else None
 
 
 def _relative(path: str, base: str) -> str:
@@ -97,10 +129,12 @@ def _before_save(file: object = "", *_: object) -> None:
         return
     all_of_them = bpy.context.preferences.filepaths.use_relative_paths
     for owner, name in _holders():
-        path = getattr(owner, name)
+        path = _get(owner, name)
         _saving.append(path)
+        if name == _OUTPUT and not _known(Path(paths.absolute(path)), name):
+            continue  # the artist's
         if path and (all_of_them or path.startswith("//")):
-            setattr(owner, name, _relative(paths.absolute(path), os.path.dirname(os.path.abspath(file))))
+            _set(owner, name, _relative(paths.absolute(path), os.path.dirname(os.path.abspath(file))))
 
 
 @persistent
@@ -108,7 +142,7 @@ def _after_save(file: str = "", *_: object) -> None:
     """A copy was saved, or nothing was: in the open file the paths stay as they were."""
     if file and _saving and os.path.abspath(file) != bpy.data.filepath:
         for (owner, name), path in zip(_holders(), _saving, strict=True):
-            setattr(owner, name, path)
+            _set(owner, name, path)
     _saving.clear()
 
 
@@ -119,14 +153,14 @@ def _after_load(*_: object) -> None:
         return
     here = Path(bpy.data.filepath).parent
     for owner, name in _holders():
-        path = getattr(owner, name)
+        path = _get(owner, name)
         if not path or path.startswith("//") or _known(Path(paths.absolute(path)), name):
             continue
         words = re.split(r"[\\/]+", path)
         tails = [Path(*words[n:]) for n in range(1, len(words)) if words[n]]
         found = next((base / tail for tail in tails for base in (here, here.parent) if _known(base / tail, name)), None)
         if found is not None:
-            setattr(owner, name, paths.blend_path(found))
+            _set(owner, name, paths.blend_path(found))
 
 
 def _known(path: Path, name: str) -> bool:
@@ -134,7 +168,8 @@ def _known(path: Path, name: str) -> bool:
     try:
         if name in ("clip", "cameras_path", "st_map", "ignore_path", "people_path"):
             return _there(path) or (name == "clip" and contract.ShotFolder(selection.beside(path)).info_path.is_file())
-        return contract.ShotFolder(path).info_path.is_file()
+        shot = _rendered_of(path) if name == _OUTPUT else path
+        return shot is not None and contract.ShotFolder(shot).info_path.is_file()
     except OSError:
         return False
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..access import present
+from ..shot import inventory, places
 from . import exchange
 
 
@@ -78,10 +80,17 @@ def _stage(mask: bpy.types.Mask, size: tuple[int, int]) -> Generator[bpy.types.S
 
 def _shift(folder: contract.ShotFolder) -> int:
     """What to add to a frame number of the shot to get the scene's frame at which its movie clip shows it."""
-    source = Path(str(contract.read_json(folder.info_path).get("source", "")))
-    for clip in bpy.data.movieclips:
-        file = Path(bpy.path.abspath(clip.filepath)).absolute()
-        sequence = clip.source == "SEQUENCE" and file.parent in (source, source.parent)
-        if file == source or sequence:
-            return int(clip.frame_start) - exchange.first_number(clip)
-    return 0
+    state = inventory.read(folder.root)
+    told = (str(state.info.get("source", "")), places.source_of(state))  # where it was, and where it is
+    sources = {_place(path) for path in told if os.path.isabs(path)}
+    folders = sources | {os.path.dirname(path) for path in sources}
+    files = [(_place(bpy.path.abspath(clip.filepath)), clip) for clip in bpy.data.movieclips]
+    same = [clip for file, clip in files if file in sources]
+    beside = [clip for file, clip in files if clip.source == "SEQUENCE" and os.path.dirname(file) in folders]
+    shown = next(iter([*same, *beside]), None)
+    return int(shown.frame_start) - exchange.first_number(shown) if shown is not None else 0
+
+
+def _place(path: str) -> str:
+    """What two paths of one file have in common."""
+    return os.path.normcase(os.path.realpath(path))

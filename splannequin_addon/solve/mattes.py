@@ -21,10 +21,11 @@ from bpy.app.handlers import persistent
 from ...torch_backend import contract
 from ..access import pixels_of, size_of
 from ..scene import paths, sequences
+from ..scene.ownership import MATTE_SHOT
 from ..shot import inventory, scene_objects
 
-_FRAME, _SHOT = "splannequin_matte", "splannequin_matte_shot"
-"""Properties of the images that are painted on: frame number, and shot folder as a .blend holds it."""
+_FRAME = "splannequin_matte"
+"""Property of the images that are painted on: frame number. `MATTE_SHOT` is another."""
 
 
 def found_file(shot: Path, frame: int) -> Path:
@@ -65,7 +66,7 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
     image = next((i for i in bpy.data.images if _is_of(i, shot, frame)), None)
     if image is None:
         image = bpy.data.images.new(f"Motion {scene_objects.name_of(shot)} {frame}", width, height, alpha=True)
-        image[_FRAME], image[_SHOT] = frame, paths.blend_path(shot)
+        image[_FRAME], image[MATTE_SHOT] = frame, paths.blend_path(shot)
     _fill(image, pixels)
     return image
 
@@ -117,7 +118,7 @@ def _lost(image: bpy.types.Image) -> bool:
 
 def _of(image: bpy.types.Image) -> tuple[str, int] | None:
     """Shot folder and frame of an image that a matte is painted on; of no other file's, which cannot be changed."""
-    frame, folder = image.get(_FRAME), image.get(_SHOT)
+    frame, folder = image.get(_FRAME), image.get(MATTE_SHOT)
     if image.library or not isinstance(frame, int) or not isinstance(folder, str):
         return None
     return os.path.abspath(bpy.path.abspath(folder)), frame

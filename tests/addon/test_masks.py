@@ -1,6 +1,7 @@
 """Masks on the panel: what the solve is asked for, and a mask drawn in Blender as pictures over the clip's frames."""
 
 import json
+import os
 from pathlib import Path
 
 import bpy
@@ -92,6 +93,35 @@ def test_a_mask_follows_the_frames_that_its_clip_shows(addon, scene, shot, drawn
     assert shift(folder) == -4
     clip.frame_start = 5
     assert shift(folder) == 0
+
+
+@pytest.mark.parametrize("how", ["moved", "linked"])
+def test_a_mask_follows_its_clip_wherever_the_project_lies(addon, scene, shot, tmp_path, pictures, how):
+    """shot.json names the footage as it was imported; Blender, as the artist has opened it since."""
+    plates = tmp_path / "project" / "plates"
+    plates.mkdir(parents=True)
+    for number in (1001, 1002):
+        pictures.write(plates / f"take.{number}.png", np.zeros((12, 16, 3), np.uint8))
+    named = "/old/place/plates/take.1001.png" if how == "moved" else str(plates / "take.1001.png")
+    info, listing = shot / "shot.json", shot / "frames" / "frames.json"
+    info.write_text(json.dumps({**json.loads(info.read_text()), "source": named}))
+    beside = os.path.relpath(plates / "take.1001.png", shot)
+    listing.write_text(json.dumps({**json.loads(listing.read_text()), "beside": beside}))
+    opened = plates / "take.1001.png"
+    if how == "linked":
+        (tmp_path / "link").symlink_to(tmp_path / "project")
+        opened = tmp_path / "link" / "plates" / "take.1001.png"
+    bpy.data.movieclips.load(str(opened))
+    assert addon("solve.drawn_masks")._shift(addon("solve.drawn_masks").contract.ShotFolder(shot)) == -1000
+
+
+def test_of_two_sequences_in_a_folder_a_mask_follows_the_one_that_was_imported(addon, shot, tmp_path, pictures):
+    for name in ("a.0001.png", "b.1001.png"):
+        pictures.write(tmp_path / name, np.zeros((12, 16, 3), np.uint8))
+        bpy.data.movieclips.load(str(tmp_path / name))
+    info = shot / "shot.json"
+    info.write_text(json.dumps({**json.loads(info.read_text()), "source": str(tmp_path / "b.1001.png")}))
+    assert addon("solve.drawn_masks")._shift(addon("solve.drawn_masks").contract.ShotFolder(shot)) == -1000
 
 
 def test_what_the_import_finds_to_be_burnt_in_is_ignored_unless_the_artist_says_otherwise(addon, contract, scene, shot):

@@ -100,6 +100,73 @@ def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_pa
     assert addon("shot.selection").shot_folder(bpy.context.scene) == project / "people.splannequin"
 
 
+def output() -> Path:
+    """Where the scene's pictures go."""
+    return Path(bpy.path.abspath(bpy.context.scene.render.filepath)).resolve()
+
+
+def painted_on(shot: Path):
+    """An image that the matte of frame 6 is painted on."""
+    image = bpy.data.images.new("Motion", 4, 4)
+    image["splannequin_matte"], image["splannequin_matte_shot"] = 6, str(shot)
+    image.use_fake_user = True
+    image.pixels[0] = 1.0
+    image.pack()
+    return image
+
+
+def test_saving_elsewhere_keeps_where_a_bake_goes_and_what_is_painted(addon, project, tmp_path):
+    shot, mattes = project / "people.splannequin", addon("solve.mattes")
+    image = painted_on(shot)
+    addon("bake.rendering").choose_output(bpy.context.scene, shot, "freeze")
+    wanted = shot / "bake" / "freeze" / "######"
+    blend(project)
+    assert bpy.context.scene.render.filepath == "//people.splannequin/bake/freeze/######"
+    there = tmp_path / "other" / "deep"
+    there.mkdir(parents=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(there / "copy.blend"), copy=True)
+    assert bpy.context.scene.render.filepath == "//people.splannequin/bake/freeze/######", "the open file stays"
+    assert mattes.find_image(shot, 6) == image
+    blend(there)
+    assert output() == wanted and mattes.find_image(shot, 6) is not None
+    opened(there)
+    assert output() == wanted and mattes.find_image(shot, 6) is not None
+    bpy.ops.wm.open_mainfile(filepath=str(there / "copy.blend"))
+    assert output() == wanted and mattes.find_image(shot, 6) is not None
+
+
+@pytest.mark.parametrize("own", ["//out/######", "//people.splannequin/bake/mine_####"])
+def test_an_output_path_of_the_artists_is_left_as_it_is(project, tmp_path, own):
+    blend(project)
+    bpy.context.scene.render.filepath = own
+    blend(tmp_path)
+    assert bpy.context.scene.render.filepath == own
+
+
+def test_an_older_file_that_holds_a_whole_output_path_bakes_beside_itself(addon, project):
+    bpy.context.preferences.filepaths.use_relative_paths = False
+    try:
+        addon("bake.rendering").choose_output(bpy.context.scene, project / "people.splannequin", "freeze")
+        blend(project)
+    finally:
+        bpy.context.preferences.filepaths.use_relative_paths = True
+    there = moved(project)
+    opened(there)
+    assert output() == there / "people.splannequin" / "bake" / "freeze" / "######"
+
+
+def test_what_is_painted_and_where_a_bake_goes_follow_a_shot_that_is_located(addon, project):
+    before, there = project / "people.splannequin", project / "renamed.splannequin"
+    painted_on(before)
+    addon("bake.rendering").choose_output(bpy.context.scene, before, "freeze")
+    blend(project)
+    before.rename(there)
+    scene = opened(project)
+    addon("shot.places").locate(scene, there)
+    assert output() == there / "bake" / "freeze" / "######"
+    assert addon("solve.mattes").find_image(there, 6) is not None
+
+
 def test_a_renamed_shot_is_missed_and_located(addon, contract, project):
     blend(project)
     addon("process.steps")
