@@ -10,13 +10,19 @@ import numpy as np
 from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..access import camera_of, named, settings_of
+from ..access import camera_of, named, present, settings_of
 from ..scene import axes, scene_setup
 from ..shot import inventory, scene_objects, selection
 
 
 def in_solve(
-    scene: bpy.types.Scene, shot: Path, view_matrix: Matrix, window_matrix: Matrix, width: int, height: int
+    scene: bpy.types.Scene,
+    shot: Path,
+    view_matrix: Matrix,
+    window_matrix: Matrix,
+    width: int,
+    height: int,
+    graph: bpy.types.Depsgraph | None = None,
 ) -> tuple[list[float], list[float]]:
     """(viewmat, K) in solve units of what a view of the scene shows.
 
@@ -27,14 +33,16 @@ def in_solve(
         window_matrix: perspective projection, [4, 4].
         width: of the picture in pixels.
         height: of the picture in pixels.
+        graph: where the root stands by it; None: in the window's scene, which is the scene then.
 
     Returns:
         viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
         K: fx, fy, cx, cy in pixels.
     """
-    root = scene_objects.part(scene, shot, "root")
+    root = scene_objects.placed_root(scene, shot, graph)
     placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
-    return axes.in_solve(view_matrix, window_matrix, placed, scene_objects.depth_scale(scene, shot), (width, height))
+    scale = scene_objects.depth_scale(scene, shot, graph)
+    return axes.in_solve(view_matrix, window_matrix, placed, scale, (width, height))
 
 
 def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:
@@ -51,7 +59,7 @@ def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Ge
     Raises:
         contract.JobError: the camera is gone, or is no perspective camera.
     """
-    named, before = scene.name, scene.frame_current
+    uid, before = scene.session_uid, scene.frame_current  # a name may be that of another scene, in another file
     size = scene_setup.render_size(scene)
     width = width or size[0]
     height = max(1, round(size[1] * width / size[0]))
@@ -60,32 +68,53 @@ def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Ge
     frames: list[contract.CameraFrame] = []
     try:
         for number in numbers:
-            frames.append(_sampled(named, name, shot, number, (width, height)))
+            frames.append(_sampled(_scene(uid), name, shot, number, (width, height)))
             yield len(frames)
     finally:
-        back = bpy.data.scenes.get(named)
+        back = _scene(uid)
         if back is not None:
             back.frame_set(before)
     return contract.CameraPath(width, height, frames)
 
 
-def _sampled(scene_name: str, name: str, shot: Path, number: int, size: tuple[int, int]) -> contract.CameraFrame:
+def _scene(uid: int) -> bpy.types.Scene | None:
+    """The scene that has a number in this session, whatever it is called now; None if it is gone."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+
+
+def _sampled(
+    scene: bpy.types.Scene | None, name: str, shot: Path, number: int, size: tuple[int, int]
+) -> contract.CameraFrame:
     """A camera at one frame, as `sample_path` reads it."""
-    scene = bpy.data.scenes[scene_name]
-    camera = named(scene.objects, name)
-    if camera is None or camera.type != "CAMERA" or camera_of(camera).type != "PERSP":
+    camera = named(scene.objects, name) if scene is not None else None
+    if scene is None or camera is None or camera.type != "CAMERA" or camera_of(camera).type != "PERSP":
         raise contract.JobError(
             f"{name} is not a perspective camera of this scene.",
             "Choose another camera to freeze from.",
             contract.ExitCode.USAGE,
         )
     scene.frame_set(number)
-    graph = bpy.context.evaluated_depsgraph_get()
+    graph = present(
+        _layer(scene, camera).depsgraph
+    )  # the context's may be another scene's, where the camera stands still
     seen = camera.evaluated_get(graph)
+    if not seen.is_evaluated:
+        raise contract.JobError(
+            f"{name} does not move: it is disabled in viewports, or its collection is excluded.",
+            "Enable it in the Outliner, or make it the scene's camera.",
+            contract.ExitCode.USAGE,
+        )
     aspect = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
     window = seen.calc_matrix_camera(graph, x=size[0], y=size[1], scale_x=aspect[0], scale_y=aspect[1])
     view = seen.matrix_world.normalized().inverted()
-    return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size), "blender")
+    return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size, graph), "blender")
+
+
+def _layer(scene: bpy.types.Scene, camera: bpy.types.Object) -> bpy.types.ViewLayer:
+    """A view layer of the scene in which a camera moves: the context's, if it is one of them, else the first."""
+    layers = [layer for layer in scene.view_layers if named(layer.objects, camera.name) == camera]
+    shown = bpy.context.view_layer
+    return next((layer for layer in layers if layer == shown), (layers or list(scene.view_layers))[0])
 
 
 def name_of(scene: bpy.types.Scene) -> str:

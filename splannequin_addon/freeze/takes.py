@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Generator, Iterable, Iterator
@@ -173,14 +174,15 @@ def reading(
 ) -> Iterator[job_timer.Progress]:
     """A camera read by `turns`, `own_camera.sample_path`, for part of a turn of the timer each; then its take begun."""
     done, path = 0, None
-    while path is None:
-        until = time.monotonic() + READING_SECONDS
-        try:
-            while time.monotonic() < until:
-                done = next(turns)
-            yield job_timer.Progress(f"Reading the camera, frame {done} of {total}", done, total)
-        except StopIteration as end:
-            path = end.value
+    with contextlib.closing(turns):  # also when it is cancelled
+        while path is None:
+            until = time.monotonic() + READING_SECONDS
+            try:
+                while time.monotonic() < until:
+                    done = next(turns)
+                yield job_timer.Progress(f"Reading the camera, frame {done} of {total}", done, total)
+            except StopIteration as end:
+                path = end.value
     found = bpy.data.scenes.get(scene_name)
     if found is None:
         return

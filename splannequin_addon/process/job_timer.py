@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -151,6 +151,18 @@ def work(shot: Path, step: str, turns: Iterator[Progress | None]) -> None:
     watch.notes.pop(step, None)
     watch.failures.pop(step, None)
     watch.work = Work(step, turns)
+
+
+def stop_work(watch: Watch) -> bool:
+    """Ends what the timer does in turns for a shot, which puts back what it changed. False if it does nothing."""
+    turns = watch.work.turns if watch.work is not None else None
+    if turns is None:
+        return False
+    watch.work = None
+    if isinstance(turns, Generator):
+        turns.close()
+    sequences.forget_ahead()  # what was read for it may be other by the time it is needed
+    return True
 
 
 def _work_on(watch: Watch, doing: Work) -> None:

@@ -122,9 +122,17 @@ def adopt(scene: bpy.types.Scene, shot: Path) -> None:
         del collection[TAG]
 
 
-def depth_scale(scene: bpy.types.Scene, shot: Path) -> float:
-    """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
+def placed_root(
+    scene: bpy.types.Scene, shot: Path, graph: bpy.types.Depsgraph | None = None
+) -> bpy.types.Object | None:
+    """The shot's root if the scene has it; as it stands by `graph`, without which it is as a window last showed it."""
     root = part(scene, shot, "root")
+    return root if root is None or graph is None else root.evaluated_get(graph)
+
+
+def depth_scale(scene: bpy.types.Scene, shot: Path, graph: bpy.types.Depsgraph | None = None) -> float:
+    """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
+    root = placed_root(scene, shot, graph)
     return float(sum(root.matrix_world.to_scale()[:]) / 3.0) if root else 1.0
 
 

@@ -31,6 +31,9 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         """Asks the job to stop."""
         folder = selection.shot_folder(scene_in(context))
         watch = job_timer.watch_of(folder) if folder else None
+        if watch and self.step in ("", watch.running()) and job_timer.stop_work(watch):
+            job_timer.redraw()
+            return {"FINISHED"}
         job = watch.jobs.get(steps.current(self.step) or watch.running() or "") if watch else None
         if job is None or job.ended:
             self.report({"WARNING"}, "Nothing is running")

@@ -121,7 +121,10 @@ class StepPanel(PanelBase):
         layout = layout_of(self)
         work = watch.work
         if work is not None:
-            self._own_progress(layout, context, work.progress)
+            row = layout.split(factor=0.7, align=True) if work.turns is not None else layout
+            self._own_progress(row, context, work.progress)
+            if work.turns is not None:
+                row.operator("splannequin.cancel", text="Cancel", icon=icons.of("splannequin.cancel")).step = self.step
             return
         job = watch.jobs[self.step]
         status = job.status

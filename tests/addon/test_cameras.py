@@ -248,6 +248,88 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     assert addon("freeze.own_camera").name_of(scene) == "", "the clip's own camera is the clip's own move"
 
 
+@pytest.fixture
+def moving(scene, shot):
+    """The scene, with a camera that moves over frames 1 to 5, and the timer's watch of its shot."""
+    scene.splannequin.shot_path = str(shot)
+    scene.frame_end = 5
+    camera = scene.objects["Camera"]
+    for frame, x in ((1, 0.0), (5, 10.0)):
+        camera.location = (x, 0.0, 0.0)
+        camera.keyframe_insert("location", frame=frame)
+    return scene
+
+
+def path_of(addon, scene, shot) -> list[float]:
+    """How far the camera is to one side, by frame."""
+    path = run_out(addon("freeze.own_camera").sample_path(scene, "Camera", shot, 64))
+    return [round(frame.viewmat[3], 4) for frame in path.frames]
+
+
+def test_a_camera_moves_in_a_scene_that_is_not_shown(addon, moving, shot):
+    """The window's scene has the same camera: what Blender evaluates there is not what this one is read from."""
+    wanted = path_of(addon, moving, shot)
+    assert len(set(wanted)) == 5
+    other = bpy.data.scenes.new("B")
+    other.collection.objects.link(moving.objects["Camera"])
+    other.splannequin.shot_path, other.frame_end = str(shot), 5
+    assert bpy.context.scene == moving and path_of(addon, other, shot) == wanted
+    root = bpy.data.objects.new("root", None)
+    other.collection.objects.link(root)
+    root.scale = (2.0, 2.0, 2.0)
+    addon("shot.scene_objects").new(other, shot).root = root
+    assert path_of(addon, other, shot) == pytest.approx([value / 2 for value in wanted], abs=1e-3)
+
+
+@pytest.mark.parametrize("how", ["disabled", "excluded"])
+def test_a_camera_that_blender_does_not_evaluate_is_refused(addon, contract, moving, shot, how):
+    """It would stand still."""
+    wanted = path_of(addon, moving, shot)
+    moving.camera = None
+    if how == "disabled":
+        moving.objects["Camera"].hide_viewport = True
+    else:
+        bpy.context.view_layer.layer_collection.children[0].exclude = True
+    with pytest.raises(contract.JobError, match="Camera does not move: it is disabled"):
+        path_of(addon, moving, shot)
+    moving.camera = moving.objects["Camera"]
+    assert path_of(addon, moving, shot) == wanted, "the scene's camera is always evaluated"
+
+
+@pytest.fixture
+def read_on(addon, moving, shot):
+    """The camera is being read by the timer: its first turns are over."""
+    timer, takes = addon("process.job_timer"), addon("freeze.takes")
+    moving.frame_end = 100000  # more than a turn reads
+    moving.frame_set(77)
+    turns = addon("freeze.own_camera").sample_path(moving, "Camera", shot, 64)
+    timer.work(shot, "freeze", takes.reading(moving.name, shot, "freeze", turns, 100000))
+    timer.tick()
+    assert timer.watch_of(shot).work.progress.done and moving.frame_current != 77
+    return timer.watch_of(shot)
+
+
+def test_reading_a_camera_can_be_cancelled(read_on, moving, shot):
+    assert bpy.ops.splannequin.cancel(step="train") == {"CANCELLED"} and read_on.work is not None
+    assert bpy.ops.splannequin.cancel(step="freeze") == {"FINISHED"}
+    assert read_on.running() is None and moving.frame_current == 77
+    assert not read_on.failures and not (shot / "jobs").exists()
+
+
+def test_reading_a_camera_ends_with_its_file_and_leaves_the_next_one_alone(read_on):
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    assert read_on.work is None and bpy.context.scene.name == "Scene"
+    assert bpy.context.scene.frame_current == 1
+
+
+def test_a_scene_that_is_renamed_while_its_camera_is_read_is_read_on(addon, moving, shot):
+    moving.frame_set(3)
+    turns = addon("freeze.own_camera").sample_path(moving, "Camera", shot, 64)
+    next(turns)
+    moving.name = "renamed"
+    assert len(run_out(turns).frames) == 5 and moving.frame_current == 3
+
+
 def run_out(turns):
     while True:
         try:
