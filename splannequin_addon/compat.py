@@ -173,13 +173,20 @@ def new_fit_node(tree: bpy.types.NodeTree, how: str = "Fit") -> Any:
     node: Any = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Render Size"
-        node.inputs["Frame Type"].default_value = how
-        if how == "Crop":  # else the outermost pixels fade out
-            node.inputs["Extension X"].default_value = node.inputs["Extension Y"].default_value = "Extend"
     else:
         node.space = "RENDER_SIZE"
-        node.frame_method = how.upper()
+    set_fit(node, how)
     return node
+
+
+def set_fit(node: Any, how: str) -> None:
+    """Has a node of `new_fit_node` do it in another way."""
+    if HAS_COMPOSITING_GROUP:
+        node.inputs["Frame Type"].default_value = how
+        beyond = "Extend" if how == "Crop" else "Clip"  # else the outermost pixels fade out
+        node.inputs["Extension X"].default_value = node.inputs["Extension Y"].default_value = beyond
+    else:
+        node.frame_method = how.upper()
 
 
 def new_quotient(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, value: bpy.types.NodeSocket) -> Any:

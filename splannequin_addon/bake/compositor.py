@@ -26,6 +26,9 @@ from .node_names import GAP, GROUP_NAME
 from .take_files import Take
 
 _CG = "cg"
+"""The mark of our node that is no part of the plate's stream."""
+_HOW = "splannequin_how"
+"""How we last had the plate fitted: what the artist set instead stays until the plate or the scene has a new shape."""
 _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
 """Of every frozen frame; what else is in the table is in some."""
 
@@ -91,8 +94,7 @@ def insert(
     group_inside.fill(scene, node, take, frozen, flow)
     changes += freeze_group.lacking(node)
     if stream is not None:
-        _show_plate(scene, tree, node, stream, take)
-        changes += stream.said
+        changes += stream.said if _show_plate(scene, tree, node, stream, take) else []
     return changes
 
 
@@ -219,30 +221,101 @@ def _show_plate(
     node: bpy.types.CompositorNodeGroup,
     plate: original_plate.Plate,
     take: Take,
+) -> bool:
+    """Leads the undistorted plate into our group, so that Mix fades between plate and freeze; or shows it where it is.
+
+    The minimal tree is the artist's from then on: a node of ours that is there is made no second time, and no link of
+    the artist's is cut.
+
+    False, and nothing is changed, where the artist leads something else into the group, or shows it in our node.
+    """
+    ours, before = _stream_of(tree, node), placing.links_of(node.inputs["Image"])
+    reader = next((n for n in ours if isinstance(n, bpy.types.CompositorNodeImage)), None)
+    others = before and before[0].from_node not in ours if reader is None else _is_others(reader.image)
+    stale = [] if others else _images(ours)
+    if not others:
+        if reader is None:
+            for old in ours:
+                original_plate.drop(old)
+            _make_stream(scene, tree, node, plate, take)
+        else:
+            sequences.show_sequence(reader, plate.image, take.first, take.last)
+            _follow_plate(scene, tree, node, reader, ours, plate)
+    for image in {i.name: i for i in [*stale, plate.image, plate.map] if i is not None}.values():
+        if image.users == 0 and not _is_others(image):
+            bpy.data.images.remove(image)
+    return not others
+
+
+def _stream_of(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> list[bpy.types.Node]:
+    """Our nodes of the plate's stream. A copy of one has our mark, too: what leads into the group goes before."""
+    marked = [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]
+    led = placing.upstream(node)
+    return sorted(marked, key=lambda n: n not in led)
+
+
+def _is_others(image: bpy.types.Image | None) -> bool:
+    return image is not None and not image.get(TAG)
+
+
+def _images(nodes: Sequence[bpy.types.Node]) -> list[bpy.types.Image]:
+    return [image for node in nodes for image in original_plate.images_of(node)]
+
+
+def _make_stream(
+    scene: bpy.types.Scene,
+    tree: bpy.types.NodeTree,
+    node: bpy.types.CompositorNodeGroup,
+    plate: original_plate.Plate,
+    take: Take,
 ) -> None:
-    """The undistorted plate as the minimal tree's own stream, so that Mix fades between plate and freeze."""
-    shown = [plate.image, plate.map]
-    for old in [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]:
-        for image in original_plate.drop(old):
-            if image.users == 0 and image not in shown:
-                bpy.data.images.remove(image)
-    image_node = tree.nodes.new("CompositorNodeImage")
-    image_node[TAG] = True
-    image_node.name = image_node.label = "Plate"
-    sequences.show_sequence(image_node, plate.image, take.first, take.last)
-    stream = image_node.outputs["Image"]
-    # The tree is ours: in a row, left to right.
+    """The stream in a tree that has none: in a row, left to right."""
+    reader = tree.nodes.new("CompositorNodeImage")
+    assert isinstance(reader, bpy.types.CompositorNodeImage)
+    reader[TAG] = True
+    reader.name = reader.label = "Plate"
+    sequences.show_sequence(reader, plate.image, take.first, take.last)
     end = present(present(compat.output_socket(tree)).node)
     end.location = (node.location.x + node.width + 60.0, node.location.y)
-    between = plate.map is not None or plate.has_shoulder
-    image_node.location = (node.location.x - (3 if between else 2) * GAP, node.location.y)
-    if plate.map is not None:
-        stream = original_plate.undistorted(tree, stream, plate.map, (node.location.x - 2 * GAP, node.location.y))
-    if plate.has_shoulder:
-        stream = original_plate.lit(tree, stream, (node.location.x - 2 * GAP, node.location.y))
-    fit = compat.new_fit_node(tree, fitting.how_it_fits(scene, plate.size))
-    fit[TAG] = True
-    fit.label = "Fit Plate"
-    fit.location = (node.location.x - GAP, node.location.y)
-    tree.links.new(stream, fit.inputs[0])
-    tree.links.new(fit.outputs[0], node.inputs["Image"])
+    reader.location = (node.location.x - (3 if original_plate.between(plate) else 2) * GAP, node.location.y)
+    _follow_plate(scene, tree, node, reader, [], plate)
+
+
+def _follow_plate(
+    scene: bpy.types.Scene,
+    tree: bpy.types.NodeTree,
+    node: bpy.types.CompositorNodeGroup,
+    reader: bpy.types.CompositorNodeImage,
+    ours: Sequence[bpy.types.Node],
+    plate: original_plate.Plate,
+) -> None:
+    """Brings what stands between Plate and group to a plate; what leaves a node of ours goes on leaving the stream."""
+    fit = next((n for n in ours if n.bl_idname == "CompositorNodeScale"), None)
+    inner = next((n for n in ours if original_plate.kind(n)), None)
+    wanted, stream = original_plate.between(plate), present(reader.outputs)["Image"]
+    if inner is not None and original_plate.kind(inner) == wanted:
+        original_plate.refill(inner, plate)
+        stream = inner.outputs[0]
+    elif inner is not None or wanted:
+        beside = (inner or fit or node).location
+        place = (beside.x - (0 if inner else GAP if fit else 2 * GAP), beside.y)
+        targets = [present(k.to_socket) for k in placing.links_of(stream if inner is None else inner.outputs[0])]
+        if inner is not None:
+            stream = next((present(k.from_socket) for k in placing.links_of(inner.inputs[0])), stream)
+            original_plate.drop(inner)
+        stream = original_plate.through(tree, stream, plate, place)
+        for target in targets:
+            tree.links.new(stream, target)
+    how, led = fitting.how_it_fits(scene, plate.size), node.inputs["Image"]
+    if fit is None and not led.is_linked:
+        fit = compat.new_fit_node(tree, how)
+        fit[TAG], fit[_HOW] = True, how
+        fit.label = "Fit Plate"
+        fit.location = (node.location.x - GAP, node.location.y)
+    elif fit is not None and fit.get(_HOW) != how:
+        compat.set_fit(fit, how)
+        fit[_HOW] = how
+    if fit is not None and not fit.inputs[0].is_linked:
+        tree.links.new(stream, fit.inputs[0])
+    if fit is not None and not led.is_linked:
+        tree.links.new(fit.outputs[0], led)

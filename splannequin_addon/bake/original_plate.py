@@ -27,6 +27,8 @@ LENS = "Splannequin Undistort"
 LIGHT = "Splannequin Working Light"
 """Name of the group that gives working frames their highlights back."""
 _IS_OURS = "splannequin_lens"
+_MAP = "ST Map"
+"""Name of the node in the first of them that shows the map."""
 
 
 @dataclass(frozen=True)
@@ -147,64 +149,76 @@ def _image(footage: Footage, frames: tuple[int, int]) -> tuple[bpy.types.Image |
     return None, f"Blender reads {footage.file.name} {shown}"
 
 
-def undistorted(
-    tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, st: bpy.types.Image, location: tuple[float, float]
+def between(plate: Plate) -> str:
+    """What stands between a plate's picture and its fit: LENS, LIGHT, or nothing."""
+    return LENS if plate.map is not None else LIGHT if plate.has_shoulder else ""
+
+
+def kind(node: bpy.types.Node) -> str:
+    """LENS or LIGHT of a node that `through` made, empty of any other."""
+    group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
+    if group is None or not group.get(_IS_OURS):
+        return ""
+    return LENS if _MAP in group.nodes else LIGHT
+
+
+def through(
+    tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, plate: Plate, location: tuple[float, float]
 ) -> bpy.types.NodeSocket:
-    """Socket of a picture seen through an ST map, by a group node of ours in a tree."""
-    group, enter, leave = _new_group(LENS)
-    reader: Any = group.nodes.new("CompositorNodeImage")
-    reader.image = st
-    reader.name = reader.label = "ST Map"
-    shown = warp_nodes.looked_up(group, enter.outputs[0], reader.outputs["Image"], size_of(st))
-    group.links.new(shown, leave.inputs[0])
-    reader.location = (-3 * GAP, -300.0)
-    return _put(tree, group, "Undistort Plate", picture, location)
-
-
-def lit(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, location: tuple[float, float]) -> bpy.types.NodeSocket:
-    """Socket of the light of working frames with a shoulder, by a group node of ours in a tree."""
-    group, enter, leave = _new_group(LIGHT)
-    group.links.new(working_light.lit(group, enter.outputs[0]), leave.inputs[0])
-    return _put(tree, group, "Light of Plate", picture, location)
-
-
-def _new_group(name: str) -> tuple[bpy.types.NodeTree, bpy.types.Node, bpy.types.Node]:
-    """A group from picture to picture, its input and its output."""
-    group = bpy.data.node_groups.new(name, "CompositorNodeTree")
+    """Socket of a plate's picture without its lens, or with its light, by a group node of ours in a tree; the picture
+    itself if it needs neither."""
+    wanted = between(plate)
+    if not wanted:
+        return picture
+    group = bpy.data.node_groups.new(wanted, "CompositorNodeTree")
     group[_IS_OURS] = True
     compat.new_socket(group, "Image", "INPUT", "NodeSocketColor")
     compat.new_socket(group, "Image", "OUTPUT", "NodeSocketColor")
-    enter, leave = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
-    enter.location, leave.location = (-3 * GAP, 0.0), (4 * GAP, 0.0)
-    return group, enter, leave
-
-
-def _put(
-    tree: bpy.types.NodeTree,
-    group: bpy.types.NodeTree,
-    label: str,
-    picture: bpy.types.NodeSocket,
-    location: tuple[float, float],
-) -> bpy.types.NodeSocket:
-    """Socket of a picture that went through a group."""
+    _fill(group, plate)
     node: Any = tree.nodes.new("CompositorNodeGroup")
     node.node_tree = group
     node[TAG] = True
-    node.name = node.label = label
+    node.name = node.label = "Undistort Plate" if wanted == LENS else "Light of Plate"
     node.location = location
     tree.links.new(picture, node.inputs[0])
     return node.outputs[0]
 
 
+def refill(node: bpy.types.Node, plate: Plate) -> None:
+    """Has a node of ours show a plate, of which the same stands between; the links around it stay."""
+    assert isinstance(node, bpy.types.CompositorNodeGroup)
+    group = present(node.node_tree)
+    group.nodes.clear()
+    _fill(group, plate)
+
+
+def _fill(group: bpy.types.NodeTree, plate: Plate) -> None:
+    """The inside of a group from picture to picture."""
+    enter, leave = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+    enter.location, leave.location = (-3 * GAP, 0.0), (4 * GAP, 0.0)
+    if plate.map is not None:
+        reader: Any = group.nodes.new("CompositorNodeImage")
+        reader.image = plate.map
+        reader.name = reader.label = _MAP
+        shown = warp_nodes.looked_up(group, enter.outputs[0], reader.outputs["Image"], size_of(plate.map))
+        reader.location = (-3 * GAP, -300.0)
+    else:
+        shown = working_light.lit(group, enter.outputs[0])
+    group.links.new(shown, leave.inputs[0])
+
+
+def images_of(node: bpy.types.Node) -> list[bpy.types.Image]:
+    """The images that a node of ours shows, itself or in its group."""
+    group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
+    nodes = group.nodes if group is not None and group.get(_IS_OURS) else [node]
+    return [n.image for n in nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
+
+
 def drop(node: bpy.types.Node) -> list[bpy.types.Image]:
     """Removes a node of ours from its tree, and its group if it is one of these; returns the images it showed."""
-    images: list[bpy.types.Image] = []
-    if isinstance(node, bpy.types.CompositorNodeImage) and node.image:
-        images.append(node.image)
+    images = images_of(node)
     group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
     present(node.id_data).nodes.remove(node)  # pyright: ignore
-    if group is not None and group.get(_IS_OURS):
-        images += [n.image for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
-        if group.users == 0:
-            bpy.data.node_groups.remove(group)
+    if group is not None and group.get(_IS_OURS) and group.users == 0:
+        bpy.data.node_groups.remove(group)
     return images

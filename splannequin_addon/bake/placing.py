@@ -63,7 +63,9 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
     tree = compat.compositor_tree(scene)
     if where == "OUTPUT" or tree is None:
         return None
-    led = [n for n in _upstream(tree) if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
+    end = compat.output_socket(tree)
+    led = upstream(end.node if end is not None else None)
+    led = [n for n in led if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
     nodes = [n for n in tree.nodes if n in led and _picture(n).is_linked]
     found = [n for n in nodes if _shows(n, footage)]
     if where == "PLATE" and not found:  # by another name, then: the chosen one, or the only one
@@ -99,10 +101,9 @@ def _picture(node: bpy.types.Node) -> bpy.types.NodeSocket:
     return next(s for s in node.outputs if s.enabled and s.type == "RGBA")
 
 
-def _upstream(tree: bpy.types.NodeTree) -> list[bpy.types.Node]:
-    """Nodes whose picture gets to the tree's output."""
-    end = compat.output_socket(tree)
-    waiting: list[bpy.types.Node | None] = [end.node] if end is not None else []
+def upstream(end: bpy.types.Node | None) -> list[bpy.types.Node]:
+    """Nodes whose picture gets to a node, with that."""
+    waiting: list[bpy.types.Node | None] = [end]
     found: list[bpy.types.Node] = []
     while waiting:
         node = waiting.pop()
