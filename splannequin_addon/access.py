@@ -93,6 +93,11 @@ def size_of(footage: bpy.types.Image | bpy.types.MovieClip) -> tuple[int, int]:
     return int(size[0]), int(size[1])
 
 
+def library_of(block: bpy.types.ID) -> bpy.types.Library | None:
+    """The file that a data-block is linked from, None of one of this file. Its types say that there always is one."""
+    return block.library
+
+
 def camera_of(thing: bpy.types.Object) -> bpy.types.Camera:
     """The lens of an object that is a camera."""
     return thing.data  # pyright: ignore[reportReturnType]

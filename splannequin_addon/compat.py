@@ -442,33 +442,51 @@ def remove_fcurves(datablock: _Animated, data_path: str) -> None:
 def set_keys(
     datablock: _Animated, frames: Sequence[int], channels: Mapping[str, np.ndarray], types: Sequence[str] = ()
 ) -> None:
-    """Keys channels of a data-block that has no action yet, straight between keys, all at once.
+    """Keys channels of a data-block, straight between keys, all at once; what else is keyed of it stays.
 
     Args:
         datablock: what is animated.
         frames: [F] ascending frame numbers.
-        channels: data path -> values [F, C], a column per array index.
+        channels: data path -> values [F, C], a column per array index. Keys that they have are replaced.
         types: [F] type of each key, which has a colour of its own: KEYFRAME, JITTER, EXTREME; empty: all KEYFRAME.
     """
     known = _enumerated("type")
-    action: Any = bpy.data.actions.new(f"{datablock.name}Action")
-    animation = datablock.animation_data_create()
+    animation: Any = datablock.animation_data_create()
+    action: Any = animation.action
+    if action is None or action.library is not None:
+        action = animation.action = bpy.data.actions.new(f"{datablock.name}Action")
     if hasattr(action, "slots"):
-        slot = action.slots.new(datablock.id_type, datablock.name)
-        strip = action.layers.new("Layer").strips.new(type="KEYFRAME")
+        slot = animation.action_slot
+        if slot is None:
+            slot = animation.action_slot = action.slots.new(datablock.id_type, datablock.name)
+        layer = action.layers[0] if action.layers else action.layers.new("Layer")
+        strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
         curves = strip.channelbag(slot, ensure=True).fcurves
-        animation.action, animation.action_slot = action, slot
     else:
         curves = action.fcurves
-        animation.action = action
     straight = _enumerated("interpolation")["LINEAR"]
     for name, values in channels.items():
         for index in range(values.shape[1]):
-            curve = curves.new(name, index=index)
+            curve = curves.find(name, index=index) or curves.new(name, index=index)
             keys = curve.keyframe_points
+            keys.clear()
             keys.add(len(frames))
             keys.foreach_set("co", np.stack([np.asarray(frames, float), values[:, index]], axis=1).ravel())
             keys.foreach_set("interpolation", np.full(len(frames), straight, dtype=np.int32))
             if any(kind != "KEYFRAME" for kind in types):
                 keys.foreach_set("type", np.array([known[kind] for kind in types], dtype=np.int32))
             curve.update()
+
+
+def remove_keys(datablock: _Animated, data_paths: Sequence[str]) -> None:
+    """Removes the F-curves of a data-block that lead to these data paths; an action that is empty then goes, too."""
+    data = datablock.animation_data
+    if data is None or data.action is None:
+        return
+    for curves in _curves(data):
+        for curve in [c for c in curves if c.data_path in data_paths]:
+            curves.remove(curve)
+    action: Any = data.action
+    if not any(len(curves) for curves in _curves(data)) and action.users == 1 + int(action.use_fake_user):
+        data.action = None
+        bpy.data.actions.remove(action)

@@ -17,11 +17,16 @@ from mathutils import Matrix, Quaternion
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import camera_of, present
+from ..access import camera_of, library_of, mesh_of, present
 from ..scene import axes, rollback, sequences
+from ..scene.ownership import TAG
 from ..shot import inventory, scene_objects
 from . import alignment, guesses
 
+_LENS = ("lens", "shift_x", "shift_y")
+"""Properties of a camera that are keyed where the lens changes."""
+_NO_REACH = (1e6, 1e-6)
+"""Clip distances of a camera that has still to be given some."""
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 """Kind of our objects -> which of `made.PARTS` it is, and last word of the name it is made with."""
 
@@ -62,7 +67,8 @@ def scene_from_solve(
 def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     """Brings the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
 
-    What an earlier call made for the same shot is replaced; the root's transform, which the artist may have set, stays.
+    What an earlier call made for the same shot shows the new solve from then on: the objects stay, with all that the
+    artist hung on them, led to them or set in them. So does the root's transform.
 
     Args:
         scene: the scene to build in; its camera is set, nothing else of it is changed.
@@ -78,44 +84,49 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
     xyz, rgb = _points(shot)
     floor, unsolved = _floor(shot), guesses.ranges(path, guesses.solved(shot, path))
+    name = scene_objects.name_of(shot)
     with rollback.scene_of(scene):
-        # All that can fail comes before what was there is taken away.
-        camera, cloud = _new_camera(shot, path), _new_points(shot, xyz, rgb)
-        _place(scene, shot, camera, cloud, scene_from_solve(path, xyz, floor), _extent(path))
-        lens = camera_of(camera)
-        lens.clip_start, lens.clip_end = (v * scene_objects.depth_scale(scene, shot) for v in _clip(path, xyz))
+        # All that can fail comes before what is there is changed.
+        stands, size, plate = scene_from_solve(path, xyz, floor), _extent(path), _plate(shot)
+        mesh = _point_mesh(f"{name} points", xyz, rgb)
+        kept = {n: item for n in ("camera", "points") if (item := _editable(scene, shot, n)) is not None}
+        _clear(scene, shot, but=("root", *kept))  # what the artist hung on the root, and where it stands, stays
+        root = _root(scene, shot, stands, size)
+        camera = kept.get("camera") or _new_camera(name, size)
+        cloud = kept.get("points") or _new_points(name, mesh)
+        _place(scene, shot, root, [item for item in (camera, cloud) if item not in kept.values()])
+        present(scene_objects.of(scene, shot)).camera = camera
+        present(scene_objects.of(scene, shot)).points = cloud
+        _animate(camera, path)
+        _show_plate(camera_of(camera), plate)
+        _reach(camera_of(camera), *(v * scene_objects.depth_scale(scene, shot) for v in _clip(path, xyz)))
+        _exchange_mesh(cloud, mesh)
         guesses.mark(scene, shot, unsolved)
         scene_objects.keep_camera(scene)
         scene.camera = camera
     return camera
 
 
-def _place(
-    scene: bpy.types.Scene,
-    shot: Path,
-    camera: bpy.types.Object,
-    cloud: bpy.types.Object,
-    stands: np.ndarray,
-    size: float,
-) -> None:
-    """Puts a new camera and new points of a shot into the scene, in place of those that are there.
+def _editable(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | None:
+    """The camera or the points of a shot, if they are there and not linked from another file."""
+    item = scene_objects.part(scene, shot, name)
+    return item if item is not None and not library_of(item) and not library_of(present(item.data)) else None
+
+
+def _root(scene: bpy.types.Scene, shot: Path, stands: np.ndarray, size: float) -> bpy.types.Object:
+    """The root of a shot, in its collection; both are made if they are not there.
 
     Args:
         scene: the scene.
         shot: shot folder.
-        camera: not in any scene yet.
-        cloud: the points, alike.
-        stands: where the root is put if there is none, [4, 4].
+        stands: where a new root is put, [4, 4].
         size: of that root.
     """
-    name = scene_objects.name_of(shot)
-    _clear(scene, shot, but=("root",))  # what the artist hung on the root, and where it stands, stays
-    entry = scene_objects.new(scene, shot)
+    name, entry = scene_objects.name_of(shot), scene_objects.new(scene, shot)
     collection = entry.collection
     if collection is None or collection not in scene.collection.children_recursive:
         collection = entry.collection = bpy.data.collections.new(f"Splannequin {name}")
         scene.collection.children.link(collection)
-
     root = scene_objects.part(scene, shot, "root")
     if root is None:
         root = entry.root = bpy.data.objects.new(f"{name} root", None)
@@ -123,35 +134,49 @@ def _place(
         root.matrix_world = Matrix(stands.tolist())
         root.empty_display_size = size
         collection.objects.link(root)
-    entry.camera, entry.points = camera, cloud
-    for item, kind in ((camera, "camera"), (cloud, "points")):
+    for item in (scene_objects.part(scene, shot, "camera"), scene_objects.part(scene, shot, "points")):
+        if item is not None and item.parent is None:  # the root that it hung on was deleted
+            item.parent, item.matrix_parent_inverse = root, Matrix()
+    return root
+
+
+def _place(scene: bpy.types.Scene, shot: Path, root: bpy.types.Object, items: Sequence[bpy.types.Object]) -> None:
+    """Puts new objects of a shot into the scene, under its root."""
+    collection = present(present(scene_objects.of(scene, shot)).collection)
+    for item in items:
         collection.objects.link(item)
         item.parent = root
-        item.hide_select = item is cloud
-        for block in (item, present(item.data)):  # now that the names are free
-            block.name = f"{name} {kind}"
-            if block.animation_data is not None and block.animation_data.action is not None:
-                block.animation_data.action.name = f"{block.name}Action"
 
 
-def _new_camera(shot: Path, path: contract.CameraPath) -> bpy.types.Object:
-    """The solved camera with its keys and the plate behind it, in no scene yet."""
-    name = scene_objects.name_of(shot)
+def _new_camera(name: str, size: float) -> bpy.types.Object:
+    """A camera without keys or plate, in no scene yet."""
     data = bpy.data.cameras.new(f"{name} camera")
-    camera = bpy.data.objects.new(f"{name} camera", data)
-    data.display_size = max(_extent(path) * 0.5, 0.05)
-    _animate(camera, path)
-    _show_plate(data, shot, name)
-    return camera
+    data.display_size = max(size * 0.5, 0.05)
+    data.clip_start, data.clip_end = _NO_REACH
+    return bpy.data.objects.new(f"{name} camera", data)
 
 
-def _new_points(shot: Path, xyz: np.ndarray, rgb: np.ndarray) -> bpy.types.Object:
+def _new_points(name: str, mesh: bpy.types.Mesh) -> bpy.types.Object:
     """The sparse points as an object, in no scene yet."""
-    name = f"{scene_objects.name_of(shot)} points"
-    cloud = bpy.data.objects.new(name, _point_mesh(name, xyz, rgb))
-    cloud.hide_render = True
+    cloud = bpy.data.objects.new(f"{name} points", mesh)
+    mesh.name = cloud.name
+    cloud.hide_render = cloud.hide_select = True
     cloud.display_type = "BOUNDS"  # Blender draws loose points black, whatever their colour: points.py draws them
     return cloud
+
+
+def _exchange_mesh(cloud: bpy.types.Object, mesh: bpy.types.Mesh) -> None:
+    """Shows other points by the same object, in the materials of those before. A copy of the artist's keeps its own."""
+    old = mesh_of(cloud)
+    if old == mesh:
+        return
+    for material in old.materials:
+        mesh.materials.append(material)
+    cloud.data = mesh
+    name = old.name
+    if old.users <= int(old.use_fake_user):
+        bpy.data.meshes.remove(old)
+        mesh.name = name
 
 
 def find(scene: bpy.types.Scene, shot: Path, kind: str) -> bpy.types.Object | None:
@@ -191,11 +216,11 @@ def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> Non
         data, images = item.data, []
         actions = [b.animation_data.action for b in (item, data) if b is not None and b.animation_data]
         if item.type == "CAMERA":
-            images = [b.image for b in data.background_images]
+            images = [b.image for b in data.background_images if b.image is not None and b.image.get(TAG)]
         bpy.data.objects.remove(item)
         unused = [b for b in (data, *actions) if b is not None and b.users <= int(b.use_fake_user)]
         bpy.data.batch_remove(unused)
-        bpy.data.batch_remove([i for i in images if i is not None and i.users == 0])
+        bpy.data.batch_remove([i for i in images if i.users == 0])
     collection = entry.collection
     if but or collection is None:
         return
@@ -209,9 +234,6 @@ def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> Non
 def _animate(camera: bpy.types.Object, path: contract.CameraPath) -> None:
     """Keys the camera on the clip's own frame numbers, straight between keys."""
     data = camera_of(camera)
-    data.sensor_fit, data.sensor_width = "HORIZONTAL", axes.SENSOR_MM
-    data.sensor_height = axes.SENSOR_MM * path.height / path.width
-    camera.rotation_mode = "QUATERNION"
     lenses = [axes.lens_from_k((f.K[0], f.K[1], f.K[2], f.K[3]), path.width, path.height) for f in path.frames]
     varies = max(map(max, zip(*lenses))) > 0 and any(
         max(column) - min(column) > 1e-6 * max(abs(max(column)), 1.0) for column in zip(*lenses)
@@ -227,31 +249,47 @@ def _animate(camera: bpy.types.Object, path: contract.CameraPath) -> None:
         places.append(location[:])
         turns.append(rotation[:])
     frames = [frame.frame for frame in path.frames]
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", axes.SENSOR_MM
+    data.sensor_height = axes.SENSOR_MM * path.height / path.width
+    camera.rotation_mode = "QUATERNION"
     camera.location, camera.rotation_quaternion = places[-1], turns[-1]
     data.lens, data.shift_x, data.shift_y = lenses[-1]
     keyed = {"location": np.array(places), "rotation_quaternion": np.array(turns)}
     compat.set_keys(camera, frames, keyed, guesses.key_types(path))
     if varies:
         columns = np.array(lenses).T
-        compat.set_keys(data, frames, {n: columns[i][:, None] for i, n in enumerate(("lens", "shift_x", "shift_y"))})
+        compat.set_keys(data, frames, {n: columns[i][:, None] for i, n in enumerate(_LENS)})
+    else:
+        compat.remove_keys(data, _LENS)
 
 
-def _show_plate(data: bpy.types.Camera, shot: Path, name: str) -> None:
-    """The undistorted plate behind the camera, fitting the sensor; frame n of the scene shows file n."""
+def _plate(shot: Path) -> tuple[bpy.types.Image, int, int] | None:
+    """The undistorted plate as a data-block, its first and last frame; None without one."""
     span = inventory.plate_range(shot)
-    if span is None:
-        return
-    first, last = span
-    path = contract.ShotFolder(shot).plate(first)
-    if not path.is_file():
-        return
-    background = data.background_images.new()
-    background.image = image = sequences.load_sequence(path, f"Plate {name}", "srgb")
-    sequences.show_sequence(background.image_user, image, first, last)
-    background.frame_method = "FIT"
-    background.display_depth = "BACK"
-    background.alpha = 1.0
-    data.show_background_images = True
+    path = contract.ShotFolder(shot).plate(span[0]) if span is not None else None
+    if span is None or path is None or not path.is_file():
+        return None
+    return sequences.load_sequence(path, f"Plate {scene_objects.name_of(shot)}", "srgb"), *span
+
+
+def _show_plate(data: bpy.types.Camera, plate: tuple[bpy.types.Image, int, int] | None) -> None:
+    """The undistorted plate behind the camera, fitting the sensor; frame n of the scene shows file n. What the artist
+    has behind the camera besides, and how ours is shown there, stays."""
+    background = next((b for b in data.background_images if b.image is not None and b.image.get(TAG)), None)
+    old = background.image if background is not None else None
+    if plate is not None:
+        if background is None:
+            background = data.background_images.new()
+            background.frame_method = "FIT"
+            background.display_depth = "BACK"
+            background.alpha = 1.0
+            data.show_background_images = True
+        background.image = plate[0]
+        sequences.show_sequence(background.image_user, *plate)
+    elif background is not None:
+        data.background_images.remove(background)
+    if old is not None and old.users == 0:
+        bpy.data.images.remove(old)
 
 
 def _floor(shot: Path) -> tuple[Sequence[float], float] | None:
@@ -288,6 +326,11 @@ def _extent(path: contract.CameraPath) -> float:
     """Length of the diagonal of the box around the camera's path, solve units; at least 0.1."""
     centres = axes.poses(path)[:, :3, 3]
     return max(float(np.linalg.norm(centres.max(axis=0) - centres.min(axis=0))), 0.1)
+
+
+def _reach(data: bpy.types.Camera, start: float, end: float) -> None:
+    """Has a camera show what lies between these distances, and what it showed before."""
+    data.clip_start, data.clip_end = min(start, data.clip_start), max(end, data.clip_end)
 
 
 def _clip(path: contract.CameraPath, xyz: np.ndarray) -> tuple[float, float]:

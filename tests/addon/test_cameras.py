@@ -156,6 +156,80 @@ def test_second_build_replaces_and_keeps_the_roots_place(addon, scene, shot):
     assert addon("shot.scene_objects").depth_scale(scene, shot) == pytest.approx(2.0)
 
 
+def rewrite(shot: Path, **lens) -> list[dict]:
+    """Another solve of the same clip: all is moved, and the last frame perhaps has a K of its own."""
+    poses, width, height = poses_of(shot)
+    for pose in poses:
+        pose["viewmat"][3] += 0.5
+    poses[-1].update(lens)
+    path = {"version": 1, "width": width, "height": height, "frames": poses}
+    (shot / "solve" / "cameras.json").write_text(json.dumps(path))
+    return poses
+
+
+def test_what_refers_to_the_camera_goes_on_with_the_next_solve(addon, scene, shot):
+    cameras = addon("solve.cameras")
+    camera = cameras.build(scene, shot)
+    root, cloud, cube = cameras.find(scene, shot, "EMPTY"), cameras.find(scene, shot, "MESH"), scene.objects["Cube"]
+    cube.parent, cube.location = camera, (0.0, 0.0, -1.0)
+    tracks = scene.objects["Light"].constraints.new("TRACK_TO")
+    tracks.target = camera
+    variable = cube.driver_add("hide_render").driver.variables.new()
+    variable.targets[0].id = camera
+    cut = scene.timeline_markers.new("cut", frame=6)
+    cut.camera = camera
+    material = bpy.data.materials.new("dots")
+    cloud.data.materials.append(material)
+    cloud.modifiers.new("nodes", "NODES")
+    poses = rewrite(shot)
+    assert cameras.build(scene, shot) == camera == cube.parent == tracks.target == variable.targets[0].id == cut.camera
+    assert cameras.find(scene, shot, "MESH") == cloud and len(cloud.modifiers) == 1
+    assert list(cloud.data.materials) == [material] and camera.parent == cloud.parent == root
+    assert scene.camera == camera and cube.location.z == -1.0
+    for pose in poses:
+        scene.frame_set(pose["frame"])
+        expected = np.linalg.inv(np.reshape(pose["viewmat"], (4, 4)))[:3, 3]
+        np.testing.assert_allclose(camera.location, expected, atol=1e-5)
+
+
+def test_what_the_artist_set_in_the_camera_stays_over_the_next_solve(addon, scene, shot):
+    cameras, compat = addon("solve.cameras"), addon("compat")
+    camera = cameras.build(scene, shot)
+    data = camera.data
+    data.dof.use_dof, data.dof.aperture_fstop, data.passepartout_alpha, data.clip_end = True, 1.4, 1.0, 1e5
+    data.dof.keyframe_insert("focus_distance", frame=5)
+    camera.keyframe_insert("hide_render", frame=5)
+    camera.name = "hero"
+    own = data.background_images.new()
+    own.image = bpy.data.images.new("storyboard", 8, 8)
+    data.background_images[0].alpha = 0.25
+    rewrite(shot, K=[30.0, 30.0, 9.0, 5.0])
+    cameras.build(scene, shot)
+    assert camera.name == "hero" and camera.data == data
+    assert data.dof.use_dof and data.dof.aperture_fstop == pytest.approx(1.4) and data.passepartout_alpha == 1.0
+    assert data.clip_end == 1e5 and [b.alpha for b in data.background_images] == [0.25, 0.5]
+    assert data.background_images[1].image.name == "storyboard"
+    assert {c.data_path for c in compat.fcurves(camera)} == {"location", "rotation_quaternion", "hide_render"}
+    assert {c.data_path for c in compat.fcurves(data)} == {"dof.focus_distance", "lens", "shift_x", "shift_y"}
+    assert [k.co[0] for k in next(iter(compat.fcurves(camera))).keyframe_points] == [5, 6, 7]
+    rewrite(shot, K=poses_of(shot)[0][0]["K"])
+    cameras.build(scene, shot)
+    assert {c.data_path for c in compat.fcurves(data)} == {"dof.focus_distance"}, "the lens no longer changes"
+    cameras.remove(scene, shot)
+    assert "storyboard" in bpy.data.images
+
+
+def test_a_lens_that_no_longer_changes_leaves_no_action(addon, scene, shot):
+    cameras = addon("solve.cameras")
+    k = poses_of(shot)[0][0]["K"]
+    rewrite(shot, K=[30.0, 30.0, 9.0, 5.0])
+    camera = cameras.build(scene, shot)
+    assert len(bpy.data.actions) == 2
+    rewrite(shot, K=k)
+    cameras.build(scene, shot)
+    assert len(bpy.data.actions) == 1 and camera.data.lens == pytest.approx(20 * 36 / 16)
+
+
 def test_remove_leaves_nothing(addon, scene, shot):
     names = {
         kind: set(getattr(bpy.data, kind).keys())
