@@ -18,7 +18,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import present
+from ..access import library_of, present
 from ..scene import numbered, sequences
 from ..scene.ownership import TAG
 from . import fitting, freeze_group, group_inside, original_plate, placing, warp_nodes
@@ -57,10 +57,11 @@ def insert(
         What was changed, one sentence each.
 
     Raises:
-        contract.JobError: "PLATE", and no node shows it.
+        contract.JobError: "PLATE", and no node shows it; or the compositor is linked from another file.
         ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is as it was.
     """
     changes: list[str] = []
+    _need_own(compat.compositor_tree(scene))
     behind = placing.place_of(scene, footage, where)
     wanted = freeze_group.wants_warp(scene) if warp is None else warp
     frozen, flow, stream = _frozen_image(take), _warp_image(take) if wanted else None, None
@@ -96,6 +97,17 @@ def insert(
     if stream is not None:
         changes += stream.said if _show_plate(scene, tree, node, stream, take) else []
     return changes
+
+
+def _need_own(tree: bpy.types.NodeTree | None) -> None:
+    """JobError if a compositor lies in another file: what is changed here would be gone when this one is opened."""
+    library = library_of(tree) if tree is not None else None
+    if library is not None:
+        raise contract.JobError(
+            f"This compositor is linked from {Path(bpy.path.abspath(library.filepath)).name}.",
+            "Make it local first.",
+            contract.ExitCode.BAKE,
+        )
 
 
 def _shot_of(take: Take) -> Path:
@@ -136,6 +148,7 @@ def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bp
 def may_combine_cg(scene: bpy.types.Scene) -> bpy.types.CompositorNodeGroup:
     """Our node, if the scene's render can be led into it. JobError if it is not there, or its CG is taken."""
     tree = compat.compositor_tree(scene)
+    _need_own(tree)
     node = freeze_group.group_node(tree) if tree else None
     if node is None:
         raise contract.JobError("The freeze is not in this compositor.", "Bake first.", contract.ExitCode.BAKE)
@@ -168,7 +181,7 @@ def remove(scene: bpy.types.Scene) -> bool:
     """Takes the group out, leads the link back, deletes what only we used. True if there was one."""
     tree = compat.compositor_tree(scene)
     node = freeze_group.group_node(tree) if tree else None
-    if tree is None or node is None:
+    if tree is None or node is None or library_of(tree):
         return False
     group = present(node.node_tree)
     before = json.loads(group.get(freeze_group.BEFORE, "{}"))

@@ -165,7 +165,7 @@ def _tick() -> float | None:
         _told = _session.failure
         end()
         return None
-    scenes = [s for s in bpy.data.scenes if selection.shot_folder(s) == _session.shot]
+    scenes = selection.scenes_of(_session.shot)
     if not any(settings_of(s).run_name == _session.run for s in scenes):
         end()  # another file, another shot or another run
         return None

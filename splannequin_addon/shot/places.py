@@ -17,7 +17,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
-from ..access import settings_of
+from ..access import library_of, settings_of
 from ..scene import paths
 from ..scene.ownership import BAKES, DIGITS, MATTE_SHOT, TAG
 from . import inventory, scene_objects, selection
@@ -79,7 +79,7 @@ def _there(path: Path) -> bool:
 
 def _holders() -> Iterator[tuple[Any, str]]:
     """(owner, property) of every path of ours in the file."""
-    for scene in bpy.data.scenes:
+    for scene in [s for s in bpy.data.scenes if not library_of(s)]:
         held = settings_of(scene)
         for one in [held, *held.shots]:
             yield from ((one, name) for name in _SETTINGS)

@@ -16,7 +16,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import OneShot, settings_of
+from ..access import OneShot, library_of, settings_of
 from ..scene import paths, scene_setup
 from . import scene_objects
 from .shot_state import ShotState
@@ -135,13 +135,13 @@ def shot_folder(scene: bpy.types.Scene) -> Path | None:
 
 
 def scenes_of(shot: Path) -> list[bpy.types.Scene]:
-    """Scenes of the file that work on a shot: of several, it is the chosen one."""
-    return [s for s in bpy.data.scenes if shot_folder(s) == shot]
+    """Scenes of the file that work on a shot: of several, it is the chosen one. Not those linked from another file."""
+    return [s for s in bpy.data.scenes if not library_of(s) and shot_folder(s) == shot]
 
 
 def scenes_with(shot: Path) -> list[bpy.types.Scene]:
-    """Scenes of the file that have a shot, chosen or not."""
-    return [s for s in bpy.data.scenes if shot in folders(s)]
+    """Scenes of the file that have a shot, chosen or not. Not those linked from another file."""
+    return [s for s in bpy.data.scenes if not library_of(s) and shot in folders(s)]
 
 
 def missing(scene: bpy.types.Scene, state: ShotState | None) -> bool:

@@ -258,6 +258,8 @@ MESSAGES: dict[str, str] = {
     "before the output": "vor der Ausgabe",
     "as the plate: what follows it goes on from there": "anstelle der Plate: was auf sie folgt, geht von dort weiter",
     'The node group "{}" was moved.': "Die Knotengruppe „{}“ wurde versetzt.",
+    "This compositor is linked from {}.": "Dieser Compositor ist aus {} verknüpft.",
+    "Make it local first.": "Erst lokal machen.",
     "No node of this compositor shows the plate.": "Kein Knoten dieses Compositors zeigt die Plate.",
     "Select the Image or Movie Clip node that does, or insert before the output.": "Den Bild- oder Filmclip-Knoten wählen, der sie zeigt, oder vor der Ausgabe einsetzen.",
     "Insert": "Einsetzen",

@@ -185,6 +185,25 @@ def test_take_without_frames_is_refused_in_words(addon, scene, shot, contract):
         addon("bake.insertion").insert(scene, shot, "empty")
 
 
+def test_a_compositor_of_another_file_is_refused_in_words_and_stays(addon, contract, scene, shot, tmp_path):
+    compat, bake = addon("compat"), addon("bake.insertion")
+    if not compat.HAS_COMPOSITING_GROUP:
+        pytest.skip("until 5.0 a compositor is the scene's own")
+    studio = compat.new_compositor_tree(scene, "Studio Comp")
+    bpy.data.libraries.write(str(tmp_path / "studio.blend"), {studio})
+    scene.compositing_node_group = None
+    bpy.data.node_groups.remove(studio)
+    with bpy.data.libraries.load(str(tmp_path / "studio.blend"), link=True) as (_, wanted):
+        wanted.node_groups = ["Studio Comp"]
+    scene.compositing_node_group = bpy.data.node_groups["Studio Comp"]
+    before, view = snapshot(scene.compositing_node_group), scene.view_settings.view_transform
+    with pytest.raises(contract.JobError, match=r"This compositor is linked from studio\.blend\."):
+        bake.insert_freeze(scene, shot, "freeze")
+    with pytest.raises(contract.JobError, match=r"This compositor is linked from studio\.blend\."):
+        bake.combine_cg(scene, shot)
+    assert snapshot(scene.compositing_node_group) == before and scene.view_settings.view_transform == view
+
+
 def test_size_comes_from_the_exr_header(addon, shot, tmp_path):
     addon("bake.compositor")
     assert addon("bake.take_files").exr_size(shot / "takes" / "freeze" / "000006.exr") == (16, 12)

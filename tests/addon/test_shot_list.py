@@ -310,3 +310,39 @@ def test_a_dropped_video_begins_a_shot_beside_one_that_was_imported(addon, scene
     props.active_shot = 0
     bpy.ops.splannequin.use_clip(filepath=str(clip))
     assert len(props.shots) == 2 and props.active_shot == 1, "one that is in the list is chosen"
+
+
+@pytest.fixture
+def linked(addon, scene, shot, tmp_path):
+    """A scene of another file that has the shot, too, linked into a new one beside it."""
+    scene.name, scene.splannequin.shot_path = "Layout", str(shot)
+    addon("solve.arrival").load_camera(scene, shot)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "layout.blend"))
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    bpy.context.scene.name, bpy.context.scene.splannequin.shot_path = "Comp", str(shot)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "comp.blend"))
+    with bpy.data.libraries.load(str(tmp_path / "layout.blend"), link=True) as (_, wanted):
+        wanted.scenes = ["Layout"]
+    found = bpy.data.scenes["Layout"]
+    assert found.library is not None
+    return found
+
+
+def test_a_linked_scene_with_the_same_shot_is_left_alone(addon, linked, shot):
+    selection, supervisor = addon("shot.selection"), addon("process.job_timer")
+    own = bpy.data.scenes["Comp"]
+    assert selection.shot_folder(linked) == shot, "it is the same one"
+    assert selection.scenes_of(shot) == [own] and selection.scenes_with(shot) == [own]
+    camera, watch = linked.camera, supervisor.watch_of(shot)
+    supervisor.change(watch, "solve", lambda scene: addon("solve.arrival").load_camera(scene, shot))
+    assert not watch.failures and linked.camera == camera and own.camera not in (None, camera)
+    supervisor.tick()
+    assert not watch.failures
+
+
+def test_paths_of_a_linked_scene_stay_over_saving(linked, shot, tmp_path):
+    """They are relative to its own file, which this one is not beside."""
+    before = linked.splannequin.shot_path, linked.splannequin.made[0].folder
+    (tmp_path / "deeper").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "deeper" / "comp.blend"))
+    assert (linked.splannequin.shot_path, linked.splannequin.made[0].folder) == before
