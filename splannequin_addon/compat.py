@@ -179,8 +179,9 @@ def new_fit_node(tree: bpy.types.NodeTree, how: str = "Fit") -> Any:
     return node
 
 
-def set_fit(node: Any, how: str) -> None:
+def set_fit(fit: bpy.types.Node, how: str) -> None:
     """Has a node of `new_fit_node` do it in another way."""
+    node: Any = fit
     if HAS_COMPOSITING_GROUP:
         node.inputs["Frame Type"].default_value = how
         beyond = "Extend" if how == "Crop" else "Clip"  # else the outermost pixels fade out

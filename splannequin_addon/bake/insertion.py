@@ -179,6 +179,8 @@ def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
         if job_timer.window_of(scene) is not None:
             changes += rendering.choose_output(scene, shot, take)  # here, for it belongs to the same undo step
             seen = scene.name
+        else:
+            changes.append(f"{scene.name} is in no window: it was not rendered.")
         return changes
 
     job_timer.change(job_timer.watch_of(shot), "bake", put_in, only)

@@ -10,9 +10,9 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import present, settings_of
+from ..access import library_of, present, settings_of
 from ..freeze import takes
-from ..process import backend, jobs
+from ..process import backend, job_timer, jobs, steps
 from ..process.steps import Step, View
 from ..scene import scene_setup
 from ..shot import scene_objects, selection
@@ -76,8 +76,16 @@ class Bake(Step):
         return insertion.insert_freeze(scene, job.shot, job.params["take"])
 
     def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
-        """In turns: Blender reads pictures, compositor and render."""
-        insertion.bring_in(scene, job.shot, str(job.params["take"]), alone=False)
+        """In turns: Blender reads pictures, compositor and render. It is about the scene where it was asked for, alone;
+        about all that work on the shot, if that is not there any more."""
+        name, take = steps.scene_of(job), str(job.params["take"])
+        asked = next((s for s in bpy.data.scenes if s.name == name and not library_of(s)), None)
+        if asked is None:
+            insertion.bring_in(scene, job.shot, take, alone=False)
+        elif asked in selection.scenes_of(job.shot):
+            insertion.bring_in(asked, job.shot, take)
+        else:
+            job_timer.watch_of(job.shot).notes[self.name] = [self.late(job)]
         return True
 
     def late(self, job: jobs.Job) -> str:

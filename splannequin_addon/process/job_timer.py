@@ -306,7 +306,7 @@ def _turn(watch: Watch, until: float) -> bool:
             watch.failures[step] = (f"The job in {job.folder} cannot be read: {error}", "")
             del watch.jobs[step]
             continue
-        if job.ended:
+        if job.ended and not job.over:
             _ended(watch, step, job)
     if watch.pending and selection.scenes_of(watch.shot):
         for step, job in watch.pending.items():

@@ -26,6 +26,8 @@ _LAST_WORD_SECONDS = 10.0
 _START_SECONDS = 30.0
 """A job without a status this long after it was made never started."""
 _LOG_LINES = 6
+_FIRST_LOOK_SECONDS = 1.0
+"""What a job that is found again wrote is read for so long at once."""
 _KILL_SECONDS = 20.0
 """A job that has not ended this long after it was asked to is ended by force on a second request."""
 _LONGEST_SECONDS = 1e7
@@ -64,6 +66,8 @@ class Job:
     """What the job answered in its `done` event."""
     end: tuple[str, _Words] | None = None
     """State and last words of the job, as its events tell them."""
+    over: bool = False
+    """It had ended before this Blender met it: what it made is there, and nothing follows from its end."""
     beat: tuple[float, float] | None = None
     """Last sign of life of a job of another computer, and when it was first seen, monotonic seconds."""
 
@@ -271,7 +275,9 @@ def latest(shot: Path) -> dict[str, Job]:
         if job is None:
             continue
         try:
-            poll(job, 1.0)
+            status = _read_status(folder)
+            job.over = status is not None and status.ended
+            poll(job, _FIRST_LOOK_SECONDS)
         except (OSError, ValueError):
             continue  # files that another hand broke: the one before it is asked
         found[kind] = job

@@ -141,14 +141,23 @@ def add(step: Step) -> None:
 
 def step_of(job: jobs.Job) -> str:
     """Name of the step that a job found in a shot folder belongs to: Freeze and Bake ask for the same kind."""
-    try:
-        with contract.open_regular(job.folder / contract.STEP_FILE) as file:
-            told = file.read(100).decode("utf-8", "replace")
-    except (OSError, ValueError):
-        told = ""  # started from the backend's command line
-    told = current(told)
+    told = current(_noted(job, contract.STEP_FILE))
     names = [s.name for s in STEPS.values() if s.kind == job.kind]
     return told if told in names else names[0]
+
+
+def scene_of(job: jobs.Job) -> str:
+    """Name that the scene had where a job was asked for; empty if nothing tells."""
+    return _noted(job, contract.SCENE_FILE)
+
+
+def _noted(job: jobs.Job, name: str) -> str:
+    """What Blender wrote into a job's folder; empty of a job that was started from the backend's command line."""
+    try:
+        with contract.open_regular(job.folder / name) as file:
+            return file.read(1024).decode("utf-8", "replace")
+    except (OSError, ValueError):
+        return ""
 
 
 def current(name: str) -> str:

@@ -258,6 +258,7 @@ MESSAGES: dict[str, str] = {
     "before the output": "vor der Ausgabe",
     "as the plate: what follows it goes on from there": "anstelle der Plate: was auf sie folgt, geht von dort weiter",
     'The node group "{}" was moved.': "Die Knotengruppe „{}“ wurde versetzt.",
+    "{} is in no window: it was not rendered.": "{} ist in keinem Fenster: gerendert wurde nicht.",
     "This compositor is linked from {}.": "Dieser Compositor ist aus {} verknüpft.",
     "Make it local first.": "Erst lokal machen.",
     "No node of this compositor shows the plate.": "Kein Knoten dieses Compositors zeigt die Plate.",

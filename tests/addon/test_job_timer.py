@@ -1,5 +1,7 @@
 """The timer: work of Blender's own in turns, questions to the backend, jobs that end, renders that are followed."""
 
+import json
+
 import bpy
 import pytest
 
@@ -84,6 +86,87 @@ def test_a_bake_whose_frames_are_there_comes_in_in_turns(addon, contract, superv
     supervisor.tick()
     assert group_node(tree(bpy.context.scene)) is not None and watch.notes["bake"]
     assert watch.running() == "bake" and not watch.failures, "the render begins with the next turn"
+
+
+def ended_bake(addon, contract, supervisor, watch, shot, scene: str):
+    """A bake whose frames are there has ended just now; it was asked for in the scene of that name."""
+    job = addon("process.jobs").new_job(shot, "freeze", contract.FreezeParams(take="freeze"))
+    (job.folder / contract.SCENE_FILE).write_text(scene, encoding="utf-8")
+    job.status = contract.Status("freeze", "done", 0, 0.0, 1.0, 0.0)
+    supervisor.follow("bake", job)
+    supervisor._ended(watch, "bake", job)
+
+
+def until_it_renders(supervisor, watch):
+    """The turns of a bake, but for that in which Blender renders."""
+    for _ in range(3):
+        if watch.work is not None and not watch.notes.get("bake"):
+            supervisor.tick()
+
+
+def baked(addon) -> list[str]:
+    group_node, tree = addon("bake.freeze_group").group_node, addon("compat").compositor_tree
+    return [s.name for s in bpy.data.scenes if tree(s) is not None and group_node(tree(s)) is not None]
+
+
+def test_a_bake_comes_into_the_scene_where_it_was_asked_for_alone(addon, contract, supervisor, watch, shot):
+    other = bpy.data.scenes.new("A lookdev")
+    other.splannequin.shot_path = str(shot)
+    before = other.view_settings.view_transform
+    ended_bake(addon, contract, supervisor, watch, shot, "Scene")
+    until_it_renders(supervisor, watch)
+    assert baked(addon) == ["Scene"] and other.view_settings.view_transform == before and not watch.failures
+    addon("bake.insertion").remove(bpy.data.scenes["Scene"])
+    watch.work = None
+    ended_bake(addon, contract, supervisor, watch, shot, "A lookdev")
+    until_it_renders(supervisor, watch)
+    assert baked(addon) == ["A lookdev"] and "A lookdev is in no window" in watch.notes["bake"][-1]
+
+
+def test_a_bake_of_a_scene_that_is_gone_comes_into_those_of_the_shot(addon, contract, supervisor, watch, shot):
+    other = bpy.data.scenes.new("A lookdev")
+    other.splannequin.shot_path = str(shot)
+    ended_bake(addon, contract, supervisor, watch, shot, "deleted since")
+    until_it_renders(supervisor, watch)
+    assert sorted(baked(addon)) == ["A lookdev", "Scene"]
+
+
+def test_a_bake_of_a_scene_that_has_another_shot_now_is_only_told_of(addon, contract, supervisor, watch, shot):
+    other = bpy.data.scenes.new("A lookdev")
+    other.splannequin.shot_path = str(shot)
+    bpy.data.scenes["Scene"].splannequin.shot_path = str(shot.parent / "another.splannequin")
+    ended_bake(addon, contract, supervisor, watch, shot, "Scene")
+    assert watch.work is None and baked(addon) == [] and "Bake again" in watch.notes["bake"][0]
+
+
+def test_a_job_keeps_the_name_of_its_scene(addon, contract, scene, shot):
+    """In its folder, where it is found again."""
+    scene.name, scene.splannequin.shot_path, scene.splannequin.take_name = "Comp é", str(shot), "freeze"
+    job = addon("process.begin").begin(scene, "bake")
+    with pytest.raises(contract.JobError):  # the shot has no run
+        addon("process.begin").wait(job)
+    found = addon("process.jobs").open_job(job.folder)
+    assert addon("process.steps").scene_of(found) == "Comp é" and addon("process.steps").step_of(found) == "bake"
+
+
+def test_a_job_that_had_ended_before_it_was_met_renders_nothing(addon, contract, supervisor, scene, shot, monkeypatch):
+    """Even if what it wrote is too long to be read at the first look."""
+    jobs = addon("process.jobs")
+    job = jobs.new_job(shot, "freeze", contract.FreezeParams(take="freeze"))
+    (job.folder / contract.STEP_FILE).write_text("bake")
+    events = [contract.Event("warning", 1, 1.0, {"message": f"n {n}"}) for n in range(3)]
+    events.append(contract.Event("done", 1, 1.0, {"result": {}}))
+    (job.folder / contract.EVENTS_FILE).write_text("".join(json.dumps(e.__dict__) + "\n" for e in events))
+    status = contract.Status(job.folder.name, "done", 1, 1.0, 2.0, 2.0, fraction=1.0)
+    (job.folder / contract.STATUS_FILE).write_text(json.dumps(status.__dict__))
+    monkeypatch.setattr(jobs, "_FIRST_LOOK_SECONDS", -1.0)
+    scene.splannequin.shot_path = str(shot)
+    watch = supervisor.watch_of(shot)
+    assert not watch.jobs["bake"].ended, "there is more to read"
+    for _ in range(5):
+        supervisor.tick()
+    assert watch.jobs["bake"].state == "done" and len(watch.jobs["bake"].warnings) == 3
+    assert watch.work is None and baked(addon) == []
 
 
 def test_a_render_is_followed_by_its_handlers(addon, watch, shot):

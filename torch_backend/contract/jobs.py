@@ -34,6 +34,8 @@ FORECAST = "forecast"
 """Stage of a metric that says how long the stage `of` will take from then on: `seconds_left`."""
 STEP_FILE = "step"
 """Name of the panel's step that asked for the job; Blender's own."""
+SCENE_FILE = "scene"
+"""Name of the scene that it was asked for in; Blender's own."""
 JOB_COMMAND = "-m torch_backend run-job"
 """How the process of a job was called, but for its Python and the job's folder."""
 HEARTBEAT_SECONDS = 2.0
