@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
+import uuid
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -12,18 +14,30 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import present
+from ..access import named, present
 from ..shot import inventory, places
 from . import exchange
 
 
 def render(mask: bpy.types.Mask, shot: Path, kind: str) -> Path:
-    """Renders a mask for every frame of an imported shot; returns the folder, SHOT/masks/KIND, with a picture for each.
+    """`in_turns`, all at once."""
+    turns = in_turns(mask.name, shot, kind)
+    while True:
+        try:
+            next(turns)
+        except StopIteration as end:
+            return end.value
+
+
+def in_turns(name: str, shot: Path, kind: str) -> Generator[tuple[int, int], None, Path]:
+    """Renders a mask for every frame of an imported shot, a frame a turn; yields how many are done, and of how many.
+
+    Returns the folder, SHOT/masks/KIND, with a picture for each. What it held stays until all of them are there.
 
     A frame of the scene is that of the clip which the Movie Clip editor shows there. Without a movie clip of the
-    shot's footage in this file the scene's frames are the clip's own.
+    shot's footage in this file the scene's frames are the clip's own. Nothing of bpy is kept between two turns.
 
-    JobError if the shot is not imported, or a picture was not written.
+    JobError if the shot is not imported, the mask is gone, or a picture was not written.
     """
     folder = contract.ShotFolder(shot)
     try:
@@ -34,23 +48,37 @@ def render(mask: bpy.types.Mask, shot: Path, kind: str) -> Path:
         raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE) from error
     into = folder.drawn_masks(kind)
     into.mkdir(parents=True, exist_ok=True)
-    for old in into.glob("*.png"):
-        if old.stem.isdecimal():
-            old.unlink()
+    beside = into.with_name(f".{kind}-{uuid.uuid4().hex}")  # not in it: what is killed leaves no picture there
     shift = _shift(folder)
-    with _stage(mask, size) as scene:
-        for number in numbers:
-            file = into / contract.frame_file(number, contract.PICTURE)
-            scene.frame_set(number + shift)
-            scene.render.filepath = str(file)
-            bpy.ops.render.render(scene=scene.name, write_still=True)
-            if not file.is_file():
-                raise contract.JobError(
-                    f"The mask {mask.name} was not written to {file}.",
-                    "Make room, or see to it that the shot's folder can be written.",
-                    contract.ExitCode.DISK,
-                )
+    try:
+        for done, number in enumerate(numbers, 1):
+            _render_one(name, size, beside / contract.frame_file(number, contract.PICTURE), number + shift)
+            yield done, len(numbers)
+        for old in into.glob("*.png"):
+            if old.stem.isdecimal():
+                old.unlink()
+        for made in sorted(beside.iterdir()):
+            os.replace(made, into / made.name)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
     return into
+
+
+def _render_one(name: str, size: tuple[int, int], file: Path, frame: int) -> None:
+    """A mask at a frame of the scene, as a picture. JobError if it is gone, or the picture was not written."""
+    mask = named(bpy.data.masks, name)
+    if mask is None:
+        raise contract.JobError(f"The mask {name} is gone.", "Choose another mask.", contract.ExitCode.USAGE)
+    with _stage(mask, size) as scene:
+        scene.frame_set(frame)
+        scene.render.filepath = str(file)
+        bpy.ops.render.render(scene=scene.name, write_still=True)
+    if not file.is_file():
+        raise contract.JobError(
+            f"The mask {name} was not written to {file}.",
+            "Make room, or see to it that the shot's folder can be written.",
+            contract.ExitCode.DISK,
+        )
 
 
 @contextlib.contextmanager

@@ -302,6 +302,8 @@ MESSAGES: dict[str, str] = {
     "{} is not a perspective camera of this scene.": "{} ist keine perspektivische Kamera dieser Szene.",
     "{} does not move: it is disabled in viewports, or its collection is excluded.": "{} bewegt sich nicht: die Kamera ist in Ansichten deaktiviert, oder ihre Sammlung ist ausgeschlossen.",
     "Enable it in the Outliner, or make it the scene's camera.": "Sie im Outliner aktivieren oder zur Kamera der Szene machen.",
+    "Choose another mask.": "Eine andere Maske wählen.",
+    "The mask {} is gone.": "Die Maske {} ist nicht mehr da.",
     "Choose another camera to freeze from.": "Eine andere Kamera zum Einfrieren wählen.",
     "The freeze is not in this compositor.": "Der Freeze ist nicht in diesem Compositor.",
     'Something is led into "CG" of {} already.': "In „CG“ von {} führt schon etwas.",

@@ -80,6 +80,25 @@ def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file
     assert bpy.context.scene == scene
 
 
+def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_as_it_was(addon, shot, drawn):
+    into = shot / "masks" / "people"
+    into.mkdir(parents=True)
+    (into / "000005.png").write_bytes(b"of before")
+    scenes = list(bpy.data.scenes)
+    turns = addon("solve.drawn_masks").in_turns(drawn.name, shot, "people")
+    assert next(turns) == (1, 3) and next(turns) == (2, 3)
+    assert list(bpy.data.scenes) == scenes, "what it renders in is gone between two turns"
+    turns.close()
+    assert [p.name for p in into.parent.iterdir()] == ["people"]
+    assert [(p.name, p.read_bytes()) for p in into.iterdir()] == [("000005.png", b"of before")]
+    turns = addon("solve.drawn_masks").in_turns(drawn.name, shot, "people")
+    next(turns)
+    bpy.data.masks.remove(drawn)
+    with pytest.raises(addon("solve.drawn_masks").contract.JobError, match="The mask people é is gone"):
+        next(turns)
+    assert [(p.name, p.read_bytes()) for p in into.iterdir()] == [("000005.png", b"of before")]
+
+
 def test_a_mask_follows_the_frames_that_its_clip_shows(addon, scene, shot, drawn, tmp_path, pictures):
     """The shot's frame 5 is the first file of the sequence, which the movie clip shows at frame 1 of the scene."""
     for number in (5, 6, 7):
