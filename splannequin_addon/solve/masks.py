@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
 from ...torch_backend import contract
-from ..access import settings_of
-from ..process import backend
-from . import drawn_masks
+from ..access import named, settings_of
+from ..process import backend, begin, job_timer
+from ..shot import selection
+from . import drawn_masks, exchange
 
 LABELS = {"ignore": "Ignore", "people": "People"}
 """Kind of mask -> its name on the panel."""
@@ -18,26 +21,65 @@ _WORDS = {"NONE": "", "ALPHA": contract.MASK_ALPHA, "FOUND": contract.MASK_FOUND
 """What is chosen -> what the backend takes for it, where that is no file."""
 
 
-def sources(scene: bpy.types.Scene, shot: Path | None) -> list[str]:
-    """Of each of `contract.MASK_KINDS` what the backend takes for it; a drawn one is rendered into the shot first.
+def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolveParams:
+    """What the solve is asked for, from what the artist set. A drawn mask is rendered into the shot first, unless it is
+    `rendered` or will be.
 
     JobError names what is not chosen, or cannot be written.
     """
-    return [_source(scene, shot, kind) for kind in contract.MASK_KINDS]
+    shot = selection.shot_folder(scene)
+    asked = exchange.params(scene, shot)
+    asked.ignore_mask, asked.people_mask = (_source(scene, shot, kind, rendered) for kind in contract.MASK_KINDS)
+    return asked
 
 
-def _source(scene: bpy.types.Scene, shot: Path | None, kind: str) -> str:
+def drawn(scene: bpy.types.Scene) -> dict[str, str]:
+    """Kind of mask -> name of the one that was drawn in Blender and is chosen for it."""
+    held = settings_of(scene)
+    chosen = {kind: getattr(held, f"{kind}_drawn") for kind in contract.MASK_KINDS if _is_drawn(scene, kind)}
+    return {kind: mask.name for kind, mask in chosen.items() if mask is not None}
+
+
+def _is_drawn(scene: bpy.types.Scene, kind: str) -> bool:
+    return bool(getattr(settings_of(scene), f"{kind}_from") == "DRAWN")
+
+
+def solve_in_turns(scene_name: str, shot: Path) -> Iterator[job_timer.Progress | None]:
+    """The drawn masks of a scene rendered, a frame a turn of the timer; then its solve is begun."""
+    params(bpy.data.scenes[scene_name], rendered=True)  # what will be refused is refused before
+    for kind, name in drawn(bpy.data.scenes[scene_name]).items():
+        now = None
+        with contextlib.closing(drawn_masks.in_turns(name, shot, kind)) as turns:
+            while True:
+                while bpy.app.is_job_running("RENDER"):  # the artist's own comes first: Blender renders one at a time
+                    yield now
+                told = next(turns, None)
+                if told is None:
+                    break
+                now = job_timer.Progress(f"Rendering the mask {name}, frame {told[0]} of {told[1]}", *told)
+                yield now
+    scene = named(bpy.data.scenes, scene_name)
+    if scene is None:
+        return
+    if selection.shot_folder(scene) != shot:
+        raise contract.JobError(
+            "Another shot was chosen while the masks were rendered.", "Choose this one and solve again."
+        )
+    job_timer.follow("solve", begin.begin(scene, "solve", params(scene, rendered=True)))
+
+
+def _source(scene: bpy.types.Scene, shot: Path | None, kind: str, rendered: bool) -> str:
     props = settings_of(scene)
-    chosen, path, drawn = (getattr(props, f"{kind}_{part}") for part in ("from", "path", "drawn"))
+    chosen, path, mask = (getattr(props, f"{kind}_{part}") for part in ("from", "path", "drawn"))
     if chosen in _WORDS:
         return _WORDS[chosen]
     if chosen == "FILE" and path:
         return os.path.abspath(bpy.path.abspath(path))
-    if chosen == "DRAWN" and drawn is not None:
+    if chosen == "DRAWN" and mask is not None:
         if shot is None:
             raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
         backend.python()  # before anything is written: without a backend nothing would read it
-        return str(drawn_masks.render(drawn, shot, kind))
+        return str(contract.ShotFolder(shot).drawn_masks(kind) if rendered else drawn_masks.render(mask, shot, kind))
     raise contract.JobError(
         f"Nothing is chosen for the mask {LABELS[kind]}.",
         "Choose a picture, a sequence, a video or a drawn mask, or set the mask to None.",

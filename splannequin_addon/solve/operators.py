@@ -15,7 +15,7 @@ from ..properties import BoolProperty, EnumProperty, IntProperty, StringProperty
 from ..shot import selection
 from ..translations import tr
 from ..ui import step_operator
-from . import arrival, exchange, stmaps
+from . import arrival, exchange, masks, stmaps
 
 FORMATS = [
     ("colmap", "COLMAP", "Cameras, images and points3D as .bin, of the plates in the shot's folder frames"),
@@ -82,6 +82,15 @@ class SPLANNEQUIN_OT_solve_camera(step_operator.StepOperator, bpy.types.Operator
     bl_label = "Solve Camera"
     bl_options = {"REGISTER"}
     step = "solve"
+
+    def execute(self, context: bpy.types.Context) -> Outcome:
+        """Runs the step. In a window drawn masks are rendered a frame per turn of the timer."""
+        scene = scene_in(context)
+        folder = selection.shot_folder(scene)
+        if folder is None or bpy.app.background or not masks.drawn(scene):
+            return super().execute(context)
+        job_timer.work(folder, self.step, masks.solve_in_turns(scene.name, folder))
+        return {"FINISHED"}
 
 
 class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):

@@ -9,13 +9,12 @@ from ...torch_backend import contract
 from ..footage import plate
 from ..process import job_timer, jobs
 from ..process.steps import Step, View
-from ..shot import scene_objects, selection
+from ..shot import scene_objects
 from ..shot.shot_state import ShotState
 from . import (
     align_operators,
     arrival,
     cameras,
-    exchange,
     guesses,
     masks,
     matte_operators,
@@ -48,10 +47,7 @@ class Solve(Step):
 
     def params(self, scene: bpy.types.Scene) -> contract.SolveParams:
         """The lens, where cameras come from, and what is masked."""
-        shot = selection.shot_folder(scene)
-        asked = exchange.params(scene, shot)
-        asked.ignore_mask, asked.people_mask = masks.sources(scene, shot)
-        return asked
+        return masks.params(scene)
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Camera: how good the solve is."""

@@ -99,6 +99,46 @@ def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_a
     assert [(p.name, p.read_bytes()) for p in into.iterdir()] == [("000005.png", b"of before")]
 
 
+@pytest.fixture
+def rendering(addon, scene, shot, drawn):
+    """The timer renders the masks of a solve; its first frame is done."""
+    timer = addon("process.job_timer")
+    scene.splannequin.shot_path, scene.splannequin.people_from, scene.splannequin.people_drawn = (
+        str(shot),
+        "DRAWN",
+        drawn,
+    )
+    timer.work(shot, "solve", addon("solve.masks").solve_in_turns(scene.name, shot))
+    timer.tick()
+    watch = timer.watch_of(shot)
+    assert not watch.failures and (watch.work.progress.done, watch.work.progress.total) == (1, 3)
+    return watch
+
+
+def test_masks_are_rendered_by_the_timer_and_then_the_solve_begins(addon, rendering, shot):
+    for _ in range(2):
+        addon("process.job_timer").tick()
+    assert rendering.running() == "solve" and not rendering.jobs and not list((shot / "masks" / "people").iterdir())
+    addon("process.job_timer").tick()
+    assert not rendering.failures and rendering.work is None
+    assert rendering.jobs["solve"].params["people_mask"] == str(shot / "masks" / "people")
+    assert sorted(p.name for p in (shot / "masks" / "people").iterdir()) == ["000005.png", "000006.png", "000007.png"]
+    rendering.jobs["solve"].process.wait()
+
+
+def test_rendering_masks_can_be_cancelled(rendering, shot):
+    assert bpy.ops.splannequin.cancel(step="solve") == {"FINISHED"}
+    assert rendering.running() is None and not rendering.failures and not rendering.jobs
+    assert not list((shot / "masks" / "people").iterdir())
+
+
+def test_no_solve_begins_for_another_shot_than_its_masks_are_of(addon, scene, rendering, tmp_path):
+    scene.splannequin.shot_path = str(tmp_path / "other.splannequin")
+    for _ in range(3):
+        addon("process.job_timer").tick()
+    assert "Another shot was chosen" in rendering.failures["solve"][0] and not rendering.jobs
+
+
 def test_a_mask_follows_the_frames_that_its_clip_shows(addon, scene, shot, drawn, tmp_path, pictures):
     """The shot's frame 5 is the first file of the sequence, which the movie clip shows at frame 1 of the scene."""
     for number in (5, 6, 7):
