@@ -7,9 +7,10 @@ scene, what the panel says, what is removed with a shot. Whoever adds a step add
 from __future__ import annotations
 
 import stat
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from ...torch_backend import contract
 from ..shot.shot_state import ShotState
@@ -72,6 +73,10 @@ class Step:
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """What the panel shows of it, as the shot stands."""
         raise NotImplementedError
+
+    def in_turns(self, scene: bpy.types.Scene, shot: Path) -> Iterator[Any] | None:
+        """What the timer does in turns before it begins the job itself; None if the job can begin at once."""
+        return None
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """What a finished job changes in the scene; returns it in words."""

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
 from ...torch_backend import contract
-from ..access import named, settings_of
-from ..process import backend, begin, job_timer
+from ..access import settings_of
+from ..process import backend
 from ..shot import selection
 from . import drawn_masks, exchange
 
@@ -42,30 +40,6 @@ def drawn(scene: bpy.types.Scene) -> dict[str, str]:
 
 def _is_drawn(scene: bpy.types.Scene, kind: str) -> bool:
     return bool(getattr(settings_of(scene), f"{kind}_from") == "DRAWN")
-
-
-def solve_in_turns(scene_name: str, shot: Path) -> Iterator[job_timer.Progress | None]:
-    """The drawn masks of a scene rendered, a frame a turn of the timer; then its solve is begun."""
-    params(bpy.data.scenes[scene_name], rendered=True)  # what will be refused is refused before
-    for kind, name in drawn(bpy.data.scenes[scene_name]).items():
-        now = None
-        with contextlib.closing(drawn_masks.in_turns(name, shot, kind)) as turns:
-            while True:
-                while bpy.app.is_job_running("RENDER"):  # the artist's own comes first: Blender renders one at a time
-                    yield now
-                told = next(turns, None)
-                if told is None:
-                    break
-                now = job_timer.Progress(f"Rendering the mask {name}, frame {told[0]} of {told[1]}", *told)
-                yield now
-    scene = named(bpy.data.scenes, scene_name)
-    if scene is None:
-        return
-    if selection.shot_folder(scene) != shot:
-        raise contract.JobError(
-            "Another shot was chosen while the masks were rendered.", "Choose this one and solve again."
-        )
-    job_timer.follow("solve", begin.begin(scene, "solve", params(scene, rendered=True)))
 
 
 def _source(scene: bpy.types.Scene, shot: Path | None, kind: str, rendered: bool) -> str:

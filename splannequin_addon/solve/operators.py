@@ -10,12 +10,12 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in
-from ..process import children, job_timer
+from ..process import children, job_timer, steps
 from ..properties import BoolProperty, EnumProperty, IntProperty, StringProperty
 from ..shot import selection
 from ..translations import tr
 from ..ui import step_operator
-from . import arrival, exchange, masks, stmaps
+from . import arrival, exchange, stmaps
 
 FORMATS = [
     ("colmap", "COLMAP", "Cameras, images and points3D as .bin, of the plates in the shot's folder frames"),
@@ -87,9 +87,10 @@ class SPLANNEQUIN_OT_solve_camera(step_operator.StepOperator, bpy.types.Operator
         """Runs the step. In a window drawn masks are rendered a frame per turn of the timer."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
-        if folder is None or bpy.app.background or not masks.drawn(scene):
+        turns = steps.STEPS[self.step].in_turns(scene, folder) if folder is not None else None
+        if folder is None or turns is None or bpy.app.background:
             return super().execute(context)
-        job_timer.work(folder, self.step, masks.solve_in_turns(scene.name, folder))
+        job_timer.work(folder, self.step, turns)
         return {"FINISHED"}
 
 

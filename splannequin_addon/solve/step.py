@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import bpy
 
 from ...torch_backend import contract
+from ..access import named
 from ..footage import plate
-from ..process import job_timer, jobs
+from ..process import begin, job_timer, jobs
 from ..process.steps import Step, View
-from ..shot import scene_objects
+from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
 from . import (
     align_operators,
     arrival,
     cameras,
+    drawn_masks,
     guesses,
     masks,
     matte_operators,
@@ -23,9 +29,6 @@ from . import (
     panel,
     points,
 )
-
-if TYPE_CHECKING:
-    import bpy
 
 
 class Solve(Step):
@@ -48,6 +51,10 @@ class Solve(Step):
     def params(self, scene: bpy.types.Scene) -> contract.SolveParams:
         """The lens, where cameras come from, and what is masked."""
         return masks.params(scene)
+
+    def in_turns(self, scene: bpy.types.Scene, shot: Path) -> Iterator[Any] | None:
+        """Renders drawn masks first, if any are chosen."""
+        return solve_in_turns(scene.name, shot) if masks.drawn(scene) else None
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Camera: how good the solve is."""
@@ -81,6 +88,30 @@ class Solve(Step):
         """Takes camera, points and plate out of the file."""
         plate.remove(scene, shot)
         return ["Camera and points were removed."] if cameras.remove(scene, shot) else []
+
+
+def solve_in_turns(scene_name: str, shot: Path) -> Iterator[job_timer.Progress | None]:
+    """The drawn masks of a scene rendered, a frame a turn of the timer; then its solve is begun."""
+    masks.params(bpy.data.scenes[scene_name], rendered=True)  # what will be refused is refused before
+    for kind, name in masks.drawn(bpy.data.scenes[scene_name]).items():
+        now = None
+        with contextlib.closing(drawn_masks.in_turns(name, shot, kind)) as turns:
+            while True:
+                while bpy.app.is_job_running("RENDER"):  # the artist's own comes first: Blender renders one at a time
+                    yield now
+                told = next(turns, None)
+                if told is None:
+                    break
+                now = job_timer.Progress(f"Rendering the mask {name}, frame {told[0]} of {told[1]}", *told)
+                yield now
+    scene = named(bpy.data.scenes, scene_name)
+    if scene is None:
+        return
+    if selection.shot_folder(scene) != shot:
+        raise contract.JobError(
+            "Another shot was chosen while the masks were rendered.", "Choose this one and solve again."
+        )
+    job_timer.follow("solve", begin.begin(scene, "solve", masks.params(scene, rendered=True)))
 
 
 STEP = Solve()

@@ -108,7 +108,7 @@ def rendering(addon, scene, shot, drawn):
         "DRAWN",
         drawn,
     )
-    timer.work(shot, "solve", addon("solve.masks").solve_in_turns(scene.name, shot))
+    timer.work(shot, "solve", addon("process.steps").STEPS["solve"].in_turns(scene, shot))
     timer.tick()
     watch = timer.watch_of(shot)
     assert not watch.failures and (watch.work.progress.done, watch.work.progress.total) == (1, 3)
