@@ -246,8 +246,8 @@ def _run(
         _log(reporter.folder, traceback.format_exc())
     except Exception as error:
         _log(reporter.folder, traceback.format_exc())
-        path_problem, text = _about_a_path(error, request.shot), str(error).lower()
-        state, code = "failed", path_problem.exit_code if path_problem else int(ExitCode.INTERNAL)
+        known, text = _about_a_path(error, request.shot) or _about_a_module(error), str(error).lower()
+        state, code = "failed", known.exit_code if known else int(ExitCode.INTERNAL)
         if type(error).__name__ == "OutOfMemoryError":  # torch's own, of a card
             message = "The graphics card is out of memory."
             hint = (
@@ -257,16 +257,8 @@ def _run(
         elif isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
             message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."
         else:
-            message = (
-                path_problem.message
-                if path_problem
-                else f"The {request.kind} step broke: {type(error).__name__}: {error}"
-            )
-            hint = (
-                path_problem.hint
-                if path_problem
-                else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
-            )
+            message = known.message if known else f"The {request.kind} step broke: {type(error).__name__}: {error}"
+            hint = known.hint if known else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
     reporter.finish(state, code, message, hint, result)
     if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
         print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log goes with the shot's folder, the status does not
@@ -305,6 +297,17 @@ def _about_a_path(error: Exception, shot: str) -> JobError | None:
     if isinstance(error, FileNotFoundError) and not error.filename:
         return JobError(str(error), "", ExitCode.USAGE)  # said in words by whoever looked for it
     return disk_error(shot) if is_disk_full(error) else path_error(error)
+
+
+def _about_a_module(error: Exception) -> JobError | None:
+    """The sentence for a package that the environment lacks; None for any other error, and for a module of ours."""
+    if not isinstance(error, ModuleNotFoundError) or (error.name or "").partition(".")[0] in ("", __package__):
+        return None
+    return JobError(
+        f"The backend's environment is incomplete: {error}.",
+        "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
+        ExitCode.ENVIRONMENT,
+    )
 
 
 def _log(folder: Path, text: str) -> None:

@@ -57,16 +57,28 @@ def device() -> str:
 
 
 def python() -> str:
-    """The backend's interpreter. JobError if there is none, or if the chosen one is missing."""
+    """The backend's interpreter. JobError if there is none, or only a half-made one, or the chosen one is missing."""
+    unfinished: Path | None = None
     for where, path in candidates():
+        chosen = where in ("the add-on's preferences", PYTHON_VARIABLE)
         if path.is_file():
-            return str(path)
-        if where in ("the add-on's preferences", PYTHON_VARIABLE):
+            if not environment.half_made(path):
+                return str(path)
+            unfinished = unfinished or path.parent.parent
+            if chosen:
+                break
+        elif chosen:
             raise contract.JobError(
                 f"The backend's Python named in {where} does not exist: {path}.",
                 "Correct the path, or clear it to have the backend found by itself.",
                 contract.ExitCode.ENVIRONMENT,
             )
+    if unfinished is not None:
+        raise contract.JobError(
+            f"The backend's set-up has not finished: the environment in {unfinished} is half-made.",
+            "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
+            contract.ExitCode.ENVIRONMENT,
+        )
     raise contract.JobError(
         "Splannequin's backend is not set up: no Python environment for it was found.",
         "Press Set Up Backend in the add-on's preferences, or choose the Python of one that is there "

@@ -26,6 +26,8 @@ CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 SIZE = "about 1.5 GB on disk (6 GB with CUDA)"
 LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp (Apache) and what they need"
 _STATE = "setup"
+_NOTES = ".splannequin"
+"""The launcher's notes in an environment that it makes (launcher/environments.py)."""
 _SHOWN = 6
 
 
@@ -142,12 +144,21 @@ def cancel(setup: SetUp) -> None:
         setup.process.terminate()
 
 
+def half_made(python: Path) -> bool:
+    """True of an interpreter whose environment the launcher has begun and not finished; one without notes is believed.
+
+    As the launcher has it: `installing` stands there while packages are written, `installed.json` once all is there.
+    """
+    notes = python.parent.parent / _NOTES
+    return notes.is_dir() and ((notes / "installing").exists() or not (notes / "installed.json").is_file())
+
+
 def remove(folder: Path) -> bool:
     """Takes the environment in `folder` away. True if there was one; ValueError if it is not one of ours."""
     environment = folder / ".venv"
     if not environment.is_dir():
         return False
-    if not (environment / ".splannequin").is_dir():
+    if not (environment / _NOTES).is_dir():
         raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
     # Renamed first: whatever is interrupted, no half of it passes for an environment.
     gone = folder / f".venv-removed-{os.getpid()}"

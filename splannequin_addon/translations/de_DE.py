@@ -449,6 +449,7 @@ MESSAGES: dict[str, str] = {
     "Correct the path, or clear it to have the backend found by itself.": "Den Pfad berichtigen oder leeren, damit das Backend selbst gefunden wird.",
     "Splannequin's backend is not set up: no Python environment for it was found.": "Splannequins Backend ist nicht eingerichtet: es wurde keine Python-Umgebung dafür gefunden.",
     "Press Set Up Backend in the add-on's preferences, or choose the Python of one that is there (or name it in {}).": "In den Einstellungen des Add-ons „Backend einrichten“ drücken oder das Python eines vorhandenen wählen (oder es in {} nennen).",
+    "The backend's set-up has not finished: the environment in {} is half-made.": "Das Einrichten des Backends ist nicht beendet: die Umgebung in {} ist halb fertig.",
     "The backend's environment is incomplete: {}.": "Die Umgebung des Backends ist unvollständig: {}.",
     "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.": "In den Einstellungen des Add-ons „Reparieren“ drücken oder `python3 splannequin.py setup` noch einmal ausführen.",
     "The backend did not answer: {}.": "Das Backend hat nicht geantwortet: {}.",

@@ -52,13 +52,13 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         layout = layout_of(self)
         try:
             there = bool(backend.python())
-            if not busy():  # a half-made one is not in use yet
-                self._say(layout, f"In use: {backend.python()}", "CHECKMARK")
+            self._say(layout, f"In use: {backend.python()}", "CHECKMARK")
         except contract.JobError as error:
-            column = layout.column(align=True)
-            column.alert = True
-            self._say(column, error.message, "ERROR")
-            self._say(column, error.hint, "BLANK1")
+            if not busy():  # it is about to be there
+                column = layout.column(align=True)
+                column.alert = True
+                self._say(column, error.message, "ERROR")
+                self._say(column, error.hint, "BLANK1")
             there = False
         for line in _findings:
             self._say(layout, line, "DOT")

@@ -184,6 +184,39 @@ def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
     monkeypatch.setattr(supervisor, "_backend", (None, 0.0))
 
 
+def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp_path):
+    """The set-up was cancelled, or Blender closed while it ran: the interpreter stands there, the packages do not."""
+    backend = addon("process.backend")
+    monkeypatch.delenv("SPLANNEQUIN_BACKEND_PYTHON", raising=False)
+    monkeypatch.setenv("SPLANNEQUIN_HOME", str(tmp_path))
+    python = backend.venv_python(tmp_path / ".venv")
+    python.parent.mkdir(parents=True)
+    python.touch()
+    assert backend.python() == str(python), "somebody's own environment has no notes of ours, and is believed"
+    notes = tmp_path / ".venv" / ".splannequin"
+    notes.mkdir()
+    refused = "The backend's set-up has not finished"
+    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(python))  # named: no other one is taken instead
+
+    def said() -> str:
+        trouble = backend.trouble()
+        if trouble is None:
+            return ""
+        assert trouble.exit_code == contract.ExitCode.ENVIRONMENT and "Press Repair" in trouble.hint
+        return trouble.message
+
+    assert said() == f"{refused}: the environment in {tmp_path / '.venv'} is half-made."
+    (notes / "installing").touch()
+    assert refused in said()
+    (notes / "installed.json").write_text("{}")
+    assert refused in said(), "a repair was begun and has not finished"
+    monkeypatch.delenv("SPLANNEQUIN_BACKEND_PYTHON")
+    found = backend.trouble()
+    assert found is not None and refused in found.message or backend.python() != str(python), "the next one is taken"
+    (notes / "installing").unlink()
+    assert backend.python() == str(python)
+
+
 def test_the_sidebar_is_laid_out_once_after_each_change(addon):
     supervisor = addon("process.job_timer")
     supervisor.redraw()

@@ -77,6 +77,7 @@ def test_what_a_station_foretells_is_what_is_left(shot, monkeypatch):
         (OSError(28, "No space left on device"), ExitCode.DISK, "No space left"),
         (ZeroDivisionError("oops"), ExitCode.INTERNAL, "import step broke"),
         (RuntimeError("CUDA out of memory"), ExitCode.INTERNAL, "Out of memory"),
+        (ModuleNotFoundError("No module named 'torch_backend.x'", name="torch_backend.x"), ExitCode.INTERNAL, "broke"),
     ],
 )
 def test_errors_become_a_sentence(shot, monkeypatch, error, code, word):
@@ -118,6 +119,19 @@ def test_who_listens_no_more_ends_no_job_without_its_end(shot, monkeypatch, erro
     job.run_job(folder, listener)
     assert status_of(folder).state == state
     assert [event["type"] for event in events_of(folder)] == ["warning", "done"]
+
+
+def test_a_package_that_the_environment_lacks_is_no_bug(shot, monkeypatch):
+    """Half of a set-up, or a package that somebody removed."""
+
+    def station(shot, params, report):
+        import a_package_that_is_not_there  # noqa: F401  # pyright: ignore
+
+    folder, (code, _) = run_with(shot, monkeypatch, station)
+    status = status_of(folder)
+    assert code == ExitCode.ENVIRONMENT and "bug" not in status.message + status.hint
+    assert status.message == ("The backend's environment is incomplete: No module named 'a_package_that_is_not_there'.")
+    assert "Press Repair" in status.hint and "a_package" in (folder / contract.LOG_FILE).read_text()
 
 
 def test_cancel_file_stops_a_job(shot, monkeypatch):
