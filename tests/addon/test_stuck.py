@@ -212,7 +212,7 @@ def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp
     assert refused in said(), "a repair was begun and has not finished"
     monkeypatch.delenv("SPLANNEQUIN_BACKEND_PYTHON")
     found = backend.trouble()
-    assert found is not None and refused in found.message or backend.python() != str(python), "the next one is taken"
+    assert (found is not None and refused in found.message) or backend.python() != str(python), "the next one is taken"
     (notes / "installing").unlink()
     assert backend.python() == str(python)
 
