@@ -96,6 +96,9 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
             progress.refused(folder)
             self.report({"ERROR"}, tr(f"Blender did not render the scene: {refused}"))
             return {"CANCELLED"}
+        if how == "EXEC_DEFAULT" and progress.end_untold(folder):
+            self.report({"ERROR"}, tr(" ".join(job_timer.watch_of(folder).failures["bake"])))
+            return {"CANCELLED"}
         for note in notes:
             self.report({"INFO"}, tr(note))
         return {"FINISHED"}

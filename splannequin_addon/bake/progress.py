@@ -9,11 +9,45 @@ from bpy.app.handlers import persistent
 
 from ..process import job_timer
 from ..process.job_timer import Progress, Watch, Work
+from ..shot import selection
+
+_IDLE_TURNS = 2
+"""Turns of the timer without a render job after which a render that told no end is over: one may be before its start."""
 
 
 def began(shot: Path, frames: int) -> None:
     """A render of a baked shot begins."""
     job_timer.watch_of(shot).work = Work("bake", None, _progress(0, frames))
+    idle = 0
+
+    def look() -> bool:
+        nonlocal idle
+        idle = 0 if bpy.app.is_job_running("RENDER") else idle + 1
+        return going_on(shot) and (idle < _IDLE_TURNS or not end_untold(shot))
+
+    job_timer.meanwhile(look)
+
+
+def going_on(shot: Path) -> bool:
+    """True while nothing has told the end of a shot's render."""
+    work = job_timer.watch_of(shot).work
+    return work is not None and work.turns is None
+
+
+def end_untold(shot: Path) -> bool:
+    """Ends a render that is over without a word of its handlers, as Blender leaves it where it cannot begin a movie's
+    file. True if there was one."""
+    if not going_on(shot):
+        return False
+    watch = job_timer.watch_of(shot)
+    watch.work = None
+    places = [scene.render.filepath for scene in selection.scenes_of(shot)]
+    watch.failures["bake"] = (
+        f"Blender rendered nothing: can {', '.join(places)} be written to?",
+        "Choose another output path, or see the console for Blender's own words.",
+    )
+    watch.redraw = True
+    return True
 
 
 def refused(shot: Path) -> None:

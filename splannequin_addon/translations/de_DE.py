@@ -237,6 +237,8 @@ MESSAGES: dict[str, str] = {
     "Suggestions come with Scrub in View": "Vorschläge kommen mit „In der Ansicht scrubben“",
     "Cancelled: finished work is kept": "Abgebrochen: Fertiges bleibt erhalten",
     "No shot is chosen: import a clip first": "Kein Shot gewählt: zuerst einen Clip importieren",
+    "Blender rendered nothing: can {} be written to?": "Blender hat nichts gerendert: kann nach {} geschrieben werden?",
+    "Choose another output path, or see the console for Blender's own words.": "Einen anderen Ausgabepfad wählen oder in der Konsole nachsehen, was Blender selbst dazu sagt.",
     "Blender did not render the scene: {}": "Blender hat die Szene nicht gerendert: {}",
     "No file was given": "Keine Datei angegeben",
     "Clip chosen: press Import Clip in the Splannequin tab": "Clip gewählt: im Reiter Splannequin „Clip importieren“ drücken",

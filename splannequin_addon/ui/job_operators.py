@@ -34,6 +34,10 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         if watch and self.step in ("", watch.running()) and job_timer.stop_work(watch):
             job_timer.redraw()
             return {"FINISHED"}
+        render = watch.work if watch is not None else None
+        if watch is not None and render is not None and render.turns is None and not bpy.app.is_job_running("RENDER"):
+            watch.work = None  # it ended, and nothing said so
+            return {"FINISHED"}
         job = watch.jobs.get(steps.current(self.step) or watch.running() or "") if watch else None
         if job is None or job.ended:
             self.report({"WARNING"}, "Nothing is running")

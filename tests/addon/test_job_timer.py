@@ -1,5 +1,6 @@
 """The timer: work of Blender's own in turns, questions to the backend, jobs that end, renders that are followed."""
 
+import contextlib
 import json
 
 import bpy
@@ -181,6 +182,48 @@ def test_a_render_is_followed_by_its_handlers(addon, watch, shot):
     progress.began(shot, 3)
     progress.refused(shot)
     assert watch.running() is None
+
+
+@pytest.fixture
+def movie_to_nowhere(scene, tmp_path):
+    """The scene writes a movie into a folder that cannot be made: Blender tells no end of such a render."""
+    (tmp_path / "file").write_text("")
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):
+        settings.media_type = "VIDEO"
+    settings.file_format = "FFMPEG"
+    scene.render.resolution_x = scene.render.resolution_y = 32
+    scene.frame_end = 2
+    scene.render.filepath = str(tmp_path / "file" / "inside" / "movie")
+    return scene
+
+
+def test_a_render_that_tells_no_end_is_over(addon, supervisor, watch, shot, movie_to_nowhere):
+    addon("bake.progress").began(shot, 2)
+    with contextlib.suppress(RuntimeError):  # some Blenders say so, but not in a window
+        bpy.ops.render.render(animation=True)
+    supervisor.tick()
+    assert watch.running() == "bake", "the job of a render may be about to begin"
+    supervisor.tick()
+    assert watch.running() is None and not supervisor._meanwhile
+    sentence, _ = watch.failures["bake"]
+    assert "rendered nothing" in sentence and movie_to_nowhere.render.filepath in sentence
+    addon("bake.progress").began(shot, 2)
+    addon("bake.progress")._on_end()
+    supervisor.tick()
+    assert not supervisor._meanwhile, "one that told its end is not looked after"
+
+
+def test_a_render_that_wrote_nothing_is_no_success(watch, movie_to_nowhere):
+    with pytest.raises(RuntimeError, match="Blender (rendered nothing|did not render)"):
+        bpy.ops.splannequin.render("EXEC_DEFAULT")
+    assert watch.running() is None
+
+
+def test_cancel_ends_a_render_that_is_no_more(addon, watch, shot):
+    addon("bake.progress").began(shot, 2)
+    assert bpy.ops.splannequin.cancel(step="bake") == {"FINISHED"}
+    assert watch.running() is None and not watch.failures
 
 
 def test_another_file_ends_what_blender_itself_was_doing(supervisor, watch, shot):
