@@ -12,7 +12,7 @@ from ..process.job_timer import Progress, Watch, Work
 from ..shot import selection
 
 _IDLE_TURNS = 2
-"""Turns of the timer without a render job after which a render that told no end is over: one may be before its start."""
+"""Turns of the timer without a render job after which a render that told no end is over: one may be before it."""
 
 
 def began(shot: Path, frames: int) -> None:

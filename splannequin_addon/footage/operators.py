@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
 import bpy
 
-from ..access import Outcome, layout_of, scene_in, settings_of
+from ..access import OneShot, Outcome, layout_of, scene_in, settings_of
 from ..process import job_timer
 from ..properties import BoolProperty, StringProperty
+from ..scene import paths
 from ..shot import selection
 from ..ui import icons, step_operator
 
@@ -40,10 +43,12 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
         if not self.filepath:
             self.report({"ERROR"}, "No file was given")
             return {"CANCELLED"}
-        known = [i for i, one in enumerate(selection.settings(scene_in(context))) if one.clip == self.filepath]
-        if known and len(props.shots):
+        clip = paths.absolute(self.filepath)
+        known = [i for i, one in enumerate(selection.settings(scene_in(context))) if _is_of(one, clip)]
+        if known:
             selection.choose(scene_in(context), known[0])
-        elif props.clip != self.filepath:
+            props.clip = props.clip or self.filepath
+        else:
             folder = selection.shot_folder(scene_in(context))
             state = job_timer.watch_of(folder).state if folder is not None else None
             if state is not None and state.frames:
@@ -51,6 +56,13 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
             props.clip, props.shot_path = self.filepath, ""
         self.report({"INFO"}, "Clip chosen: press Import Clip in the Splannequin tab")
         return {"FINISHED"}
+
+
+def _is_of(one: OneShot, clip: str) -> bool:
+    """True if a clip, an absolute path, is that of a shot; or if the shot, opened without a clip, lies beside it."""
+    if one.clip:
+        return os.path.normcase(paths.absolute(one.clip)) == os.path.normcase(clip)
+    return selection.folder_of(one) == selection.beside(Path(clip))
 
 
 class SPLANNEQUIN_OT_use_movie_clip(bpy.types.Operator):

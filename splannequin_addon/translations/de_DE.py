@@ -460,6 +460,7 @@ MESSAGES: dict[str, str] = {
     "Choose the Python of the backend's environment in the add-on's preferences.": "In den Einstellungen des Add-ons das Python der Backend-Umgebung wählen.",
     # ------------------------------------------------------------------------------------------ several shots, alignment
     "Shots": "Shots",
+    "Its things stay: another shot of the list has the same folder": "Was zu ihm gehört, bleibt: ein anderer Shot der Liste hat denselben Ordner",
     "Which shot of the scene the five steps below are about": "Um welchen Shot der Szene es in den fünf Schritten darunter geht",
     "All shots of the scene if there are several": "Alle Shots der Szene, wenn es mehrere gibt",
     "Shot": "Shot",

@@ -89,7 +89,9 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
         """Removes it."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
-        if self.things and folder is not None:
+        if self.things and selection.folders(scene).count(folder) > 1:
+            self.report({"INFO"}, "Its things stay: another shot of the list has the same folder")
+        elif self.things and folder is not None:
             for note in begin.remove_all(scene, folder):
                 self.report({"INFO"}, note)
         selection.remove(scene, settings_of(scene).loaded_shot)

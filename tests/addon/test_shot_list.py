@@ -346,3 +346,29 @@ def test_paths_of_a_linked_scene_stay_over_saving(linked, shot, tmp_path):
     (tmp_path / "deeper").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "deeper" / "comp.blend"))
     assert (linked.splannequin.shot_path, linked.splannequin.made[0].folder) == before
+
+
+def test_a_video_dropped_again_is_the_shot_that_it_was(addon, scene, shot, tmp_path):
+    """However its path is written: after saving, the .blend holds it relative to itself."""
+    props, clip = scene.splannequin, tmp_path / f"{addon('shot.scene_objects').name_of(shot)}.mp4"
+    clip.touch()
+    props.shot_path = str(shot)
+    bpy.ops.splannequin.use_clip(filepath=str(clip))
+    assert not len(props.shots) and props.clip == str(clip), "the shot beside it was opened without a clip"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    props = bpy.context.scene.splannequin
+    props.clip = f"//{clip.name}"
+    bpy.ops.splannequin.use_clip(filepath=str(clip))
+    assert not len(props.shots)
+    bpy.ops.splannequin.shot_add()
+    props.clip = "/another.mov"
+    bpy.ops.splannequin.use_clip(filepath=str(tmp_path / "x" / ".." / clip.name))
+    assert len(props.shots) == 2 and props.active_shot == 0 and props.clip == f"//{clip.name}"
+
+
+def test_what_two_entries_share_stays_with_the_other(addon, two, shot):
+    props, cameras = two.splannequin, addon("solve.cameras")
+    props.shot_path = str(shot)
+    assert addon("shot.selection").folders(two) == [shot, shot]
+    assert bpy.ops.splannequin.shot_remove(things=True) == {"FINISHED"}
+    assert addon("shot.selection").folders(two) == [shot] and cameras.find(two, shot, "CAMERA") is not None
