@@ -62,7 +62,10 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a shot."""
         folder = selection.shot_folder(scene_in(context))
-        if folder is None or not inventory.read(folder).info:
+        watch = job_timer.watch_of(folder) if folder is not None else None
+        if watch is not None and bpy.app.background:
+            job_timer.refresh(watch)  # no timer does
+        if watch is None or watch.state is None or not watch.state.info:
             cls.poll_message_set(tr("Import a clip first"))
             return False
         return True

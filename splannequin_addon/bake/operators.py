@@ -26,7 +26,7 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
     bl_options = {"REGISTER"}
     step = "bake"
 
-    def execute(self, context: bpy.types.Context) -> Outcome:
+    def perform(self, context: bpy.types.Context) -> Outcome:
         """Bakes; a complete take needs no backend."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
@@ -35,7 +35,7 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
             if folder is not None and not bpy.app.background and own_camera.follows_camera(scene):
                 takes.read_in_turns(scene, folder, self.step)
                 return {"FINISHED"}
-            return super().execute(context)
+            return super().perform(context)
         if not bpy.app.background:
             insertion.bring_in(scene, folder, take)
             return {"FINISHED"}

@@ -22,12 +22,12 @@ class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
     bl_options = {"REGISTER"}
     step = "freeze"
 
-    def execute(self, context: bpy.types.Context) -> Outcome:
+    def perform(self, context: bpy.types.Context) -> Outcome:
         """Runs the step. In a window a camera of the artist's is read a few frames per turn of the timer."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         if not own_camera.name_of(scene) or folder is None or bpy.app.background:
-            return super().execute(context)
+            return super().perform(context)
         takes.read_in_turns(scene, folder, self.step)
         return {"FINISHED"}
 

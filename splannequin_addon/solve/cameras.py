@@ -7,6 +7,8 @@ depth is brought to scene units through it.
 from __future__ import annotations
 
 import math
+import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -299,12 +301,18 @@ def _floor(shot: Path) -> tuple[Sequence[float], float] | None:
 
 
 def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Sparse points of the solve: xyz [P, 3] float32 in solve units, rgb [P, 3] uint8; empty without them."""
+    """Sparse points of the solve: xyz [P, 3] float32 in solve units, rgb [P, 3] uint8; empty without them.
+
+    ValueError if they cannot be read.
+    """
     file = contract.ShotFolder(shot).points
     if not file.is_file():
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    with np.load(file, allow_pickle=False) as stored:
-        return stored["xyz"].astype(np.float32), stored["rgb"].astype(np.uint8)
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            return stored["xyz"].astype(np.float32), stored["rgb"].astype(np.uint8)
+    except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError) as error:
+        raise ValueError(f"{file} is damaged: solve again.") from error
 
 
 def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> bpy.types.Mesh:

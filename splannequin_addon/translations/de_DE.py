@@ -394,6 +394,7 @@ MESSAGES: dict[str, str] = {
     "Check the backend's Python in the add-on's preferences.": "In den Einstellungen des Add-ons das Python des Backends prüfen.",
     "Start it again.": "Noch einmal starten.",
     "Start it again. Its log is {}.": "Noch einmal starten. Das Protokoll ist {}.",
+    "{} is damaged: solve again.": "{} ist beschädigt: die Kamera neu lösen.",
     "{} is damaged: {}.": "{} ist beschädigt: {}.",
     "The backend stopped without a word during {}{}.": "Das Backend hat ohne ein Wort aufgehört, bei: {!t}{}.",
     "Last line of its log: {}": "Letzte Zeile des Protokolls: {}",

@@ -32,26 +32,28 @@ class StepOperator(OperatorBase):
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Runs the step."""
-        scene = scene_in(context)
+        """Runs the step; says in words what keeps it from that."""
         try:
-            job = begin.begin(scene, self.step, self.params(scene))
-            job_timer.follow(self.step, job)
-            if not bpy.app.background:
-                return {"FINISHED"}
-            begin.wait(job)
-            notes = self.after(scene, job)
+            return self.perform(context)
         except contract.Cancelled:
             self.report({"WARNING"}, "Cancelled: finished work is kept")
-            return {"CANCELLED"}
-        except (contract.JobError, ValueError, OSError, RuntimeError) as error:
-            folder = selection.shot_folder(scene)
+        except (contract.JobError, ValueError, OSError, RuntimeError, KeyError) as error:
+            folder = selection.shot_folder(scene_in(context))
             sentence = getattr(error, "message", str(error))
             if folder is not None:
                 job_timer.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
             self.report({"ERROR"}, tr(f"{sentence} {getattr(error, 'hint', '')}".strip()))
-            return {"CANCELLED"}
-        for note in notes:
+        return {"CANCELLED"}
+
+    def perform(self, context: bpy.types.Context) -> Outcome:
+        """Begins the job, and waits for it where nothing follows it. What it raises `execute` tells."""
+        scene = scene_in(context)
+        job = begin.begin(scene, self.step, self.params(scene))
+        job_timer.follow(self.step, job)
+        if not bpy.app.background:
+            return {"FINISHED"}
+        begin.wait(job)
+        for note in self.after(scene, job):
             self.report({"INFO"}, tr(note))
         return {"FINISHED"}
 
@@ -77,7 +79,7 @@ def edit(
         return {"CANCELLED"}
     try:
         notes = change(scene_in(context), folder)
-    except (contract.JobError, OSError, ValueError) as error:
+    except (contract.JobError, OSError, ValueError, RuntimeError, KeyError) as error:
         operator.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
         return {"CANCELLED"}
     job_timer.watch_of(folder).notes[step] = notes

@@ -55,6 +55,15 @@ def test_the_button_writes_a_job_with_what_the_artist_set(scene, imported, tmp_p
     assert places == str([str(imported)])
 
 
+def test_the_button_is_on_once_there_is_something_to_export(scene, shot):
+    """In a script, too, where no timer looks at the folder."""
+    scene.splannequin.shot_path = str(shot)
+    (shot / "shot.json").rename(shot / "away")
+    assert not bpy.ops.splannequin.export_for_farm.poll()
+    (shot / "away").rename(shot / "shot.json")
+    assert bpy.ops.splannequin.export_for_farm.poll()
+
+
 def test_the_button_says_what_is_wrong(scene, imported, tmp_path, contract):
     scene.splannequin.shot_path = str(imported)
     with pytest.raises(RuntimeError, match="t\\* is frame 900"):

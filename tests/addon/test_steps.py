@@ -1,11 +1,13 @@
 """The five steps and their buttons, run headless on real jobs, and what they change in the scene."""
 
+import io
 import json
 import shutil
 import types
 from pathlib import Path
 
 import bpy
+import numpy as np
 import pytest
 
 
@@ -229,6 +231,37 @@ def test_a_newer_shot_is_refused_in_words(addon, contract, tmp_path: Path):
         addon("shot.inventory").read(tmp_path)
     watch = addon("process.job_timer").watch_of(tmp_path)
     assert "version 99" in watch.failures["import"][0], "the panel shows it instead of breaking"
+
+
+def test_no_button_meets_a_newer_or_damaged_shot_with_a_traceback(scene, shot, tmp_path, monkeypatch, capfd):
+    """Nor does what asks at every draw whether one is on."""
+    scene.splannequin.shot_path = str(shot)
+    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))  # then Bake looks into the shot itself
+    for text in ('{"version": 99, "name": "x"}', "{"):
+        (shot / "shot.json").write_text(text)
+        assert not bpy.ops.splannequin.export_for_farm.poll()
+        for name in ("bake", "freeze", "solve_camera", "train", "import_clip"):
+            with pytest.raises(RuntimeError) as told:
+                getattr(bpy.ops.splannequin, name)()
+            assert "Traceback" not in str(told.value), name
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_broken_points_are_told_in_a_sentence(addon, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    points = shot / "solve" / "points.npz"
+    whole = points.read_bytes()
+    archive = io.BytesIO()
+    np.savez(archive, other=np.zeros(3))
+    for data in (whole[: len(whole) // 2], b"", b"no archive", archive.getvalue()):
+        points.write_bytes(data)
+        with pytest.raises(RuntimeError) as told:
+            bpy.ops.splannequin.load_camera()
+        assert str(told.value).strip() == f"Error: {points} is damaged: solve again."
+    german = addon("translations").translate(f"{points} is damaged: solve again.", "de_DE")
+    assert german == f"{points} ist beschädigt: die Kamera neu lösen."
+    points.write_bytes(whole)
+    assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
 
 
 def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_path):
