@@ -95,15 +95,22 @@ def give_camera_back(scene: bpy.types.Scene) -> None:
 def tidy(scene: bpy.types.Scene) -> None:
     """Lets go of what the artist deleted: the pointer would keep it in the file, out of sight."""
     before = settings_of(scene).camera_before
-    if before is not None and not before.users_scene:
+    if before is not None and not _stands(before, [scene.objects]):
         settings_of(scene).camera_before = None
     for entry in settings_of(scene).made:
-        for name in (*PARTS, "plate"):
-            item = getattr(entry, name)
-            if item is not None and not item.users_scene:
-                setattr(entry, name, None)
         if entry.collection is not None and entry.collection not in scene.collection.children_recursive:
             entry.collection = None
+        own = [entry.collection.objects] if entry.collection is not None else []  # few, and most of ours lie there
+        for name in (*PARTS, "plate"):
+            item = getattr(entry, name)
+            if item is not None and not _stands(item, [*own, scene.objects]):
+                setattr(entry, name, None)
+
+
+def _stands(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:
+    """True if a scene has an object, looked for by its name `among` some first: every turn of the timer asks, and
+    `users_scene` copies the list of all objects of every scene, which may be tens of thousands."""
+    return any(named(objects, item.name) == item for objects in among) or bool(item.users_scene)
 
 
 def adopt(scene: bpy.types.Scene, shot: Path) -> None:

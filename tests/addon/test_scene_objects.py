@@ -1,6 +1,7 @@
 """What is ours in a scene, and what the artist's: copies, renamed objects, things hung on the root, other files."""
 
 import shutil
+import sys
 
 import bpy
 import numpy as np
@@ -78,6 +79,34 @@ def test_what_the_artist_deleted_is_let_go(addon, built, shot):
     assert bpy.data.objects.get("my shot é camera") is None or not bpy.data.objects["my shot é camera"].users
     cameras.build(built, shot)
     assert cameras.find(built, shot, "CAMERA")
+
+
+def test_a_turn_of_the_timer_lists_no_scenes_objects(addon, built, shot):
+    """There may be tens of thousands, and the artist waits meanwhile."""
+    made, called = addon("shot.scene_objects"), []
+    assert built.splannequin.camera_before is not None and built.splannequin.made[0].camera is not None
+    sys.setprofile(lambda frame, event, _: called.append(frame.f_code.co_name) if event == "call" else None)
+    try:
+        made.tidy(built)
+    finally:
+        sys.setprofile(None)
+    assert "tidy" in called and "users_scene" not in called
+    assert built.splannequin.camera_before is not None and built.splannequin.made[0].camera is not None
+
+
+def test_what_another_scene_has_is_not_let_go(addon, built, shot):
+    made, camera = addon("shot.scene_objects"), built.splannequin.made[0].camera
+    own = built.splannequin.camera_before
+    elsewhere = bpy.data.scenes.new("elsewhere")
+    for item in (camera, own):
+        for collection in item.users_collection:
+            collection.objects.unlink(item)
+        elsewhere.collection.objects.link(item)
+    made.tidy(built)
+    assert built.splannequin.made[0].camera == camera and built.splannequin.camera_before == own
+    bpy.data.scenes.remove(elsewhere)
+    made.tidy(built)
+    assert built.splannequin.made[0].camera is None and built.splannequin.camera_before is None
 
 
 def test_ours_are_found_after_saving_and_in_a_full_copy_of_the_scene(addon, built, shot, tmp_path):
