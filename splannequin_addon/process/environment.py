@@ -13,6 +13,8 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
+import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,6 +30,8 @@ LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp
 _STATE = "setup"
 _NOTES = ".splannequin"
 """The launcher's notes in an environment that it makes (launcher/environments.py)."""
+_REMOVED = ".venv-removed-"
+"""Begins the name of an environment that was taken away and is being deleted."""
 _SHOWN = 6
 
 
@@ -153,19 +157,30 @@ def half_made(python: Path) -> bool:
     return notes.is_dir() and ((notes / "installing").exists() or not (notes / "installed.json").is_file())
 
 
-def remove(folder: Path) -> bool:
-    """Takes the environment in `folder` away. True if there was one; ValueError if it is not one of ours."""
+def remove(folder: Path, wait: bool = False) -> bool:
+    """Takes the environment in `folder` away. True if there was one; ValueError if it is not one of ours.
+
+    It is gone at once; its gigabytes are deleted in the background unless asked to `wait`.
+    """
     environment = folder / ".venv"
     if not environment.is_dir():
         return False
     if not (environment / _NOTES).is_dir():
         raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
     # Renamed first: whatever is interrupted, no half of it passes for an environment.
-    gone = folder / f".venv-removed-{os.getpid()}"
-    os.replace(environment, gone)
-    shutil.rmtree(gone, ignore_errors=True)
+    os.replace(environment, folder / f"{_REMOVED}{uuid.uuid4().hex[:8]}")
     shutil.rmtree(folder / _STATE, ignore_errors=True)
+    if wait:
+        _empty(folder)
+    else:
+        threading.Thread(target=_empty, args=(folder,), name="removed backend", daemon=True).start()
     return True
+
+
+def _empty(folder: Path) -> None:
+    """Deletes removed environments, also those that a Blender that was closed meanwhile left there."""
+    for gone in folder.glob(f"{_REMOVED}*"):
+        shutil.rmtree(gone, ignore_errors=True)
 
 
 def findings(facts: str) -> list[str]:

@@ -440,6 +440,8 @@ MESSAGES: dict[str, str] = {
     "Checking the backend.": "Das Backend wird geprüft.",
     "The backend's environment was removed": "Die Umgebung des Backends wurde entfernt",
     "There was nothing to remove": "Es gab nichts zu entfernen",
+    "The environment stays: it is being set up": "Die Umgebung bleibt: sie wird gerade eingerichtet",
+    "The environment stays: a step of {} runs. Wait for it or cancel it.": "Die Umgebung bleibt: ein Schritt von {} läuft. Darauf warten oder ihn abbrechen.",
     "The environment stays: {}": "Die Umgebung bleibt: {}",
     "Python {}, torch {}.": "Python {}, torch {}.",
     "Trains on {}.": "Trainiert auf {}.",

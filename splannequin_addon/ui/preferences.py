@@ -215,9 +215,17 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
         return context.window_manager.invoke_confirm(self, event)
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Deletes it."""
+        """Deletes it, unless somebody is at work with it."""
+        if busy():
+            self.report({"ERROR"}, "The environment stays: it is being set up")
+            return {"CANCELLED"}
+        for watch in job_timer.watches():
+            if any(not job.ended for job in watch.jobs.values()):
+                name = watch.shot.name
+                self.report({"ERROR"}, tr(f"The environment stays: a step of {name} runs. Wait for it or cancel it."))
+                return {"CANCELLED"}
         try:
-            there = environment.remove(backend.folder())
+            there = environment.remove(backend.folder(), wait=bpy.app.background)
         except (OSError, ValueError) as error:
             self.report({"ERROR"}, tr(f"The environment stays: {error}"))
             return {"CANCELLED"}

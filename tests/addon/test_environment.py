@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -60,6 +61,50 @@ def test_what_is_not_ours_is_not_removed(addon, tmp_path):
     with pytest.raises(ValueError, match="was not made by Splannequin"):
         addon("process.environment").remove(tmp_path)
     assert (tmp_path / ".venv").is_dir()
+
+
+@pytest.fixture
+def made(addon, tmp_path, monkeypatch):
+    """A folder with an environment of ours, where Set Up Backend would put it."""
+    folder = tmp_path / "backend"
+    (folder / ".venv" / ".splannequin").mkdir(parents=True)
+    (folder / ".venv" / "package.py").touch()
+    monkeypatch.setattr(addon("process.backend"), "folder", lambda: folder)
+    return folder
+
+
+def test_removal_does_not_wait_for_the_files(addon, made):
+    """Deleting gigabytes takes longer than Blender may stand still; what was left of an earlier one goes, too."""
+    environment = addon("process.environment")
+    (made / ".venv-removed-before").mkdir()
+    deleted_by: set[str] = set()
+
+    def note(frame, event, _) -> None:
+        if event == "call" and "rmtree" in frame.f_code.co_name:
+            deleted_by.add(threading.current_thread().name)
+
+    threading.setprofile(note)
+    try:
+        assert environment.remove(made)
+    finally:
+        threading.setprofile(None)
+    assert not (made / ".venv").exists()
+    for thread in threading.enumerate():
+        if thread.name == "removed backend":
+            thread.join(60.0)
+    assert deleted_by == {"removed backend"} and not list(made.iterdir())
+
+
+def test_what_a_job_works_with_is_not_removed(addon, contract, made, shot):
+    supervisor, jobs = addon("process.job_timer"), addon("process.jobs")
+    job = jobs.new_job(shot, "train", contract.TrainParams())
+    supervisor.follow("train", job)
+    with pytest.raises(RuntimeError, match=f"a step of {shot.name} runs"):
+        bpy.ops.splannequin.remove_backend()
+    assert (made / ".venv" / "package.py").exists()
+    job.status = contract.Status("train", "done", 0, 0.0, 1.0, 0.0)
+    assert bpy.ops.splannequin.remove_backend() == {"FINISHED"}
+    assert not list(made.iterdir()), "headless, it is gone when the button says so"
 
 
 def test_the_button_needs_leave_to_go_online(addon):
