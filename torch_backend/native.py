@@ -16,10 +16,11 @@ import os
 import sys
 import tempfile
 import threading
+from collections import deque
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, cast
 
 import torch
@@ -49,6 +50,8 @@ def default_threads() -> int:
 
 
 _WORTH_A_THREAD = 460_000
+_LOOK_SECONDS = 1.0
+"""A caller looks so often whether its workers have ended, if nothing tells it: nobody may wait for a word for ever."""
 
 
 @contextlib.contextmanager
@@ -134,34 +137,74 @@ def build(name: str, text: str) -> Launch:
     return launch
 
 
+class _Ask:
+    """One stage that is asked for: who has begun and ended is told by lists, which no interrupt leaves halfway."""
+
+    def __init__(self, run: Launch, address: int, stage: int, workers: int) -> None:
+        self._run, self._address, self._stage = run, address, stage
+        self._pending = deque(range(workers))
+        self._entered: list[None] = []
+        self._left: list[None] = []
+        self._told: SimpleQueue[None] = SimpleQueue()
+        self.errors: list[BaseException] = []
+        """What workers ended with that did not end well."""
+
+    def help(self) -> None:
+        """A worker of the crew's: one that nobody has begun, if there still is one."""
+        self._entered.append(None)
+        try:
+            self._take(self._pending.pop)
+        finally:
+            self._left.append(None)
+            self._told.put(None)
+
+    def finish(self) -> None:
+        """The caller's: all that nobody has begun; then waits for who has. Returns when nobody is at the block."""
+        while True:
+            try:
+                while self._take(self._pending.popleft):
+                    pass
+                left = len(self._left)  # before who entered: who did so meanwhile is waited for
+                if left == len(self._entered):
+                    return
+                self._told.get(timeout=_LOOK_SECONDS)
+            except Empty:
+                pass
+            except BaseException as raised:  # Ctrl-C: raised once the block is nobody's
+                self.errors.append(raised)
+
+    def _take(self, pop: Callable[[], int]) -> bool:
+        try:
+            worker = pop()
+        except IndexError:
+            return False
+        try:
+            self._run(self._address, self._stage, worker)
+        except BaseException as raised:  # whoever asked raises it
+            self.errors.append(raised)
+        return True
+
+
 class _Crew:
     """Threads that carry out what they are asked to. A pool of futures takes several times as long."""
 
     def __init__(self) -> None:
         self._lock, self._threads = threading.Lock(), 0
-        self._asked: SimpleQueue[tuple[Launch, int, int, int, SimpleQueue[BaseException | None]]] = SimpleQueue()
+        self._asked: SimpleQueue[_Ask] = SimpleQueue()
 
-    def ask(self, run: Launch, address: int, stage: int, workers: int) -> "SimpleQueue[BaseException | None]":
-        """Runs a stage as workers 1 to `workers` - 1; the queue gets what each of them ended with, in any order."""
-        if self._threads < workers - 1:
+    def ask(self, ask: _Ask, helpers: int) -> None:
+        """Has so many threads help."""
+        if self._threads < helpers:
             with self._lock:
-                while self._threads < workers - 1:
+                while self._threads < helpers:
                     threading.Thread(target=self._work, name=f"native-{self._threads}", daemon=True).start()
                     self._threads += 1
-        ended: SimpleQueue[BaseException | None] = SimpleQueue()
-        for worker in range(1, workers):
-            self._asked.put((run, address, stage, worker, ended))
-        return ended
+        for _ in range(helpers):
+            self._asked.put(ask)
 
     def _work(self) -> None:
         while True:
-            run, address, stage, worker, ended = self._asked.get()
-            error: BaseException | None = None
-            try:
-                run(address, stage, worker)
-            except BaseException as raised:  # whoever asked raises it
-                error = raised
-            ended.put(error)
+            self._asked.get().help()
 
 
 _crew = _Crew()
@@ -177,28 +220,21 @@ if hasattr(os, "register_at_fork"):
 
 
 def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
-    """Run one stage of a block (a ctypes structure with a field `counter`) on `workers` threads, the caller's too."""
+    """Run one stage of a block (a ctypes structure with a field `counter`) as so many workers, on as many threads as
+    come in time, the caller's among them: a stage must not have one worker wait for another."""
     block.counter = 0
     address = ctypes.addressof(block)
     if workers == 1:
         run(address, stage, 0)
         return
-    ended = _crew.ask(run, address, stage, workers)
-    errors: list[BaseException] = []
+    ask = _Ask(run, address, stage, workers)
     try:
-        run(address, stage, 0)
+        _crew.ask(ask, workers - 1)
     except BaseException as raised:
-        errors.append(raised)
-    left = workers - 1
-    while left:  # as long as one of them runs the block has to stay, whatever Ctrl-C says
-        try:
-            error = ended.get()
-            left -= 1
-            errors += [] if error is None else [error]
-        except BaseException as raised:
-            errors.append(raised)
-    if errors:
-        raise errors[0]
+        ask.errors.append(raised)
+    ask.finish()
+    if ask.errors:
+        raise ask.errors[0]
 
 
 class Snippet:

@@ -12,6 +12,7 @@ import pytest
 import torch
 import warp as wp
 
+from torch_backend import native
 from torch_backend.native import (
     INTEGER,
     POINTER,
@@ -147,26 +148,39 @@ def test_an_error_of_a_worker_is_the_callers_once_all_have_ended(failing):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a signal for one thread is POSIX")
 def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
-    at_work, ended = threading.Event(), []
+    main, at_work, begun, ended = threading.get_ident(), threading.Event(), [], []
 
     def run(_address, _stage, worker):
-        if worker:
+        if threading.get_ident() == main:
+            assert at_work.wait(30.0)
+        else:
+            begun.append(worker)
             at_work.set()
-            time.sleep(0.3)
+            time.sleep(0.5)
             ended.append(worker)
-
-    main = threading.get_ident()
 
     def interrupt():
         at_work.wait()
+        time.sleep(0.1)
         signal.pthread_kill(main, signal.SIGINT)
 
     other = threading.Thread(target=interrupt)
     other.start()
     with pytest.raises(KeyboardInterrupt):
         run_workers(run, Block(), 0, 3)
-    assert sorted(ended) == [1, 2]
+    assert begun and sorted(begun) == sorted(ended)
     other.join()
+
+
+def test_a_caller_does_itself_what_no_worker_has_begun():
+    """Workers that are late, or were not woken, hold nobody up."""
+    crew, done, hold = native._Crew(), [], threading.Event()
+    crew.ask(native._Ask(lambda *_: hold.wait(), 0, 0, 1), 1)  # its one thread is busy with another's
+    ask = native._Ask(lambda _address, _stage, worker: done.append(worker), 0, 0, 5)
+    crew.ask(ask, 1)
+    ask.finish()
+    assert sorted(done) == [0, 1, 2, 3, 4] and not ask.errors
+    hold.set()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows does not fork")
