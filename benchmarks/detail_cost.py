@@ -37,6 +37,7 @@ from torch_backend.footage.importing import import_key
 from torch_backend.footage.opening import open_source
 from torch_backend.footage.plates import Plates
 from torch_backend.shot import Shot, write_json
+from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 
 THREADS = 2
 WIDTHS = (640, 1280, 3840)
@@ -79,6 +80,9 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
     key = import_key(open_source(str(footage), config.fps, config.layer).info, config)
     record |= {"config": settings, "key": key, "bits": 8, "beside": ""}
     write_json(copy / "frames" / "frames.json", record)
+    for checkpoint in (copy / "runs").glob("*/checkpoint.safetensors"):  # they were trained on these, smaller
+        tensors, facts = load_checkpoint(checkpoint)
+        save_checkpoint(checkpoint, tensors, {**facts, "pictures": key})
     made = Shot.open(copy)
     made.update(source=str(footage))
     note = Plates(made).note

@@ -165,9 +165,13 @@ def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
         signal.pthread_kill(main, signal.SIGINT)
 
     other = threading.Thread(target=interrupt)
-    other.start()
-    with pytest.raises(KeyboardInterrupt):
-        run_workers(run, Block(), 0, 3)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        other.start()
+        with pytest.raises(KeyboardInterrupt):
+            run_workers(run, Block(), 0, 3)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert begun and sorted(begun) == sorted(ended)
     other.join()
 
