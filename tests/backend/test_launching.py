@@ -179,7 +179,11 @@ def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
 def test_a_caller_does_itself_what_no_worker_has_begun():
     """Workers that are late, or were not woken, hold nobody up."""
     crew, done, hold = native._Crew(), [], threading.Event()
-    crew.ask(native._Ask(lambda *_: hold.wait(), 0, 0, 1), 1)  # its one thread is busy with another's
+
+    def busy(_address, _stage, _worker):
+        hold.wait()
+
+    crew.ask(native._Ask(busy, 0, 0, 1), 1)  # its one thread is at another's
     ask = native._Ask(lambda _address, _stage, worker: done.append(worker), 0, 0, 5)
     crew.ask(ask, 1)
     ask.finish()
