@@ -163,9 +163,7 @@ class JobReporter:
         if self._listener:
             try:
                 self._listener(event)
-            except (
-                OSError
-            ) as error:  # its terminal is gone, or its log's disk is full: the work is not to be lost by it
+            except OSError as error:  # its terminal is gone, or its disk is full: no work is to be lost by that
                 self._listener = None
                 if isinstance(error, BrokenPipeError):  # as `| head` does: nobody wants to know how it goes on
                     self.cancel()

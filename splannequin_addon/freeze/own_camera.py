@@ -94,9 +94,8 @@ def _sampled(
             contract.ExitCode.USAGE,
         )
     scene.frame_set(number)
-    graph = present(
-        _layer(scene, camera).depsgraph
-    )  # the context's may be another scene's, where the camera stands still
+    # The context's may be another scene's, where the camera stands still.
+    graph = present(_layer(scene, camera).depsgraph)
     seen = camera.evaluated_get(graph)
     if not seen.is_evaluated:
         raise contract.JobError(
