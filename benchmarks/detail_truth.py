@@ -3,8 +3,9 @@
 SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot, with exact
 cameras, and an `auto` run are made in DIR if they are not there. Printed is the mean PSNR of all poses and instants
 that have a truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and what got worse; and
-their ST-LPIPS, if its weights are there: a metric of pictures that forgives a shift by two pixels. The pose of t*
-itself does not count: plate t* is its truth. DIR gets truth-NAME.json.
+their ST-LPIPS, if its weights are there: a metric of pictures that forgives a shift by two pixels. Of scenes with a
+small mover it also tells how much of that is there (`torch_backend/report/things.py`). The pose of t* itself does not
+count: plate t* is its truth. DIR gets truth-NAME.json.
 
 Pictures are judged at the size of the run, or with `--delivered` as an artist gets them: at that of the plates.
 """
@@ -31,6 +32,7 @@ from torch_backend.contract import SWITCH, JobError
 from torch_backend.native import default_threads
 from torch_backend.report.metrics import WHOLE, score
 from torch_backend.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
+from torch_backend.report.things import overall, recall_of
 from torch_backend.report.truth import REGIONS, TruthScene
 from torch_backend.shot import write_json
 from torch_backend.train import load_run
@@ -38,6 +40,8 @@ from torch_backend.train import load_run
 VARIANTS = (SPLATS, DEVELOPED, WITHHELD, DELIVERED)
 PERCEIVED = "st_lpips"
 """In a row: the same by ST-LPIPS; less is better."""
+RECALLED = "recalled"
+"""In a row: {variant: {thing: [pixels that show it, pixels that should]}}, {} of scenes without a small mover."""
 GOALS = {WHOLE: 4.0, "never_seen": 3.0, "moving": 1.5}
 """Region -> dB that delivered frames should gain over splats."""
 WITHHELD_GOAL = 2.0
@@ -59,7 +63,7 @@ def trained(truth: TruthScene, source: str, args: argparse.Namespace) -> str:
 def judge(
     truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1, develop: bool = True, width: int = 0
 ) -> list[dict[str, Any]]:
-    """Every pose of every instant: [{t_star, pose, variant: {region: dB or None}, `PERCEIVED`: the same of it}].
+    """Every pose of every instant: [{t_star, pose, variant: {region: dB or None}, `PERCEIVED`, `RECALLED`}].
 
     Not developed is as splats are. But for the pose of t* itself: what is delivered there is plate t*, which is the
     truth to the byte. `width`: pixels of the pictures; 0: the plates' own.
@@ -69,10 +73,12 @@ def judge(
     for t_star in t_stars:
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
-            told = {name: score(image, target, regions) for name, image in _pictures(clip, pose, t_star).items()}
+            behind, pictures = truth.behind(t_star, pose, *size), _pictures(clip, pose, t_star)
+            told = {name: score(image, target, regions) for name, image in pictures.items()}
             row: dict[str, Any] = {"t_star": t_star, "pose": pose}
             row |= {v: {region: of["psnr_db"] for region, of in found.items()} for v, found in told.items()}
             row[PERCEIVED] = {v: {region: of[PERCEIVED] for region, of in found.items()} for v, found in told.items()}
+            row[RECALLED] = {name: recall_of(behind, image, target, regions) for name, image in pictures.items()}
             rows.append(row)
         print(f"{truth.name}, t* {t_star}: {gains_text(means(rows)[WHOLE])} dB whole so far", flush=True)
     return rows
@@ -132,6 +138,30 @@ def perceived_table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     return [*head, *lines] if lines else []
 
 
+def recalls(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, tuple[float | None, float | None]]]:
+    """{thing: {variant: share of its pixels that is there, in all poses and in the worst}}."""
+    things = dict.fromkeys(thing for row in rows for of in row[RECALLED].values() for thing in of)
+    return {
+        thing: {v: overall([row[RECALLED][v][thing] for row in rows if thing in row[RECALLED][v]]) for v in VARIANTS}
+        for thing in things
+    }
+
+
+def recall_table(found: dict[str, dict[str, dict[str, tuple[float | None, float | None]]]]) -> list[str]:
+    """Recall by scene and thing in Markdown; nothing where there is no small mover."""
+    lines = [
+        f"| {scene} | {thing} | {' -> '.join(' / '.join(_share(s) for s in of[v]) for v in VARIANTS)} |"
+        for scene, things in found.items()
+        for thing, of in things.items()
+    ]
+    head = ["", "| scene | thing | recall: all poses / the worst |", "|---|---|---|"]
+    return [*head, *lines] if lines else []
+
+
+def _share(share: float | None) -> str:
+    return "–" if share is None else f"{share:.3f}"
+
+
 def shortfalls(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     """Sentences: regions that got worse, and gains that are less than wanted."""
     sentences = []
@@ -164,7 +194,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--train-only", action="store_true")
     args = parser.parse_args(argv)
     torch.set_num_threads(default_threads())
-    found, seen, results = {}, {}, args.results.absolute()
+    found, seen, there, results = {}, {}, {}, args.results.absolute()
     try:
         for folder in args.scenes:
             source = f"{args.cameras}:{folder.absolute()}"
@@ -175,7 +205,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 continue
             width = 0 if args.delivered else load_run(truth.shot, run, torch.device("cpu")).width
             rows = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on", width)
-            found[truth.name], seen[truth.name] = means(rows), perceived(rows)
+            found[truth.name], seen[truth.name], there[truth.name] = means(rows), perceived(rows), recalls(rows)
             name = truth.name.replace(" ", "-")
             facts = {"version": 1, "scene": truth.name, "run": str(truth.shot.run(run))}
             write_json(results / f"truth-{name}.json", {**facts, "mean": found[truth.name], "frames": rows})
@@ -183,7 +213,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"Error: {error}", file=sys.stderr)
         return 1
     if found:
-        print("\n".join(["", *table(found), *perceived_table(seen), "", *shortfalls(found)]))
+        tables = [*table(found), *perceived_table(seen), *recall_table(there)]
+        print("\n".join(["", *tables, "", *shortfalls(found)]))
     return 0
 
 

@@ -8,11 +8,9 @@ import numpy as np
 
 from .records import SPLATS, FrameScore, RunRecord
 from .setting import NONE, Setting
-from .things import RECALL_APART, RECALL_DISTANCE
+from .things import LEAST_PIXELS, RECALL_APART, RECALL_DISTANCE, overall
 from .truth import PANES
 
-LEAST_PIXELS = 6
-"""A pose in which fewer pixels should show the thing says nothing by itself: it counts in the sum only."""
 RECALLED = ("swinging", "arm")
 """Things whose presence is asked for."""
 
@@ -78,11 +76,7 @@ def _counts(runs: Sequence[RunRecord], name: str) -> list[tuple[int, int]]:
 
 def _recall(counts: Sequence[tuple[int, int]]) -> list[str]:
     """Over all frames, and of the worst frame of those with enough pixels."""
-    should = sum(of for _, of in counts)
-    if not should:
-        return [NONE, NONE]
-    each = [found / of for found, of in counts if of >= LEAST_PIXELS]
-    return [f"{sum(found for found, _ in counts) / should:.2f}", f"{min(each):.2f}" if each else NONE]
+    return [NONE if share is None else f"{share:.2f}" for share in overall(counts)]
 
 
 def _decibels(setting: Setting, region: str) -> str:

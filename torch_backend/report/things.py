@@ -22,6 +22,8 @@ display-referred values in [0, 1]. PSNR of such a pixel is 16.5 dB: soft, displa
 RECALL_APART = 0.1
 """Thing and background less far apart than this, in the same measure, cannot be told from each other: such pixels do
 not count."""
+LEAST_PIXELS = 6
+"""A pose in which fewer pixels should show the thing says nothing by itself: it counts in the sum only."""
 OPENED = 0.5
 """A pixel of a frozen frame was taken for something that moves if its motion matte is above this."""
 
@@ -50,6 +52,16 @@ def recall_of(
 ) -> dict[str, list[int]]:
     """{thing: [pixels that show it, pixels that should]} of a frozen frame, for every thing that has a `behind`."""
     return {name: list(recalled(image, truth, b, regions[name])) for name, b in behind.items() if name in regions}
+
+
+def overall(counts: Sequence[tuple[int, int]]) -> tuple[float | None, float | None]:
+    """Shares of what `recalled` counted in several frames: of all their pixels, and of the worst frame's.
+
+    None where there is nothing to count; frames of fewer than `LEAST_PIXELS` are no worst one.
+    """
+    should = sum(of for _, of in counts)
+    each = [found / of for found, of in counts if of >= LEAST_PIXELS]
+    return sum(found for found, _ in counts) / should if should else None, min(each) if each else None
 
 
 def opened_on(motion: Tensor, regions: Mapping[str, Tensor]) -> dict[str, float]:

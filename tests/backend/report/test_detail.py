@@ -145,6 +145,20 @@ def test_regions_that_got_worse_are_named():
     json.dumps(mean)
 
 
+def test_how_much_of_a_small_mover_is_there_is_told_of_all_poses_and_of_the_worst():
+    def pose(found: int, should: int) -> dict:
+        return {detail_truth.RECALLED: {v: {"arm": [found, should]} for v in detail_truth.VARIANTS}}
+
+    nowhere = {detail_truth.RECALLED: {v: {} for v in detail_truth.VARIANTS}}
+    there = detail_truth.recalls([pose(90, 100), pose(30, 60), pose(0, 5), nowhere])
+    assert there == {"arm": dict.fromkeys(detail_truth.VARIANTS, (120 / 165, 0.5))}, "five pixels are no worst pose"
+    row = "| room | arm | 0.727 / 0.500 -> 0.727 / 0.500 -> 0.727 / 0.500 -> 0.727 / 0.500 |"
+    assert detail_truth.recall_table({"room": there})[-1] == row
+    few = detail_truth.recalls([pose(0, 0)])
+    assert detail_truth.recall_table({"room": few})[-1] == f"| room | arm | {' -> '.join(['– / –'] * 4)} |"
+    assert detail_truth.recall_table({"room": detail_truth.recalls([nowhere])}) == []
+
+
 def test_a_sway_that_mattes_miss_makes_plates_prefer_the_mean_and_truth_the_instant():
     def picture(*places: int) -> torch.Tensor:
         shown = torch.full((40, 60, 3), 0.2)
