@@ -8,11 +8,13 @@ from typing import Any
 
 import bpy
 
+from ...torch_backend import contract
 from ..access import OneShot, Outcome, layout_of, scene_in, settings_of
 from ..process import job_timer
 from ..properties import BoolProperty, StringProperty
 from ..scene import paths
-from ..shot import selection
+from ..shot import selection, source
+from ..translations import tr
 from ..ui import icons, step_operator
 
 VIDEO = ".mp4;.mov;.m4v;.mkv;.avi;.mxf;.mts;.webm;.mpg;.mpeg"
@@ -119,6 +121,24 @@ class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator)
     bl_label = "Import Clip"
     bl_options = {"REGISTER"}
     step = "import"
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
+        """Asks first where the shot is of another clip: a script that says both has said what it wants."""
+        question = replaces(scene_in(context))
+        if not question:
+            return self.execute(context)
+        return context.window_manager.invoke_confirm(
+            self, event, title="Import Another Clip", message=tr(question), confirm_text="Import", icon="WARNING"
+        )
+
+
+def replaces(scene: bpy.types.Scene) -> str:
+    """What an import would replace, in a sentence, if the scene's shot was made of another clip than is chosen."""
+    clip, folder = paths.absolute(settings_of(scene).clip), selection.shot_folder(scene)
+    if not clip or folder is None or source.is_of(folder, clip) is not False:
+        return ""
+    other = contract.printable(source.named(folder))
+    return f"{folder.name} is the shot of {other}: its frames are replaced, and its solve is removed."
 
 
 CLASSES = (

@@ -23,6 +23,7 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
     Raises:
         contract.JobError: nothing to work on, no backend, or the shot cannot be written.
     """
+    selection.look_again()
     params = params or steps.STEPS[step].params(scene)
     folder = needed(scene, step)
     backend.python()  # before anything is written: without a backend there is nothing to start

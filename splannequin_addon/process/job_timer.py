@@ -205,6 +205,7 @@ def refresh(watch: Watch) -> bool:
             return False
         watch.stamp = stamp
         watch.state = inventory.read(watch.shot)
+        selection.look_again()
     except (OSError, ValueError, KeyError) as error:
         watch.state = ShotState(watch.shot)
         why = getattr(error, "strerror", None) or error

@@ -8,6 +8,7 @@ and range, where a shot has set them.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,16 @@ from ...torch_backend import contract
 from .. import compat
 from ..access import OneShot, library_of, settings_of
 from ..scene import paths, scene_setup
-from . import scene_objects
+from . import scene_objects, source
 from .shot_state import ShotState
 
 _T_STAR = "splannequin.t_star"
 """Data path of the one setting that can be keyed."""
 _ITEMS_OWN = ("rna_type", "name", "scene_settings")
 """What an item of the list has beside a shot's settings."""
+_LOOK_SECONDS = 1.0
+_beside: dict[Path, tuple[float, Path]] = {}
+"""Clip -> when its shot folder was looked up, monotonic seconds, and the folder."""
 
 
 def names() -> list[str]:
@@ -44,8 +48,26 @@ def folder_of(one: OneShot) -> Path | None:
 
 
 def beside(clip: Path) -> Path:
-    """The shot folder of a clip for which none was chosen."""
-    return clip.with_name(clip.stem + contract.SHOT_SUFFIX)
+    """The shot folder of a clip for which none was chosen: it is called as the clip, with the clip's ending where
+    another clip's shot is called so. Looked up once a second, since drawing asks all the time."""
+    found = _beside.get(clip)
+    if found is None or time.monotonic() - found[0] > _LOOK_SECONDS:
+        found = _beside[clip] = (time.monotonic(), _free_beside(clip))
+    return found[1]
+
+
+def look_again() -> None:
+    """Has `beside` look at the disk when it is asked next: a shot may have been imported since."""
+    _beside.clear()
+
+
+def _free_beside(clip: Path) -> Path:
+    plain = clip.with_name(clip.stem + contract.SHOT_SUFFIX)
+    if source.is_of(plain, clip):
+        return plain
+    # A folder of pictures has no ending.
+    whole = clip.with_name((clip.name if clip.suffix else f"{clip.name} 2") + contract.SHOT_SUFFIX)
+    return whole if source.is_of(plain, clip) is False or source.is_of(whole, clip) else plain
 
 
 def settings(scene: bpy.types.Scene) -> list[OneShot]:

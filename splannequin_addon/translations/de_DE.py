@@ -378,6 +378,8 @@ MESSAGES: dict[str, str] = {
     "The shot folder {} is not there any more: moved, renamed or deleted.": "Der Shot-Ordner {} ist nicht mehr da: verschoben, umbenannt oder gelöscht.",
     "Locate": "Suchen",
     "Import Anew": "Von Neuem importieren",
+    "Import Another Clip": "Einen anderen Clip importieren",
+    "{} is the shot of {}: its frames are replaced, and its solve is removed.": "{} ist der Shot von {}: seine Bilder werden ersetzt, und seine Kameralösung wird entfernt.",
     "Choose the folder that holds shot.json; its name ends with .splannequin unless it was renamed.": "Den Ordner wählen, in dem shot.json liegt; sein Name endet auf .splannequin, wenn er nicht umbenannt wurde.",
     "{} cannot be read: {}": "{} kann nicht gelesen werden: {}",
     "The shot folder {} is not there any more.": "Der Shot-Ordner {} ist nicht mehr da.",

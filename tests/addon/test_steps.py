@@ -274,6 +274,66 @@ def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_pat
     assert addon("shot.selection").shot_folder(scene) == tmp_path / "second.splannequin"
 
 
+def imported(addon, scene, clip, name: Path) -> Path:
+    """The shot folder of a clip that was imported in the scene, a copy called `name`."""
+    name.parent.mkdir(exist_ok=True)
+    shutil.copy(clip, name)
+    scene.splannequin.clip = str(name)
+    addon("process.begin").run(scene, "import")
+    return addon("shot.selection").shot_folder(scene)
+
+
+@pytest.fixture
+def a_few(scene):
+    """Eight frames are imported."""
+    scene.splannequin.use_range, scene.splannequin.first, scene.splannequin.last = True, 1, 8
+    return scene
+
+
+def test_two_clips_that_differ_in_their_ending_have_a_shot_each(addon, a_few, clip, tmp_path):
+    first = imported(addon, a_few, clip, tmp_path / "a.mov")
+    second = imported(addon, a_few, clip, tmp_path / "a.mp4")
+    assert (first, second) == (tmp_path / "a.splannequin", tmp_path / "a.mp4.splannequin")
+    sources = [addon("shot.source").named(folder) for folder in (first, second)]
+    assert sources == [str(tmp_path / "a.mov"), str(tmp_path / "a.mp4")]
+    for name, folder in (("a.mov", first), ("a.mp4", second)):
+        assert imported(addon, a_few, clip, tmp_path / name) == folder, "the same clip again"
+    assert not addon("shot.selection").missing(a_few, addon("shot.inventory").read(second))
+    shutil.rmtree(first)
+    addon("shot.selection").look_again()
+    assert addon("shot.selection").shot_folder(a_few) == second, "its own shot, though the shorter name is free"
+    (tmp_path / "a").mkdir()
+    a_few.splannequin.clip = str(tmp_path / "a")
+    assert addon("shot.selection").shot_folder(a_few) == first
+
+
+def test_a_clip_and_its_shot_stay_together_wherever_they_are_taken(addon, a_few, clip, tmp_path):
+    imported(addon, a_few, clip, tmp_path / "here" / "a.mov")
+    shutil.copytree(tmp_path / "here", tmp_path / "copy")
+    a_few.splannequin.clip = str(tmp_path / "copy" / "a.mov")
+    assert addon("shot.selection").shot_folder(a_few) == tmp_path / "copy" / "a.splannequin"
+    (tmp_path / "here").rename(tmp_path / "there")
+    a_few.splannequin.clip = str(tmp_path / "there" / "a.mov")
+    assert addon("shot.selection").shot_folder(a_few) == tmp_path / "there" / "a.splannequin"
+
+
+def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_without_a_question(
+    addon, a_few, clip, tmp_path
+):
+    replaces, props = addon("footage.operators").replaces, a_few.splannequin
+    props.shot_path = str(tmp_path / "own.splannequin")
+    props.clip = str(tmp_path / "A" / "shot.mp4")
+    assert not replaces(a_few), "nothing is there yet"
+    imported(addon, a_few, clip, tmp_path / "A" / "shot.mp4")
+    assert not replaces(a_few), "the same clip again"
+    props.clip = str(tmp_path / "B" / "shot.mp4")
+    told = replaces(a_few)
+    assert told.startswith(f"own.splannequin is the shot of {tmp_path / 'A' / 'shot.mp4'}: its frames")
+    assert addon("translations").translate(told, "de_DE").startswith("own.splannequin ist der Shot von ")
+    props.clip = ""
+    assert not replaces(a_few), "its own clip is taken"
+
+
 def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, shot, tmp_path):
     bpy.ops.splannequin.insert_freeze()
     with_shot.frame_start = with_shot.frame_end = 5

@@ -10,8 +10,8 @@ ROOT = Path(__file__).resolve().parents[2]
 FREE = (
     "bake.node_names", "bake.take_files", "freeze.live", "process.children", "process.environment", "process.jobs",
     "process.steps", "scene.axes", "scene.ownership", "scene.numbered", "scene.scene_setup", "shot.checkpoints",
-    "shot.inventory", "shot.file_cache", "shot.markers", "shot.shot_state", "solve.alignment", "train.estimates",
-    "train.training", "ui.icons",
+    "shot.inventory", "shot.file_cache", "shot.markers", "shot.shot_state", "shot.source", "solve.alignment",
+    "train.estimates", "train.training", "ui.icons",
 )  # fmt: skip
 IMPORTS = """
 import importlib, importlib.util, sys
