@@ -10,9 +10,9 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
-from ..access import named, settings_of
+from ..access import present, settings_of
 from ..process import job_timer
-from ..scene import rollback, scene_setup
+from ..scene import rollback, scene_setup, session
 from ..shot import inventory, scene_objects
 from ..shot.shot_state import ShotState
 from . import compositor, freeze_group, rendering, take_files
@@ -162,23 +162,25 @@ def bring_in(scene: bpy.types.Scene, shot: Path, take: str, alone: bool = True) 
         take: name of a take.
         alone: see `scene`.
     """
-    job_timer.work(shot, "bake", _turns(scene.name, shot, take, scene.name if alone else ""))
+    job_timer.work(shot, "bake", _turns(scene.session_uid, shot, take, scene.session_uid if alone else 0))
 
 
-def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
+def _turns(scene_uid: int, shot: Path, take: str, only: int) -> Iterator[None]:
     """A picture a turn; the compositor; the render, a turn after it, since Blender takes its time for both."""
+    if session.scene_of(scene_uid) is None:
+        return
     with contextlib.suppress(
         contract.JobError, OSError, RuntimeError, ValueError
     ):  # inserting fails alike, and says so
-        yield from read_ahead(bpy.data.scenes[scene_name], shot, take)
-    seen = ""
+        yield from read_ahead(present(session.scene_of(scene_uid)), shot, take)
+    seen = 0
 
     def put_in(scene: bpy.types.Scene) -> list[str]:
         nonlocal seen
         changes = insert_freeze(scene, shot, take)
         if job_timer.window_of(scene) is not None:
             changes += rendering.choose_output(scene, shot, take)  # here, for it belongs to the same undo step
-            seen = scene.name
+            seen = scene.session_uid
         else:
             changes.append(f"{scene.name} is in no window: it was not rendered.")
         return changes
@@ -187,7 +189,7 @@ def _turns(scene_name: str, shot: Path, take: str, only: str) -> Iterator[None]:
     if not seen:
         return
     yield None
-    scene = named(bpy.data.scenes, seen)
+    scene = session.scene_of(seen)
     window = job_timer.window_of(scene) if scene is not None else None
     if window is not None:
         with bpy.context.temp_override(window=window, scene=window.scene):  # pyright: ignore[reportUnknownMemberType]

@@ -14,7 +14,7 @@ from ..access import library_of, present, settings_of
 from ..freeze import takes
 from ..process import backend, job_timer, jobs, steps
 from ..process.steps import Step, View
-from ..scene import scene_setup
+from ..scene import scene_setup, session
 from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
 from . import farm, freeze_group, insertion, operators, panel, progress, shown_take
@@ -79,7 +79,8 @@ class Bake(Step):
         """In turns: Blender reads pictures, compositor and render. It is about the scene where it was asked for, alone;
         about all that work on the shot, if that is not there any more."""
         name, take = steps.scene_of(job), str(job.params["take"])
-        asked = next((s for s in bpy.data.scenes if s.name == name and not library_of(s)), None)
+        named = next((s for s in bpy.data.scenes if s.name == name and not library_of(s)), None)
+        asked = session.scene_of(job.scene_uid) or named  # by its name in another file, and of a job found again
         if asked is None:
             insertion.bring_in(scene, job.shot, take, alone=False)
         elif asked in selection.scenes_of(job.shot):

@@ -11,7 +11,7 @@ from mathutils import Matrix
 
 from ...torch_backend import contract
 from ..access import camera_of, named, present, settings_of
-from ..scene import axes, scene_setup
+from ..scene import axes, scene_setup, session
 from ..shot import inventory, scene_objects, selection
 
 
@@ -59,7 +59,7 @@ def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Ge
     Raises:
         contract.JobError: the camera is gone, or is no perspective camera.
     """
-    uid, before = scene.session_uid, scene.frame_current  # a name may be that of another scene, in another file
+    uid, before = scene.session_uid, scene.frame_current
     size = scene_setup.render_size(scene)
     width = width or size[0]
     height = max(1, round(size[1] * width / size[0]))
@@ -68,18 +68,13 @@ def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Ge
     frames: list[contract.CameraFrame] = []
     try:
         for number in numbers:
-            frames.append(_sampled(_scene(uid), name, shot, number, (width, height)))
+            frames.append(_sampled(session.scene_of(uid), name, shot, number, (width, height)))
             yield len(frames)
     finally:
-        back = _scene(uid)
+        back = session.scene_of(uid)
         if back is not None:
             back.frame_set(before)
     return contract.CameraPath(width, height, frames)
-
-
-def _scene(uid: int) -> bpy.types.Scene | None:
-    """The scene that has a number in this session, whatever it is called now; None if it is gone."""
-    return next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
 
 
 def _sampled(

@@ -15,6 +15,7 @@ from ...torch_backend import contract
 from .. import compat
 from ..access import settings_of
 from ..process import backend, begin, job_timer, steps
+from ..scene import session
 from ..shot import inventory, selection
 from . import own_camera
 
@@ -166,11 +167,11 @@ def read_in_turns(scene: bpy.types.Scene, shot: Path, step: str) -> None:
     job_timer.watch_of(shot).notes.clear()
     turns = own_camera.sample_path(scene, own_camera.name_of(scene), shot, _asked(scene, step).width)
     total = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
-    job_timer.work(shot, step, reading(scene.name, shot, step, turns, total))
+    job_timer.work(shot, step, reading(scene.session_uid, shot, step, turns, total))
 
 
 def reading(
-    scene_name: str, shot: Path, step: str, turns: Generator[int, None, contract.CameraPath], total: int
+    scene_uid: int, shot: Path, step: str, turns: Generator[int, None, contract.CameraPath], total: int
 ) -> Iterator[job_timer.Progress]:
     """A camera read by `turns`, `own_camera.sample_path`, for part of a turn of the timer each; then its take begun."""
     done, path = 0, None
@@ -183,7 +184,7 @@ def reading(
                 yield job_timer.Progress(f"Reading the camera, frame {done} of {total}", done, total)
             except StopIteration as end:
                 path = end.value
-    found = bpy.data.scenes.get(scene_name)
+    found = session.scene_of(scene_uid)
     if found is None:
         return
     if selection.shot_folder(found) != shot:

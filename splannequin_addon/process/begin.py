@@ -34,6 +34,7 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
         job = jobs.new_job(folder, steps.STEPS[step].kind, params)
         (job.folder / contract.STEP_FILE).write_text(step, encoding="utf-8")
         (job.folder / contract.SCENE_FILE).write_text(scene.name, encoding="utf-8")
+        job.scene_uid = scene.session_uid
     except OSError as error:
         raise inventory.unwritable(folder, error, "Choose another shot folder.") from error
     try:

@@ -397,10 +397,10 @@ def window_of(scene: bpy.types.Scene) -> bpy.types.Window | None:
     return next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
 
 
-def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]], only: str = "") -> None:
-    """Changes the scenes that work on a shot, or the one of them that is named `only`: as one undo step each in a
-    window. Notes what was changed or why not."""
-    for scene in [s for s in selection.scenes_of(watch.shot) if only in ("", s.name)]:
+def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]], only: int = 0) -> None:
+    """Changes the scenes that work on a shot, or the one of them whose `session_uid` is `only`: as one undo step each
+    in a window. Notes what was changed or why not."""
+    for scene in [s for s in selection.scenes_of(watch.shot) if only in (0, s.session_uid)]:
         window = window_of(scene)
         try:
             if window is None:

@@ -68,6 +68,8 @@ class Job:
     """State and last words of the job, as its events tell them."""
     over: bool = False
     """It had ended before this Blender met it: what it made is there, and nothing follows from its end."""
+    scene_uid: int = 0
+    """`session_uid` of the scene in which this Blender was asked for it; 0 of one that was found again."""
     beat: tuple[float, float] | None = None
     """Last sign of life of a job of another computer, and when it was first seen, monotonic seconds."""
 

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     import bpy
 
 NAME = "t*"
-_known: dict[str, tuple[int, int]] = {}
-"""Scene -> (frame of the marker, t*) when they last agreed."""
+_known: dict[int, tuple[int, int]] = {}
+"""`session_uid` of a scene -> (frame of the marker, t*) when they last agreed."""
 
 
 def toggle(scene: bpy.types.Scene) -> bool:
@@ -19,13 +19,13 @@ def toggle(scene: bpy.types.Scene) -> bool:
     if remove(scene):
         return False
     scene.timeline_markers.new(NAME, frame=settings_of(scene).t_star)
-    _known[scene.name] = (settings_of(scene).t_star, settings_of(scene).t_star)
+    _known[scene.session_uid] = (settings_of(scene).t_star, settings_of(scene).t_star)
     return True
 
 
 def remove(scene: bpy.types.Scene) -> bool:
     """Takes the marker away. True if there was one."""
-    _known.pop(scene.name, None)
+    _known.pop(scene.session_uid, None)
     marker = named(scene.timeline_markers, NAME)
     if marker is None:
         return False
@@ -38,17 +38,17 @@ def follow(scene: bpy.types.Scene) -> bool:
     marker, props = named(scene.timeline_markers, NAME), settings_of(scene)
     if marker is None or marker.frame == props.t_star:
         if marker is not None:
-            _known[scene.name] = (marker.frame, props.t_star)
+            _known[scene.session_uid] = (marker.frame, props.t_star)
         return False
-    before = _known.get(scene.name)
+    before = _known.get(scene.session_uid)
     if before is not None and before[0] != marker.frame and before[1] == props.t_star:
         props.t_star, props.choose_t_star = marker.frame, True
     else:
         marker.frame = props.t_star
-    _known[scene.name] = (marker.frame, props.t_star)
+    _known[scene.session_uid] = (marker.frame, props.t_star)
     return True
 
 
 def forget() -> None:
-    """Drops what is known of scenes: another file may have others of the same names."""
+    """Drops what is known of scenes, as those of another file are others."""
     _known.clear()

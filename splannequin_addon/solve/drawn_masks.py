@@ -14,14 +14,15 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import named, present
+from ..access import present
+from ..scene import session
 from ..shot import inventory, places
 from . import exchange
 
 
 def render(mask: bpy.types.Mask, shot: Path, kind: str) -> Path:
     """`in_turns`, all at once."""
-    turns = in_turns(mask.name, shot, kind)
+    turns = in_turns(mask.session_uid, mask.name, shot, kind)
     while True:
         try:
             next(turns)
@@ -29,7 +30,7 @@ def render(mask: bpy.types.Mask, shot: Path, kind: str) -> Path:
             return end.value
 
 
-def in_turns(name: str, shot: Path, kind: str) -> Generator[tuple[int, int], None, Path]:
+def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple[int, int], None, Path]:
     """Renders a mask for every frame of an imported shot, a frame a turn; yields how many are done, and of how many.
 
     Returns the folder, SHOT/masks/KIND, with a picture for each. What it held stays until all of them are there.
@@ -52,7 +53,7 @@ def in_turns(name: str, shot: Path, kind: str) -> Generator[tuple[int, int], Non
     shift = _shift(folder)
     try:
         for done, number in enumerate(numbers, 1):
-            _render_one(name, size, beside / contract.frame_file(number, contract.PICTURE), number + shift)
+            _render_one(mask_uid, name, size, beside / contract.frame_file(number, contract.PICTURE), number + shift)
             yield done, len(numbers)
         for old in into.glob("*.png"):
             if old.stem.isdecimal():
@@ -64,9 +65,9 @@ def in_turns(name: str, shot: Path, kind: str) -> Generator[tuple[int, int], Non
     return into
 
 
-def _render_one(name: str, size: tuple[int, int], file: Path, frame: int) -> None:
+def _render_one(mask_uid: int, name: str, size: tuple[int, int], file: Path, frame: int) -> None:
     """A mask at a frame of the scene, as a picture. JobError if it is gone, or the picture was not written."""
-    mask = named(bpy.data.masks, name)
+    mask = session.of(bpy.data.masks, mask_uid)
     if mask is None:
         raise contract.JobError(f"The mask {name} is gone.", "Choose another mask.", contract.ExitCode.USAGE)
     with _stage(mask, size) as scene:

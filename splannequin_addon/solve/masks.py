@@ -31,11 +31,11 @@ def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolvePara
     return asked
 
 
-def drawn(scene: bpy.types.Scene) -> dict[str, str]:
-    """Kind of mask -> name of the one that was drawn in Blender and is chosen for it."""
+def drawn(scene: bpy.types.Scene) -> dict[str, bpy.types.Mask]:
+    """Kind of mask -> the one that was drawn in Blender and is chosen for it."""
     held = settings_of(scene)
     chosen = {kind: getattr(held, f"{kind}_drawn") for kind in contract.MASK_KINDS if _is_drawn(scene, kind)}
-    return {kind: mask.name for kind, mask in chosen.items() if mask is not None}
+    return {kind: mask for kind, mask in chosen.items() if mask is not None}
 
 
 def _is_drawn(scene: bpy.types.Scene, kind: str) -> bool:

@@ -10,10 +10,10 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
-from ..access import named
 from ..footage import plate
 from ..process import begin, job_timer, jobs
 from ..process.steps import Step, View
+from ..scene import session
 from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
 from . import (
@@ -54,7 +54,7 @@ class Solve(Step):
 
     def in_turns(self, scene: bpy.types.Scene, shot: Path) -> Iterator[Any] | None:
         """Renders drawn masks first, if any are chosen."""
-        return solve_in_turns(scene.name, shot) if masks.drawn(scene) else None
+        return solve_in_turns(scene.session_uid, shot) if masks.drawn(scene) else None
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Camera: how good the solve is."""
@@ -90,12 +90,12 @@ class Solve(Step):
         return ["Camera and points were removed."] if cameras.remove(scene, shot) else []
 
 
-def solve_in_turns(scene_name: str, shot: Path) -> Iterator[job_timer.Progress | None]:
+def solve_in_turns(scene_uid: int, shot: Path) -> Iterator[job_timer.Progress | None]:
     """The drawn masks of a scene rendered, a frame a turn of the timer; then its solve is begun."""
-    masks.params(bpy.data.scenes[scene_name], rendered=True)  # what will be refused is refused before
-    for kind, name in masks.drawn(bpy.data.scenes[scene_name]).items():
+    chosen = _chosen(scene_uid)
+    for kind, (mask_uid, name) in chosen.items():
         now = None
-        with contextlib.closing(drawn_masks.in_turns(name, shot, kind)) as turns:
+        with contextlib.closing(drawn_masks.in_turns(mask_uid, name, shot, kind)) as turns:
             while True:
                 while bpy.app.is_job_running("RENDER"):  # the artist's own comes first: Blender renders one at a time
                     yield now
@@ -104,7 +104,7 @@ def solve_in_turns(scene_name: str, shot: Path) -> Iterator[job_timer.Progress |
                     break
                 now = job_timer.Progress(f"Rendering the mask {name}, frame {told[0]} of {told[1]}", *told)
                 yield now
-    scene = named(bpy.data.scenes, scene_name)
+    scene = session.scene_of(scene_uid)
     if scene is None:
         return
     if selection.shot_folder(scene) != shot:
@@ -112,6 +112,16 @@ def solve_in_turns(scene_name: str, shot: Path) -> Iterator[job_timer.Progress |
             "Another shot was chosen while the masks were rendered.", "Choose this one and solve again."
         )
     job_timer.follow("solve", begin.begin(scene, "solve", masks.params(scene, rendered=True)))
+
+
+def _chosen(scene_uid: int) -> dict[str, tuple[int, str]]:
+    """Kind of mask -> (`session_uid`, name) of what `masks.drawn` says of a scene; what will be refused is refused
+    before anything is rendered."""
+    scene = session.scene_of(scene_uid)
+    if scene is None:
+        return {}
+    masks.params(scene, rendered=True)
+    return {kind: (mask.session_uid, mask.name) for kind, mask in masks.drawn(scene).items()}
 
 
 STEP = Solve()

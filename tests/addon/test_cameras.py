@@ -377,7 +377,7 @@ def read_on(addon, moving, shot):
     moving.frame_end = 100000  # more than a turn reads
     moving.frame_set(77)
     turns = addon("freeze.own_camera").sample_path(moving, "Camera", shot, 64)
-    timer.work(shot, "freeze", takes.reading(moving.name, shot, "freeze", turns, 100000))
+    timer.work(shot, "freeze", takes.reading(moving.session_uid, shot, "freeze", turns, 100000))
     timer.tick()
     assert timer.watch_of(shot).work.progress.done and moving.frame_current != 77
     return timer.watch_of(shot)
@@ -402,6 +402,19 @@ def test_a_scene_that_is_renamed_while_its_camera_is_read_is_read_on(addon, movi
     next(turns)
     moving.name = "renamed"
     assert len(run_out(turns).frames) == 5 and moving.frame_current == 3
+
+
+def test_a_take_begins_though_its_scene_is_renamed_while_the_camera_is_read(addon, moving, shot):
+    timer, turns = addon("process.job_timer"), addon("freeze.own_camera").sample_path(moving, "Camera", shot, 64)
+    moving.splannequin.shot_path = str(shot)
+    timer.work(shot, "freeze", addon("freeze.takes").reading(moving.session_uid, shot, "freeze", turns, 5))
+    moving.name = "renamed"
+    bpy.data.scenes.new("Scene")
+    watch = timer.watch_of(shot)
+    while watch.work is not None:
+        timer.tick()
+    assert not watch.failures and watch.jobs["freeze"].scene_uid == moving.session_uid
+    watch.jobs["freeze"].process.wait()
 
 
 def run_out(turns):

@@ -89,10 +89,12 @@ def test_a_bake_whose_frames_are_there_comes_in_in_turns(addon, contract, superv
     assert watch.running() == "bake" and not watch.failures, "the render begins with the next turn"
 
 
-def ended_bake(addon, contract, supervisor, watch, shot, scene: str):
-    """A bake whose frames are there has ended just now; it was asked for in the scene of that name."""
+def ended_bake(addon, contract, supervisor, watch, shot, scene: str, uid: int = 0):
+    """A bake whose frames are there has ended just now; it was asked for in the scene of that name, in this session if
+    it has a number."""
     job = addon("process.jobs").new_job(shot, "freeze", contract.FreezeParams(take="freeze"))
     (job.folder / contract.SCENE_FILE).write_text(scene, encoding="utf-8")
+    job.scene_uid = uid
     job.status = contract.Status("freeze", "done", 0, 0.0, 1.0, 0.0)
     supervisor.follow("bake", job)
     supervisor._ended(watch, "bake", job)
@@ -132,6 +134,29 @@ def test_a_bake_of_a_scene_that_is_gone_comes_into_those_of_the_shot(addon, cont
     assert sorted(baked(addon)) == ["A lookdev", "Scene"]
 
 
+def test_a_bake_comes_into_its_scene_though_that_is_renamed_meanwhile(addon, contract, supervisor, watch, scene, shot):
+    """While its job runs, and in the turns in which it comes in; others have its names since."""
+    uid = scene.session_uid
+    scene.name = "renamed"
+    other = bpy.data.scenes.new("Scene")
+    other.splannequin.shot_path = str(shot)
+    ended_bake(addon, contract, supervisor, watch, shot, "Scene", uid)
+    supervisor.tick()
+    scene.name = "renamed again"
+    until_it_renders(supervisor, watch)
+    assert baked(addon) == ["renamed again"] and not watch.failures
+
+
+def test_a_bake_whose_scene_is_deleted_while_it_comes_in_changes_no_other(addon, contract, supervisor, watch, shot):
+    other = bpy.data.scenes.new("A lookdev")
+    other.splannequin.shot_path = str(shot)
+    ended_bake(addon, contract, supervisor, watch, shot, "A lookdev", other.session_uid)
+    bpy.data.scenes.remove(other)
+    for _ in range(4):
+        supervisor.tick()
+    assert watch.work is None and baked(addon) == [] and not watch.failures
+
+
 def test_a_bake_of_a_scene_that_has_another_shot_now_is_only_told_of(addon, contract, supervisor, watch, shot):
     other = bpy.data.scenes.new("A lookdev")
     other.splannequin.shot_path = str(shot)
@@ -162,6 +187,7 @@ def test_a_job_that_had_ended_before_it_was_met_renders_nothing(addon, contract,
     (job.folder / contract.STATUS_FILE).write_text(json.dumps(status.__dict__))
     monkeypatch.setattr(jobs, "_FIRST_LOOK_SECONDS", -1.0)
     scene.splannequin.shot_path = str(shot)
+    scene.frame_start = scene.frame_end  # if it renders nevertheless, that is not long
     watch = supervisor.watch_of(shot)
     assert not watch.jobs["bake"].ended, "there is more to read"
     for _ in range(5):

@@ -85,13 +85,13 @@ def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_a
     into.mkdir(parents=True)
     (into / "000005.png").write_bytes(b"of before")
     scenes = list(bpy.data.scenes)
-    turns = addon("solve.drawn_masks").in_turns(drawn.name, shot, "people")
+    turns = addon("solve.drawn_masks").in_turns(drawn.session_uid, drawn.name, shot, "people")
     assert next(turns) == (1, 3) and next(turns) == (2, 3)
     assert list(bpy.data.scenes) == scenes, "what it renders in is gone between two turns"
     turns.close()
     assert [p.name for p in into.parent.iterdir()] == ["people"]
     assert [(p.name, p.read_bytes()) for p in into.iterdir()] == [("000005.png", b"of before")]
-    turns = addon("solve.drawn_masks").in_turns(drawn.name, shot, "people")
+    turns = addon("solve.drawn_masks").in_turns(drawn.session_uid, drawn.name, shot, "people")
     next(turns)
     bpy.data.masks.remove(drawn)
     with pytest.raises(addon("solve.drawn_masks").contract.JobError, match="The mask people é is gone"):
@@ -123,6 +123,15 @@ def test_masks_are_rendered_by_the_timer_and_then_the_solve_begins(addon, render
     assert not rendering.failures and rendering.work is None
     assert rendering.jobs["solve"].params["people_mask"] == str(shot / "masks" / "people")
     assert sorted(p.name for p in (shot / "masks" / "people").iterdir()) == ["000005.png", "000006.png", "000007.png"]
+    rendering.jobs["solve"].process.wait()
+
+
+def test_a_solve_begins_though_its_scene_and_its_mask_are_renamed_meanwhile(addon, rendering, scene, drawn, shot):
+    scene.name, drawn.name = "renamed", "renamed"
+    for _ in range(3):
+        addon("process.job_timer").tick()
+    assert not rendering.failures and rendering.jobs["solve"].scene_uid == scene.session_uid
+    assert len(list((shot / "masks" / "people").iterdir())) == 3
     rendering.jobs["solve"].process.wait()
 
 

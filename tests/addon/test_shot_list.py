@@ -285,7 +285,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
 
 def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, other):
     supervisor = addon("process.job_timer")
-    read = addon("freeze.takes").reading(two.name, other, "freeze", iter_path(contract), 1)
+    read = addon("freeze.takes").reading(two.session_uid, other, "freeze", iter_path(contract), 1)
     supervisor.work(other, "freeze", read)
     two.splannequin.active_shot = 0
     while supervisor.watch_of(other).work is not None:

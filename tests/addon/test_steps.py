@@ -423,6 +423,9 @@ def test_marker_and_instant_follow_whichever_changed_last(addon, with_shot, shot
     marker.frame = 6
     markers.follow(scene)
     assert marker.frame == 5, "after a file load the setting in the file leads"
+    scene.name = "renamed"
+    marker.frame = 7
+    assert markers.follow(scene) and scene.splannequin.t_star == 7, "known by another name"
     other = scene.timeline_markers.new("mine", frame=3)
     assert "The marker t* was removed." in addon("process.begin").remove_all(scene, shot)
     assert list(scene.timeline_markers) == [other]
