@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Generator
@@ -49,7 +51,8 @@ def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple
         raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE) from error
     into = folder.drawn_masks(kind)
     into.mkdir(parents=True, exist_ok=True)
-    beside = into.with_name(f".{kind}-{uuid.uuid4().hex}")  # not in it: what is killed leaves no picture there
+    _tidy(into.parent)
+    beside = _beside(into, os.getpid())
     shift = _shift(folder)
     try:
         for done, number in enumerate(numbers, 1):
@@ -63,6 +66,30 @@ def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return into
+
+
+def _beside(into: Path, pid: int) -> Path:
+    """Where a process makes the pictures of a folder: not in it, since what is killed leaves some. Its name says whose
+    they are."""
+    return into.with_name(f".{into.name}-{_here()}-{pid}-{int(contract.process_start(pid))}-{uuid.uuid4().hex[:8]}")
+
+
+_BESIDE = re.compile(r"\.[a-z]+-([0-9a-f]{8})-([0-9]{1,10})-([0-9]{1,20})-[0-9a-f]{8}")
+
+
+def _here() -> str:
+    """What tells this computer from others in the name of a folder."""
+    return hashlib.sha256(contract.computer_name().encode()).hexdigest()[:8]
+
+
+def _tidy(masks: Path) -> None:
+    """Removes what Blenders of this computer that were killed while they rendered a mask left in a shot."""
+    if contract.is_link(masks):
+        return
+    left = [(folder, _BESIDE.fullmatch(folder.name)) for folder in masks.glob(".*")]
+    for folder, told in left:
+        if told and told[1] == _here() and not contract.runs_still(int(told[2]), float(told[3])):
+            shutil.rmtree(folder, ignore_errors=True)  # a link is left alone
 
 
 def _render_one(mask_uid: int, name: str, size: tuple[int, int], file: Path, frame: int) -> None:

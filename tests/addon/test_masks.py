@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import bpy
@@ -97,6 +99,22 @@ def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_a
     with pytest.raises(addon("solve.drawn_masks").contract.JobError, match="The mask people é is gone"):
         next(turns)
     assert [(p.name, p.read_bytes()) for p in into.iterdir()] == [("000005.png", b"of before")]
+
+
+def test_what_a_killed_blender_left_of_a_mask_is_removed_by_the_next_one_and_a_living_ones_stays(addon, shot, drawn):
+    into, masks = shot / "masks" / "people", addon("solve.drawn_masks")
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        half, ours = masks._beside(into, other.pid), masks._beside(into.with_name("ignore"), os.getpid())
+        kept = [ours, into.with_name(".people"), into.with_name(".people-1")]
+        for folder in (half, *kept):
+            folder.mkdir(parents=True)
+            (folder / "000005.png").write_bytes(b"half of all")
+        masks.render(drawn, shot, "people")
+        assert (half / "000005.png").is_file(), "it is at work"
+        other.kill()
+    masks.render(drawn, shot, "people")
+    assert sorted(p for p in into.parent.iterdir()) == sorted([*kept, into])
+    assert len(list(into.iterdir())) == 3
 
 
 @pytest.fixture
