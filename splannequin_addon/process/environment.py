@@ -157,6 +157,12 @@ def half_made(python: Path) -> bool:
     return notes.is_dir() and ((notes / "installing").exists() or not (notes / "installed.json").is_file())
 
 
+def at_work(folder: Path) -> int | None:
+    """Id of a process that runs in the environment in `folder`, whoever started it; None if there is none, or if the
+    system does not tell."""
+    return next(iter(contract.run_from(folder / ".venv")), None)
+
+
 def remove(folder: Path, wait: bool = False) -> bool:
     """Takes the environment in `folder` away. True if there was one; ValueError if it is not one of ours.
 

@@ -444,6 +444,7 @@ MESSAGES: dict[str, str] = {
     "There was nothing to remove": "Es gab nichts zu entfernen",
     "The environment stays: it is being set up": "Die Umgebung bleibt: sie wird gerade eingerichtet",
     "The environment stays: a step of {} runs. Wait for it or cancel it.": "Die Umgebung bleibt: ein Schritt von {} läuft. Darauf warten oder ihn abbrechen.",
+    "The environment stays: another Blender, a live view or a command line works with it (process {}). Wait for it or end it.": "Die Umgebung bleibt: ein anderes Blender, eine Live-Ansicht oder eine Kommandozeile arbeitet damit (Prozess {}). Darauf warten oder es beenden.",
     "The environment stays: {}": "Die Umgebung bleibt: {}",
     "Python {}, torch {}.": "Python {}, torch {}.",
     "Trains on {}.": "Trainiert auf {}.",

@@ -224,6 +224,10 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
                 name = watch.shot.name
                 self.report({"ERROR"}, tr(f"The environment stays: a step of {name} runs. Wait for it or cancel it."))
                 return {"CANCELLED"}
+        other = environment.at_work(backend.folder())
+        if other is not None:
+            self.report({"ERROR"}, tr(_at_work(other)))
+            return {"CANCELLED"}
         try:
             there = environment.remove(backend.folder(), wait=bpy.app.background)
         except (OSError, ValueError) as error:
@@ -232,6 +236,13 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
         _findings.clear()
         self.report({"INFO"}, "The backend's environment was removed" if there else "There was nothing to remove")
         return {"FINISHED"}
+
+
+def _at_work(pid: int) -> str:
+    return (
+        f"The environment stays: another Blender, a live view or a command line works with it (process {pid}). "
+        "Wait for it or end it."
+    )
 
 
 _checks: list[children.Question] = []

@@ -1,6 +1,7 @@
 """Setting the backend up from the preferences: a real launcher that fails for want of a network, and removal."""
 
 import os
+import subprocess
 import sys
 import threading
 import time
@@ -105,6 +106,21 @@ def test_what_a_job_works_with_is_not_removed(addon, contract, made, shot):
     job.status = contract.Status("train", "done", 0, 0.0, 1.0, 0.0)
     assert bpy.ops.splannequin.remove_backend() == {"FINISHED"}
     assert not list(made.iterdir()), "headless, it is gone when the button says so"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
+def test_what_a_process_of_others_works_with_is_not_removed(addon, made):
+    """A job of another Blender, or of a command line: nothing in this Blender knows of it."""
+    (made / ".venv" / "bin").mkdir()
+    python = made / ".venv" / "bin" / "python"
+    python.symlink_to(os.path.realpath(sys.executable))
+    with subprocess.Popen([python, "-S", "-c", "print('', flush=True); input()"], stdin=-1, stdout=-1) as other:
+        assert other.stdout.readline().strip() == b"", "it has begun"
+        with pytest.raises(RuntimeError, match=rf"stays: another Blender.*\(process {other.pid}\)"):
+            bpy.ops.splannequin.remove_backend()
+        assert (made / ".venv" / "package.py").exists()
+        other.kill()
+    assert bpy.ops.splannequin.remove_backend() == {"FINISHED"} and not list(made.iterdir())
 
 
 def test_the_button_needs_leave_to_go_online(addon):

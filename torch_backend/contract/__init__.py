@@ -160,6 +160,7 @@ from .path_rules import (
 from .processes import (
     GRACE_SECONDS,
     Process,
+    commands_of_ps,
     computer_name,
     end_with_starter,
     process,
@@ -167,6 +168,7 @@ from .processes import (
     process_start,
     program,
     python_child,
+    run_from,
     runs_still,
 )
 from .results import (
@@ -382,6 +384,7 @@ __all__ = [
     "checked_name",
     "checkpoint_facts",
     "command_line",
+    "commands_of_ps",
     "computer_name",
     "content_key",
     "default_of",
@@ -433,6 +436,7 @@ __all__ = [
     "replacing_folder",
     "requested_params",
     "restore_folder",
+    "run_from",
     "runs_job",
     "runs_still",
     "said_of",

@@ -170,6 +170,42 @@ def process_of_ps(pid: int) -> Process | None:
     return Process(float(calendar.timegm((*when, 0, 0, 0))), line)
 
 
+def run_from(folder: Path) -> list[int]:
+    """Ids of this computer's processes whose program lies in a folder, as far as the system tells: their command lines
+    begin with its whole path, as those of our children do.
+
+    None on Windows, which itself refuses to move a folder of which a program runs.
+    """
+    if sys.platform == "win32":
+        return []
+    starts = tuple({f"{folder.absolute()}{os.sep}", f"{os.path.realpath(folder)}{os.sep}"})
+    known = _commands_of_proc() if Path("/proc/self/cmdline").exists() else commands_of_ps()
+    return sorted(pid for pid, command in known.items() if command.startswith(starts))
+
+
+def _commands_of_proc() -> dict[int, str]:
+    """Process id -> its program; what is not ours to read is left out."""
+    found: dict[int, str] = {}
+    for entry in os.scandir("/proc"):
+        if entry.name.isdecimal():
+            with contextlib.suppress(OSError):  # it has ended since
+                found[int(entry.name)] = os.fsdecode(Path(entry.path, "cmdline").read_bytes().partition(b"\0")[0])
+    return found
+
+
+def commands_of_ps() -> dict[int, str]:
+    """Process id -> its command line, from `ps`, on systems without /proc (macOS)."""
+    command = ["/bin/ps", "-axww", "-o", "pid=,command="]
+    try:  # as in `process_of_ps`
+        output = subprocess.run(
+            command, capture_output=True, env={"PATH": "/usr/bin:/bin"}, close_fds=False, timeout=5.0, check=False
+        )
+    except (OSError, subprocess.SubprocessError):
+        return {}
+    lines = (line.split(None, 1) for line in os.fsdecode(output.stdout).splitlines())
+    return {int(words[0]): words[1] for words in lines if len(words) == 2 and words[0].isdecimal()}
+
+
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 
 

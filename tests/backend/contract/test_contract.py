@@ -111,6 +111,20 @@ def test_a_process_is_known_by_its_start_and_command():
         assert contract.process(pid) is None and not contract.runs_still(pid, 0.0)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
+def test_who_runs_from_a_folder_is_told_by_its_command(tmp_path):
+    folder = tmp_path.resolve()
+    (folder / "bin").mkdir()
+    (folder / "link").symlink_to(folder / "bin")
+    (folder / "bin" / "python").symlink_to(os.path.realpath(sys.executable))
+    with subprocess.Popen([folder / "bin" / "python", "-S", "-c", "input()"], stdin=subprocess.PIPE) as child:
+        assert contract.run_from(folder) == contract.run_from(folder / "link") == [child.pid]
+        assert contract.run_from(folder / "bi") == [] and child.pid in contract.commands_of_ps()
+        assert contract.commands_of_ps()[child.pid].startswith(str(folder / "bin" / "python"))
+        child.kill()
+    assert contract.run_from(folder) == []
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="ps is POSIX")
 def test_ps_tells_the_same_as_proc():
     """What macOS is asked; ps of Linux answers in the same words."""
