@@ -6,15 +6,14 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import bpy
 
 from ...torch_backend import contract
 from ..scene import scene_setup
 from ..shot import inventory, markers, selection
 from . import backend, jobs, steps
-
-if TYPE_CHECKING:
-    import bpy
 
 
 def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) -> jobs.Job:
@@ -34,7 +33,9 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
         job = jobs.new_job(folder, steps.STEPS[step].kind, params)
         (job.folder / contract.STEP_FILE).write_text(step, encoding="utf-8")
         (job.folder / contract.SCENE_FILE).write_text(scene.name, encoding="utf-8")
-        job.scene_uid = scene.session_uid
+        job.scene_uid, job.blend = scene.session_uid, os.path.basename(bpy.data.filepath)
+        if job.blend:
+            (job.folder / contract.BLEND_FILE).write_text(job.blend, encoding="utf-8", errors="replace")
     except OSError as error:
         raise inventory.unwritable(folder, error, "Choose another shot folder.") from error
     try:

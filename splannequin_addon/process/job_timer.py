@@ -114,6 +114,8 @@ def watch_of(shot: Path) -> Watch:
         watch = _watches[shot] = Watch(shot)
         with contextlib.suppress(OSError):  # a path that can be none: `refresh` says so
             watch.jobs = {steps.step_of(job): job for job in jobs.latest(shot).values()}
+        for job in watch.jobs.values():
+            job.blend = steps.blend_of(job)
     if watch.state is None:
         refresh(watch)
     return watch

@@ -70,6 +70,8 @@ class Job:
     """It had ended before this Blender met it: what it made is there, and nothing follows from its end."""
     scene_uid: int = 0
     """`session_uid` of the scene in which this Blender was asked for it; 0 of one that was found again."""
+    blend: str = ""
+    """Name of the .blend in which it was asked for; empty if nothing tells."""
     beat: tuple[float, float] | None = None
     """Last sign of life of a job of another computer, and when it was first seen, monotonic seconds."""
 

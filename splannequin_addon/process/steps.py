@@ -156,6 +156,11 @@ def scene_of(job: jobs.Job) -> str:
     return _noted(job, contract.SCENE_FILE)
 
 
+def blend_of(job: jobs.Job) -> str:
+    """Name of the .blend where a job was asked for; empty if nothing tells."""
+    return contract.printable(_noted(job, contract.BLEND_FILE), 200)
+
+
 def _noted(job: jobs.Job, name: str) -> str:
     """What Blender wrote into a job's folder; empty of a job that was started from the backend's command line."""
     try:

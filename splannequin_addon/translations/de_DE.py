@@ -377,6 +377,7 @@ MESSAGES: dict[str, str] = {
     "Colour space of the footage, by its name in the OCIO configuration ($OCIO, else the built-in ACES studio configuration: ACEScg, ARRI LogC3 (EI800), ADX10, ...); empty: what the files say": "Farbraum des Materials, mit seinem Namen in der OCIO-Konfiguration ($OCIO, sonst die eingebaute ACES-Studio-Konfiguration: ACEScg, ARRI LogC3 (EI800), ADX10, ...); leer: was die Dateien sagen",
     "The shot folder {} is not there any more: moved, renamed or deleted.": "Der Shot-Ordner {} ist nicht mehr da: verschoben, umbenannt oder gelöscht.",
     "Locate": "Suchen",
+    "Started from {}.": "Gestartet aus {}.",
     "Import Anew": "Von Neuem importieren",
     "Import Another Clip": "Einen anderen Clip importieren",
     "{} is the shot of {}: its frames are replaced, and its solve is removed.": "{} ist der Shot von {}: seine Bilder werden ersetzt, und seine Kameralösung wird entfernt.",

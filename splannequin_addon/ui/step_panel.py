@@ -5,17 +5,17 @@ Drawing only reads what the job timer keeps; it touches the disk when a shot is 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import os
+from typing import Any
+
+import bpy
 
 from ..access import PanelBase, layout_of, scene_in
-from ..process import job_timer, steps
+from ..process import job_timer, jobs, steps
 from ..shot import selection
 from ..translations import tr
 from . import icons
 from .sentences import wrap
-
-if TYPE_CHECKING:
-    import bpy
 
 CATEGORY = "Splannequin"
 
@@ -137,6 +137,8 @@ class StepPanel(PanelBase):
         if status and status.eta_seconds is not None:
             detail.append(f"about {minutes(status.eta_seconds)} left")
         wrap(layout, context, ", ".join(tr(part) for part in detail) if detail else "The backend is starting.", "INFO")
+        if started_elsewhere(job):
+            wrap(layout, context, f"Started from {job.blend}.", "FILE_BLEND")
 
     def _own_progress(
         self, layout: bpy.types.UILayout, context: bpy.types.Context, now: job_timer.Progress | None
@@ -178,6 +180,11 @@ class StepPanel(PanelBase):
     def _paused(self, context: bpy.types.Context) -> bool:
         """True if the panel says already that what was stopped can go on."""
         return False
+
+
+def started_elsewhere(job: jobs.Job) -> bool:
+    """True if a job is known to have been asked for in another .blend than is open."""
+    return job.blend not in ("", os.path.basename(bpy.data.filepath))
 
 
 def unsaid(warnings: list[tuple[str, str]], said: list[str]) -> list[str]:

@@ -175,6 +175,24 @@ def test_a_job_keeps_the_name_of_its_scene(addon, contract, scene, shot):
     assert addon("process.steps").scene_of(found) == "Comp é" and addon("process.steps").step_of(found) == "bake"
 
 
+def test_a_job_names_the_blend_that_it_was_started_from_in_every_other_one(addon, contract, scene, shot):
+    other = addon("ui.step_panel").started_elsewhere
+    scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), "freeze"
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot.parent / "a é.blend"))
+    job = addon("process.begin").begin(bpy.context.scene, "freeze")
+    assert job.blend == "a é.blend" and not other(job)
+    with pytest.raises(contract.JobError):  # the shot has no run
+        addon("process.begin").wait(job)
+    addon("process.job_timer").forget()
+    found = addon("process.job_timer").watch_of(shot).jobs["freeze"]
+    assert not other(found), "the same file"
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot.parent / "b.blend"))
+    assert other(found) and found.blend == "a é.blend"
+    (found.folder / contract.BLEND_FILE).unlink()
+    addon("process.job_timer").forget()
+    assert not other(addon("process.job_timer").watch_of(shot).jobs["freeze"]), "of a command line"
+
+
 def test_a_job_that_had_ended_before_it_was_met_renders_nothing(addon, contract, supervisor, scene, shot, monkeypatch):
     """Even if what it wrote is too long to be read at the first look."""
     jobs = addon("process.jobs")

@@ -84,6 +84,7 @@ from .hosts import (
     host_names,
 )
 from .jobs import (
+    BLEND_FILE,
     CANCEL_FILE,
     EVENTS_FILE,
     FORECAST,
@@ -264,6 +265,7 @@ from .writing import (
 __all__ = [
     "BACKEND",
     "BLENDER",
+    "BLEND_FILE",
     "BURNT_IN_FILE",
     "CAMERAS_FILE",
     "CAMERA_MODELS",

@@ -36,6 +36,8 @@ STEP_FILE = "step"
 """Name of the panel's step that asked for the job; Blender's own."""
 SCENE_FILE = "scene"
 """Name of the scene that it was asked for in; Blender's own."""
+BLEND_FILE = "blend"
+"""Name of the .blend that it was asked for in, without its folder; Blender's own, and not there of an unsaved one."""
 JOB_COMMAND = "-m torch_backend run-job"
 """How the process of a job was called, but for its Python and the job's folder."""
 HEARTBEAT_SECONDS = 2.0
