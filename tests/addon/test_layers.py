@@ -1,7 +1,6 @@
 """Frames made of plates in the compositor: what was invented, the splats alone, and the freeze as a warp of the
 artist's own linear plate, with values beyond white and below black."""
 
-import importlib.util
 import json
 import shutil
 from pathlib import Path
@@ -10,10 +9,9 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.addon.data import make_detail as made
+
 DATA = Path(__file__).resolve().parent / "data"
-_spec = importlib.util.spec_from_file_location("_make_detail", DATA / "make_detail.py")
-made = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(made)
 SIZE = made.WIDTH, made.HEIGHT
 
 

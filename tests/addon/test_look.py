@@ -1,6 +1,5 @@
 """What leaves the compositor: the frozen frame with grain, the plate untouched, all or a part. Pixels of renders."""
 
-import importlib.util
 import shutil
 from pathlib import Path
 
@@ -8,10 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-_SPEC = importlib.util.spec_from_file_location("make_grain", Path(__file__).parent / "data" / "make_grain.py")
-assert _SPEC and _SPEC.loader
-grains = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(grains)
+from tests.addon.data import make_grain as grains
 
 
 def exr_output(scene, kind: str = "OPEN_EXR") -> None:

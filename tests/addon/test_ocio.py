@@ -1,6 +1,5 @@
 """Colour configurations of other studios (OCIO): the camera and the take come in, or the scene stays as it was."""
 
-import importlib.util
 import json
 import os
 import shutil
@@ -12,17 +11,10 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.addon.data import make_detail as made
+from tests.addon.data import make_shoulder as shoulder
+
 DATA = Path(__file__).resolve().parent / "data"
-
-
-def _load(name: str):
-    spec = importlib.util.spec_from_file_location(f"_{name}", DATA / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-made, shoulder = _load("make_detail"), _load("make_shoulder")
 
 FROM_AP0 = (
     "!<MatrixTransform> {matrix: [2.52168618674388, -1.13413098823972, -0.387555198504164, 0, -0.276479914229922, "

@@ -1,6 +1,5 @@
 """A bake into a scene without a compositor of its own: the plate is the footage itself, not a copy of it."""
 
-import importlib.util
 import json
 import shutil
 from pathlib import Path
@@ -9,17 +8,11 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.addon.data import make_detail as made
+from tests.addon.data import make_levels as levels
+from tests.addon.data import make_shoulder as shoulder
+
 DATA = Path(__file__).resolve().parent / "data"
-
-
-def _load(name: str):
-    spec = importlib.util.spec_from_file_location(f"_{name}", DATA / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-made, levels, shoulder = _load("make_detail"), _load("make_levels"), _load("make_shoulder")
 SIZE = made.WIDTH, made.HEIGHT
 SRGB = tuple(float(((v + 0.055) / 1.055) ** 2.4) for v in (0.78125, 0.390625, 0.1953125))
 LINEAR = (0.78125, 0.390625, 0.1953125)

@@ -1,6 +1,5 @@
 """The plate's own stream in a tree that a bake made: the artist's from then on, whatever is baked next."""
 
-import importlib.util
 import json
 import shutil
 from pathlib import Path
@@ -9,17 +8,9 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.addon.data import make_detail as made
+
 DATA = Path(__file__).resolve().parent / "data"
-
-
-def _load(name: str):
-    spec = importlib.util.spec_from_file_location(f"_{name}", DATA / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-made = _load("make_detail")
 
 
 @pytest.fixture
