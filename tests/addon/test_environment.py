@@ -114,8 +114,8 @@ def test_what_a_process_of_others_works_with_is_not_removed(addon, made):
     (made / ".venv" / "bin").mkdir()
     python = made / ".venv" / "bin" / "python"
     python.symlink_to(os.path.realpath(sys.executable))
-    with subprocess.Popen([python, "-S", "-c", "print('', flush=True); input()"], stdin=-1, stdout=-1) as other:
-        assert other.stdout.readline().strip() == b"", "it has begun"
+    with subprocess.Popen([python, "-S", "-c", "print('begun', flush=True); input()"], stdin=-1, stdout=-1) as other:
+        assert other.stdout.readline().strip() == b"begun"
         with pytest.raises(RuntimeError, match=rf"stays: another Blender.*\(process {other.pid}\)"):
             bpy.ops.splannequin.remove_backend()
         assert (made / ".venv" / "package.py").exists()

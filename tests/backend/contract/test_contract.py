@@ -117,7 +117,9 @@ def test_who_runs_from_a_folder_is_told_by_its_command(tmp_path):
     (folder / "bin").mkdir()
     (folder / "link").symlink_to(folder / "bin")
     (folder / "bin" / "python").symlink_to(os.path.realpath(sys.executable))
-    with subprocess.Popen([folder / "bin" / "python", "-S", "-c", "input()"], stdin=subprocess.PIPE) as child:
+    words = [folder / "bin" / "python", "-S", "-c", "print('begun', flush=True); input()"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None and child.stdout.readline().strip() == b"begun", "no command line before that"
         assert contract.run_from(folder) == contract.run_from(folder / "link") == [child.pid]
         assert contract.run_from(folder / "bi") == [] and child.pid in contract.commands_of_ps()
         assert contract.commands_of_ps()[child.pid].startswith(str(folder / "bin" / "python"))
