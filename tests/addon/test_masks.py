@@ -77,9 +77,19 @@ def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file
     height, width = found.shape
     inside = np.zeros(found.shape, bool)
     inside[round(0.45 * height) : round(0.55 * height), round(0.15 * width) : round(0.25 * width)] = True
-    assert (found[inside] > 0.6).all() and (found[:, width // 2 :] < 0.1).all() and (found[0] < 0.1).all()
+    assert (found[inside] > 0.99).all() and (found[:, width // 2 :] < 0.1).all() and (found[0] < 0.1).all()
     assert {kind: len(getattr(bpy.data, kind)) for kind in before} == before
     assert bpy.context.scene == scene
+
+
+@pytest.mark.parametrize("share", [1.0, 0.4])
+def test_a_drawn_masks_values_are_those_of_its_picture(addon, shot, drawn, share):
+    """The solve cuts at half: a view transform would make half of what is drawn at 0.4 (AgX) or darker."""
+    drawn.layers[0].alpha = share
+    found = read(addon("solve.drawn_masks").render(drawn, shot, "people") / "000006.png")
+    height, width = found.shape
+    inside = found[round(0.45 * height) : round(0.55 * height), round(0.15 * width) : round(0.25 * width)]
+    assert np.allclose(inside, share, atol=0.01) and (found[:, width // 2 :] == 0.0).all()
 
 
 def test_a_mask_is_rendered_a_frame_a_turn_and_one_that_is_given_up_leaves_all_as_it_was(addon, shot, drawn):
