@@ -366,11 +366,21 @@ class Metrics:
                 picture.unlink()
         lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
         kept = [line for line in lines if _iteration_of(line) <= iteration]
+        self._measured = max(map(_iteration_of, kept), default=-1.0)
         if kept != lines:
             write_atomic(self.path, "".join(f"{line}\n" for line in kept).encode("utf-8"))
 
     def add(self, trainer: Trainer, test: list[int], held_out: Tensor) -> None:
-        """Measures on the held-out frames, appends a line, shows a preview."""
+        """Measures on the held-out frames, appends a line, shows a preview; of a step only what is not there yet."""
+        if self._measured < trainer.iteration:
+            self._measure(trainer, test, held_out)
+        preview = self.folder / PREVIEWS_FOLDER / f"{trainer.iteration:06d}.png"
+        if not preview.is_file():
+            index = test[len(test) // 2] if test else trainer.train_ids[len(trainer.train_ids) // 2]
+            save_png(preview, trainer.render_frame(index))
+            self.report.image("preview", preview)
+
+    def _measure(self, trainer: Trainer, test: list[int], held_out: Tensor) -> None:
         value = trainer.heldout_psnr(test, held_out)
         row = {
             "seconds": round(trainer.trained_seconds, 2),
@@ -381,11 +391,8 @@ class Metrics:
         }
         with open(self.path, "a", encoding="utf-8") as lines:
             lines.write(json.dumps(row) + "\n")
+        self._measured = trainer.iteration
         self.report.metric("training", row)
-        index = test[len(test) // 2] if test else trainer.train_ids[len(trainer.train_ids) // 2]
-        preview = self.folder / PREVIEWS_FOLDER / f"{trainer.iteration:06d}.png"
-        save_png(preview, trainer.render_frame(index))
-        self.report.image("preview", preview)
 
 
 def _iteration_of(line: str) -> float:

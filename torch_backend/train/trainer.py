@@ -172,7 +172,8 @@ class Trainer:
         self.policy.joined = True  # a run that ended early may still hold its probe frames back
 
     def run(self, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
-        """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured.
+        """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured,
+        once more for a step that it goes on from.
 
         Without a checkpoint nothing is written.
         """
@@ -188,6 +189,8 @@ class Trainer:
         since = time.perf_counter() - self.trained_seconds
         started = self.iteration
         watch = Stopwatch() if self.device.type == "cpu" else None
+        if started > begin and (started - begin) % every == 0:  # a cancel may have ended it in this very evaluation
+            self._with_room(lambda: evaluate(self))
         try:
             while self.iteration < self.end:
                 self.report.check_cancelled()

@@ -293,6 +293,58 @@ def test_a_finished_run_stays_until_one_of_other_settings_is_done(world, quiet):
     assert rows == list(range(6, 61, 6))
 
 
+def test_an_evaluation_that_a_cancel_ended_is_made_when_the_run_goes_on(world, quiet, monkeypatch):
+    """Cancelled in its evaluation once and once more, and in that after its last step: its curve has no hole."""
+    train_shot(world.shot, short(world, "whole"), quiet())
+    measured, goes_on = Trainer.frame_psnrs, []
+
+    def pressed(self, *args, **options):
+        if self.iteration in (30, 60) and goes_on.count(self.iteration) < 2:
+            goes_on.append(self.iteration)
+            self.report.cancelled = True
+        return measured(self, *args, **options)
+
+    monkeypatch.setattr(Trainer, "frame_psnrs", pressed)
+    for _ in range(4):
+        with pytest.raises(Cancelled):
+            train_shot(world.shot, short(world, "holed"), quiet())
+        assert iteration_of(world.shot.run("holed")) == goes_on[-1]
+    report = quiet()
+    train_shot(world.shot, short(world, "holed"), report)
+    assert goes_on == [30, 30, 60, 60]
+    curves = []
+    for name in ("whole", "holed"):
+        lines = (world.shot.run(name) / "metrics.jsonl").read_text().splitlines()
+        curves.append([{**json.loads(line), "seconds": None} for line in lines])
+    assert curves[0] == curves[1]
+    assert [row["iteration"] for row in curves[0]] == list(range(6, 61, 6))
+    whole, holed = (files_of(world.shot.run(name)) for name in ("whole", "holed"))
+    pictures = [name for name in whole if name.startswith("previews")]
+    assert len(pictures) == 10
+    assert {name: whole[name] for name in pictures} == {n: digest for n, digest in holed.items() if n in pictures}
+    held, gone_on = (load_checkpoint(world.shot.run(name) / "checkpoint.safetensors")[0] for name in ("whole", "holed"))
+    assert all(torch.equal(value, gone_on[name]) for name, value in held.items())
+
+
+def test_what_a_step_was_measured_at_is_not_measured_again_when_the_run_goes_on(world, quiet):
+    class Stops(quiet):
+        def image(self, label, path):
+            super().image(label, path)
+            self.cancelled = path.stem == "000030"
+
+    with pytest.raises(Cancelled):
+        train_shot(world.shot, short(world, "told"), Stops())
+    assert iteration_of(world.shot.run("told")) == 30
+    report = quiet()
+    train_shot(world.shot, short(world, "told"), report)
+    rows = [
+        json.loads(line)["iteration"]
+        for line in (world.shot.run("told") / "metrics.jsonl").read_text().split("\n")[:-1]
+    ]
+    assert rows == list(range(6, 61, 6))
+    assert [Path(e[2]).stem for e in report.events if e[0] == "image"] == [f"{n:06d}" for n in range(36, 61, 6)]
+
+
 def test_a_finished_run_that_begins_anew_stays_too(world, quiet):
     train_shot(world.shot, short(world, "restarted"), quiet())
     run = world.shot.run("restarted")
