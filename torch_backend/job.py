@@ -298,14 +298,10 @@ def _about_a_path(error: Exception, shot: str) -> JobError | None:
 
 
 def _about_a_module(error: Exception) -> JobError | None:
-    """The sentence for a package that the environment lacks; None for any other error, and for a module of ours."""
-    if not isinstance(error, ModuleNotFoundError) or (error.name or "").partition(".")[0] in ("", __package__):
+    """The sentence for a package that is missing or broken; None for any other error, and for a module of ours."""
+    if not isinstance(error, ImportError) or (error.name or "").partition(".")[0] == __package__:
         return None
-    return JobError(
-        f"The backend's environment is incomplete: {error}.",
-        "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
-        ExitCode.ENVIRONMENT,
-    )
+    return contract.incomplete(str(error))
 
 
 def _log(folder: Path, text: str) -> None:

@@ -134,6 +134,25 @@ def test_a_package_that_the_environment_lacks_is_no_bug(shot, monkeypatch):
     assert "Press Repair" in status.hint and "a_package" in (folder / contract.LOG_FILE).read_text()
 
 
+def test_a_package_that_is_there_and_cannot_be_loaded_is_no_bug_either(shot, monkeypatch, tmp_path):
+    """A library of the system lacks, or a package needs another version of one beside it."""
+    (tmp_path / "a_broken_package.py").write_text("raise ImportError('libx.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def broken(shot, params, report):
+        import a_broken_package  # noqa: F401  # pyright: ignore
+
+    def ours(shot, params, report):
+        from torch_backend.contract import a_name_that_we_forgot  # noqa: F401  # pyright: ignore
+
+    folder, (code, _) = run_with(shot, monkeypatch, broken)
+    said = status_of(folder)
+    assert code == ExitCode.ENVIRONMENT and "Press Repair" in said.hint
+    assert said.message == "The backend's environment is incomplete: libx.so.1: cannot open shared object file."
+    folder, (code, _) = run_with(shot, monkeypatch, ours)
+    assert code == ExitCode.INTERNAL and "This is a bug" in status_of(folder).hint
+
+
 def test_cancel_file_stops_a_job(shot, monkeypatch):
     def station(shot, params, report):
         folder = next(shot.jobs.iterdir())

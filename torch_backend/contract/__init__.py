@@ -56,6 +56,7 @@ from .errors import (
     ExitCode,
     JobError,
     disk_error,
+    incomplete,
     is_disk_full,
     path_error,
 )
@@ -400,6 +401,7 @@ __all__ = [
     "gives_back",
     "gone",
     "host_names",
+    "incomplete",
     "is_disk_full",
     "is_half_written",
     "is_link",

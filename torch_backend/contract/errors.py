@@ -46,6 +46,16 @@ def disk_error(folder: str | Path, detail: str = "the disk is full") -> JobError
     )
 
 
+def incomplete(lacks: str) -> JobError:
+    """The one sentence for an environment with a package that is missing or broken. lacks: what Python says of it."""
+    what = (lacks.strip().splitlines() or ["a package cannot be loaded"])[-1]  # numpy's advice fills a page before that
+    return JobError(
+        f"The backend's environment is incomplete: {what.rstrip('.')}.",
+        "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
+        ExitCode.ENVIRONMENT,
+    )
+
+
 def is_disk_full(error: OSError) -> bool:
     """True if the system refused to write for want of space or quota."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT)

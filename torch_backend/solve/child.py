@@ -12,7 +12,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from ..contract import ExitCode, JobError, Reporter, python_child
+from ..contract import ExitCode, JobError, Reporter, incomplete, python_child
 from ..shot import need_disk
 
 _POLL_SECONDS = 0.2
@@ -26,9 +26,9 @@ SQLite in one process breaks the first one's locks.)"""
 def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = False) -> dict[str, Any]:
     """Runs `worker.py` on a request file; returns its last message ({"result"} or {"failure"}).
 
-    The worker is killed on cancellation and on any other exception here. JobError (SOLVE, or DISK if
-    that is full) if it dies by itself, with the end of COLMAP's log, which is kept in `log`: with `keep_log` after what
-    stands there.
+    The worker is killed on cancellation and on any other exception here. JobError (ENVIRONMENT if a package cannot be
+    loaded, DISK if that is full, else SOLVE) if it dies by itself, with the end of COLMAP's log, which is kept in
+    `log`: with `keep_log` after what stands there.
     """
     package_root = Path(__file__).resolve().parents[2]
     environment = {**os.environ, "PYTHONSAFEPATH": "1"}
@@ -38,7 +38,7 @@ def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = Fals
     environment["PYTHONPATH"] = os.pathsep.join([str(package_root), *inherited])
     # Threads that spin while they wait take the core from whoever shares it.
     environment.setdefault("OMP_WAIT_POLICY", "passive")
-    command = python_child(sys.executable, "torch_backend.solve.worker", str(request.absolute()))
+    command = python_child(sys.executable, "torch_backend.solve.start_worker", str(request.absolute()))
     with open(log, "ab" if keep_log else "wb") as errors:
         start = errors.tell()
         process = subprocess.Popen(
@@ -59,6 +59,8 @@ def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = Fals
             for pipe in (process.stdin, process.stdout):
                 if pipe:
                     pipe.close()
+    if answer is not None and "lacks" in answer:
+        raise incomplete(answer["lacks"])
     if answer is None or code != 0:
         need_disk(log.parent, _FULL_BYTES, "The camera solve")
         raise JobError(

@@ -1,4 +1,4 @@
-"""The child process in which COLMAP runs: `python -m torch_backend.solve.worker REQUEST.json`.
+"""What runs in the child process of COLMAP, which `start_worker.py` starts.
 
 A process of its own because pycolmap and OpenImageIO cannot share one (see footage/images.py), because COLMAP ends its
 process on a failed check, and because a process can be stopped at any moment. Nothing else imports its parts, which
@@ -18,7 +18,6 @@ poses held.
 from __future__ import annotations
 
 import os
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -146,7 +145,3 @@ def _die_with_parent() -> None:
     while os.read(0, 64):
         pass
     os._exit(1)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1]))
