@@ -20,7 +20,15 @@ from torch_backend.shot import write_json
 
 from .blender import BPY_WHEELS, DEMO_WHEELS, choose_wheels, find_blender
 from .children import child_environ, say
-from .environments import BACKEND_DISK_GB, BPY_DISK_GB, Environment, backend_environment, bpy_environment, home
+from .environments import (
+    BPY_DISK_GB,
+    Environment,
+    backend_environment,
+    bpy_environment,
+    disk_gb,
+    home,
+    this_machines_index,
+)
 from .places import LINUX, WINDOWS
 
 BLENDER_LIBRARIES = {
@@ -89,7 +97,8 @@ def machine_findings() -> Iterator[Finding]:
     if not backend_environment().ready() and not (folder.is_dir() and os.access(folder, os.W_OK)):
         yield Finding("home", "missing", f"{folder} cannot be written: name another folder in SPLANNEQUIN_HOME")
     free = shutil.disk_usage(folder).free / 1e9
-    need = 1.0 if backend_environment().ready() else BACKEND_DISK_GB + BPY_DISK_GB
+    backend = backend_environment()
+    need = 1.0 if backend.ready() else disk_gb(backend, this_machines_index()) + BPY_DISK_GB
     advice = "" if free >= need else f": {need:.0f} GB are needed, free some or set SPLANNEQUIN_HOME to another disk"
     yield Finding("disk", "ok" if free >= need else "missing", f"{free:.0f} GB free in {folder}{advice}")
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torch_backend.cards import nvidia_cards
-from torch_backend.contract import ExitCode, program, python_child
+from torch_backend.contract import ExitCode, brings_cuda, program, python_child, torch_index
 from torch_backend.shot import is_disk_full, locked, write_json
 
 from .children import child_environ, close_input, say, start_child, stop_child, tied_command
@@ -31,15 +31,11 @@ from .places import REQUIREMENTS, ROOT, WINDOWS
 
 BACKEND_DISK_GB = 4.0
 """Free disk that setting up the backend may need: the environment and pip's downloads (Linux, CPU build of torch)."""
+CUDA_DISK_GB = 5.0
+"""What CUDA adds to that: the environment takes 6 GB then, not 1.5."""
 BPY_DISK_GB = 2.0
 HEARTBEAT_SECONDS = 15.0
 """A set-up that has printed nothing for this long says that it is still at work."""
-
-TORCH_INDEX = "SPLANNEQUIN_TORCH_INDEX"
-CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
-"""Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
-CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-"""Where torch without CUDA comes from on Linux, whose PyPI build brings 4 GB for a card that is not there."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +51,11 @@ class Environment:
     probe: str
     """Python source that imports what must work."""
     disk_gb: float
-    """Free disk that setting it up may need, in GB."""
+    """Free disk that setting it up may need, in GB; without CUDA, if it has torch."""
     complete: bool = False
     """The requirement files name every package that is needed, so nothing else is installed."""
+    torch: bool = False
+    """It has torch, which is another one where there is a card for it."""
 
     @property
     def python(self) -> str:
@@ -112,7 +110,7 @@ def backend_environment(testing: bool = False) -> Environment:
     """The backend's environment, with the test tools on request."""
     probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, fileseq, safetensors, scipy"
     files = ("backend.txt", "test.txt") if testing else ("backend.txt",)
-    return Environment("the backend", home() / ".venv", files, probe, BACKEND_DISK_GB)
+    return Environment("the backend", home() / ".venv", files, probe, BACKEND_DISK_GB, torch=True)
 
 
 def bpy_environment(series: str, testing: bool = False) -> Environment:
@@ -155,8 +153,9 @@ def set_up(environment: Environment, python: str) -> float:
 def _make(environment: Environment, python: str) -> None:
     say(f"Setting up {environment.name} in {environment.folder} (once)")
     usable = environment.folder.is_dir() and _has_pip(environment)
+    index = _reachable_index() if environment.torch else ""
     if not usable:
-        _make_room(environment)
+        _make_room(environment, disk_gb(environment, index))
     environment.state.mkdir(parents=True, exist_ok=True)
     environment.log.write_bytes(b"")
     if not usable:
@@ -169,12 +168,7 @@ def _make(environment: Environment, python: str) -> None:
     pip = tied_command(environment.python, "pip", "install", "--no-input", "--progress-bar", "off")
     pip += ["--disable-pip-version-check", "--only-binary=:all:"]
     pip += ["--no-deps"] if environment.complete else []
-    index = torch_index() if environment.requirements[0] == "backend.txt" else ""
-    if index:
-        if _reachable(index):
-            pip += ["--extra-index-url", index]
-        else:  # pip would ask it in vain for every single package, minutes in all
-            say(f"{index} cannot be reached: torch comes from the usual index")
+    pip += ["--extra-index-url", index] if index else []
     for name in environment.requirements:
         pip += ["-r", str(REQUIREMENTS / name)]
     _step(environment, "installing packages", pip, condense_pip)
@@ -194,7 +188,12 @@ def _has_pip(environment: Environment) -> bool:
     return done.returncode == 0
 
 
-def _make_room(environment: Environment) -> None:
+def disk_gb(environment: Environment, index: str, system: str = sys.platform) -> float:
+    """Free disk in GB that setting an environment up may need, with the torch that comes of an index."""
+    return environment.disk_gb + (CUDA_DISK_GB if environment.torch and brings_cuda(index, system) else 0.0)
+
+
+def _make_room(environment: Environment, needed: float) -> None:
     """Clears away a broken environment of ours. LauncherError if it is not ours, or the disk is too full."""
     folder = environment.folder
     if folder.is_dir() and any(folder.iterdir()) and not environment.state.is_dir():
@@ -205,9 +204,9 @@ def _make_room(environment: Environment) -> None:
     if folder.is_dir():
         shutil.rmtree(folder)
     free = shutil.disk_usage(folder.parent).free / 1e9
-    if free < environment.disk_gb:
+    if free < needed:
         raise LauncherError(
-            f"Setting up {environment.name} needs {environment.disk_gb:.0f} GB and {folder.parent} has {free:.1f} GB "
+            f"Setting up {environment.name} needs {needed:.0f} GB and {folder.parent} has {free:.1f} GB "
             "free: free some, or name a folder on another disk in SPLANNEQUIN_HOME.",
             ExitCode.DISK,
         )
@@ -223,17 +222,18 @@ for package in importlib.metadata.distributions():
 """pip writes a package's RECORD last: without one the package is not all there, and pip must not believe it is."""
 
 
-def torch_index(system: str = sys.platform) -> str:
-    """Package index, beside pip's own, that torch comes from; empty for none.
+def this_machines_index(system: str = sys.platform) -> str:
+    """Package index, beside pip's own, that this machine's torch comes from; empty for none."""
+    return torch_index(system, program("nvidia-smi") is not None, lambda: any(c.fits for c in nvidia_cards()[0]))
 
-    What the variable says; without it, on Windows the one with CUDA where there is a card for it, and on Linux the one
-    without where there is no NVIDIA driver.
-    """
-    if TORCH_INDEX in os.environ:
-        return os.environ[TORCH_INDEX]
-    if system == "win32":
-        return CUDA_INDEX if any(card.fits for card in nvidia_cards()[0]) else ""
-    return CPU_INDEX if system == "linux" and program("nvidia-smi") is None else ""
+
+def _reachable_index() -> str:
+    """`this_machines_index` if it answers; pip would ask it in vain for every single package, minutes in all."""
+    index = this_machines_index()
+    if index and not _reachable(index):
+        say(f"{index} cannot be reached: torch comes from the usual index")
+        return ""
+    return index
 
 
 def _reachable(index: str) -> bool:

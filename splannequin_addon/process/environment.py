@@ -21,10 +21,6 @@ from pathlib import Path
 from ...torch_backend import contract
 from . import children
 
-CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
-"""Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
-CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-"""Where torch without CUDA comes from on Linux, whose PyPI build brings 4 GB for a card that is not there."""
 SIZE = "about 1.5 GB on disk (6 GB with CUDA)"
 LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp (Apache) and what they need"
 _STATE = "setup"
@@ -42,16 +38,9 @@ def default_folder() -> Path:
     return Path.home() / ".splannequin"
 
 
-def torch_index() -> str:
-    """Package index, beside PyPI, that has the torch this machine needs; empty if PyPI's own is the one."""
-    if sys.platform == "win32":
-        return CUDA_INDEX if nvidia_card() else ""
-    return "" if sys.platform != "linux" or nvidia_card() else CPU_INDEX
-
-
-def sources() -> str:
-    """Where the packages come from, in words."""
-    return "PyPI and PyTorch's own index" if torch_index() else "PyPI"
+def sources(system: str = sys.platform) -> str:
+    """Where the packages may come from, in words. Whether a card fits is asked by the launcher: Blender cannot wait."""
+    return "PyPI and PyTorch's own index" if contract.torch_index(system, nvidia_card(), lambda: True) else "PyPI"
 
 
 def nvidia_card() -> bool:
@@ -97,8 +86,6 @@ def start(folder: Path, python: str, package_root: Path) -> SetUp:
     """
     setup = SetUp(folder)
     environ = {"SPLANNEQUIN_HOME": str(folder.absolute())}
-    if torch_index() and "SPLANNEQUIN_TORCH_INDEX" not in os.environ:
-        environ["SPLANNEQUIN_TORCH_INDEX"] = torch_index()
     python = os.path.abspath(python)
     launcher = str(package_root / "splannequin.py")
     command = [python, "-P", launcher, "setup", "--backend", "--output", str(setup.log.parent.absolute())]

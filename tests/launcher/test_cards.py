@@ -7,6 +7,7 @@ import pytest
 
 from launcher import doctor, environments
 from torch_backend.cards import Card, nvidia_cards, why_unused
+from torch_backend.contract import CPU_INDEX, CUDA_INDEX
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="the stand-in is a shell script")
 
@@ -79,12 +80,16 @@ def test_a_card_that_somebody_hid_is_not_missed(nvidia_smi, monkeypatch):
 
 def test_torch_comes_with_cuda_where_a_card_can_use_it(nvidia_smi, tmp_path: Path, monkeypatch):
     monkeypatch.delenv("SPLANNEQUIN_TORCH_INDEX", raising=False)
-    for row, index in ((OLD_DRIVER, ""), (OLD_CARD, ""), (GOOD, environments.CUDA_INDEX)):
+    for row, index in ((OLD_DRIVER, ""), (OLD_CARD, ""), (GOOD, CUDA_INDEX)):
         nvidia_smi(row)
-        assert environments.torch_index("win32") == index
-        assert environments.torch_index("linux") == environments.torch_index("darwin") == "", "PyPI's has CUDA"
+        assert environments.this_machines_index("win32") == index
+        assert environments.this_machines_index("linux") == environments.this_machines_index("darwin") == "", (
+            "PyPI's has CUDA"
+        )
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert environments.torch_index("linux") == environments.CPU_INDEX, "no driver: 4 GB less"
-    assert environments.torch_index("win32") == environments.torch_index("darwin") == "", "PyPI's has none"
+    assert environments.this_machines_index("linux") == CPU_INDEX, "no driver: 4 GB less"
+    assert environments.this_machines_index("win32") == environments.this_machines_index("darwin") == "", (
+        "PyPI's has none"
+    )
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "")
-    assert environments.torch_index("linux") == "", "somebody's wish"
+    assert environments.this_machines_index("linux") == "", "somebody's wish"

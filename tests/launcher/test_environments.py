@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -129,6 +130,47 @@ def test_a_full_disk_is_said_before_anything_is_written(environment: Environment
         set_up(dataclasses.replace(environment, disk_gb=1e9), sys.executable)
     assert refused.value.exit_code == 8
     assert not environment.folder.exists()
+
+
+@pytest.mark.parametrize(("index", "needed"), [("/whl/cpu", 4), ("/whl/cu130", 9)])
+def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
+    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, index: str, needed: int
+):
+    backend = dataclasses.replace(environment, disk_gb=environments.BACKEND_DISK_GB, torch=True)
+    monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", f"file://{tmp_path}{index}")
+    disk = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 - 1e8)))
+    with pytest.raises(LauncherError, match=f"needs {needed} GB and .* has {needed - 0.1:.1f} GB free") as refused:
+        set_up(backend, sys.executable)
+    assert refused.value.exit_code == 8
+    assert not backend.folder.exists()
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 + 1e8)))
+    set_up(backend, sys.executable)
+    assert backend.ready()
+
+
+@pytest.mark.parametrize(("system", "needed"), [("linux", 9.0), ("win32", 4.0), ("darwin", 4.0)])
+def test_without_an_index_it_is_that_of_what_pypi_has(system: str, needed: float):
+    assert environments.disk_gb(environments.backend_environment(), "", system) == needed
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="PyPI has CUDA for Linux alone")
+def test_an_index_out_of_reach_is_not_reckoned_with(
+    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
+):
+    """Then torch comes from the usual index, which on Linux has the one with CUDA."""
+    backend = dataclasses.replace(environment, disk_gb=environments.BACKEND_DISK_GB, torch=True)
+    monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "http://127.0.0.1:9/whl/cpu")
+    disk = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(5e9)))
+    with pytest.raises(LauncherError, match="needs 9 GB"):
+        set_up(backend, sys.executable)
+    assert "cannot be reached: torch comes from the usual index" in capsys.readouterr().out
+
+
+def test_no_other_environment_has_torch():
+    assert environments.backend_environment(testing=True).torch
+    assert not any(e.torch for e in (environments.bpy_environment("5.0"), environments.bench_environment()))
 
 
 def test_every_wheel_has_pinned_requirements():

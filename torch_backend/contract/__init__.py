@@ -17,6 +17,7 @@
     timecode        SMPTE timecode: the footage's start, and the code of each frame after it
     frame_layers    what the layers of a frozen frame hold
     checkpoint_header   what a checkpoint says of itself
+    torch_source    which PyTorch a set-up takes
     results         verdicts and the figures of a run
 
 Their public names are this package's own. Everything that is written carries a version; a newer one than ours is
@@ -228,6 +229,13 @@ from .timecode import (
     later,
     parse_timecode,
 )
+from .torch_source import (
+    CPU_INDEX,
+    CUDA_INDEX,
+    TORCH_INDEX,
+    brings_cuda,
+    torch_index,
+)
 from .typed import (
     CONTRACT_VERSION,
     check_version,
@@ -279,6 +287,8 @@ __all__ = [
     "COMMANDS",
     "CONFIG_FILE",
     "CONTRACT_VERSION",
+    "CPU_INDEX",
+    "CUDA_INDEX",
     "DETECTORS",
     "DEVELOPED_FOLDER",
     "DEVICES",
@@ -348,6 +358,7 @@ __all__ = [
     "TAKES_FOLDER",
     "TAKE_FILE",
     "TAKE_UNDISTORT",
+    "TORCH_INDEX",
     "UNPUBLISHED_FILE",
     "VERBS",
     "VERDICT_WORDS",
@@ -380,6 +391,7 @@ __all__ = [
     "Writer",
     "as_json",
     "atomic_path",
+    "brings_cuda",
     "busy",
     "channels_of",
     "check_params",
@@ -447,6 +459,7 @@ __all__ = [
     "summarise",
     "sweep_half_written",
     "take_figures",
+    "torch_index",
     "trains_anew",
     "try_lock",
     "verdict_lines",

@@ -1,0 +1,51 @@
+"""Which PyTorch a set-up takes, and whether that brings CUDA."""
+
+import pytest
+
+from torch_backend.contract import CPU_INDEX, CUDA_INDEX, TORCH_INDEX, brings_cuda, torch_index
+
+ROWS = [
+    # system, NVIDIA's driver is there, a card fits, index, CUDA comes with it
+    ("linux", False, False, CPU_INDEX, False),
+    ("linux", True, False, "", True),
+    ("linux", True, True, "", True),
+    ("win32", False, False, "", False),
+    ("win32", True, False, "", False),
+    ("win32", True, True, CUDA_INDEX, True),
+    ("darwin", False, False, "", False),
+]
+
+
+@pytest.mark.parametrize(("system", "driver", "fits", "index", "cuda"), ROWS)
+def test_torch_comes_with_cuda_where_a_card_can_use_it(monkeypatch, system, driver, fits, index, cuda):
+    monkeypatch.delenv(TORCH_INDEX, raising=False)
+    assert torch_index(system, driver, lambda: fits) == index
+    assert brings_cuda(index, system) is cuda
+    monkeypatch.setenv(TORCH_INDEX, "https://somewhere.else/simple")
+    assert torch_index(system, driver, lambda: fits) == "https://somewhere.else/simple", "somebody's wish"
+
+
+@pytest.mark.parametrize(("system", "driver"), [("linux", True), ("linux", False), ("win32", False), ("darwin", True)])
+def test_a_card_that_may_take_seconds_to_answer_is_asked_only_where_that_counts(monkeypatch, system, driver):
+    def asked() -> bool:
+        raise AssertionError("nobody needs to know")
+
+    monkeypatch.delenv(TORCH_INDEX, raising=False)
+    torch_index(system, driver, asked)
+    monkeypatch.setenv(TORCH_INDEX, "")
+    assert torch_index("win32", True, asked) == ""
+
+
+@pytest.mark.parametrize(
+    ("index", "linux", "windows"),
+    [
+        ("", True, False),
+        ("https://download.pytorch.org/whl/cu126/", True, True),
+        ("https://download.pytorch.org/whl/cpu/", False, False),
+        ("https://mirror.studio/pytorch-cpu/simple", False, False),
+        ("file:///srv/wheels", True, False),
+    ],
+)
+def test_what_an_index_brings_is_read_from_its_name_or_else_is_what_pypi_has(index, linux, windows):
+    assert brings_cuda(index, "linux") is linux
+    assert brings_cuda(index, "win32") is brings_cuda(index, "darwin") is windows
