@@ -158,20 +158,32 @@ class _Ask:
             self._left.append(None)
             self._told.put(None)
 
-    def finish(self) -> None:
-        """The caller's: all that nobody has begun; then waits for who has. Returns when nobody is at the block."""
+    def carry_out(self, crew: "_Crew", helpers: int) -> None:
+        """The caller's: asks for helpers, does all that nobody has begun, waits for who has. Returns, also after a
+        Ctrl-C, when nobody is at the block.
+
+        Helpers are asked in here, and the loop that waits is another function's: Python looks for a Ctrl-C as a
+        function begins and as a loop turns, and that has to be within `try`.
+        """
         while True:
             try:
-                while self._take(self._pending.popleft):
-                    pass
-                left = len(self._left)  # before who entered: who did so meanwhile is waited for
-                if left == len(self._entered):
-                    return
-                self._told.get(timeout=_LOOK_SECONDS)
-            except Empty:
-                pass
+                if helpers:
+                    wanted, helpers = helpers, 0
+                    crew.ask(self, wanted)
+                self._finish()
+                return
             except BaseException as raised:  # Ctrl-C: raised once the block is nobody's
                 self.errors.append(raised)
+
+    def _finish(self) -> None:
+        while True:
+            while self._take(self._pending.popleft):
+                pass
+            left = len(self._left)  # before who entered: who did so meanwhile is waited for
+            if left == len(self._entered):
+                return
+            with contextlib.suppress(Empty):
+                self._told.get(timeout=_LOOK_SECONDS)
 
     def _take(self, pop: Callable[[], int]) -> bool:
         try:
@@ -193,13 +205,16 @@ class _Crew:
         self._asked: SimpleQueue[_Ask] = SimpleQueue()
 
     def ask(self, ask: _Ask, helpers: int) -> None:
-        """Has so many threads help."""
+        """Has so many threads help, or as many as the system lets us have."""
         if self._threads < helpers:
             with self._lock:
                 while self._threads < helpers:
-                    threading.Thread(target=self._work, name=f"native-{self._threads}", daemon=True).start()
+                    try:
+                        threading.Thread(target=self._work, name=f"native-{self._threads}", daemon=True).start()
+                    except RuntimeError:
+                        break
                     self._threads += 1
-        for _ in range(helpers):
+        for _ in range(min(helpers, self._threads)):  # what nobody takes would lie there for good
             self._asked.put(ask)
 
     def _work(self) -> None:
@@ -228,11 +243,7 @@ def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
         run(address, stage, 0)
         return
     ask = _Ask(run, address, stage, workers)
-    try:
-        _crew.ask(ask, workers - 1)
-    except BaseException as raised:
-        ask.errors.append(raised)
-    ask.finish()
+    ask.carry_out(_crew, workers - 1)
     if ask.errors:
         raise ask.errors[0]
 

@@ -185,10 +185,88 @@ def test_a_caller_does_itself_what_no_worker_has_begun():
 
     crew.ask(native._Ask(busy, 0, 0, 1), 1)  # its one thread is at another's
     ask = native._Ask(lambda _address, _stage, worker: done.append(worker), 0, 0, 5)
-    crew.ask(ask, 1)
-    ask.finish()
+    ask.carry_out(crew, 1)
     assert sorted(done) == [0, 1, 2, 3, 4] and not ask.errors
     hold.set()
+
+
+def interrupted_at(step, work):
+    """Does some work with a Ctrl-C before the nth instruction of `native` in this thread, at which the others get time
+    to come as far as they can. False if the work has fewer."""
+    passed = 0
+
+    def look(frame, event, _arg):
+        nonlocal passed
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            passed += 1
+            if passed == step:
+                time.sleep(0.005)
+                raise KeyboardInterrupt
+        return look
+
+    before = sys.gettrace()
+    own = native.__file__
+    sys.settrace(lambda frame, event, arg: look(frame, event, arg) if frame.f_code.co_filename == own else None)
+    try:
+        work()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        sys.settrace(before)
+    return passed >= step
+
+
+def test_no_interrupt_leaves_a_worker_at_the_block():
+    """Wherever it comes: the memory that the block tells of is given back as soon as the caller is left."""
+    main, at_block = threading.get_ident(), []
+
+    def run(_address, _stage, worker):
+        if threading.get_ident() != main:
+            at_block.append(worker)
+            time.sleep(0.02)
+            at_block.remove(worker)
+
+    run_workers(lambda *_: time.sleep(0.01), Block(), 0, 3)  # its threads are there
+    step = 1
+    while interrupted_at(step, lambda: run_workers(run, Block(), 0, 3)):
+        assert not at_block, f"after {step} instructions"
+        step += 1
+    assert step > 50
+
+
+def test_a_caller_that_gets_no_threads_does_it_all_itself(monkeypatch):
+    """Threads are limited by the system, and none begins any more while Python ends."""
+
+    def start(_self):
+        raise RuntimeError("can't start new thread")
+
+    crew, done = native._Crew(), []
+    ask = native._Ask(lambda _address, _stage, worker: done.append(worker), 0, 0, 4)
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", start)
+        ask.carry_out(crew, 3)
+    assert sorted(done) == [0, 1, 2, 3] and not ask.errors
+    assert crew._asked.empty(), "nobody would ever take what lies there"
+
+
+def test_workers_may_have_workers():
+    """A piece that is made of pieces waits for nobody who waits for it."""
+    done = []
+
+    def inner(_address, stage, worker):
+        time.sleep(0.001)
+        done.append((stage, worker))
+
+    def outer(_address, _stage, worker):
+        run_workers(inner, Block(), worker, 3)
+
+    callers = [threading.Thread(target=run_workers, args=(outer, Block(), 0, 4)) for _ in range(3)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert sorted(done) == sorted([(stage, worker) for stage in range(4) for worker in range(3)] * 3)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows does not fork")
