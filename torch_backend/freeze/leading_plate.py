@@ -142,7 +142,7 @@ def _let_go(
     h, w = moving.shape
     render = resized(posed.image.color, w, h)
     off, gained = _off(sightings, posed, frame, render)
-    travel = _travel(sightings, config, posed, frame)
+    travel = _travel(sightings, posed, frame)
     wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
     both = None if truth is None else _both_plates(sightings, posed, frame, truth)
     apart = off if both is None else sightings.difference(both.own, both.instant)
@@ -268,7 +268,7 @@ def _of_its_time(
     return opened(shown, round(config.thin * sightings.unit))
 
 
-def _travel(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int) -> Tensor:
+def _travel(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor:
     """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
     h, w = posed.depth.shape
     size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: Gaussians of what moves are larger than its pixels
