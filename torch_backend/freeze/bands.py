@@ -37,18 +37,18 @@ def hand_back() -> None:
         trim(0)
 
 
-def look_up_near(picture: Tensor, pixels: Tensor, mode: str = "bilinear") -> Tensor:
-    """`reproject.look_up` of places that lie near to each other: only the rows that they need become float32.
+def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:
+    """`reproject.look_up`, bicubic, of places that lie near to each other: only the rows that they need become float32.
 
     Equal to it but for the rounding of coordinates, some 1e-4 pixels.
     """
     height, width = picture.shape[:2]
     if height * width <= BAND_PIXELS or not pixels.numel():
-        return look_up(picture, pixels, mode)
+        return look_up(picture, pixels, "bicubic")
     least, most = (float(y) for y in torch.aminmax(pixels[..., 1]))
     if not (math.isfinite(least) and math.isfinite(most)):
-        return look_up(picture, pixels, mode)
+        return look_up(picture, pixels, "bicubic")
     top = min(max(0, math.floor(least) - _REACH), height - 1)
     bottom = max(min(height, math.ceil(most) + _REACH), top + 1)
     down = torch.tensor([0.0, float(top)], dtype=pixels.dtype, device=pixels.device)
-    return look_up(picture[top:bottom], pixels - down, mode)
+    return look_up(picture[top:bottom], pixels - down, "bicubic")

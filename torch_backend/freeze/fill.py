@@ -164,7 +164,7 @@ def fill(
     total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
     filling.share = total / (total + config.doubt)
     for n, residual in enumerate(fillers.residuals):
-        carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n], "bicubic")
+        carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n])
     filling.color += carried * filling.share[:, None]
     if fillers.instant is not None:
         # A plate near in pose that shows the same, a little swayed, has it at its place: plate t* may be a pixel off.

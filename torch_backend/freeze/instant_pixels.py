@@ -55,7 +55,7 @@ class InstantPixels:
         smooth, nearest = look_up(moved, pixels), look_up(moved, pixels, "nearest")
         apart = norm(smooth - nearest, -1) > self.together  # between two surfaces the mean is at neither
         places = pixels + torch.where(apart[:, None], nearest, smooth)
-        shown = look_up_near(self.plate, places * larger, "bicubic")
+        shown = look_up_near(self.plate, places * larger)
         shown = shown * self.gain + self.offset
         if self.light is None:
             return shown
