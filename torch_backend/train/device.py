@@ -46,7 +46,8 @@ def choose_device(requested: str, report: Reporter | None = None, doing: str = "
 
 
 def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]:
-    """`choose_device`, and why `auto` leaves this machine's card unused with what to do about it, as `unused_card`.
+    """`choose_device`, and why `auto` leaves this machine's card unused with what to do about it; None if it does not,
+    or there is none.
 
     Both of one look at the card: one that does not answer is waited for once.
     """
@@ -67,7 +68,7 @@ def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]
 
 
 def unused_words(unused: tuple[str, str], doing: str) -> tuple[str, str]:
-    """(sentence, hint) for whoever waits for `doing`, of what `unused_card` says."""
+    """(sentence, hint) for whoever waits for `doing`, of what `decide_device` says."""
     return f"{doing} uses the processor, not the graphics card: {unused[0]}", unused[1]
 
 
@@ -95,15 +96,9 @@ def _failed(found: SelfTest) -> tuple[str, str] | None:
     return (f"The graphics card failed its self-test: {found.problem}.", _REPORT) if found.problem else None
 
 
-def unused_card() -> tuple[str, str] | None:
-    """Why the NVIDIA card of this machine is not used, and what to do about it; None if it is, or there is none."""
-    return _unused(cuda_refusal())
-
-
 def _unused(refusal: str) -> tuple[str, str] | None:
-    """`unused_card`, of what `cuda_refusal` said."""
+    """Why this machine's NVIDIA card, which `cuda_refusal` refuses so, is not used, and what to do about it; None if
+    there is none."""
     if torch.version.hip is not None:
         return None
-    if not refusal:
-        return failed_self_test()
     return (refusal, "") if torch.cuda.is_available() else why_unused(torch.version.cuda)

@@ -13,7 +13,7 @@ from torch_backend.contract import FreezeParams, JobError, TrainParams
 from torch_backend.freeze import freeze_shot
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import choose_device, config_from_params, load_run, train_shot
-from torch_backend.train.device import cuda_refusal, unused_card
+from torch_backend.train.device import cuda_refusal, decide_device
 from torch_backend.train.trainer import Trainer
 
 ROOT = Path(torch_backend.__file__).parent
@@ -77,7 +77,8 @@ def test_cuda_without_a_gpu_is_refused_in_words(world, quiet):
 @pytest.mark.skipif(not cuda_refusal() or sys.platform == "win32", reason="there is a GPU, or no shell")
 def test_a_card_that_is_not_used_is_said_at_the_start_of_training(world, quiet, nvidia_smi):
     nvidia_smi("NVIDIA GeForce RTX 3090, 535.183.01, 8.6")
-    assert unused_card() is not None and cuda_refusal() == unused_card()[0]
+    unused = decide_device("auto")[1]
+    assert unused is not None and cuda_refusal() == unused[0]
     with pytest.raises(JobError, match="R580 or newer is needed") as refused:
         choose_device("cuda")
     assert refused.value.hint.startswith("Update the NVIDIA driver")

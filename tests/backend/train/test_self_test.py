@@ -83,7 +83,7 @@ def test_where_only_the_fields_kernels_are_wrong_torch_stands_in_for_them(
     monkeypatch.setattr(device, "cuda_refusal", lambda: "")
     monkeypatch.setattr(device, "card_verdict", lambda: found)
     report = quiet()
-    assert choose_device("auto", report, "Training").type == "cuda" and device.unused_card() is None
+    assert choose_device("auto", report, "Training").type == "cuda" and device.decide_device("auto")[1] is None
     ((_, sentence, advice),) = report.events
     assert sentence.startswith("Training computes what moves with PyTorch's own operators") and found.planes in sentence
     assert "doctor --gpu" in advice
@@ -153,14 +153,16 @@ def test_a_card_that_fails_is_not_used_and_said(monkeypatch):
     wrong = "a frame comes out wrong on it (2e-01 off, 1e-02 is allowed)"
     monkeypatch.setattr(device, "card_verdict", lambda: SelfTest(problem=wrong))
     assert choose_device("auto").type == "cpu"
-    sentence, advice = device.unused_card()
+    sentence, advice = device.decide_device("auto")[1]
     assert sentence.startswith("The graphics card failed its self-test: a frame comes out wrong")
     assert "doctor --gpu" in advice
     with pytest.raises(JobError, match="failed its self-test") as refused:
         choose_device("cuda")
     assert "--device cpu" in refused.value.hint
     monkeypatch.setattr(device, "card_verdict", SelfTest)
-    assert choose_device("auto").type == choose_device("cuda").type == "cuda" and device.unused_card() is None
+    assert (
+        choose_device("auto").type == choose_device("cuda").type == "cuda" and device.decide_device("auto")[1] is None
+    )
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
