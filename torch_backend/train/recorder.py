@@ -120,9 +120,9 @@ class Recorder:
             self._recorded.clear()
             self.recording.drop()
 
-    def give_up(self, reason: str) -> bool:
-        """Nothing is recorded any more; was there a recording, whose memory is free now?"""
-        held, self.refused = bool(self._recorded), reason
+    def give_up(self) -> bool:
+        """The card's memory ended: nothing is recorded any more. Was there a recording, whose memory is free now?"""
+        held, self.refused = bool(self._recorded), "the memory of the graphics card ended"
         self.forget()
         return held
 

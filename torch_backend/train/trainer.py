@@ -226,7 +226,7 @@ class Trainer:
         """Work between steps, which may be begun again: once more, without recordings, where the card's memory ends."""
         with contextlib.suppress(torch.OutOfMemoryError):
             return work()
-        if self.recorder is None or not self.recorder.give_up("the memory of the graphics card ended"):
+        if self.recorder is None or not self.recorder.give_up():
             torch.cuda.empty_cache()
         return work()
 
@@ -278,7 +278,7 @@ class Trainer:
         if len(self.densifier.seen) != before:  # it ended between a round of growth and its end
             self.densifier.reset(before)
         forget_demands()
-        held = self.recorder is not None and self.recorder.give_up("the memory of the graphics card ended")
+        held = self.recorder is not None and self.recorder.give_up()
         torch.cuda.empty_cache()
         if held:
             return
