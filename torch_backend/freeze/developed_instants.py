@@ -206,29 +206,27 @@ def _turned_of(tensors: dict[str, Tensor]) -> Turned | None:
 
 def developed(
     shot: Shot, run: LoadedRun, scene: Scene, t_star: int, frozen: FrozenGaussians,
-    config: DevelopConfig | None = None, check: Callable[[int, int], None] | None = None, keep: bool = True,
-    query: str = "nearest",
+    config: DevelopConfig | None = None, keep: bool = True,
 ) -> FrozenGaussians:  # fmt: skip
     """The scene frozen at frame `t_star`, developed: from the run's folder if it is there, else made now and kept.
 
     Args:
-        frozen: the run's scene at t*, asked as `query` says.
-        check: called with steps done and in all; raises to cancel, and then nothing is kept.
+        frozen: the run's scene at t*, asked at the nearest time at which it was seen.
         keep: write it into the run's folder. OSError or JobError if that cannot be done.
     """
     config = config or config_for(run)
-    made = load_developed(shot, run, t_star, frozen, config, query)
+    made = load_developed(shot, run, t_star, frozen, config)
     if made is not None:
         return made
-    made = _make(shot, run, scene, t_star, frozen, config, check)
+    made = _make(shot, run, scene, t_star, frozen, config)
     if keep and not run.stale:
-        _save(shot, run, t_star, frozen, made, developed_key(shot, run, t_star, config, query))
+        _save(shot, run, t_star, frozen, made, developed_key(shot, run, t_star, config))
     return made
 
 
 def _make(
     shot: Shot, run: LoadedRun, scene: Scene, t_star: int, frozen: FrozenGaussians, config: DevelopConfig,
-    check: Callable[[int, int], None] | None,
+    check: Callable[[int, int], None] | None = None,
 ) -> FrozenGaussians:  # fmt: skip
     moving = motion_mattes(shot)
 

@@ -72,9 +72,8 @@ class RunFigures:
     """Share of what the motion mattes call still that is not explained; None without mattes."""
 
 
-def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int, limits: RunLimits | None = None) -> RunFigures:
+def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int) -> RunFigures:
     """A run's figures from its frames; `width` of the working frames, `pixels` of a frame as it was trained on."""
-    limits = limits or RunLimits()
     known = [one for one in seen if math.isfinite(one.psnr_db)]
     kept = [one for one in known if one.held_out]
     values = [one.psnr_db for one in kept or known] or [0.0]  # a clip that is all mask was refused
@@ -87,7 +86,7 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int, limits: R
         np.stack([one.unexplained for one in seen]),
         np.stack([one.travel for one in seen]),
         float(np.percentile(moving, 95)) if len(moving) else 0.0,
-        float((moving > limits.far).sum()) / whole,
+        float((moving > RunLimits.far).sum()) / whole,
         float(np.percentile(moving, 99)) if len(moving) else 0.0,
         float(np.percentile(values, 50)),
         float(np.percentile(values, 10)),
