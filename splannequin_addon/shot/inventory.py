@@ -56,7 +56,9 @@ def read(folder: Path) -> ShotState:
         run["anew"] = checkpoints.anew(place.root)
         if run["anew"] is not None:
             run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
-            run["anew"]["history"] = _history(contract.RunFolder(run["anew"]["folder"]).metrics)
+            instead = contract.RunFolder(run["anew"]["folder"])
+            run["anew"]["history"] = _history(instead.metrics)
+            run["anew"]["preview"] = max(instead.previews.glob("*.png"), default=None)
         run["other_cameras"] = checkpoints.other_cameras(folder, place.root)
         run["history"] = file_cache.of(place.metrics, _history) if place.metrics.is_file() else []
         run["preview"] = max(place.previews.glob("*.png"), default=None)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 
 from ..access import layout_of, scene_in, settings_of
@@ -85,7 +83,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         run = watch.state.runs.get(name) or watch.state.unfinished.get(name) or {}
         going = job is not None and watch.running() == "train"
         if going and job is not None:
-            picture, points = job.images.get("preview"), training.history(run, job.history)
+            picture, points = training.preview(run, job.images.get("preview")), training.history(run, job.history)
         elif run:
             picture, points = run.get("preview"), run.get("history", [])
         else:
@@ -93,7 +91,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         body = step_panel.sub_panel(layout_of(self), "train_pictures", "Progress", folded=False)
         if body is None:
             return
-        icon = pictures.icon_of(Path(picture)) if picture else 0
+        icon = pictures.icon_of(picture) if picture else 0
         if icon:
             body.template_icon(icon_value=icon, scale=8.0)
         icon = pictures.plot(points)

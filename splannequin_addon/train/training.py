@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ...torch_backend import contract
@@ -76,3 +77,8 @@ def history(told: dict[str, Any], now: list[tuple[float, float]]) -> list[tuple[
     from before it."""
     before = (told.get("anew") or told).get("history", [])
     return [point for point in before if not now or point[0] < now[0][0]] + list(now)
+
+
+def preview(told: dict[str, Any], now: str | None) -> Path | None:
+    """Latest picture of a run, or of the one that will take its place: what a job wrote `now`, else one of before."""
+    return Path(now) if now else (told.get("anew") or told).get("preview")

@@ -211,6 +211,27 @@ def test_the_curve_of_an_added_stretch_follows_the_runs_own(addon):
     assert history({}, [(1.0, 9.0)]) == [(1.0, 9.0)]
 
 
+def test_a_run_that_goes_on_shows_its_last_picture_until_it_has_another(addon, with_runs, shot):
+    def shown(now=None):
+        return addon("train.training").preview(addon("shot.inventory").read(shot).runs["main"], now)
+
+    def picture(run, name):
+        (run / "previews").mkdir(parents=True)
+        (run / "previews" / name).write_bytes(b"")
+        return run / "previews" / name
+
+    run = shot / "runs" / "main"
+    assert shown() is None
+    before = picture(run, "000170.png")
+    assert shown() == before
+    assert shown(str(before.with_name("000350.png"))) == before.with_name("000350.png")
+    instead = run / "next" / "0123456789abcdef"
+    checkpoint(instead / "checkpoint.safetensors", key="other", iteration=450)
+    assert shown() is None, "the run's own is of other settings"
+    after = picture(instead, "000020.png")
+    assert shown() == after
+
+
 _WORLD = "import sys; from pathlib import Path; from tests.backend.conftest import build_world; build_world(Path({!r}))"
 
 

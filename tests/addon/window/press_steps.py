@@ -352,11 +352,11 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
     watch = _supervisor().watch_of(work / "sitting.splannequin")
     began, taken = time.monotonic(), False
     stage = "training" if name == "3-train" else ""
+    share = {"2-solve": 0.3, "3-train": 0.3 if cancel else 0.6}.get(name, 0.05)  # the others are over soon
     yield 1.0
     while watch.running() is not None:
         job = next((j for j in watch.jobs.values() if not j.ended), None)
         status = job.status if job is not None else None
-        share = 0.3 if name in ("2-solve", "3-train") else 0.05  # the others are over soon
         far = status is not None and status.fraction > share and status.stage.startswith(stage)
         drawn = watch.work is not None and watch.work.progress is not None and watch.work.progress.done > 0
         if not taken and (drawn if name == "5-bake" else far):
