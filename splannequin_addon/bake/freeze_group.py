@@ -167,6 +167,6 @@ def new_node(tree: bpy.types.NodeTree, before: dict[str, bool]) -> bpy.types.Com
     assert isinstance(node, bpy.types.CompositorNodeGroup)
     node.node_tree = group
     node.name = node.label = GROUP_NAME
-    node.width = 180.0
+    node.width = 240.0  # "Show What Is Invented" and "CG Depth" stand there whole, with their values
     set_defaults(node, {s.name for s in node.inputs})
     return node
