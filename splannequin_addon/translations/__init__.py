@@ -3,7 +3,7 @@
 Sentences are composed, kept and logged in English, here and in the backend's process, and translated where they are
 shown: Blender looks up what its own widgets say (labels of buttons, tooltips), `tr` what was composed. `{}` in a key
 stands for any value, so that "74 frames, 1 to 74" is found under "{} frames, {} to {}". In the translation `{}` is the
-next value, `{1}` the second, and `{!t}` a value that is itself translated.
+next value, `{1}` the second, `{!t}` a value that is itself translated, and `{!l}` a list of such values.
 
 tests/addon/test_translations.py prints the lines that a language lacks.
 """
@@ -24,7 +24,7 @@ LANGUAGES: dict[str, Mapping[str, str]] = {"de_DE": de_DE.MESSAGES}
 _PACKAGE = __name__.partition(".splannequin_addon")[0]
 _CONTEXTS = ("*", "Operator")
 """Where Blender looks: what buttons of operators say has a context of its own."""
-_FIELD = re.compile(r"\{(\d*)(!t)?\}")
+_FIELD = re.compile(r"\{(\d*)(![tl])?\}")
 
 
 def tr(text: str) -> str:
@@ -70,6 +70,8 @@ def _filled(target: str, values: tuple[str, ...], locale: str) -> str:
 
     def value(field: re.Match[str]) -> str:
         said = values[int(field[1])] if field[1] else next(following)
+        if field[2] == "!l":
+            return ", ".join(translate(part, locale) for part in said.split(", "))
         return translate(said, locale) if field[2] else said
 
     return _FIELD.sub(value, target)

@@ -148,7 +148,7 @@ def test_translations_are_filled_in_and_have_the_fields_of_the_original(addon):
     for messages in languages(addon).values():
         for text, said in messages.items():
             assert said.strip() == said and said, text
-            fields = re.findall(r"\{(\d*)(?:!t)?\}", said)
+            fields = re.findall(r"\{(\d*)(?:![tl])?\}", said)
             count = text.count("{}")
             assert said.count("{") == len(fields), text
             assert fields in ([""] * count, sorted(fields)) or set(fields) == {str(n) for n in range(count)}, text
@@ -185,6 +185,15 @@ def test_composed_sentences_are_translated_with_their_values(addon):
         (
             "Cannot write to /a b: Permission denied. Choose another shot folder.",
             "In /a b kann nicht geschrieben werden: Permission denied. Einen anderen Shot-Ordner wählen.",
+        ),
+        (
+            "Read as 640 x 480, square pixels, 10 fps, 8 bits, video, Rec.709, matrix BT.601, full levels, no alpha.",
+            "Gelesen als 640 x 480, quadratische Pixel, 10 Bilder/s, 8 Bit, Video, Rec.709, Matrix BT.601, "
+            "Pegel: voll, kein Alpha.",
+        ),
+        (
+            "Assumed, for the footage does not say: pixel aspect, colour space, levels.",
+            "Angenommen, denn das Material sagt es nicht: Pixelseitenverhältnis, Farbraum, Pegel.",
         ),
         ("An unknown sentence. Choose another shot folder.", "An unknown sentence. Einen anderen Shot-Ordner wählen."),
         ("The run {0} is called {1!t}.", "The run {0} is called {1!t}."),
