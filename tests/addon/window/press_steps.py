@@ -362,6 +362,7 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
         if not taken and (drawn if name == "5-bake" else far):
             if name == "3-train" and not cancel:
                 yield from _scroll_down()  # its preview and curve stand below the window's edge
+                yield from _scroll_down()
             yield from _shoot(work, f"{name}-running", settle=2)
             taken = True
             if cancel:
