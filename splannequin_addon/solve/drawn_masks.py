@@ -128,7 +128,8 @@ def _stage(mask: bpy.types.Mask, size: tuple[int, int]) -> Generator[bpy.types.S
         render.dither_intensity = 0.0
         with contextlib.suppress(TypeError):  # an OCIO configuration of the artist's own may have no such view
             # Half of the mask is half of the picture's values, which is where the solve cuts: AgX makes 0.2 of it half.
-            present(scene.view_settings).view_transform = "Raw"
+            view: Any = present(scene.view_settings)
+            view.view_transform = "Raw"
         yield scene
     finally:
         data = camera.data
