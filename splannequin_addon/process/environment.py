@@ -144,14 +144,17 @@ def half_made(python: Path) -> bool:
     return notes.is_dir() and ((notes / "installing").exists() or not (notes / "installed.json").is_file())
 
 
-def at_work(folder: Path) -> int | None:
-    """Id of a process that runs in the environment in `folder`, whoever started it; None if there is none, or if the
-    system does not tell."""
-    return next(iter(contract.run_from(folder / ".venv")), None)
+class AtWork(Exception):
+    """A process runs in an environment that was to be taken away."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        super().__init__(f"process {pid} runs in it")
 
 
 def remove(folder: Path, wait: bool = False) -> bool:
-    """Takes the environment in `folder` away. True if there was one; ValueError if it is not one of ours.
+    """Takes the environment in `folder` away. True if there was one; ValueError if it is not one of ours, AtWork if a
+    process runs in it, whoever started it (as far as the system tells).
 
     It is gone at once; its gigabytes are deleted in the background unless asked to `wait`.
     """
@@ -160,14 +163,26 @@ def remove(folder: Path, wait: bool = False) -> bool:
         return False
     if not (environment / _NOTES).is_dir():
         raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
+    _nobody_in(environment)
     # Renamed first: whatever is interrupted, no half of it passes for an environment.
-    os.replace(environment, folder / f"{_REMOVED}{uuid.uuid4().hex[:8]}")
+    renamed = folder / f"{_REMOVED}{uuid.uuid4().hex[:8]}"
+    os.replace(environment, renamed)
+    try:
+        _nobody_in(environment)  # who began between the look and the renaming has its old path and needs the rest of it
+    except AtWork:
+        os.replace(renamed, environment)
+        raise
     shutil.rmtree(folder / _STATE, ignore_errors=True)
     if wait:
         _empty(folder)
     else:
         threading.Thread(target=_empty, args=(folder,), name="removed backend", daemon=True).start()
     return True
+
+
+def _nobody_in(environment: Path) -> None:
+    for pid in contract.run_from(environment):
+        raise AtWork(pid)
 
 
 def _empty(folder: Path) -> None:

@@ -224,12 +224,11 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
                 name = watch.shot.name
                 self.report({"ERROR"}, tr(f"The environment stays: a step of {name} runs. Wait for it or cancel it."))
                 return {"CANCELLED"}
-        other = environment.at_work(backend.folder())
-        if other is not None:
-            self.report({"ERROR"}, tr(_at_work(other)))
-            return {"CANCELLED"}
         try:
             there = environment.remove(backend.folder(), wait=bpy.app.background)
+        except environment.AtWork as other:
+            self.report({"ERROR"}, tr(_at_work(other.pid)))
+            return {"CANCELLED"}
         except (OSError, ValueError) as error:
             self.report({"ERROR"}, tr(f"The environment stays: {error}"))
             return {"CANCELLED"}

@@ -108,19 +108,51 @@ def test_what_a_job_works_with_is_not_removed(addon, contract, made, shot):
     assert not list(made.iterdir()), "headless, it is gone when the button says so"
 
 
+def at_work(folder) -> subprocess.Popen[bytes]:
+    """A process that runs in the environment in `folder`, and has begun."""
+    python = folder / ".venv" / "bin" / "python"
+    if not python.exists():
+        python.parent.mkdir()
+        python.symlink_to(os.path.realpath(sys.executable))
+    stays = "import time; print('begun', flush=True); time.sleep(600)"
+    process = subprocess.Popen([python, "-S", "-c", stays], stdout=-1)
+    assert process.stdout is not None and process.stdout.readline().strip() == b"begun"
+    return process
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
-def test_what_a_process_of_others_works_with_is_not_removed(addon, made):
+def test_what_a_process_of_others_works_with_is_not_removed(addon, contract, made):
     """A job of another Blender, or of a command line: nothing in this Blender knows of it."""
-    (made / ".venv" / "bin").mkdir()
-    python = made / ".venv" / "bin" / "python"
-    python.symlink_to(os.path.realpath(sys.executable))
-    with subprocess.Popen([python, "-S", "-c", "print('begun', flush=True); input()"], stdin=-1, stdout=-1) as other:
-        assert other.stdout.readline().strip() == b"begun"
-        with pytest.raises(RuntimeError, match=rf"stays: another Blender.*\(process {other.pid}\)"):
-            bpy.ops.splannequin.remove_backend()
-        assert (made / ".venv" / "package.py").exists()
-        other.kill()
+    with at_work(made) as other:
+        try:
+            assert contract.run_from(made / ".venv") == [other.pid] and other.poll() is None
+            with pytest.raises(RuntimeError, match=rf"stays: another Blender.*\(process {other.pid}\)"):
+                bpy.ops.splannequin.remove_backend()
+            assert other.poll() is None and (made / ".venv" / "package.py").exists()
+        finally:
+            other.kill()
     assert bpy.ops.splannequin.remove_backend() == {"FINISHED"} and not list(made.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
+def test_what_a_process_begins_with_while_it_is_being_removed_is_put_back(addon, made, monkeypatch):
+    environment, begun, replace = addon("process.environment"), [], os.replace
+
+    def after_somebody_began(source, target):
+        if not begun:
+            begun.append(at_work(made))
+        replace(source, target)
+
+    monkeypatch.setattr(environment.os, "replace", after_somebody_began)
+    try:
+        with pytest.raises(environment.AtWork, match="runs in it"):
+            environment.remove(made)
+        assert [path.name for path in made.iterdir()] == [".venv"] and (made / ".venv" / "package.py").exists()
+    finally:
+        for process in begun:
+            with process:
+                process.kill()
+    assert environment.remove(made, wait=True) and not list(made.iterdir())
 
 
 def test_the_button_needs_leave_to_go_online(addon):
