@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,24 +59,32 @@ class Question:
     """A backend that is asked for one answer, beside Blender."""
 
     process: subprocess.Popen[str]
-    _told: tuple[str, str] | None = None
+    _told: tuple[str, str] = ("", "")
     """What it printed on the standard output and error."""
+
+    def __post_init__(self) -> None:
+        # What it prints is read while it runs: a pipe holds 4 KB on Windows, and who has more to say waits for a reader.
+        self._reader = threading.Thread(target=self._listen, name="splannequin answer", daemon=True)
+        self._reader.start()
+
+    def _listen(self) -> None:
+        self._told = self.process.communicate()
 
     @property
     def ended(self) -> bool:
         """True once it has answered, or failed to."""
-        return self.process.poll() is not None
+        return not self._reader.is_alive()
 
     def wait(self, seconds: float = 600.0) -> None:
         """Blocks until it has ended; after `seconds`, or on Ctrl-C, it is ended by force."""
+        until = time.monotonic() + seconds
         try:
-            self._told = self.process.communicate(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self._told = self.process.communicate()
-        except BaseException:
-            self.process.kill()
-            raise
+            while not self.ended and time.monotonic() < until:
+                self._reader.join(0.2)  # a wait without limit cannot be interrupted on Windows
+        finally:
+            if not self.ended:
+                self.process.kill()
+        self._reader.join()
 
     def answer(self, failed: str, hint: str = "", code: int | None = None) -> str:
         """What it printed. JobError with its own sentence if it failed by intention, else with `failed`.
@@ -85,7 +94,7 @@ class Question:
             hint: what to do then.
             code: exit code of that error; None: its own.
         """
-        self._told = self._told or self.process.communicate()
+        self._reader.join()
         out, errors = self._told
         if not self.process.returncode:
             return out
@@ -99,7 +108,8 @@ class Question:
 
 def ask(python: str, package_root: Path, *words: str) -> Question:
     """Asks the backend something, without waiting: `torch_backend WORDS`. JobError if it cannot be started."""
-    piped: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "encoding": "utf-8"}
+    piped: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    piped |= {"encoding": "utf-8", "errors": "replace"}  # what a library prints may be of another encoding
     try:
         child = start(contract.python_child(python, "torch_backend", *words), package_root, **piped)
     except OSError as error:

@@ -163,6 +163,21 @@ def test_the_childs_environment_is_free_of_blenders_python(addon, monkeypatch, r
     assert "PYTHONHOME" not in environ and environ["PYTHONPATH"] == str(root)
 
 
+def test_an_answer_that_no_pipe_holds_is_read_while_it_is_given(addon, tmp_path):
+    """Linux holds 64 KB for who does not read, Windows 4: a traceback of a library that cannot be loaded is longer."""
+    (tmp_path / "torch_backend").mkdir()
+    words = "import sys; sys.stderr.write('x' * 300000); sys.stdout.write('y' * 300000)"
+    (tmp_path / "torch_backend" / "__main__.py").write_text(f"{words}; sys.stdout.buffer.write(bytes([255]))")
+    asked = addon("process.children").ask(sys.executable, tmp_path, "doctor")
+    until = time.monotonic() + 30.0
+    while not asked.ended and time.monotonic() < until:  # as the timer looks, which waits for nothing
+        time.sleep(0.05)
+    try:
+        assert asked.ended and asked.answer("{}") == "y" * 300000 + "\N{REPLACEMENT CHARACTER}"
+    finally:
+        asked.process.kill()
+
+
 def test_a_python_that_does_not_start_is_an_environment_error(addon, contract, empty_shot, root):
     jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "import", contract.ImportParams("x.mp4"))

@@ -193,7 +193,7 @@ def test_an_export_in_a_window_is_followed_without_waiting(addon, scene, shot, t
     supervisor.tick()
     watch = supervisor.watch_of(shot)
     assert not watch.notes and not watch.failures
-    asked.process.wait(60)
+    asked.wait(60)
     supervisor.tick()
     said = watch.notes["solve"][0] if well else watch.failures["solve"][0]
     assert (str(tmp_path / "out") if well else "is not a shot folder") in said
