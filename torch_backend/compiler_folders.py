@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .contract import ExitCode, JobError
-from .shot import locked
+from .shot import locked, replace_file
 
 _FOLDER = "Splannequin"
 
@@ -100,5 +100,5 @@ def _copied(native: Path, home: Path) -> Path:
                 beside = home / "native.part"
                 shutil.rmtree(beside, ignore_errors=True)
                 shutil.copytree(native, beside)
-                os.replace(beside, home / "native")
+                replace_file(beside, home / "native")
     return home

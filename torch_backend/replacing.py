@@ -26,6 +26,7 @@ from .contract import (
     STMAP_FILES,
     ShotFolder,
     make_folder,
+    remove_file,
     replace_file,
 )
 
@@ -70,7 +71,7 @@ def replacing_solve(shot: ShotFolder) -> Generator[Staged]:
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    partial.rename(shot.solve / _NEXT)
+    replace_file(partial, shot.solve / _NEXT)  # a scanner may be at hundreds of new pictures
     settle_solve(shot)
 
 
@@ -93,8 +94,8 @@ def settle_solve(shot: ShotFolder) -> None:
                 make_folder(target.parent)
                 replace_file(source, target)
             else:
-                target.unlink(missing_ok=True)
-                source.unlink()
+                remove_file(target)
+                remove_file(source)
     shutil.rmtree(ready, ignore_errors=True)
 
 

@@ -31,6 +31,7 @@ from .contract import (
     path_error,
     read_json,
     refuse_foreign,
+    remove_file,
     replace_file,
     replacing_folder,
     restore_folder,
@@ -43,8 +44,8 @@ from .replacing import settle_solve
 
 __all__ = [
     "SHOT_SUFFIX", "Shot", "ShotInfo", "atomic_path", "checked_name", "content_key", "disk_error", "is_disk_full",
-    "locked", "make_folder", "need_disk", "path_error", "replace_file", "replacing_folder", "restore_folder",
-    "try_lock", "working_on", "write_atomic", "write_json",
+    "locked", "make_folder", "need_disk", "path_error", "remove_file", "replace_file", "replacing_folder",
+    "restore_folder", "try_lock", "working_on", "write_atomic", "write_json",
 ]  # fmt: skip
 """With what of the contract the stations write into a shot."""
 
@@ -140,7 +141,7 @@ class Shot(ShotFolder):
             info = from_dict(ShotInfo, {**dataclasses.asdict(self.info()), **{name: told[name] for name in IMPORTED}})
             shutil.rmtree(self.own(self.solve), ignore_errors=True)
             self.save(info)
-        news.unlink()
+        remove_file(news)
 
     def info(self) -> ShotInfo:
         """shot.json as it is now."""

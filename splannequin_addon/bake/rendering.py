@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import uuid
 from collections.abc import Callable, Generator
@@ -64,7 +63,7 @@ def render_beside(
         with _without_stamps(scene):
             numbers = render(scene, beside, png, on_frame, check_cancelled)
         for made in sorted(beside.iterdir()):
-            os.replace(made, folder / made.name)
+            contract.replace_file(made, folder / made.name)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return numbers

@@ -60,9 +60,9 @@ def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple
             yield done, len(numbers)
         for old in into.glob("*.png"):
             if old.stem.isdecimal():
-                old.unlink()
+                contract.remove_file(old)
         for made in sorted(beside.iterdir()):
-            os.replace(made, into / made.name)
+            contract.replace_file(made, into / made.name)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
     return into

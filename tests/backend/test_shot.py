@@ -6,7 +6,8 @@ import os
 
 import pytest
 
-from torch_backend.contract import ExitCode, JobError, sweep_half_written
+from torch_backend.contract import Cancelled, ExitCode, JobError, sweep_half_written
+from torch_backend.contract.files import patiently
 from torch_backend.shot import Shot, atomic_path, checked_name, content_key, need_disk, write_atomic, write_json
 
 
@@ -40,6 +41,31 @@ def test_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
         raise OSError(errno.ENOSPC, "full")
     assert json.loads(path.read_text()) == {"a": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_what_went_wrong_in_a_write_is_told_though_its_rest_cannot_be_removed(tmp_path):
+    """As on Windows, where the writer of a picture has its file open still."""
+    with pytest.raises(Cancelled), atomic_path(tmp_path / "a.mp4") as beside:
+        beside.mkdir()
+        raise Cancelled
+
+
+@pytest.mark.parametrize("refusals, windows, done", [(3, True, True), (4, True, False), (1, False, False)])
+def test_what_windows_refuses_for_a_moment_is_tried_anew(refusals, windows, done):
+    """Elsewhere a refusal is one for good."""
+    left = [PermissionError(errno.EACCES, "held")] * refusals
+
+    def act() -> str:
+        if left:
+            raise left.pop()
+        return "done"
+
+    if done:
+        assert patiently(act, 4, 0.0, windows) == "done"
+    else:
+        with pytest.raises(PermissionError):
+            patiently(act, 4, 0.0, windows)
+        assert len(left) == (0 if windows else refusals - 1)
 
 
 def test_json_refuses_nan(tmp_path):

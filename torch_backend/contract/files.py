@@ -7,9 +7,12 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Generator
+import time
+from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any, BinaryIO, TypeGuard
+from typing import Any, BinaryIO, TypeGuard, TypeVar
+
+T = TypeVar("T")
 
 LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
@@ -19,6 +22,22 @@ LONGEST_LINE = 1 << 20
 """Bytes of a line of events.jsonl or metrics.jsonl that are read."""
 
 
+def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, windows: bool = os.name == "nt") -> T:
+    """What `act` gives, tried anew where Windows refuses: for a moment somebody else may hold the file open, a reader,
+    a virus scanner, or whoever renames another one over it. Two seconds long, unless told otherwise.
+
+    PermissionError if it was refused to the last.
+    """
+    while True:
+        tries -= 1
+        try:
+            return act()
+        except PermissionError:
+            if not windows or tries <= 0:
+                raise
+            time.sleep(pause)
+
+
 def open_regular(path: str | Path) -> BinaryIO:
     """Opens a regular file (or a link to one) for reading, without ever waiting for it.
 
@@ -26,11 +45,17 @@ def open_regular(path: str | Path) -> BinaryIO:
     FileNotFoundError or another OSError of the system's; ValueError names a path that holds something else.
     """
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-    # One owner of the handle from the start: closed twice, by us and by a file object that goes, an interrupt between
-    # the two would read as a fault of the disk.
+
+    def opened() -> BinaryIO:
+        # One owner of the handle from the start: closed twice, by us and by a file object that goes, an interrupt
+        # between the two would read as a fault of the disk.
+        return open(path, "rb", opener=lambda name, _: os.open(name, flags))
+
     try:
-        source = open(path, "rb", opener=lambda name, _: os.open(name, flags))  # noqa: SIM115 -- it is what we return
-    except IsADirectoryError:
+        source = patiently(opened, 4, 0.01)  # no longer than Blender may wait
+    except (IsADirectoryError, PermissionError) as error:
+        if isinstance(error, PermissionError) and not os.path.isdir(path):  # what Windows says of a folder
+            raise
         raise ValueError(f"{path} is not a file: remove it") from None
     try:
         if not stat.S_ISREG(os.fstat(source.fileno()).st_mode):

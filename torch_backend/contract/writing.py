@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import disk_error
-from .files import is_link, remove_link
+from .files import is_link, patiently, remove_link
 
 _worked_on: list[Path] = []
 """Shot folders that jobs of this process work on."""
@@ -69,7 +70,8 @@ def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
             os.fsync(handle.fileno())
         replace_file(beside, path)
     except BaseException:
-        beside.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # what went wrong is to be told, not that Windows has it open still
+            beside.unlink(missing_ok=True)
         raise
 
 
@@ -132,15 +134,13 @@ def _discard(folder: Path) -> None:
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Renames over `target`; on Windows a reader may hold it open for a moment, so that is tried for two seconds."""
-    for attempt in range(40):
-        try:
-            os.replace(source, target)
-            return
-        except PermissionError:
-            if os.name != "nt" or attempt == 39:
-                raise
-            time.sleep(0.05)
+    """Renames over `target`, a file, or a folder to where none is. Waits on Windows, see `files.patiently`."""
+    patiently(functools.partial(os.replace, source, target))
+
+
+def remove_file(path: Path) -> None:
+    """Removes a file, if it is there. Waits on Windows, see `files.patiently`."""
+    patiently(functools.partial(path.unlink, missing_ok=True))
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ from ..contract import (
     Reporter,
     TakeFolder,
     read_json,
+    remove_file,
 )
 from ..shot import Shot, content_key, write_json
 from .exr import read_key
@@ -43,7 +44,7 @@ def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, A
     chosen = in_range(take.whole, params)
     told = take.folder.facts
     if told.is_file() and not _same_take(told, take):
-        told.unlink(missing_ok=True)  # what it tells of goes, frame by frame
+        remove_file(told)  # what it tells of goes, frame by frame
     state = {"version": 1, "key": take.key, "t_star": take.t_star, "frames": _all_keys(take)}
     write_json(take.folder.state, state)
     return {"t_star": take.t_star, "first": chosen[0].frame, "last": chosen[-1].frame, "frames": len(chosen)}
@@ -90,7 +91,7 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     for number in frames_of(take.folder):
         if number not in right:
             for old in files_of(take.folder, number):
-                old.unlink(missing_ok=True)
+                remove_file(old)
     return finish(shot, params, take, [f for f in take.whole if f.frame in right], {}, report)
 
 

@@ -23,7 +23,7 @@ from ..contract import (
 from ..footage.images import read_png
 from ..gaussians.ply import write_ply
 from ..scene import Scene
-from ..shot import Shot, disk_error, is_disk_full, write_json
+from ..shot import Shot, disk_error, is_disk_full, remove_file, write_json
 from ..solve.stmap import write_take_map
 from ..torch_types import from_numpy
 from ..train import LoadedRun
@@ -161,7 +161,7 @@ def _redistort(
     shot: Shot, folder: TakeFolder, size: tuple[int, int], beyond: tuple[int, int], Ks: np.ndarray, report: Reporter
 ) -> Path | None:
     """The map back through the lens over overscanned frames; None where the shot's own map fits, or none does."""
-    folder.redistort.unlink(missing_ok=True)
+    remove_file(folder.redistort)
     if not any(beyond):
         return None
     try:

@@ -16,6 +16,7 @@ from ..contract import (
     TakeFolder,
     frame_number,
     read_json,
+    remove_file,
     replace_file,
     sweep_half_written,
 )
@@ -49,7 +50,7 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
     there = _right_frames(take, beside, params) if beside.root.is_dir() else set[int]()
     for n in set(_numbers(beside)) - there:
         for file in files_of(beside, n):
-            file.unlink(missing_ok=True)
+            remove_file(file)
     stands = folder.facts.is_file() and bool(set(frames_of(folder)) - here)
     if not stands:
         place = Place(folder, beside, here, there)
@@ -80,7 +81,7 @@ def clear(take: PlannedTake, done: Set[int]) -> None:
     folder = take.folder
     stale = set(_numbers(folder)) - done
     for old in [folder.facts, *(file for n in stale for file in files_of(folder, n))] if stale else ():
-        old.unlink(missing_ok=True)
+        remove_file(old)
     write_json(folder.state, {"version": 1, "key": take.key})
 
 

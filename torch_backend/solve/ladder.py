@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..contract import REQUEST_FILE, JobError, Reporter
-from ..shot import make_folder, need_disk, write_json
+from ..shot import make_folder, need_disk, replace_file, write_json
 from .child import run_worker
 from .lens_verdict import FISHEYE, like_a_fisheye
 from .verdict import FAIR_SHARE, Fault, fault_of, quality_words
@@ -181,7 +181,7 @@ def _attempt(
     make_folder(folder)
     reuse = before is not None and (before.folder / DATABASE_FILE).is_file()
     if before is not None and reuse:
-        (before.folder / DATABASE_FILE).rename(folder / DATABASE_FILE)
+        replace_file(before.folder / DATABASE_FILE, folder / DATABASE_FILE)
     write_json(folder / REQUEST_FILE, {**request, "reuse": reuse})
     answer = run_worker(folder / REQUEST_FILE, log, report, keep_log=rung != FIRST)
     return Attempt(rung, folder, answer, fault_of(answer, frames), len(request["solved"]))

@@ -41,7 +41,7 @@ from ..footage.lens_tags import focal_px
 from ..footage.masks import Mask, read_masks
 from ..footage.sources import frame_words
 from ..replacing import Staged, replacing_solve, settle_solve
-from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, write_json
+from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, replace_file, write_json
 from . import foreign, map_reading
 from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
@@ -380,7 +380,7 @@ def _finish(
     _undistort_all(shot, frames, lenses, maps, masks, staged, report)
     with atomic_path(staged.solve / POINTS_FILE) as beside:
         save_arrays(beside, points)
-    (scratch / "model").rename(staged.solve / COLMAP_FOLDER)
+    replace_file(scratch / "model", staged.solve / COLMAP_FOLDER)
     write_json(staged.solve / CAMERAS_FILE, path.to_json())
     result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
     warnings = _warnings(frames, path, result, "given" in answer)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..contract import CONFIG_FILE, METRICS_FILE, NEXT_FOLDER, PREVIEWS_FOLDER, is_link, remove_link
 from ..contract import SUMMARY_FILE as SUMMARY_FILE
-from ..shot import replace_file
+from ..shot import remove_file, replace_file
 from .checkpoint import CHECKPOINT_FILE, read_meta
 from .extend import EXTENSION_FILE
 
@@ -46,7 +46,7 @@ def replace_run(run: Path, done: Path) -> None:
     if (done / PREVIEWS_FOLDER).is_dir():
         shutil.rmtree(run / PREVIEWS_FOLDER, ignore_errors=True)
         replace_file(done / PREVIEWS_FOLDER, run / PREVIEWS_FOLDER)
-    (run / EXTENSION_FILE).unlink(missing_ok=True)
+    remove_file(run / EXTENSION_FILE)
     replace_file(done / SUMMARY_FILE, run / SUMMARY_FILE)
     shutil.rmtree(run / NEXT_FOLDER, ignore_errors=True)
 

@@ -30,7 +30,7 @@ from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import HELD_BYTES, Scene, load_scene, split_frames
-from ..shot import Shot, content_key, make_folder, need_disk, write_atomic, write_json
+from ..shot import Shot, content_key, make_folder, need_disk, remove_file, write_atomic, write_json
 from ..solve.masks import IGNORE, load_mask, masks_key
 from ..solve.motion import load_motion, motion_key
 from . import adam
@@ -125,7 +125,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     checkpoint = folder / CHECKPOINT_FILE
     resumed = _resume(trainer, checkpoint, params.resume, report)
     for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
-        (folder / name).unlink(missing_ok=True)
+        remove_file(folder / name)
     write_json(folder / CONFIG_FILE, {"version": 1, **identity, "config": config_to_json(config)})
     metrics = Metrics(folder, report, trainer.iteration if resumed else -1)
     held_out = images[len(train) :]
@@ -206,7 +206,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     summary = summarise(trainer, params.run, test, held_out, facts["key"], mattes)
     trainer.save(checkpoint)
     write_json(folder / SUMMARY_FILE, summary)
-    beside.unlink(missing_ok=True)
+    remove_file(beside)
     report.metric("train", summary)
     warn_if_poor(summary, report)
     return summary
