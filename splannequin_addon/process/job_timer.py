@@ -80,6 +80,8 @@ class Watch:
     """What Blender itself is doing for it."""
     pending: dict[str, jobs.Job] = field(default_factory=dict[str, Any])  # `jobs` is a field here
     """Jobs that ended well while another shot of the scene was chosen, by the step's name: they wait for this one."""
+    unread: tuple[str, str] | None = None
+    """(sentence, hint) of why the folder could not be read, which is tried again."""
     redraw: bool = False
     """Something changed outside the timer: draw at its next turn."""
 
@@ -200,7 +202,7 @@ def when_answered(question: children.Question, then: Callable[[], None]) -> None
 
 def refresh(watch: Watch) -> bool:
     """Reads the shot folder again if something in it changed. True if it did."""
-    watch.looked = time.monotonic()
+    watch.looked, first = time.monotonic(), next(iter(steps.STEPS))
     try:
         stamp = inventory.stamp(watch.shot)
         if stamp == watch.stamp and watch.state is not None:
@@ -209,10 +211,19 @@ def refresh(watch: Watch) -> bool:
         watch.state = inventory.read(watch.shot)
         selection.look_again()
     except (OSError, ValueError, KeyError) as error:
-        watch.state = ShotState(watch.shot)
+        # Not for good: a network disk that was away for a moment, or a file that was being replaced on Windows, comes
+        # back as it was.
+        watch.state, watch.stamp = ShotState(watch.shot), ()
         why = getattr(error, "strerror", None) or error
-        first = next(iter(steps.STEPS))
-        watch.failures[first] = (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one.")
+        known, watch.unread = (
+            watch.unread,
+            (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one."),
+        )
+        watch.failures[first] = watch.unread
+        return watch.unread != known
+    if watch.unread is not None and watch.failures.get(first) == watch.unread:
+        del watch.failures[first]
+    watch.unread = None
     return True
 
 

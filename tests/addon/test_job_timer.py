@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 
 import bpy
 import pytest
@@ -58,6 +59,22 @@ def test_what_the_last_turn_begins_goes_on(supervisor, watch, shot):
     supervisor.tick()
     supervisor.tick()
     assert watch.running() == "bake" and watch.work.turns is None, "Blender renders by itself"
+
+
+def test_a_shot_that_cannot_be_read_for_a_moment_is_read_again(contract, supervisor, watch, shot):
+    """Its files are what they were: on a network disk that was away, or replaced on Windows while they were read."""
+    file = contract.ShotFolder(shot).info_path
+    whole = file.read_bytes()
+    assert watch.state.info
+    file.write_bytes(b"{")
+    assert supervisor.refresh(watch) and not watch.state.info
+    assert "cannot be read" in watch.failures["import"][0]
+    assert not supervisor.refresh(watch)  # nothing new to be drawn
+    damaged = file.stat()
+    file.write_bytes(whole)
+    os.utime(file, ns=(damaged.st_atime_ns, damaged.st_mtime_ns))
+    assert supervisor.refresh(watch) and watch.state.info
+    assert "import" not in watch.failures
 
 
 def test_one_that_breaks_does_not_end_the_timer_for_the_others(supervisor, capfd):
