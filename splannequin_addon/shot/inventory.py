@@ -64,7 +64,8 @@ def read(folder: Path) -> ShotState:
         run["preview"] = max(place.previews.glob("*.png"), default=None)
     state.takes = _named(_Take, there.takes, contract.TAKE_FILE, state.damaged["take"])
     for name, take in state.takes.items():
-        take["frame_count"] = file_cache.of(there.takes / name, _frame_count)
+        folder_of = contract.TakeFolder(there.takes / name)
+        take["frame_count"] = file_cache.of(folder_of.root, _frame_count, _mtime(folder_of.facts))
     return state
 
 
@@ -75,7 +76,9 @@ def stamp(folder: Path) -> tuple[float, ...]:
     deep = [p for place in (there.runs, there.takes) if place.is_dir() for p in place.iterdir()]
     places = (contract.RunFolder(run).next for run in deep)
     anew = [p for place in places if place.is_dir() for p in place.iterdir()]
-    return tuple(_mtime(p) for p in [*parts, *deep, *anew])
+    # Windows dates no folder of a FAT or exFAT disk, as memory cards and portable disks are, when its files change.
+    files = [place / name for place in [*deep, *anew] for name in _TOLD]
+    return tuple(_mtime(p) for p in [*parts, *deep, *anew, *files])
 
 
 def plate_range(folder: Path) -> tuple[int, int] | None:
@@ -104,7 +107,8 @@ def _listed(path: Path) -> tuple[int, str, list[str], str]:
     return len(told["frames"]), told["beside"], read_as, contract.parse_timecode(told["timecode"])
 
 
-def _frame_count(take: Path) -> int:
+def _frame_count(take: Path, told: float) -> int:
+    """Frames in a take's folder. `told`: when take.json was written, which may be all that a change is known by."""
     with os.scandir(take) as entries:
         return sum(1 for entry in entries if entry.name.endswith(contract.LAYERS))
 
@@ -238,6 +242,8 @@ def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
 _MOST_SENTENCES = 4
 _LARGEST = 1 << 31
 """Blender's whole numbers end there."""
+_TOLD = (contract.SUMMARY_FILE, contract.CHECKPOINT_FILE, contract.EXTENSION_FILE, contract.TAKE_FILE)
+"""In the folders of runs and takes: what the panel tells of them."""
 _LONGEST_HISTORY = 1 << 24
 """Bytes of a run's measurements that are read; 100,000 take as much."""
 

@@ -55,6 +55,19 @@ def test_what_did_not_change_is_not_opened_again(addon, long_shot, opened):
     assert first.runs["main"]["other_cameras"] and first.runs["main"]["history"] == [(1.0, 20.0)]
 
 
+def test_what_changed_is_seen_where_folders_have_no_date(addon, long_shot):
+    """As those of a FAT or exFAT disk under Windows, which keep the date that they were made on."""
+    inventory = addon("shot.inventory")
+    for name in ("runs/main/summary.json", "takes/freeze/take.json"):
+        file = long_shot / name
+        inventory.read(long_shot)
+        stamp, dated = inventory.stamp(long_shot), file.parent.stat()
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"first": 2}))
+        os.utime(file, ns=(0, file.stat().st_mtime_ns + 10**9))
+        os.utime(file.parent, ns=(dated.st_atime_ns, dated.st_mtime_ns))
+        assert inventory.stamp(long_shot) != stamp
+
+
 def test_what_changed_is_read_again_and_only_that(addon, long_shot, opened):
     read = addon("shot.inventory").read
     read(long_shot)
