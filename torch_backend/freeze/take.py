@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from ..contract import (
     Reporter,
     TakeFolder,
     Verdict,
+    path_error,
     read_json,
     verdict_of,
 )
@@ -93,14 +96,18 @@ def _finish(
     verdict = judge_take({"t_star_frame": t_star, **inputs, "detail": made_of.get("detail")}, run_verdict(run))
     info = shot.info()
     title = f"{info.name}, {Path(info.source).name}: t* = frame {t_star}, run {params.run}"
-    sheet = _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
+    with missable("contact sheet", report):
+        _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
     report.check_cancelled()
     report.progress("finishing the take", 1, 3, "video")
-    note = write_video(folder.video, (read_png(p) for p in previews), info.fps or 24.0)
-    if note:
-        report.warning(note)
+    with missable("video", report):
+        note = write_video(folder.video, (read_png(p) for p in previews), info.fps or 24.0)
+        if note:
+            report.warning(note)
     report.progress("finishing the take", 2, 3, "PLY")
-    _write_ply(folder.ply, spec.instants.at(float(t_star), report), scene)
+    frozen = spec.instants.at(float(t_star), report)
+    with missable("PLY", report):
+        _write_ply(folder.ply, frozen, scene)
     redistort = _redistort(shot, folder, size, spec.beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
@@ -125,16 +132,29 @@ def _finish(
         "grain": None if spec.grain is None else spec.grain.to_json(),
         "footage": footage_facts(shot, folder.root),
         "exr_dir": str(folder.root),
-        "contact_sheet": str(sheet),
+        "contact_sheet": str(folder.contact_sheet),
         "video": str(folder.video),
         "ply": str(folder.ply),
         **made_of,
         **({} if verdict is None else {"verdict": vars(verdict)}),
     }
     write_json(folder.facts, facts)
-    report.image("contact sheet", sheet)
+    report.image("contact sheet", folder.contact_sheet)
     report.progress("finishing the take", 3, 3, "done")
     return facts
+
+
+@contextlib.contextmanager
+def missable(what: str, report: Reporter) -> Generator[None]:
+    """Writes a file that a take can do without: on Windows that of before cannot be replaced while a player has it
+    open. A full disk is none of these."""
+    try:
+        yield
+    except OSError as error:
+        told = None if is_disk_full(error) else path_error(error)
+        if told is None:
+            raise
+        report.warning(f"The {what} is not written: {told.message}", "The frames are. Close it, then freeze again.")
 
 
 def run_verdict(run: LoadedRun) -> Verdict | None:
@@ -176,7 +196,7 @@ def _redistort(
 def _contact_sheet(
     shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int,
     verdict: Verdict | None,
-) -> Path:  # fmt: skip
+) -> None:  # fmt: skip
     seen = [i for i, n in enumerate(numbers) if shot.plate(n).is_file()]  # all but those that the footage lacks
     own_poses = not params.camera_path and bool(seen)
     if own_poses:
@@ -187,7 +207,6 @@ def _contact_sheet(
     write_contact_sheet(
         path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt
     )
-    return path
 
 
 def _write_ply(path: Path, frozen: FrozenGaussians, scene: Scene) -> None:

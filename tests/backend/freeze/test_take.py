@@ -24,7 +24,9 @@ from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_at, freeze_shot, take_frames, write_beside
 from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.freeze.take import missable
 from torch_backend.freeze.take_cameras import plan
+from torch_backend.freeze.video import write_video
 from torch_backend.gaussians.ply import read_ply
 from torch_backend.scene import load_scene
 from torch_backend.shot import Shot, write_json
@@ -32,6 +34,18 @@ from torch_backend.train import device, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 from torch_backend.train.run import solve_key
 from torch_backend.train.self_test import SelfTest
+
+
+def test_a_video_that_cannot_be_replaced_is_missed_in_words_and_ends_no_freeze(quiet, tmp_path):
+    """As Windows refuses while a player has it open; a folder in its place is refused everywhere."""
+    report, frames = quiet(), [np.zeros((16, 16, 3), np.uint8)]
+    (tmp_path / "video.mp4").mkdir()
+    with missable("video", report):
+        write_video(tmp_path / "video.mp4", frames, 24.0)
+    (told,) = report.events
+    assert told[0] == "warning" and "The video is not written" in told[1] and "video.mp4" in told[1]
+    with pytest.raises(OSError, match="No space"), missable("video", report):
+        raise OSError(28, "No space left on device", "video.mp4")
 
 
 @pytest.fixture(scope="module")
