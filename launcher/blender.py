@@ -48,10 +48,10 @@ def find_blender() -> tuple[str, str] | None:
     if path is None:
         return None
     try:
-        out = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=60).stdout
+        asked = subprocess.run([path, "--version"], capture_output=True, text=True, errors="replace", timeout=60)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    found = re.search(r"Blender (\d+)\.(\d+)(\S*)", out)
+    found = re.search(r"Blender (\d+)\.(\d+)(\S*)", asked.stdout)
     if not found or (int(found.group(1)), int(found.group(2))) < OLDEST_BLENDER:
         return None
     return path, f"{found.group(1)}.{found.group(2)}{found.group(3)}"

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import re
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +133,25 @@ def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = Fals
         close_input(child)
 
 
+def _lines_of(child: subprocess.Popen[bytes]) -> Iterator[bytes]:
+    """What a child prints, as it comes. A thread reads it, also after a Ctrl-C: on Windows nothing interrupts a read,
+    and a child that nobody reads stands still in its next word, instead of coming to its end."""
+    lines: queue.Queue[bytes | None] = queue.Queue()
+
+    def read() -> None:
+        for line in child.stdout or ():
+            lines.put(line)
+        lines.put(None)
+
+    threading.Thread(target=read, name="child's output", daemon=True).start()
+    while True:
+        with contextlib.suppress(queue.Empty):
+            line = lines.get(timeout=0.2)
+            if line is None:
+                return
+            yield line
+
+
 def exit_code_of(code: int) -> int:
     """A child's return code as one of `ExitCode`: of one that a signal ended, CANCELLED or, with a word, INTERNAL."""
     if code in (-signal.SIGINT, -signal.SIGTERM, 0xC000013A):  # the last: Ctrl-C on Windows
@@ -153,7 +174,7 @@ def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
     child = start_child(command, child_environ(**environ), **streams)
     try:
         with open(log, "w", encoding="utf-8") as stream:
-            for raw in child.stdout or ():
+            for raw in _lines_of(child):
                 line = raw.decode("utf-8", "replace").rstrip()
                 stream.write(line + "\n")
                 if line.startswith("Error: "):

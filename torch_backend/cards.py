@@ -64,7 +64,7 @@ def _listed(tool: str) -> tuple[list[Card], str]:
     for fields in ("name,driver_version,compute_cap", "name,driver_version"):  # old drivers do not know the third
         command = [tool, f"--query-gpu={fields}", "--format=csv,noheader"]
         try:
-            ran = subprocess.run(command, capture_output=True, text=True, timeout=_ANSWER_SECONDS)
+            ran = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=_ANSWER_SECONDS)
         except (OSError, subprocess.TimeoutExpired) as error:
             return [], str(error)
         output = ran.stdout.strip() or ran.stderr.strip()

@@ -1,6 +1,7 @@
 """What the launcher makes of NVIDIA's tool, for which a script stands in that prints what the real one prints."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,13 @@ def test_a_torch_with_cuda_that_sees_no_card_is_not_said_to_be_without(nvidia_sm
 def test_a_driver_that_does_not_answer(nvidia_smi):
     nvidia_smi("Failed to initialize NVML: Driver/library version mismatch", code=18)
     assert "version mismatch" in told(CUDA)["gpu"] and "restart" in told(CUDA)["gpu"]
+
+
+def test_a_driver_that_speaks_in_another_code_page(nvidia_smi, tmp_path: Path):
+    nvidia_smi("x", code=18)
+    tool = Path(shutil.which("nvidia-smi") or "")
+    tool.write_bytes(b"#!/bin/sh\nprintf 'Der Treiber antwortet nicht: \\374berlastet\\n'; exit 18\n")
+    assert "Der Treiber antwortet nicht" in told(CUDA)["gpu"]
 
 
 def test_no_card_is_nothing_to_mend(nvidia_smi, tmp_path: Path, monkeypatch):

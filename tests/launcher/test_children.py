@@ -122,6 +122,33 @@ def test_blenders_own_lines_go_to_the_log_alone(tmp_path: Path, capfd: pytest.Ca
     assert (tmp_path / "blender.log").read_text().splitlines() == lines
 
 
+BAKING = """
+import pathlib, sys, time
+folder = pathlib.Path(sys.argv[1])
+try:
+    (folder / "started").touch()
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("Saved\\n" * 30000, flush=True)
+    (folder / "checkpoint").write_text("whole")
+"""
+BAKER = """
+import pathlib, sys
+from launcher import children
+folder = pathlib.Path(sys.argv[2])
+children.run_blender([sys.executable, "-c", sys.argv[1], str(folder)], folder / "blender.log")
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
+def test_a_bake_that_has_much_to_say_on_ctrl_c_comes_to_its_end(tmp_path: Path, parent):
+    """Nobody takes down what it says then, but a pipe that is full, with 4 KB on Windows, would hold it up."""
+    launcher = parent(BAKER, BAKING, tmp_path)
+    wait_for(tmp_path / "started")
+    launcher.send_signal(signal.SIGINT)
+    wait_for(tmp_path / "checkpoint")
+
+
 TIED = """
 import os, pathlib, sys
 folder = pathlib.Path(sys.argv[1])

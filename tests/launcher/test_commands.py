@@ -38,6 +38,13 @@ def test_doctor_before_set_up_says_so(tmp_path: Path):
     assert not (tmp_path / "nothing here yet").exists()
 
 
+def test_a_name_that_the_console_has_no_letters_for_ends_nothing(tmp_path: Path):
+    """As where the output goes into a file on Windows, whose code page has only some letters."""
+    home = tmp_path / "\N{CJK UNIFIED IDEOGRAPH-65E5}"
+    ran = launch("doctor", "--output", tmp_path, SPLANNEQUIN_HOME=str(home), PYTHONIOENCODING="cp1252")
+    assert "makes it in" in ran.stdout and "\\u65e5" in ran.stdout and "Traceback" not in ran.stderr
+
+
 def test_a_clip_that_is_not_there_is_one_sentence_and_sets_nothing_up(tmp_path: Path):
     ran = launch(
         "freeze", tmp_path / "absent.mp4", "--output", tmp_path / "out", SPLANNEQUIN_HOME=str(tmp_path / "home")
