@@ -164,7 +164,10 @@ def _make(path: Path, mine: Writer) -> bool:
     try:
         _write(beside, mine)
         if sys.platform == "win32":
-            os.rename(beside, path)  # which refuses to replace, there
+            try:
+                os.rename(beside, path)  # which refuses to replace, there
+            except PermissionError:  # a scanner is at it, or the one of before is just going: it is looked at again
+                return False
         else:
             try:
                 os.link(beside, path)
@@ -175,7 +178,7 @@ def _make(path: Path, mine: Writer) -> bool:
     except FileExistsError:
         return False
     finally:
-        beside.unlink(missing_ok=True)
+        contract.remove_file(beside)
     return True
 
 

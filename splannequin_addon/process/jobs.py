@@ -455,7 +455,8 @@ def _kill(job: Job) -> None:
             raise _not_ours("The process of this step cannot be told from others for sure, so none was ended.")
     if sys.platform == "win32":
         program = os.path.join(os.environ.get("SYSTEMROOT", r"C:\Windows"), "System32", "taskkill.exe")
-        subprocess.run([program, "/F", "/T", "/PID", str(pid)], capture_output=True, check=False)
+        words = [program, "/F", "/T", "/PID", str(pid)]
+        subprocess.run(words, capture_output=True, check=False, creationflags=subprocess.CREATE_NO_WINDOW)
         return
     try:
         if os.getpgid(pid) == pid:
