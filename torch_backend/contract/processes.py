@@ -79,7 +79,8 @@ def computer_name() -> str:
     """This computer as files name it: its name, and in brackets what tells it from another one of the same name.
 
     On Linux that is a hash of the machine's id and, in a container, of its process ids' namespace; on Windows of the
-    machine's GUID; elsewhere there is none.
+    machine's GUID; elsewhere there is none. A Mac is named as its owner has it: what `gethostname` says there comes
+    from the network, another one at home than in the studio.
     """
     marks: list[str] = []
     if sys.platform == "win32":
@@ -94,7 +95,20 @@ def computer_name() -> str:
         with contextlib.suppress(OSError):
             marks.append(os.readlink("/proc/self/ns/pid"))
     mark = hashlib.sha256("\n".join(marks).encode()).hexdigest()[:8]
-    return f"{socket.gethostname()} ({mark})" if any(marks) else socket.gethostname()
+    name = _name_of_mac() or socket.gethostname()
+    return f"{name} ({mark})" if any(marks) else name
+
+
+def _name_of_mac() -> str:
+    """A Mac's own name on local networks; empty elsewhere, or if the system does not tell."""
+    if sys.platform != "darwin":
+        return ""
+    try:  # as in `process_of_ps`
+        command = ["/usr/sbin/scutil", "--get", "LocalHostName"]
+        asked = subprocess.run(command, capture_output=True, close_fds=False, timeout=5.0, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return os.fsdecode(asked.stdout).strip()
 
 
 @dataclass(frozen=True)
