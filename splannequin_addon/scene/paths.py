@@ -11,12 +11,16 @@ import bpy
 def blend_path(path: Path) -> str:
     """`path` as a .blend should hold it: relative to the file if it is saved and on the same drive."""
     absolute = os.path.abspath(path)
-    if not bpy.data.filepath:
-        return absolute
+    return relative(absolute, os.path.dirname(bpy.data.filepath)) if bpy.data.filepath else absolute
+
+
+def relative(path: str, base: str) -> str:
+    """An absolute path as a .blend in the folder `base` should hold it; as it is on another drive. With slashes, which
+    every system reads."""
     try:
-        return bpy.path.relpath(absolute)
+        return bpy.path.relpath(path, start=base).replace(os.sep, "/")
     except ValueError:  # another drive on Windows
-        return absolute
+        return path
 
 
 def absolute(path: str) -> str:

@@ -114,10 +114,7 @@ def _rendered_of(path: Path) -> Path | None:
 
 def _relative(path: str, base: str) -> str:
     """`path` as a .blend in the folder `base` should hold it."""
-    try:
-        return bpy.path.relpath(path, start=base) if path and base else path
-    except ValueError:  # another drive on Windows
-        return path
+    return paths.relative(path, base) if path and base else path
 
 
 @persistent
@@ -151,6 +148,7 @@ def _after_load(*_: object) -> None:
     """What an older file names by its whole path, and is not there, is looked for beside the .blend."""
     if not bpy.data.filepath:
         return
+    _read_backslashes()
     here = Path(bpy.data.filepath).parent
     for owner, name in _holders():
         path = _get(owner, name)
@@ -161,6 +159,27 @@ def _after_load(*_: object) -> None:
         found = next((base / tail for tail in tails for base in (here, here.parent) if _known(base / tail, name)), None)
         if found is not None:
             _set(owner, name, paths.blend_path(found))
+
+
+def _read_backslashes() -> None:
+    """Relative paths of a file that was saved on Windows get slashes elsewhere, as Blender reads its own."""
+    if os.sep == "\\":
+        return
+    for owner, name in _holders():
+        path = _get(owner, name)
+        slashed = _slashed(path)
+        if slashed != path and (name != _OUTPUT or _known(Path(paths.absolute(slashed)), name)):
+            _set(owner, name, slashed)
+    for image in bpy.data.images:
+        if image.get(TAG) and not image.library and _slashed(image.filepath) != image.filepath:
+            image.filepath = _slashed(image.filepath)
+
+
+def _slashed(path: str) -> str:
+    """A relative path with slashes; as it is if it is none, or if a file is called so: names may hold backslashes."""
+    if not path.startswith("//") or "\\" not in path or os.path.lexists(paths.absolute(path)):
+        return path
+    return path.replace("\\", "/")
 
 
 def _known(path: Path, name: str) -> bool:

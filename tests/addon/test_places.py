@@ -1,6 +1,7 @@
 """A project folder that is moved goes on working; a shot folder that is gone is said and located, never made empty."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -71,6 +72,26 @@ def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
     scene = opened(copy)
     assert addon("shot.selection").shot_folder(scene) == copy / "people.splannequin"
     assert addon("solve.cameras").find(scene, copy / "people.splannequin", "CAMERA") == scene.camera
+
+
+@pytest.mark.skipif(os.sep != "/", reason="there a backslash is what it is")
+def test_a_file_that_was_saved_on_windows_finds_its_shot_elsewhere(addon, project):
+    """Windows, and Blender there, write backslashes into relative paths."""
+    (project / "scenes").mkdir()
+    odd = project / "scenes" / "a\\b.exr"
+    odd.touch()
+    blend(project / "scenes")
+    held, image = bpy.context.scene.splannequin, bpy.context.scene.camera.data.background_images[0].image
+    assert held.clip == "//../people.mp4"
+    for owner, name in ((held, "clip"), (held, "shot_path"), (image, "filepath")):
+        setattr(owner, name, getattr(owner, name).replace("/", "\\").replace("\\\\", "//", 1))
+    held.st_map = "//a\\b.exr"
+    bpy.ops.wm.save_mainfile()
+    scene = opened(project / "scenes")
+    assert addon("scene.paths").absolute(scene.splannequin.clip) == str(project / "people.mp4")
+    assert addon("shot.selection").shot_folder(scene) == project / "people.splannequin"
+    assert plate_file().resolve() == project / "people.splannequin" / "frames" / "000005.png"
+    assert addon("scene.paths").absolute(scene.splannequin.st_map) == str(odd), "a name of Linux's own"
 
 
 def test_an_older_file_that_holds_whole_paths_is_found_beside(addon, project):
