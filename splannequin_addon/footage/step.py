@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,14 +64,25 @@ class Import(Step):
 
     def ended(self, job: jobs.Job) -> None:
         """The shot that an import was to begin, and did not, is not left behind empty."""
-        if job.state != "done":
-            contract.discard_unborn(job.shot)
+        if job.state != "done" and _discard(job):
+            job_timer.meanwhile(functools.partial(_discard, job))
 
     def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
         """Through the camera that shows the clip."""
         camera = plate.find(scene, shot)
         if camera is not None:
             job_timer.look_through_camera(window, camera)
+
+
+def _discard(job: jobs.Job) -> bool:
+    """Takes away what an import left, unless another works there by now. True while its process has not ended: until
+    then it holds the shot's lock, and on Windows its log, which cannot be removed."""
+    if any(watch.shot == job.shot and watch.running() for watch in job_timer.watches()):
+        return False
+    if job.process is not None and job.process.poll() is None:
+        return True
+    contract.discard_unborn(job.shot)
+    return False
 
 
 def _imported_from(scene: bpy.types.Scene) -> str:

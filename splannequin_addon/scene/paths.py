@@ -23,6 +23,11 @@ def relative(path: str, base: str) -> str:
         return path
 
 
+def same(one: str, other: str) -> bool:
+    """True if two absolute paths are one as the system writes them: on Windows `c:` is `C:`."""
+    return os.path.normcase(one) == os.path.normcase(other)
+
+
 def absolute(path: str) -> str:
     """A path of the settings, absolute; empty if there is none."""
     return os.path.abspath(bpy.path.abspath(path)) if path else ""

@@ -62,7 +62,7 @@ def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = Fals
     """
     wanted = os.path.abspath(path)
     for image in bpy.data.images:
-        if image.get(TAG) and os.path.abspath(bpy.path.abspath(image.filepath)) == wanted:
+        if image.get(TAG) and paths.same(paths.absolute(image.filepath), wanted):
             compat.set_image_colour(image, encoding)  # another import may have made it of other light
             _make_opaque(image, opaque)
             if wanted not in _ahead:
@@ -91,7 +91,7 @@ def load_numbers(path: Path, name: str) -> bpy.types.Image:
     """A picture of numbers, not colours, as a data-block, reused by path."""
     wanted = os.path.abspath(path)
     for known in bpy.data.images:
-        if known.get(TAG) and os.path.abspath(bpy.path.abspath(known.filepath)) == wanted:
+        if known.get(TAG) and paths.same(paths.absolute(known.filepath), wanted):
             if wanted not in _ahead:
                 known.reload()
             _ahead.discard(wanted)

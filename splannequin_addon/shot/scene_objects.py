@@ -47,9 +47,9 @@ def of(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made | None:
     for entry in settings_of(scene).made:
         if entry.name != name_of(shot):
             continue
-        folder = os.path.abspath(bpy.path.abspath(entry.folder))
+        folder = os.path.abspath(paths.absolute(entry.folder))
         # Of another path: another shot of the same name, unless it was moved here since.
-        if folder == os.path.abspath(shot) or not os.path.isdir(folder):
+        if paths.same(folder, os.path.abspath(shot)) or not os.path.isdir(folder):
             return entry
     return None
 

@@ -1,8 +1,11 @@
 """A project folder that is moved goes on working; a shot folder that is gone is said and located, never made empty."""
 
+import dataclasses
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import bpy
@@ -271,6 +274,27 @@ def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, sc
         supervisor.tick()
     assert not job.shot.exists()
     assert watch.jobs["import"].state == "failed" and "text.mp4" in watch.jobs["import"].status.message
+
+
+def test_a_failed_import_is_taken_away_once_its_process_has_ended(addon, contract, tmp_path):
+    """It tells its end before it lets go of the shot's lock and, on Windows, of its own log."""
+    supervisor, jobs, shot = addon("process.job_timer"), addon("process.jobs"), tmp_path / "text.splannequin"
+    addon("shot.inventory").create(shot)
+    job = jobs.new_job(shot, "import", contract.ImportParams("text.mp4"))
+    job.process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    pid, here = job.process.pid, contract.computer_name()
+    began = contract.process_start(pid)
+    contract.write_json(
+        contract.ShotFolder(shot).lock, dataclasses.asdict(contract.Writer(here, pid, began, "import", "j", 1.0))
+    )
+    supervisor.follow("import", job)
+    status = contract.Status("import", "failed", pid, 1.0, began, 1.0, message="No video.", exit_code=3, host=here)
+    contract.write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
+    supervisor.tick()
+    assert job.ended and shot.is_dir()
+    job.process.communicate(b"\n")
+    supervisor.tick()
+    assert not shot.exists()
 
 
 def test_a_failed_import_takes_nothing_of_a_shot_that_has_frames(addon, shot, tmp_path):
