@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .contract import NO_DEPTH, JobError, LiveView, from_dict, read_message, write_message
+from .contract import NO_DEPTH, JobError, LiveView, from_dict, own_input, read_message, write_message
 from .footage.plates import Plates
 from .freeze.detail import DetailConfig, DetailedFrame, Detailer
 from .freeze.developed_instants import developed_path, load_developed
@@ -319,11 +319,12 @@ def run_live(shot: str | Path, run: str, device: str = "auto") -> int:
     # Whatever a library prints would stand between two messages: what was the standard output is ours alone.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    requests = os.fdopen(own_input(), "rb")
     try:
         session = LiveSession(Shot.open(shot), run, device)
     except (JobError, ValueError, OSError) as error:
         message, hint = getattr(error, "message", str(error)), getattr(error, "hint", "")
         write_message(answers, {"kind": "error", "message": message, "hint": hint})
         return int(getattr(error, "exit_code", 1))
-    serve(session, sys.stdin.buffer, answers)
+    serve(session, requests, answers)
     return 0

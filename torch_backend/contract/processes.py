@@ -37,17 +37,25 @@ def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]
     return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
 
 
+def own_input() -> int:
+    """A handle of the standard input for us alone, to be read from by a thread; in its old place is nothing.
+
+    Whoever as much as looks at a pipe that somebody reads from waits on Windows until something comes: a child that
+    inherits it as it starts, and a library as it is loaded.
+    """
+    taken = os.dup(0)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    return taken
+
+
 def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
     """Stops this process, as Ctrl-C does, once its standard input closes: its starter holds that open, however it ends.
 
     A checkpoint may take `grace_seconds`; then the process ends at once, with the group that it leads (POSIX).
     """
-    starter = os.dup(0)
-    # Nobody else has it: on Windows a child of ours that inherits a pipe hangs at its start while we read from that.
-    nothing = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nothing, 0)
-    os.close(nothing)
-    watch = functools.partial(_stop_when_alone, starter, grace_seconds)
+    watch = functools.partial(_stop_when_alone, own_input(), grace_seconds)
     threading.Thread(target=watch, name="end with starter", daemon=True).start()
 
 

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from ..contract import own_input
 from . import colmap_types as colmap
 from .answers import write_answers, write_points, write_undistortion
 from .lens_verdict import angle_deg, bends_of, impossible
@@ -47,7 +48,7 @@ from .request import SEED, Request, say
 
 def main(path: str) -> int:
     """Runs the request; 0 unless something broke that no sentence covers."""
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    threading.Thread(target=_die_with_parent, args=(own_input(),), daemon=True).start()
     request = Request(Path(path))
     pycolmap.set_random_seed(SEED)
     if request.known is not None:
@@ -140,8 +141,8 @@ def take_over(request: Request, known: dict[str, Any]) -> int:
     return 0
 
 
-def _die_with_parent() -> None:
+def _die_with_parent(told: int) -> None:
     # Unbuffered: the interpreter could not close a buffer that a thread still reads.
-    while os.read(0, 64):
+    while os.read(told, 64):
         pass
     os._exit(1)

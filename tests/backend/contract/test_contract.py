@@ -127,6 +127,21 @@ def test_who_runs_from_a_folder_is_told_by_its_command(tmp_path):
     assert contract.run_from(folder) == []
 
 
+READER = """
+import os, subprocess, sys
+from torch_backend.contract import own_input
+taken = own_input()
+child = subprocess.run([sys.executable, "-c", "import os; print(os.read(0, 3))"], stdout=subprocess.PIPE, text=True)
+print(os.read(0, 3), child.stdout.strip(), os.read(taken, 3))
+"""
+
+
+def test_an_input_that_is_ours_alone_is_seen_by_nobody_else():
+    """On Windows a child, or a library that is loaded, would wait for what a thread of ours is waiting for."""
+    ran = subprocess.run([sys.executable, "-c", READER], input="abc", capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["b''", "b''", "b'abc'"]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="ps is POSIX")
 def test_ps_tells_the_same_as_proc():
     """What macOS is asked; ps of Linux answers in the same words."""

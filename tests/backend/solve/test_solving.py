@@ -364,7 +364,8 @@ def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, tools):
 
 
 def test_a_worker_ends_with_its_parent(tmp_path):
-    code = "import time\nfrom torch_backend.solve.worker import _die_with_parent\n_die_with_parent()\ntime.sleep(60)"
+    code = "import time\nfrom torch_backend.solve.worker import _die_with_parent, own_input\n"
+    code += "_die_with_parent(own_input())\ntime.sleep(60)"
     worker = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, cwd=ROOT)
     assert worker.poll() is None
     worker.stdin.close()
