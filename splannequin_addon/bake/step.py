@@ -14,7 +14,7 @@ from ..access import library_of, present, settings_of
 from ..freeze import takes
 from ..process import backend, job_timer, jobs, steps
 from ..process.steps import Step, View
-from ..scene import scene_setup, session
+from ..scene import paths, scene_setup, session
 from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
 from . import farm, freeze_group, insertion, operators, panel, progress, shown_take
@@ -122,10 +122,8 @@ def _baked(scene: bpy.types.Scene) -> Path | None:
 def shown(take: Path) -> bool:
     """True if an image of this file that something uses is a frame of the take."""
     wanted = os.path.abspath(take)
-    return any(
-        image.users and image.filepath and os.path.dirname(os.path.abspath(bpy.path.abspath(image.filepath))) == wanted
-        for image in bpy.data.images
-    )
+    used = (image.filepath for image in bpy.data.images if image.users and image.filepath)
+    return any(paths.same(os.path.dirname(paths.absolute(file)), wanted) for file in used)
 
 
 def unsure(take: dict[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.job import new_job, run_job
 from torch_backend.shot import Shot, write_json
-from torch_backend.solve import SolveConfig, load_points, solve_shot
+from torch_backend.solve import SolveConfig, child, load_points, solve_shot
 from torch_backend.solve.child import run_worker
 from torch_backend.solve.floor import floor_of
 from torch_backend.solve.lens_verdict import lens_remarks
@@ -361,6 +361,21 @@ def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, tools):
         run_worker(tmp_path / "request.json", tmp_path / "log.txt", tools.recorder())
     assert error.value.exit_code == ExitCode.SOLVE
     assert "KeyError" in error.value.message
+
+
+def test_a_worker_that_is_stopped_with_its_job_is_no_failure(tmp_path, tools, monkeypatch):
+    """Ctrl-C of a console may reach both; the worker is dead then before its parent looks up."""
+    report, listen = tools.recorder(), child._listen
+
+    def interrupted(*words):
+        answer = listen(*words)
+        report.cancelled = True
+        return answer
+
+    monkeypatch.setattr(child, "_listen", interrupted)
+    (tmp_path / "request.json").write_text(json.dumps({"images": str(tmp_path)}))
+    with pytest.raises(Cancelled):
+        run_worker(tmp_path / "request.json", tmp_path / "log.txt", report)
 
 
 def test_a_worker_ends_with_its_parent(tmp_path):
