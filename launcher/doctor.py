@@ -162,8 +162,9 @@ def gpu_finding(card: Card) -> Finding:
 def backend_facts(backend: Environment, gpu: bool = False) -> dict[str, Any]:
     """What the backend says about its own environment; with `gpu` it tests the card."""
     command = python_child(backend.python, "torch_backend", "doctor", *(["--gpu"] if gpu else []))
-    told: dict[str, Any] = {"text": True, "encoding": "utf-8", "errors": "replace"}  # as `child_environ` has it speak
-    ran = subprocess.run(**command, **told, capture_output=True, env=child_environ())
+    ran = subprocess.run(
+        **command, capture_output=True, text=True, encoding="utf-8", errors="replace", env=child_environ()
+    )  # UTF-8, as `child_environ` has it speak
     try:
         return json.loads(ran.stdout[ran.stdout.index("{") :])
     except ValueError:

@@ -210,7 +210,7 @@ def read_instants(path: str) -> dict[str, list[int]]:
     """A file with a line per shot, its name and then its instants; # begins a comment. JobError names a wrong line."""
     found: dict[str, list[int]] = {}
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()  # editors on Windows begin with a mark
     except (OSError, ValueError) as error:
         raise JobError(f"{path} cannot be read: {error}.", "", ExitCode.USAGE) from error
     for number, line in enumerate(lines, 1):

@@ -69,6 +69,8 @@ def test_a_list_of_instants(tmp_path):
     file = tmp_path / "list.txt"
     file.write_text("# night shoot\nkitchen 34, 60\nhall 2.splannequin: -3 5  # two\n\nkitchen 70\n")
     assert read_instants(str(file)) == {"kitchen": [34, 60, 70], "hall 2": [-3, 5]}
+    file.write_text("kitchen 34\n", encoding="utf-8-sig")
+    assert read_instants(str(file)) == {"kitchen": [34]}
     file.write_text("kitchen\n")
     with pytest.raises(JobError, match=r"Line 1 .* is not the name of a shot and its instants"):
         read_instants(str(file))
