@@ -43,6 +43,16 @@ def test_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
+def test_a_file_that_is_being_written_has_hardly_a_longer_path(tmp_path):
+    """Windows takes no path of more than 260 letters, and an artist's projects lie deep."""
+    names = set()
+    for _ in range(100):
+        with atomic_path(tmp_path / "checkpoint.safetensors") as beside:
+            beside.touch()
+            names.add(beside.name)
+    assert len(names) == 100 and max(map(len, names)) <= len("checkpoint.safetensors") + 20
+
+
 def test_what_went_wrong_in_a_write_is_told_though_its_rest_cannot_be_removed(tmp_path):
     """As on Windows, where the writer of a picture has its file open still."""
     with pytest.raises(Cancelled), atomic_path(tmp_path / "a.mp4") as beside:

@@ -62,8 +62,9 @@ def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
         make_folder(path.parent)
     else:
         path.parent.mkdir(exist_ok=True)
-    # Not the process's number: two hosts of a farm have the same ones. Nobody can have put a link there, either.
-    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp{path.suffix}")
+    # Not the process's number: two hosts of a farm have the same ones. Nobody can have put a link there, either. Short:
+    # Windows counts 260 letters of a whole path.
+    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
     try:
         yield beside
         with open(beside, "rb+") as handle:
