@@ -215,10 +215,8 @@ def refresh(watch: Watch) -> bool:
         # back as it was.
         watch.state, watch.stamp = ShotState(watch.shot), ()
         why = getattr(error, "strerror", None) or error
-        known, watch.unread = (
-            watch.unread,
-            (f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one."),
-        )
+        known = watch.unread
+        watch.unread = f"The shot folder {watch.shot} cannot be read: {why}", "Choose another one."
         watch.failures[first] = watch.unread
         return watch.unread != known
     if watch.unread is not None and watch.failures.get(first) == watch.unread:

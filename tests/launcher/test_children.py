@@ -122,16 +122,8 @@ def test_blenders_own_lines_go_to_the_log_alone(tmp_path: Path, capfd: pytest.Ca
     assert (tmp_path / "blender.log").read_text().splitlines() == lines
 
 
-BAKING = """
-import pathlib, sys, time
-folder = pathlib.Path(sys.argv[1])
-try:
-    (folder / "started").touch()
-    time.sleep(60)
-except KeyboardInterrupt:
-    print("Saved\\n" * 30000, flush=True)
-    (folder / "checkpoint").write_text("whole")
-"""
+SAVED = '    print("Saved\\n" * 30000, flush=True)\n    (folder / "checkpoint")'
+BAKING = CHILD.replace('    (folder / "checkpoint")', SAVED)
 BAKER = """
 import pathlib, sys
 from launcher import children
