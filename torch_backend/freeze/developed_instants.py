@@ -32,7 +32,7 @@ from .unseen import with_unseen
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 21
+VERSION = 22
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame

@@ -70,6 +70,12 @@ class InstantConfig:
     """So far about a piece that stands too near its veil reaches,"""
     before: float = 1.25
     """and what is seen there for the most part is at least so many times as far away as the veil."""
+    crumb: float = 0.2
+    """Share of a thing that was taken out that a piece left of it has at most,"""
+    crumb_reach: float = 4.0
+    """so far from it at most;"""
+    crumb_steady: float = 0.06
+    """depths of neighbouring pixels that differ by a smaller share are of one piece."""
     stuck: float = 0.5
     """Detail that correlates this well with that at the same pixels of other frames is on the picture (a logo)."""
     depth: DepthConfig = field(default_factory=DepthConfig)

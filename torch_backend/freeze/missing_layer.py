@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..array_types import connected
 from ..scene import Scene
 from ..torch_types import from_numpy
 from ..train import LoadedRun
@@ -314,7 +315,8 @@ def _found(
                     found.misplaced |= core
                     if before:
                         rows = in_its_place(bench, frozen, core, hangs.depth / (1.0 + c.deep))
-                    found.astray = torch.cat([found.astray, rows])
+                    crumbs = _crumbs(bench, _less(frozen, rows), core, depth)
+                    found.astray = torch.cat([found.astray, rows, crumbs])
         found.parts.append(Part(soft, depths, thing))
         found.regions.append(facts)
     return found
@@ -326,6 +328,25 @@ def in_its_place(bench: InstantBench, frozen: FrozenGaussians, core: NDArray[np.
     rows = bench.painters(frozen, grown(core, bench.unit), nearer)
     veils, _ = bench.veils(_less(frozen, rows), core)
     return torch.cat([rows, veils])
+
+
+def _crumbs(bench: InstantBench, frozen: FrozenGaussians, core: NDArray[np.bool_], depth: float) -> Tensor:
+    """int64 [M]: rows of what is left beside a region [h, w] of a thing that stood there, `depth` scene units away, and
+    has been taken out: a finger's tip, a sliver of a wrist, which would hang in the air.
+
+    Small pieces that move and are as deep as it. What was whole without it, another hand or a shoulder, is larger.
+    """
+    c, image = bench.config, bench.render(frozen)
+    shown, moves = image.depth.numpy(), image.motion.numpy() > 0.5
+    labels = connected(np.log(np.maximum(shown, 1e-6)), c.crumb_steady)
+    sizes, moving = np.bincount(labels.ravel()), np.bincount(labels.ravel(), weights=moves.ravel())
+    found = np.zeros_like(core)
+    for label in np.unique(labels[grown(core, c.crumb_reach * bench.unit)]):
+        if sizes[label] <= c.crumb * core.sum() and moving[label] >= 0.5 * sizes[label]:
+            piece = labels == label
+            if abs(np.log(np.median(shown[piece]) / depth)) < np.log1p(c.depth.deep):
+                found |= piece
+    return bench.painters(frozen, grown(found, bench.unit), depth * (1.0 + c.depth.deep))
 
 
 def _less(frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:

@@ -14,7 +14,7 @@ from torch_backend.freeze.frozen import FrozenGaussians, freeze_at, render_froze
 from torch_backend.freeze.instant_bench import InstantBench, InstantConfig, low_difference
 from torch_backend.freeze.instant_depth import DepthConfig, as_field
 from torch_backend.freeze.instant_track import Track
-from torch_backend.freeze.missing_layer import _helps, _thing_cover, instant_layer, join
+from torch_backend.freeze.missing_layer import _crumbs, _helps, _thing_cover, instant_layer, join
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
 from torch_backend.scene import Scene
@@ -322,17 +322,17 @@ def test_a_hand_that_the_field_has_but_too_pale_is_as_deep_as_the_field_has_it(t
         assert off < 0.25 * np.square(without - truth)[changed].mean()
 
 
-def test_a_hand_that_the_field_has_far_before_its_arm_stands_at_its_arm(tmp_path):
-    share = 1 / 1.35
-    view = scene_at(tmp_path).viewmats[T_STAR - 1]
+def nearer(made_in, state, share=1 / 1.35):
+    """The same to t*'s camera, at `share` of its distance."""
+    view = scene_at(made_in).viewmats[T_STAR - 1]
     centre = -view[:3, :3].mT @ view[:3, 3]
+    means = centre + share * (state["means"] - centre)
+    return {**state, "means": means, "log_scales": state["log_scales"] + math.log(share)}
+
+
+def test_a_hand_that_the_field_has_far_before_its_arm_stands_at_its_arm(tmp_path):
     true, behind = hand(T_STAR), together(wall(), arm(half=0.5))
-    near = {
-        **true,
-        "means": centre + share * (true["means"] - centre),  # to t*'s camera the same
-        "log_scales": true["log_scales"] + math.log(share),
-    }
-    known = together(behind, pale(near, -2.2))
+    known = together(behind, pale(nearer(tmp_path, true), -2.2))
     motion = (torch.arange(len(known["means"])) >= len(behind["means"])).float()
     made = world(tmp_path, known, lambda n: together(behind, hand(n)), motion=motion)
     layer = made.found()
@@ -346,6 +346,41 @@ def test_a_hand_that_the_field_has_far_before_its_arm_stands_at_its_arm(tmp_path
         assert off < 0.25 * np.square(without - truth)[changed].mean()
     # Where no layer is good enough nothing is taken out either.
     assert made.layer(config=InstantConfig(gain=1.1, detail=1.1)) is None
+
+
+def test_fingers_that_looked_right_do_not_stay_in_the_air_where_their_hand_was(tmp_path):
+    true, behind = hand(T_STAR), together(wall(), arm(half=0.5))
+    near, tips = nearer(tmp_path, true), (true["means"][:, 0] < -0.40) & (true["means"][:, 1].abs() < 0.05)
+    near["opacity_logits"] = torch.where(tips, 3.0, -2.2)
+    known = together(behind, near)
+    motion = (torch.arange(len(known["means"])) >= len(behind["means"])).float()
+    made = world(tmp_path, known, lambda n: together(behind, hand(n)), motion=motion)
+    left = lambda layer: float(layer.kept[motion > 0][tips].mean())  # noqa: E731
+    layer = made.found()
+    assert left(layer) < 0.05 and bool((layer.kept[motion == 0] == 1).all())
+    assert left(made.layer(config=InstantConfig(crumb=0.0))) > 0.3, "they are what this looks for"
+    for n in (1, FRAMES):
+        truth, without = made.image(together(behind, true), n), made.image(known, n)
+        changed = np.abs(truth - without).max(-1) > 0.1
+        off = np.square(made.image(join(made.frozen, layer).state, n) - truth)[changed].mean()
+        assert off < 0.25 * np.square(without - truth)[changed].mean()
+
+
+def test_what_is_left_of_a_thing_is_small_moves_and_is_as_deep_as_it(waving):
+    """Not the other hand, not a shirt's button, and not what is farther away."""
+    core = where(waving, hand(T_STAR))
+    pieces = {
+        "finger": sheet((-0.56, -0.50), (-0.05, 0.05), ARM, 0.02, skin),
+        "other hand": sheet((-0.4, 0.0), (0.22, 0.6), ARM, 0.02, skin),
+        "button": sheet((-0.3, -0.2), (-0.28, -0.22), ARM, 0.02, skin),
+        "farther": sheet((-0.1 * 1.3, 0.0), (-0.28 * 1.3, -0.22 * 1.3), 1.3 * ARM, 0.02, skin),
+    }
+    counts = [len(wall()["means"]), *(len(piece["means"]) for piece in pieces.values())]
+    owner = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+    frozen = frozen_of(together(wall(), *pieces.values()), ((owner > 0) & (owner != 3)).float())
+    bench = InstantBench(waving.run, waving.scene, T_STAR - 1, InstantConfig(), None)
+    rows = _crumbs(bench, frozen, core, ARM)
+    assert set(owner[rows].tolist()) == {1} and len(rows) > 0.9 * counts[1]
 
 
 def test_a_trace_of_what_the_field_moves_tells_no_depth():
