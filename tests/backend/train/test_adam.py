@@ -1,7 +1,10 @@
 """The fused Adam against torch's, on both bodies: equal paths, skipped rows, steps left out, checkpoints."""
 
 import math
+import subprocess
+import sys
 import weakref
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,6 +12,8 @@ import torch
 from torch_backend.gaussians import Gaussians
 from torch_backend.train.adam import FusedAdam, all_finite
 from torch_backend.train.checkpoint import optimizer_state, restore_optimizer
+
+ROOT = Path(__file__).parents[3]
 
 BODIES = [pytest.param(False, id="snippet"), pytest.param(True, id="kernel")]
 SHAPES = [(3001, 3), (3001,), (3001, 1, 3), (3001, 8, 3), (7,), (1, 16, 9, 11)]
@@ -296,3 +301,17 @@ def test_restored_moments_lie_where_their_parameter_does():
         for name in ("exp_avg", "exp_avg_sq"):
             assert (state[name].device, state[name].dtype, state[name].stride()) == (a.device, dtype, a.stride())
         assert (state["step"].device.type, state["step"].dtype, state["step"].shape) == (device, torch.float32, ())
+
+
+def test_no_process_that_trains_waits_for_torchs_compiler():
+    code = (
+        "import sys, torch\n"
+        "from torch_backend.train.adam import FusedAdam; from torch_backend.torch_types import pulled\n"
+        "x = torch.nn.Parameter(torch.ones(3)); adam = FusedAdam([x], 0.1)\n"
+        "x.square().sum().backward(); adam.step(); adam.zero_grad()\n"
+        "assert x.grad is None and float(x.detach().max()) < 1.0, x\n"
+        "assert pulled(3.0 * x[:, None], x, torch.arange(3.0)[:, None]).tolist() == [0.0, 3.0, 6.0]\n"
+        "sys.exit(', '.join({'torch._dynamo', 'sympy'} & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
