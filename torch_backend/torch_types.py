@@ -62,7 +62,7 @@ def backward(loss: Tensor, retain_graph: bool | None = None) -> None:
     cast(Any, loss).backward(retain_graph=retain_graph)
 
 
-def pulled(values: Tensor, leaf: Tensor, weights: Tensor) -> Tensor:
+def weighted_gradient(values: Tensor, leaf: Tensor, weights: Tensor) -> Tensor:
     """The gradient of the sum of `values` times `weights`, of one shape, with regard to `leaf`, in its shape.
 
     As `torch.autograd.grad` with `grad_outputs`, which imports sympy to compare two shapes: 0.6 s in every process.

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..deformation import Deformation, Deltas, apply_deltas, host
 from ..gaussians import Gaussians
 from ..raster import RasterOutput, rasterize
-from ..torch_types import checkpoint, pulled
+from ..torch_types import checkpoint, weighted_gradient
 from .config import TrainConfig
 from .exposure import Exposure
 
@@ -139,4 +139,4 @@ def gathered(
     with torch.enable_grad():
         ink = torch.zeros(len(held["means"]), weights.shape[2], device=weights.device, requires_grad=True)
         out = render(held, 0, viewmat, K, width, height, colors=ink, with_contributions=False)
-        return pulled(out.colors[0, ..., 3:], ink, weights.to(ink))
+        return weighted_gradient(out.colors[0, ..., 3:], ink, weights.to(ink))

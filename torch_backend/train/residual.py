@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from ..scene import resize_intrinsics
-from ..torch_types import pulled
+from ..torch_types import weighted_gradient
 from .model import render
 from .run_view import RunView
 
@@ -55,7 +55,7 @@ def signed_residual(run: RunView, rows: Tensor) -> tuple[Tensor, Tensor]:
             lack = lack * (F.interpolate(ignored[None, None].float(), (height, width), mode="area")[0, 0] == 0.0)
         if out.weight_sum is None:
             raise RuntimeError("the frame was rendered without contributions")
-        lacks = pulled(out.colors[0, ..., 3], ink, lack)
+        lacks = weighted_gradient(out.colors[0, ..., 3], ink, lack)
         weight[n] = out.weight_sum[0][rows]
         residual[n] = lacks[rows, 0] / weight[n].clamp_min(1e-6)
     return residual, weight
