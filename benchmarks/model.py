@@ -224,7 +224,7 @@ class Freezer:
     def __init__(self, args: argparse.Namespace, shot: Shot, trainer: Trainer) -> None:
         t, self.shot, self.trainer = trainer, shot, trainer
         frames = [t.scene.frames[i] for i in t.train_ids]
-        self.run = LoadedRun(args.results / args.name, t.config, t.model, t.width, t.height, frames, [args.name])
+        self.run = LoadedRun(args.results / args.name, t.config, t.model, t.width, t.height, frames, args.name)
         changes = dict(change.split("=", 1) for change in args.develop_set)
         changes = {name: json.loads(value) for name, value in changes.items()}
         self.config = dataclasses.replace(config_for(self.run), **changes)

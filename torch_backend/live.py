@@ -131,7 +131,7 @@ class LiveSession:
         self._shot, self.run = shot, load_run(shot, run, chosen)
         self.scene = load_scene(shot)
         self._span = span_of(self.scene, self.run)
-        self._frozen: OrderedDict[tuple[int, tuple[int, int] | None], FrozenGaussians] = OrderedDict()
+        self._frozen: OrderedDict[tuple[int, tuple[int, ...] | None], FrozenGaussians] = OrderedDict()
         self._sharpness = {frame: row["sharpness"] for frame, row in frame_table(shot).items()}
         self._details = _Details(shot, self.run, self.scene)
 
@@ -225,13 +225,13 @@ class LiveSession:
         return freeze_at(self.run.model, self.scene.time_of_frame(frame), self._span)
 
 
-def _file_of(path: Path) -> tuple[int, int] | None:
-    """Bytes and time (ns) of a file, None if there is none: what is read of it is known by them."""
+def _file_of(path: Path) -> tuple[int, ...] | None:
+    """Inode, bytes and time (ns) of a file, None if there is none: it is read again when one of them changes."""
     try:
         found = path.stat()
     except OSError:
         return None
-    return found.st_size, found.st_mtime_ns
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 class _Waiting:

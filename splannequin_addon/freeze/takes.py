@@ -130,7 +130,15 @@ def may_be_stale(shot: Path, take: str) -> bool:
     there = contract.ShotFolder(shot)
     trained = contract.RunFolder(there.runs / str(facts.get("run", ""))).checkpoint
     told = contract.TakeFolder(there.takes / take).facts
-    return trained.is_file() and told.is_file() and trained.stat().st_mtime > told.stat().st_mtime
+    if not trained.is_file() or not told.is_file():
+        return False
+    try:
+        frozen = contract.read_json(told, contract.SHORT_JSON).get("checkpoint")
+        if frozen:
+            return contract.file_digest(trained) != frozen
+    except (OSError, ValueError):
+        return True
+    return trained.stat().st_mtime > told.stat().st_mtime  # frozen by an earlier version, which did not say of what
 
 
 def _path_of(shot: Path, facts: dict[str, Any]) -> str:

@@ -90,8 +90,6 @@ def other_cameras(shot: Path, run: Path) -> bool:
     """True if the shot was solved again, with another result, after the run was trained."""
     cameras, there = contract.ShotFolder(shot).cameras, RunFolder(run)
     try:
-        if cameras.stat().st_mtime <= there.checkpoint.stat().st_mtime:
-            return False
         told = file_cache.of(there.config, contract.read_json)["solve"]
         return file_cache.of(cameras, _key) != told
     except (OSError, ValueError, KeyError):

@@ -10,6 +10,7 @@
     shot_folder     where everything of a shot lies
     unborn          what a failed import leaves behind
     files, typed    reading what may come from anywhere, and plain JSON into dataclasses
+    identity        what a file is known by: its content
     writing         atomic files and folders
     camera_path     a pinhole camera over frames
     live_messages   what Blender and a live session say to each other
@@ -84,6 +85,10 @@ from .frame_layers import (
 )
 from .hosts import (
     host_names,
+)
+from .identity import (
+    file_digest,
+    files_digest,
 )
 from .jobs import (
     BLEND_FILE,
@@ -408,6 +413,8 @@ __all__ = [
     "discard_unborn",
     "disk_error",
     "end_with_starter",
+    "file_digest",
+    "files_digest",
     "frame_file",
     "frame_number",
     "freezes_a_shot",

@@ -19,6 +19,7 @@ from typing import Any
 
 from .errors import disk_error
 from .files import is_link, patiently, remove_link
+from .identity import file_digest
 
 _worked_on: list[Path] = []
 """Shot folders that jobs of this process work on."""
@@ -191,12 +192,11 @@ def write_json(path: str | Path, data: Mapping[str, Any], parents: bool = True) 
 
 
 def content_key(*parts: Any) -> str:
-    """Short hash of JSON-able values and of files (given as Path: size and modification time), for "already done?"."""
+    """Short hash of JSON-able values and of files (given as Path: their content), for "already done?"."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, Path):
-            found = part.stat()
-            part = [part.name, found.st_size, found.st_mtime_ns]
+            part = file_digest(part)
         elif dataclasses.is_dataclass(part) and not isinstance(part, type):
             part = dataclasses.asdict(part)
         digest.update(json.dumps(part, sort_keys=True, default=str).encode("utf-8"))

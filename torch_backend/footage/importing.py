@@ -88,9 +88,11 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     for folder in (shot.raw, shot.solve):
         shot.own(folder)
     shot.publish_frames()
-    done = _finished(shot, key) or _finished(shot, import_key(opened.info, config, PLAIN))
+    done = _finished(shot, import_keys(opened.info, config) | import_keys(opened.info, config, PLAIN))
     if done is not None:
         report.progress("import", 1, 1, "already imported")
+        if shot.info().source != str(source):  # the same footage in another place, where it is looked for from now on
+            shot.update(source=str(source))
         return _result(shot, done)
     with replacing_folder(shot.frames) as fresh:
         extracted = _extract(shot, opened, config, fresh / RAW_FOLDER, report)
@@ -121,10 +123,19 @@ def import_key(info: SourceInfo, config: FootageConfig, display: Display | None 
 
     `display` None: the one in which it would be made now.
     """
+    return _import_key(info.key, config, display or display_for(info))
+
+
+def import_keys(info: SourceInfo, config: FootageConfig, display: Display | None = None) -> set[str]:
+    """`import_key`, and the one that an earlier version made of the same footage while its files' times are the same:
+    an import that carries either is finished."""
+    return {_import_key(key, config, display or display_for(info)) for key in (info.key, info.former_key) if key}
+
+
+def _import_key(footage: list[Any], config: FootageConfig, display: Display) -> str:
     plain = _recorded(type(config)())
     settings = {n: v for n, v in _recorded(config).items() if n in _ALWAYS_IN_THE_KEY or v != plain[n]}
-    name = (display or display_for(info)).name
-    return content_key(FRAMES_VERSION, info.key, settings, *([name] if name else []))
+    return content_key(FRAMES_VERSION, footage, settings, *([display.name] if display.name else []))
 
 
 def _recorded(config: FootageConfig) -> dict[str, Any]:
@@ -191,12 +202,12 @@ def _check_range(opened: Source, config: FootageConfig) -> None:
         )
 
 
-def _finished(shot: Shot, key: str) -> dict[str, Any] | None:
+def _finished(shot: Shot, keys: set[str]) -> dict[str, Any] | None:
     try:
         record = load_frames(shot)
     except JobError:  # none yet, or damaged: it is imported anew
         return None
-    whole = record.get("key") == key and all(is_whole_png(shot.frames / f["file"]) for f in record["frames"])
+    whole = record.get("key") in keys and all(is_whole_png(shot.frames / f["file"]) for f in record["frames"])
     return record if whole else None
 
 

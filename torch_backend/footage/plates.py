@@ -24,7 +24,7 @@ from ..torch_types import from_numpy
 from . import plate_encoding
 from .display import display_of
 from .images import read_frame, read_png, resize_float, working_size
-from .importing import FootageConfig, import_key, load_frames, source_places
+from .importing import FootageConfig, import_keys, load_frames, source_places
 from .ocio import Colours
 from .opening import open_source
 from .sources import Known, Source, SourceInfo, told_in
@@ -196,7 +196,7 @@ class Plates:
     def _is_imported(self, source: Source, record: dict[str, Any], config: FootageConfig) -> bool:
         """True if the footage is by its key, or by its first, middle and last picture, what was imported."""
         info = source.info
-        if import_key(info, config, self._display) == record.get("key"):
+        if record.get("key") in import_keys(info, config, self._display):
             return True
         if working_size(info.width, info.height, config.working_height) != self._working:
             return False

@@ -33,6 +33,7 @@ from .sources import (
     SourceFrame,
     SourceInfo,
     believable_aspect,
+    content_key_of,
     footage_error,
     frame_words,
     square_size,
@@ -135,9 +136,14 @@ class SequenceSource:
             deep=light or not space.as_it_stands or str(spec.format) not in ("uint8", "int8"),
             extended=light or not space.as_it_stands or str(spec.format) in ("half", "float", "double"),
             colour="linear" if light else "srgb",
-            # Without the folder: footage and shot may have been moved together. What is read otherwise than it used to
-            # be is imported again.
-            key=[Path(str(sequence)).name, len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)]
+            # By content: footage may be copied or moved. What is read otherwise than it used to be is imported again.
+            key=content_key_of(self._files) + ([] if ordinary else reading_key),
+            former_key=[
+                Path(str(sequence)).name,
+                len(stats),
+                sum(s.st_size for s in stats),
+                max(s.st_mtime_ns for s in stats),
+            ]
             + ([] if ordinary else reading_key),
             reading={
                 "colour": space.name,

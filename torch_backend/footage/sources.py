@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from pathlib import Path
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from ..contract import ExitCode, ImportParams, JobError
+from ..contract import ExitCode, ImportParams, JobError, files_digest
 
 LONGEST_PIXEL = 4
 """Anamorphic pixels are at most about 2 times as wide as high."""
@@ -55,7 +56,7 @@ class SourceInfo:
     colour: str
     """srgb, or linear for pictures that hold light: scene-linear, log, HDR."""
     key: list[Any]
-    """What tells this footage from another: names, sizes, modification times."""
+    """What tells this footage from another: its files' count, bytes and content, and how they are read."""
     reading: dict[str, Any] = field(default_factory=dict[str, Any])
     """How it is read, and what of that was assumed: the record in frames.json says so."""
     file: str = ""
@@ -64,6 +65,8 @@ class SourceInfo:
     """Linear Rec.709 light that `contract.PROBE` means in its files."""
     unlike: str = ""
     """Why another program would show the files otherwise than they are read here, a clause; empty if it would not."""
+    former_key: list[Any] = field(default_factory=list[Any])
+    """`key` as earlier versions made it, of names and modification times: imports that carry it stay finished."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,11 @@ class PlateReader(Protocol):
     def close(self) -> None:
         """Frees what is held open."""
         ...
+
+
+def content_key_of(files: Mapping[int, Path]) -> list[Any]:
+    """What `SourceInfo.key` begins with: count, bytes and content of numbered files; 1 is the number of a video."""
+    return [len(files), sum(file.stat().st_size for file in files.values()), files_digest(files)]
 
 
 def footage_error(message: str, hint: str = "") -> JobError:

@@ -31,6 +31,7 @@ from .sources import (
     SourceInfo,
     Told,
     believable_aspect,
+    content_key_of,
     footage_error,
     frame_words,
     square_size,
@@ -97,6 +98,7 @@ class VideoSource:
                 **({"focal_35mm": lens} if (lens := focal_of_video(container, stream)) else {}),
             }
         stat = path.stat()
+        reading_key = _reading_key(self._space) + (["deinterlaced"] if self._interlaced else [])
         self.info = SourceInfo(
             width=width,
             height=height,
@@ -107,8 +109,8 @@ class VideoSource:
             extended=not self._space.as_it_stands,
             colour="linear" if self._space.is_light else "srgb",
             # What is read otherwise than it used to be is imported again; all else keeps its key.
-            key=[path.name, stat.st_size, stat.st_mtime_ns, *_reading_key(self._space)]
-            + (["deinterlaced"] if self._interlaced else []),
+            key=content_key_of({1: path}) + reading_key,
+            former_key=[path.name, stat.st_size, stat.st_mtime_ns, *reading_key],
             reading=reading,
             file=str(path),
             probe=self._space.probe,

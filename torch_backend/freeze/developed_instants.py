@@ -136,8 +136,14 @@ def developed_key(
     shot: Shot, run: LoadedRun, t_star: int, config: DevelopConfig | None = None, query: str = "nearest"
 ) -> str:
     """Identifies what a developed instant is made from and how; `query` as in `FreezeParams`."""
+    return _key(shot, run, t_star, config, query, run.stamp)
+
+
+def _key(
+    shot: Shot, run: LoadedRun, t_star: int, config: DevelopConfig | None, query: str, stamp: str | list[Any]
+) -> str:  # fmt: skip
     how = dataclasses.asdict(config or config_for(run))
-    return content_key(VERSION, run.stamp, query, int(t_star), motion_key(shot), how)
+    return content_key(VERSION, stamp, query, int(t_star), motion_key(shot), how)
 
 
 def developed_path(run: LoadedRun, t_star: int) -> Path:
@@ -155,7 +161,9 @@ def load_developed(
     """
     path = developed_path(run, t_star)
     try:
-        if not path.is_file() or read_meta(path).get("key") != developed_key(shot, run, t_star, config, query):
+        # An instant of an earlier version is known by the time of its run's checkpoint.
+        keys = [_key(shot, run, t_star, config, query, stamp) for stamp in (run.stamp, run.former_stamp)]
+        if not path.is_file() or read_meta(path).get("key") not in keys:
             return None
         tensors, _ = load_checkpoint(path)
     except (JobError, OSError):
@@ -275,7 +283,8 @@ def _save(
     sweep_half_written(folder)
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)
+    stamps = run.stamp, run.former_stamp
     for other in folder.glob("*.safetensors"):
         with contextlib.suppress(OSError):  # known by its key, it does no harm but take room
-            if frame_number(other.stem) is not None and other != path and read_meta(other).get("run") != run.stamp:
+            if frame_number(other.stem) is not None and other != path and read_meta(other).get("run") not in stamps:
                 other.unlink()

@@ -114,6 +114,7 @@ def _finish(
         "key": take.key,
         "take": params.take,
         "run": params.run,
+        "checkpoint": run.stamp,
         "t_star_frame": t_star,
         "t_star_per_frame": params.t_star_per_frame,
         "camera_path": params.camera_path,

@@ -20,6 +20,7 @@ from ..contract import (
     JobError,
     Reporter,
     TrainParams,
+    file_digest,
     read_json,
     sweep_half_written,
 )
@@ -72,13 +73,15 @@ class LoadedRun:
     """Height of them."""
     train_frames: list[int]
     """Frame numbers it was trained on."""
-    stamp: list[Any]
-    """Name, bytes and time (ns) of the checkpoint that the model is from: what is made of it is known by them."""
+    stamp: str
+    """`contract.file_digest` of the checkpoint that the model is from: what is made of it is known by it."""
+    former_stamp: list[Any] = dataclasses.field(default_factory=list[Any])
+    """The checkpoint's name, size and modification time (ns), by which earlier versions knew it."""
 
     @property
     def stale(self) -> bool:
         """True if the run has been trained since it was loaded."""
-        return _stamp(self.folder / CHECKPOINT_FILE)[1:] != self.stamp
+        return _stamp(self.folder / CHECKPOINT_FILE) != self.stamp
 
 
 def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
@@ -454,9 +457,9 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
         message = f"{shot.root.name} has no trained run named {name!r}."
         raise JobError(message, "Run the training step first.", ExitCode.FREEZE)
     for _ in range(_ATTEMPTS):
-        inode, *stamp = _stamp(checkpoint)
+        stamp = _stamp(checkpoint)
         tensors, meta = load_checkpoint(checkpoint)
-        if [inode, *stamp] == _stamp(checkpoint):  # else it was replaced meanwhile: which one was read cannot be told
+        if stamp == _stamp(checkpoint):  # else it was replaced meanwhile: which one was read cannot be told
             break
     else:
         message = f"The run {name!r} is written again and again while it is read."
@@ -471,15 +474,20 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
         config = config_from_json(meta["config"])
         model = restore_model(tensors, meta, config, device)
         size = int(meta["width"]), int(meta["height"])
-        return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp)
+        return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp, _former_stamp(checkpoint))
     except MISFITS as error:  # whole, but not as `save` wrote it
         raise misfit(checkpoint, error, ExitCode.FREEZE) from None
 
 
-def _stamp(checkpoint: Path) -> list[Any]:
-    """[inode, name, bytes, time in ns] of a file, all None if it is gone. A replaced file has another inode."""
+def _stamp(checkpoint: Path) -> str:
+    """Digest of a checkpoint, empty if it is gone."""
     try:
-        status = checkpoint.stat()
+        return file_digest(checkpoint)
     except FileNotFoundError:
-        return [None] * 4
-    return [status.st_ino, checkpoint.name, status.st_size, status.st_mtime_ns]
+        return ""
+
+
+def _former_stamp(checkpoint: Path) -> list[Any]:
+    """See `LoadedRun.former_stamp`."""
+    status = checkpoint.stat()
+    return [checkpoint.name, status.st_size, status.st_mtime_ns]

@@ -348,6 +348,41 @@ def test_an_import_is_known_by_what_version_0_2_noted_of_it(shot, clip, recorder
     assert noted["config"].items() >= {**asked, "layer": ""}.items() and noted["key"] == import_key(info, config)
 
 
+@pytest.mark.parametrize("kind", ["video", "sequence"])
+def test_a_copy_of_the_footage_is_the_same_footage(shot, clip, pan, tmp_path, recorder, kind):
+    """As `cp -r` makes it: another folder, another name, other times. The solve stays."""
+    there = tmp_path / "copied"
+    there.mkdir()
+    if kind == "video":
+        first, copy = clip, shutil.copyfile(clip, there / "other.mp4")
+    else:
+        (tmp_path / "plates").mkdir()
+        for n, pixels in enumerate(pan(12), 1):
+            write_png(tmp_path / "plates" / f"p.{n:04d}.png", pixels)
+            shutil.copyfile(tmp_path / "plates" / f"p.{n:04d}.png", there / f"q.{n:04d}.png")
+        first, copy = str(tmp_path / "plates" / "p.0001.png"), there / "q.0001.png"
+    for file in there.iterdir():
+        os.utime(file, (1, 1))
+    import_footage(shot, first, FootageConfig(), recorder())
+    shot.solve.mkdir()
+    import_footage(shot, str(copy), FootageConfig(), recorder())
+    assert shot.solve.is_dir(), "it is not imported again"
+    assert shot.info().source == str(copy), "it is looked for there from now on"
+
+
+def test_an_import_that_an_earlier_version_knew_by_times_stays_while_they_are_the_same(shot, clip, recorder):
+    import_footage(shot, clip, FootageConfig(), recorder())
+    record, source = json.loads(shot.listing.read_text()), os.stat(clip)
+    settings = {n: record["config"][n] for n in ("first", "last", "step", "working_height", "fps")}
+    old = content_key(1, ["clip.mp4", source.st_size, source.st_mtime_ns], settings)
+    shot.listing.write_text(json.dumps({**record, "key": old}))
+    import_footage(shot, clip, FootageConfig(), recorder())
+    assert load_frames(shot)["key"] == old, "it is not imported again"
+    os.utime(clip, (1, 1))
+    import_footage(shot, clip, FootageConfig(), recorder())
+    assert load_frames(shot)["key"] == record["key"] != old
+
+
 def test_an_option_that_comes_later_leaves_finished_imports_alone():
     """A field that imports of before do not know tells them from others only where it is not its default."""
     old = FootageConfig(first=1, step=2)

@@ -179,7 +179,7 @@ def build(folder, report, still=False, logo=None, drawn=None):
     gaussians.support[:] = True
     exposure = Exposure(torch.from_numpy(times).float(), ExposureConfig())
     model = DynamicModel(gaussians, None if still else Sways(), torch.from_numpy(times).float(), 0, exposure)
-    run = LoadedRun(shot.run("main"), TrainConfig(), model, width, height, scene.frames, [])
+    run = LoadedRun(shot.run("main"), TrainConfig(), model, width, height, scene.frames, "")
     return World(shot, scene, run, still)
 
 

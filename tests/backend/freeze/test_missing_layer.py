@@ -126,7 +126,7 @@ def world(folder, known, shown, drawn=None, exposed=(0.0, 0.0), motion=None, far
     exposure = Exposure(torch.from_numpy(scene.times).float(), ExposureConfig())
     exposure.values.data[:] = torch.tensor(exposed)[:, None]
     model = DynamicModel(gaussians, None, torch.from_numpy(scene.times).float(), 0, exposure)
-    run = LoadedRun(folder, TrainConfig(), model, W, H, scene.frames, [])
+    run = LoadedRun(folder, TrainConfig(), model, W, H, scene.frames, "")
     frozen = freeze_at(model, float(scene.times[T_STAR - 1]), 1.0)
     if motion is not None:
         frozen.motion = motion
