@@ -252,7 +252,7 @@ def _show_plate(
                 original_plate.drop(old)
             _make_stream(scene, tree, node, plate, take)
         else:
-            sequences.show_sequence(reader, plate.image, take.first, take.last)
+            sequences.show_sequence(reader, plate.image, take.first, take.last, plate.shift)
             _follow_plate(scene, tree, node, reader, ours, plate)
     for image in {i.name: i for i in [*stale, plate.image, plate.map] if i is not None}.values():
         if image.users == 0 and not _is_others(image):
@@ -287,7 +287,7 @@ def _make_stream(
     assert isinstance(reader, bpy.types.CompositorNodeImage)
     reader[TAG] = True
     reader.name = reader.label = "Plate"
-    sequences.show_sequence(reader, plate.image, take.first, take.last)
+    sequences.show_sequence(reader, plate.image, take.first, take.last, plate.shift)
     end = present(present(compat.output_socket(tree)).node)
     end.location = (node.location.x + node.width + 60.0, node.location.y)
     reader.location = (node.location.x - (3 if original_plate.between(plate) else 2) * GAP, node.location.y)

@@ -45,6 +45,8 @@ class Footage:
     """Name of its colour space."""
     map: Path | None
     """ST map from it to the plate without the lens; None: there is no lens."""
+    shift: int = 0
+    """Number of a frame in the shot minus its number in the footage."""
 
 
 @dataclass
@@ -59,6 +61,8 @@ class Plate:
     """What it is, a sentence each."""
     size: tuple[int, int]
     """Width and height of the plate in pixels."""
+    shift: int = 0
+    """Number of a frame in the shot minus its number in the image's files."""
     has_shoulder: bool = False
     """True if it is read as sRGB and has a shoulder, see `working_light`."""
 
@@ -81,7 +85,7 @@ def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
             return None, "the take's ST map is gone"
         width, height = (int(side) for side in told["size"])
         probe = tuple(float(value) for value in told["probe"])
-        return Footage(file, (width, height), probe, str(told["space"]), st), ""
+        return Footage(file, (width, height), probe, str(told["space"]), st, int(told.get("shift") or 0)), ""
     except (OSError, ValueError, TypeError, KeyError, contract.JobError):
         return None, ""  # of an earlier version, or damaged
 
@@ -96,13 +100,14 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
         said = [f"The compositor shows working frames as the plate, not the footage: {why}."] if why else []
         image = sequences.load_sequence(stand_in, working_name(stand_in), "srgb")
         size = sequences.shown_size(image, take.first, take.last)
-        return Plate(image, None, said, size, working_light.has_shoulder(contract.ShotFolder(shot)))
+        return Plate(image, None, said, size, has_shoulder=working_light.has_shoulder(contract.ShotFolder(shot)))
     st = None
     if footage.map is not None:
         st = sequences.load_numbers(footage.map, _map_name(take))
     width, height = footage.size
     without = ", without its lens by the take's ST map" if st is not None else ""
-    return Plate(image, st, [f"The plate is {footage.file.name} itself, {width} x {height}{without}."], footage.size)
+    said = [f"The plate is {footage.file.name} itself, {width} x {height}{without}."]
+    return Plate(image, st, said, footage.size, footage.shift)
 
 
 def read_ahead(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
@@ -112,7 +117,7 @@ def read_ahead(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
         sequences.read(stand_in, working_name(stand_in), "srgb", take.first, take.last)
         yield
         return
-    sequences.read(footage.file, _name(footage), footage.probe, take.first, take.last, opaque=True)
+    sequences.read(footage.file, _name(footage), footage.probe, take.first, take.last, True, footage.shift)
     yield
     if footage.map is not None:
         sequences.read_numbers(footage.map, _map_name(take))
@@ -140,7 +145,7 @@ def _image(footage: Footage, frames: tuple[int, int]) -> tuple[bpy.types.Image |
         return None, f"Blender's colour configuration has no space like {footage.space}"
     except RuntimeError:
         return None, f"Blender cannot read {footage.file.name}"
-    size = sequences.shown_size(image, *frames)
+    size = sequences.shown_size(image, *frames, footage.shift)
     if size == footage.size:
         return image, ""
     if image.users == 0:

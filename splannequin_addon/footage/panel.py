@@ -30,6 +30,11 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
         span.enabled = props.use_range
         span.prop(props, "first", text="")
         span.prop(props, "last", text="")
+        row = layout.row(heading="Start")
+        row.prop(props, "use_start", text="")
+        start = row.row()
+        start.enabled = props.use_start
+        start.prop(props, "start", text="")
 
     def draw_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """No backend, no shot folder: what to do about it."""

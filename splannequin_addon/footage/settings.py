@@ -38,6 +38,18 @@ class ImportSettings:
         **contract.panel(contract.ImportParams, "last", 250),
         options=set(),
     )
+    use_start = BoolProperty(
+        name="First Frame of Its Own",
+        description="Number the shot's frames from a number of your own instead of as the clip's files do",
+        default=False,
+        options=set(),
+    )
+    start = IntProperty(
+        **contract.panel(contract.ImportParams, "start", 1001),
+        min=0,
+        max=contract.LAST_FRAME,
+        options=set(),
+    )
     solve_step = IntProperty(
         **contract.panel(contract.ImportParams, "step"),
         min=0,

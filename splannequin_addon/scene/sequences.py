@@ -25,11 +25,13 @@ def forget_ahead() -> None:
     _ahead.clear()
 
 
-def read(path: Path, name: str, encoding: Encoding, first: int, last: int, opaque: bool = False) -> None:
+def read(
+    path: Path, name: str, encoding: Encoding, first: int, last: int, opaque: bool = False, shift: int = 0
+) -> None:
     """Has a picture of a sequence read, whose frames go from `first` to `last`: a node does it for the frame that it
-    shows. `opaque`: see `load_sequence`."""
+    shows. `opaque`: see `load_sequence`; `shift`: see `show_sequence`."""
     _ahead.discard(os.path.abspath(path))
-    shown_size(load_sequence(path, name, encoding, opaque), first, last)
+    shown_size(load_sequence(path, name, encoding, opaque), first, last, shift)
     _ahead.add(os.path.abspath(path))
 
 
@@ -40,14 +42,14 @@ def read_numbers(path: Path, name: str) -> None:
     _ahead.add(os.path.abspath(path))
 
 
-def shown_size(image: bpy.types.Image, first: int, last: int) -> tuple[int, int]:
-    """Width and height of the pictures of a sequence, whose frames go from `first` to `last`, as a node shows them.
+def shown_size(image: bpy.types.Image, first: int, last: int, shift: int = 0) -> tuple[int, int]:
+    """Width and height of the pictures of a sequence, which `show_sequence` would show so, as a node shows them.
 
     (0, 0) of those with several layers. A sequence that no node shows has none.
     """
     reader = bpy.data.node_groups.new("Splannequin Reader", "CompositorNodeTree")
     try:
-        show_sequence(reader.nodes.new("CompositorNodeImage"), image, first, last)
+        show_sequence(reader.nodes.new("CompositorNodeImage"), image, first, last, shift)
         return size_of(image)
     finally:
         bpy.data.node_groups.remove(reader)
@@ -111,11 +113,11 @@ def relative_images() -> None:
             image.filepath = paths.blend_path(Path(bpy.path.abspath(image.filepath)))
 
 
-def show_sequence(user: Any, image: bpy.types.Image, first: int, last: int) -> None:
-    """Makes an Image node (or an image user) show file n at scene frame n."""
+def show_sequence(user: Any, image: bpy.types.Image, first: int, last: int, shift: int = 0) -> None:
+    """Makes an Image node (or an image user) show file n - `shift` at scene frame n, from `first` to `last`."""
     if hasattr(user, "image"):
         user.image = image
     user.frame_duration = last - first + 1
     user.frame_start = first
-    user.frame_offset = first - 1
+    user.frame_offset = first - shift - 1
     user.use_auto_refresh = True

@@ -86,6 +86,24 @@ def test_mix_0_is_the_footage_bit_for_bit_and_no_copy_is_shown(addon, scene, foo
         assert np.array_equal(render(scene, tmp_path, frame), made.plate(frame))
 
 
+@pytest.mark.parametrize("shift", [4, -90])
+def test_footage_that_the_shot_numbers_otherwise_is_shown_at_the_shots_frames(addon, scene, footage, tmp_path, shift):
+    """Behind the camera's own nodes: an Image node whose file number is not the scene's frame."""
+    shot = footage(shift=shift)
+    folder = tmp_path / "the plate"
+    for frame in (5, 6):
+        (folder / f"{frame:06d}.exr").rename(folder / f"moved.{frame - shift:06d}.exr")
+    take = shot / "takes" / "detail" / "take.json"
+    facts = json.loads(take.read_text())
+    facts["footage"]["file"] = str(folder / f"moved.{5 - shift:06d}.exr")
+    take.write_text(json.dumps(facts))
+    said = addon("bake.insertion").insert_freeze(scene, shot, "detail")
+    assert any("itself, 56 x 42." in line for line in said)
+    node_of(addon, scene).inputs["Mix"].default_value = 0.0
+    for frame in (5, 6):
+        assert np.array_equal(render(scene, tmp_path, frame), made.plate(frame))
+
+
 def test_acescg_footage_is_brought_to_the_scenes_light(addon, scene, footage, tmp_path):
     """Under Blender's own configuration, where light is Rec.709's."""
     matrix = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])

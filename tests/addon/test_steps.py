@@ -30,6 +30,16 @@ def test_the_import_button_brings_the_clip_in(addon, scene, clip, tmp_path):
     assert 2 <= props.t_star <= 9
 
 
+def test_an_import_with_a_start_counts_from_it(addon, scene, clip, tmp_path):
+    props = scene.splannequin
+    props.clip, props.shot_path = str(clip), str(tmp_path / "s.splannequin")
+    props.use_range, props.first, props.last = True, 2, 9
+    props.use_start, props.start = True, 1001
+    assert bpy.ops.splannequin.import_clip() == {"FINISHED"}
+    assert addon("shot.inventory").read(tmp_path / "s.splannequin").frame_range == (1001, 1008)
+    assert (scene.frame_start, scene.frame_end) == (1001, 1008) and 1001 <= props.t_star <= 1008
+
+
 def test_a_scene_in_use_is_left_alone_without_consent(addon, scene, shot):
     scene.render.resolution_x, scene.frame_end = 4096, 99
     said = addon("footage.arrival").imported(scene, shot)

@@ -83,6 +83,19 @@ class ImportParams:
         tip="Last frame number to import, inclusive",
     )
     """Last frame number to take, inclusive; None: the last there is."""
+    start: int | None = option(
+        None,
+        flag="--start",
+        metavar="N",
+        help="number of the first frame in the shot, such as 1001; `--first`, `--last` and the files keep their own "
+        "numbers",
+        words="the footage's own",
+        limit=Limit("number of the shot's first frame", 0, LAST_FRAME),
+        label="Start",
+        tip="Number of the first frame in the shot, such as 1001. The range above is in the footage's own numbers",
+    )
+    """Number that the first frame of the range has in the shot; None: the footage's own. All numbers after the import
+    are the shot's."""
     step: int = option(
         0,
         flag="--step",

@@ -25,6 +25,7 @@ from ..contract import (
     write_json,
 )
 from ..contract.files import is_json_object
+from ..footage.numbering import renumbered, shift_of
 from ..footage.opening import open_source
 
 TAKE_DIGITS = 4
@@ -145,11 +146,13 @@ def _of_clip(path: str, requests: dict[str, Any], shots_folder: str) -> FarmShot
     """A clip's shot. JobError if it is no footage, or does not say how long it is."""
     clip = path if "://" in path else str(Path(path).absolute())
     taken: ImportParams = dataclasses.replace(requests["import"], source=clip)
-    info = open_source(clip, taken.fps, taken.layer).info
+    opened = open_source(clip, taken.fps, taken.layer)
+    shift = shift_of(opened.info, taken)
+    info = renumbered(opened, shift).info
     if info.last is None:
         raise JobError(f"{clip} does not say how many frames it has.", "Import it, and name the shot.", ExitCode.USAGE)
-    first = info.first if taken.first is None else max(info.first, taken.first)
-    last = info.last if taken.last is None else min(info.last, taken.last)
+    first = info.first if taken.first is None else max(info.first, taken.first + shift)
+    last = info.last if taken.last is None else min(info.last, taken.last + shift)
     stem = _plain(re.split(r"[\\/]", clip.rstrip("\\/"))[-1].partition(".")[0])
     folder = Path(shots_folder).absolute() if shots_folder else Path(clip).parent
     high = taken.working_height or min(720, info.height)

@@ -7,7 +7,7 @@ import re
 import shutil
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, f
 from .burnt_in import WIDTH, find_mark, looked_at
 from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
 from .images import is_whole_png, read_frame, resize, working_size, write_png
+from .numbering import renumbered, shift_of
 from .ocio import Colours
 from .opening import open_source
 from .reading import read_as
@@ -82,24 +83,26 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     """
     _check(config)
     opened = open_source(source, config.fps, config.layer, Colours(config.colour_space), told_in(config))
-    _check_range(opened, config)
-    key = import_key(opened.info, config)
+    shift = shift_of(opened.info, config)
+    _check_range(opened, config, shift)
+    key = import_key(opened.info, config, shift=shift)
     restore_folder(shot.frames)
     for folder in (shot.raw, shot.solve):
         shot.own(folder)
     shot.publish_frames()
-    done = _finished(shot, import_keys(opened.info, config) | import_keys(opened.info, config, PLAIN))
+    done = _finished(shot, {k for d in (None, PLAIN) for k in import_keys(opened.info, config, d, shift)})
     if done is not None:
         report.progress("import", 1, 1, "already imported")
         if shot.info().source != str(source):  # the same footage in another place, where it is looked for from now on
             shot.update(source=str(source))
         return _result(shot, done)
+    opened = renumbered(opened, shift)  # from here on all numbers are the shot's
     with replacing_folder(shot.frames) as fresh:
-        extracted = _extract(shot, opened, config, fresh / RAW_FOLDER, report)
-        _refuse_unusable(extracted.measures)
+        extracted = _extract(shot, opened, _in_the_shots_numbers(config, shift), fresh / RAW_FOLDER, report)
+        _refuse_unusable(extracted.measures, shift)
         for message, hint in opened.warnings + _remarks(extracted):
             report.warning(message, hint)
-        record = _record(opened, config, extracted, key)
+        record = _record(opened, config, extracted, key, shift)
         record["beside"] = _beside(shot, source)
         record |= _marked(shot, record, fresh, report)
         write_json(fresh / FRAMES_FILE, record)
@@ -118,29 +121,38 @@ def display_for(info: SourceInfo) -> Display:
     return ROLLED if info.colour == "linear" else PLAIN
 
 
-def import_key(info: SourceInfo, config: FootageConfig, display: Display | None = None) -> str:
+def import_key(info: SourceInfo, config: FootageConfig, display: Display | None = None, shift: int = 0) -> str:
     """What tells an import from others: of which footage it is, what was taken of it, and in which display.
 
-    `display` None: the one in which it would be made now.
+    `display` None: the one in which it would be made now. `shift`: see `numbering`.
     """
-    return _import_key(info.key, config, display or display_for(info))
+    return _import_key(info.key, config, display or display_for(info), shift)
 
 
-def import_keys(info: SourceInfo, config: FootageConfig, display: Display | None = None) -> set[str]:
+def import_keys(info: SourceInfo, config: FootageConfig, display: Display | None = None, shift: int = 0) -> set[str]:
     """`import_key`, and the one that an earlier version made of the same footage while its files' times are the same:
     an import that carries either is finished."""
-    return {_import_key(key, config, display or display_for(info)) for key in (info.key, info.former_key) if key}
+    display = display or display_for(info)
+    return {_import_key(key, config, display, shift) for key in (info.key, info.former_key) if key}
 
 
-def _import_key(footage: list[Any], config: FootageConfig, display: Display) -> str:
+def _import_key(footage: list[Any], config: FootageConfig, display: Display, shift: int) -> str:
     plain = _recorded(type(config)())
     settings = {n: v for n, v in _recorded(config).items() if n in _ALWAYS_IN_THE_KEY or v != plain[n]}
+    settings.pop("start", None)  # a start that is the footage's own number changes nothing
+    settings |= {"shift": shift} if shift else {}
     return content_key(FRAMES_VERSION, footage, settings, *([display.name] if display.name else []))
 
 
 def _recorded(config: FootageConfig) -> dict[str, Any]:
     """What was taken of the footage, wherever that lies by now."""
     return {name: value for name, value in asdict(config).items() if name != "source"}
+
+
+def _in_the_shots_numbers(config: FootageConfig, shift: int) -> FootageConfig:
+    """The configuration with its range, which is in the footage's own numbers, in those of the shot."""
+    first, last = (None if number is None else number + shift for number in (config.first, config.last))
+    return replace(config, first=first, last=last)
 
 
 def load_frames(shot: Shot) -> dict[str, Any]:
@@ -186,7 +198,8 @@ def _check(config: FootageConfig) -> None:
         )
 
 
-def _check_range(opened: Source, config: FootageConfig) -> None:
+def _check_range(opened: Source, config: FootageConfig, shift: int) -> None:
+    """JobError for a range that the footage lacks, or numbers in the shot (own number + `shift`) that cannot be."""
     info = opened.info
     if info.last is None:
         return
@@ -194,11 +207,11 @@ def _check_range(opened: Source, config: FootageConfig) -> None:
     last = info.last if config.last is None else config.last
     if first > info.last or last < info.first:
         raise footage_error(f"Frames {first} to {last} lie outside of the clip, which has {info.first} to {info.last}.")
-    first, last = max(first, info.first), min(last, info.last)
+    first, last = max(first, info.first) + shift, min(last, info.last) + shift
     if last > LAST_FRAME or first < -LAST_FRAME:
         raise footage_error(
             f"The frames are numbered {first} to {last}: Blender's frames end at {LAST_FRAME}.",
-            "Renumber the files from 1, or from 1001, or choose a range below that.",
+            "Number the shot from 1001 (Start, or --start 1001), or choose a range below that.",
         )
 
 
@@ -273,8 +286,8 @@ def _expected(opened: Source, config: FootageConfig) -> int:
     return min(info.last, info.last if config.last is None else config.last) - first + 1
 
 
-def _refuse_unusable(measures: list[FrameMeasures]) -> None:
-    """JobError for a clip that no solve could use: too short, a still, or cut."""
+def _refuse_unusable(measures: list[FrameMeasures], shift: int) -> None:
+    """JobError for a clip that no solve could use: too short, a still, or cut. `shift`: see `numbering`."""
     if len(measures) < LEAST_FRAMES:
         raise footage_error(
             f"The clip has only {len(measures)} frames: a freeze needs at least {LEAST_FRAMES}.",
@@ -294,12 +307,14 @@ def _refuse_unusable(measures: list[FrameMeasures]) -> None:
         )
     cuts = find_cuts(measures)
     if cuts:
-        raise _cut_error(measures, cuts)
+        ends = measures[0].frame - shift, measures[-1].frame - shift
+        raise _cut_error(*ends, [(before - shift, after - shift) for before, after in cuts])
 
 
-def _cut_error(measures: list[FrameMeasures], cuts: list[tuple[int, int]]) -> Exception:
-    starts = [measures[0].frame, *(after for _, after in cuts)]
-    ends = [*(before for before, _ in cuts), measures[-1].frame]
+def _cut_error(first: int, last: int, cuts: list[tuple[int, int]]) -> Exception:
+    """The error in the footage's own numbers, which the range that it proposes has to be in."""
+    starts = [first, *(after for _, after in cuts)]
+    ends = [*(before for before, _ in cuts), last]
     shots = [f"{a} to {b}" for a, b in zip(starts, ends, strict=True)]
     where = " and ".join(f"{after}" for _, after in cuts[:3]) + (" and later" if len(cuts) > 3 else "")
     longest = max(zip(starts, ends, strict=True), key=lambda pair: pair[1] - pair[0])
@@ -339,8 +354,8 @@ def _remarks(extracted: _Extracted) -> list[tuple[str, str]]:
     return remarks
 
 
-def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: str) -> dict[str, Any]:
-    """frames.json."""
+def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: str, shift: int) -> dict[str, Any]:
+    """frames.json; `shift`: see `numbering`."""
     measures, info = extracted.measures, opened.info
     step = config.step or automatic_step(len(measures), info.fps)
     solved = choose_solved(measures, step)
@@ -371,18 +386,24 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "fps": info.fps,
         "colour": info.colour,
         "reading": info.reading,
-        "read_as": read_as(info, timecode),
+        "read_as": read_as(info, timecode) + _numbered(measures[0].frame, shift),
         "timecode": timecode,
         "bits": 16 if info.deep else 8,
         "source_size": [info.width, info.height],
         "extended": info.extended,
         **_displayed(info, measures),
+        **({"shift": shift} if shift else {}),
         "start": start,
         "step": step,
         "config": _recorded(config),
         "key": key,
         "frames": frames,
     }
+
+
+def _numbered(first: int, shift: int) -> list[str]:
+    """A sentence that says how the shot numbers its frames, if not as the footage does."""
+    return [f"Frame {first} of the shot is frame {first - shift} of the footage."] if shift else []
 
 
 def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -> dict[str, Any]:

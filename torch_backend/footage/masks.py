@@ -24,6 +24,7 @@ from . import plate_encoding
 from .images import error_of
 from .importing import FootageConfig, load_frames, source_places
 from .layers import find_layer
+from .numbering import recorded_shift
 from .sequence import PICTURES, SequenceSource, find_sequence
 from .sources import footage_error, frame_words
 from .video import VideoSource
@@ -97,6 +98,7 @@ class _Reading:
         self.shot, self.frames, self.kind, self.source, self.report = shot, frames, kind, source, report
         self.numbers = [int(row["frame"]) for row in frames["frames"]]
         self.size = int(frames["width"]), int(frames["height"])
+        self.shift = recorded_shift(frames)
         self.name = f"The mask {source}" if source != MASK_ALPHA else "The footage's alpha"
 
     def mask(self) -> Mask:
@@ -171,6 +173,12 @@ class _Reading:
     def _matched(self, theirs: list[int]) -> dict[int, int]:
         """Frame -> number of the mask's picture. JobError names the frames that have none."""
         missing = sorted(set(self.numbers) - set(theirs))
+        if missing and self.shift and not {n - self.shift for n in self.numbers} - set(theirs):
+            self.report.warning(
+                f"{self.name} is numbered as the footage, not as the shot: its picture {theirs[0]} is taken for frame "
+                f"{theirs[0] + self.shift}."
+            )
+            return {n: n - self.shift for n in self.numbers}
         if not missing:
             return {n: n for n in self.numbers}
         if len(theirs) == len(self.numbers):
@@ -222,7 +230,8 @@ class _Reading:
                 f"{video.path.name} has no alpha to mask by.", "Give the mask as pictures of their own, or a video."
             )
         missing = set(self.numbers)
-        for number, alpha in video.alphas(self.numbers[-1]):
+        for own_number, alpha in video.alphas(self.numbers[-1] - self.shift):
+            number = own_number + self.shift
             if number in missing:
                 missing.remove(number)
                 yield number, alpha
@@ -245,7 +254,7 @@ class _Reading:
                 SequenceSource(sequence, settings.fps, settings.layer)
             except (JobError, OSError):
                 continue
-            files = {number: Path(sequence.frame(number)) for number in self.numbers}
+            files = {number: Path(sequence.frame(number - self.shift)) for number in self.numbers}
             if all(file.is_file() for file in files.values()):
                 return files, settings.layer
         raise footage_error(

@@ -25,6 +25,7 @@ from . import plate_encoding
 from .display import display_of
 from .images import read_frame, read_png, resize_float, working_size
 from .importing import FootageConfig, import_keys, load_frames, source_places
+from .numbering import recorded_shift, renumbered
 from .ocio import Colours
 from .opening import open_source
 from .sources import Known, Source, SourceInfo, told_in
@@ -186,17 +187,18 @@ class Plates:
         """Where footage lies that can be opened, and itself, read as it was imported."""
         # By the configuration of the import: another one of today would read other colours.
         reading: dict[str, Any] = record.get("reading") or {}
+        shift = recorded_shift(record)
         colours = Colours(config.colour_space, str(reading.get("ocio", "")))
         for place in source_places(self._shot, record):
             try:
-                yield place, open_source(place, config.fps, config.layer, colours, told_in(config))
+                yield place, renumbered(open_source(place, config.fps, config.layer, colours, told_in(config)), shift)
             except (JobError, OSError):
                 continue
 
     def _is_imported(self, source: Source, record: dict[str, Any], config: FootageConfig) -> bool:
         """True if the footage is by its key, or by its first, middle and last picture, what was imported."""
         info = source.info
-        if record.get("key") in import_keys(info, config, self._display):
+        if record.get("key") in import_keys(info, config, self._display, recorded_shift(record)):
             return True
         if working_size(info.width, info.height, config.working_height) != self._working:
             return False

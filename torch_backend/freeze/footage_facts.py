@@ -9,6 +9,7 @@ from typing import Any
 from ..contract import TAKE_UNDISTORT
 from ..footage.color import LIGHTS
 from ..footage.importing import load_frames
+from ..footage.numbering import recorded_shift
 from ..footage.plates import Plates
 from ..shot import Shot, content_key
 from ..solve.stmap import write_plate_map
@@ -18,7 +19,8 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     """For take.json: where the footage lies and how its files are shown; {} where it is not there any more.
 
     file: the video, or the first picture of the sequence. beside: the same, seen from the shot folder. size: of its
-    pictures. first, last: its frames' numbers; those of a video count from 1. probe: linear Rec.709 light that
+    pictures. first, last: its frames' own numbers; those of a video count from 1. shift: what is added to them to get
+    the shot's numbers; absent if they are the same. probe: linear Rec.709 light that
     `contract.PROBE` means in it. space: the name of its colour space. map: the ST map in the take's folder that takes
     the lens away, which this writes; empty if there is no lens. unlike: why a program that shows the files would not
     show what the freeze was made from, a clause; empty if it would.
@@ -30,12 +32,14 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     if info is None:
         return {}
     unlike = info.unlike or _unsteady(shot, info.fps) or ("its lens changes between frames" if lens is None else "")
+    shift = recorded_shift(load_frames(shot))
     facts = {
         "file": os.path.abspath(info.file),
         "beside": _beside(shot.root, info.file),
         "size": [info.width, info.height],
-        "first": info.first,
-        "last": info.last,
+        "first": info.first - shift,
+        "last": None if info.last is None else info.last - shift,
+        **({"shift": shift} if shift else {}),
         "probe": list(info.probe),
         "space": info.reading.get("colour", ""),
         "map": "",

@@ -293,7 +293,11 @@ def frame_numbers(names: Sequence[str]) -> list[int | None]:
 
 
 def match(
-    solve: ForeignSolve, frames: Sequence[int], size: tuple[int, int], solved: Sequence[int] | None = None
+    solve: ForeignSolve,
+    frames: Sequence[int],
+    size: tuple[int, int],
+    solved: Sequence[int] | None = None,
+    renumbered: int = 0,
 ) -> Matched:
     """Finds the camera of each frame by its number.
 
@@ -304,6 +308,8 @@ def match(
         frames: frame numbers of the clip, ascending.
         size: width and height of the working frames in pixels.
         solved: of `frames`, those that are trained on; None: all.
+        renumbered: what the import added to the footage's own numbers (`footage.numbering`). The cameras are taken by
+            the footage's numbers if more frames have a camera then.
 
     Raises:
         JobError: too few of these have a camera, or the pictures had another shape.
@@ -323,6 +329,8 @@ def match(
         if sorted(n + step for n in table) == list(frames):
             shift = step
     wanted = set(frames)
+    if shift == 0 and sum(n + renumbered in wanted for n in table) > sum(n in wanted for n in table):
+        shift = renumbered
     cameras = {n + shift: camera for n, camera in table.items() if n + shift in wanted}
     missing = [n for n in frames if n not in cameras]
     needed = list(frames if solved is None else solved)
