@@ -12,8 +12,8 @@ import bpy
 from ...torch_backend import contract
 from ..access import present, settings_of
 from ..process import job_timer
-from ..scene import rollback, scene_setup, session
-from ..shot import inventory, scene_objects
+from ..scene import paths, rollback, scene_setup, session
+from ..shot import inventory, places, scene_objects
 from ..shot.shot_state import ShotState
 from . import compositor, freeze_group, rendering, take_files
 from .take_files import Take
@@ -79,11 +79,11 @@ def _sources(scene: bpy.types.Scene, shot: Path, take: str) -> tuple[Take, Path 
 
 
 def _footage(scene: bpy.types.Scene, shot: Path, plate: Path | None) -> list[Path]:
-    """Files by which a node that shows the plate is known: the undistorted plate, the clip."""
-    told = str(inventory.read(shot).info.get("source", ""))
-    chosen = settings_of(scene).clip
-    files = [plate, Path(told) if told else None, Path(bpy.path.abspath(chosen)) if chosen else None]
-    return [file for file in files if file is not None]
+    """Footage by which a node that shows the plate is known: the undistorted plate, the clip as it was imported, where
+    it is now if it was moved, and as it is chosen in the panel."""
+    state = inventory.read(shot)
+    clips = [str(state.info.get("source", "")), places.source_of(state), paths.absolute(settings_of(scene).clip)]
+    return [*([plate] if plate is not None else []), *(Path(clip) for clip in dict.fromkeys(clips) if clip)]
 
 
 def remove(scene: bpy.types.Scene) -> bool:

@@ -5,8 +5,6 @@ Only links are moved, and led back.
 
 from __future__ import annotations
 
-import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +13,7 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..access import present, size_of
-from ..scene import scene_setup
+from ..scene import same_footage, scene_setup
 from ..scene.ownership import TAG
 
 _STANDS_IN = "splannequin_stands_in"
@@ -67,7 +65,7 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
     led = upstream(end.node if end is not None else None)
     led = [n for n in led if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
     nodes = [n for n in tree.nodes if n in led and _picture(n).is_linked]
-    found = [n for n in nodes if _shows(n, footage)]
+    found = [n for n in nodes if same_footage.shows(_shown(n), footage)]
     if where == "PLATE" and not found:  # by another name, then: the chosen one, or the only one
         found = [n for n in nodes if n == tree.nodes.active] or (nodes if len(nodes) == 1 else [])
     if not found:
@@ -113,27 +111,11 @@ def upstream(end: bpy.types.Node | None) -> list[bpy.types.Node]:
     return found
 
 
-def _shows(node: bpy.types.Node, footage: Sequence[Path]) -> bool:
-    """True if an Image or Movie Clip node shows one of these files, or another of the sequence that it belongs to."""
-    data = _shown(node)
-    if data is None or not data.filepath:
-        return False
-    numbered = data.source == "SEQUENCE"
-    path = _footage_key(Path(bpy.path.abspath(data.filepath)), numbered)
-    return any(path == _footage_key(known, numbered) for known in footage)
-
-
 def _shown(node: bpy.types.Node) -> bpy.types.Image | bpy.types.MovieClip | None:
     """The footage of an Image or Movie Clip node."""
     if isinstance(node, bpy.types.CompositorNodeImage):
         return node.image
     return node.clip if isinstance(node, bpy.types.CompositorNodeMovieClip) else None
-
-
-def _footage_key(path: Path, numbered: bool) -> tuple[str, str]:
-    """Folder and name of a file; of one of a sequence without its number, which may stand there as ####."""
-    folder, name = os.path.split(os.path.realpath(path))
-    return os.path.normcase(folder), re.sub(r"\d+|#+", "#", name) if numbered else os.path.normcase(name)
 
 
 def _conforms(scene: bpy.types.Scene, node: bpy.types.Node, plate: bpy.types.Node) -> bool:

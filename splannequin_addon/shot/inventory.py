@@ -40,7 +40,8 @@ def read(folder: Path) -> ShotState:
         return state
     state.info = _typed(_Info, there.info_path)
     if there.listing.is_file():
-        state.frames, state.beside, state.read_as, state.timecode = file_cache.of(there.listing, _listed)
+        told = file_cache.of(there.listing, _listed)
+        state.frames, state.beside, state.read_as, state.timecode, state.shift = told
     if there.cameras.is_file():
         state.solve = _typed(_Solve, there.solve_record)
     state.runs = _named(_Run, there.runs, contract.SUMMARY_FILE, state.damaged["run"])
@@ -100,11 +101,11 @@ def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
     return [n for n in frames if n not in there]
 
 
-def _listed(path: Path) -> tuple[int, str, list[str], str]:
-    """Of frames.json: how many frames there are, `ShotState.beside`, `ShotState.read_as` and `ShotState.timecode`."""
+def _listed(path: Path) -> tuple[int, str, list[str], str, int]:
+    """Of frames.json: how many frames there are, and `beside`, `read_as`, `timecode` and `shift` of `ShotState`."""
     told = _read_typed(path, _Listing, contract.LONGEST_JSON)
     read_as = [contract.printable(line, 300) for line in told["read_as"][:_MOST_SENTENCES] if isinstance(line, str)]
-    return len(told["frames"]), told["beside"], read_as, contract.parse_timecode(told["timecode"])
+    return len(told["frames"]), told["beside"], read_as, contract.parse_timecode(told["timecode"]), told["shift"]
 
 
 def _frame_count(take: Path, told: float) -> int:
@@ -159,6 +160,7 @@ class _Listing:
     beside: str = ""
     timecode: str = ""
     read_as: list[Any] = field(default_factory=list[Any])
+    shift: int = 0
 
 
 @dataclass

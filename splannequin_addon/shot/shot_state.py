@@ -23,6 +23,8 @@ class ShotState:
     """How the footage was read, in sentences; empty for one of an earlier version."""
     beside: str = ""
     """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
+    shift: int = 0
+    """Number of a frame in the shot minus its number in the footage."""
     timecode: str = ""
     """SMPTE timecode of the first frame; empty if the footage carries none."""
     solve: dict[str, Any] = field(default_factory=dict[str, Any])

@@ -17,7 +17,7 @@ import bpy
 from ...torch_backend import contract
 from .. import compat
 from ..access import present
-from ..scene import session
+from ..scene import same_footage, session
 from ..shot import inventory, places
 from . import exchange
 
@@ -143,15 +143,8 @@ def _shift(folder: contract.ShotFolder) -> int:
     """What to add to a frame number of the shot to get the scene's frame at which its movie clip shows it."""
     state = inventory.read(folder.root)
     told = (str(state.info.get("source", "")), places.source_of(state))  # where it was, and where it is
-    sources = {_place(path) for path in told if os.path.isabs(path)}
-    folders = sources | {os.path.dirname(path) for path in sources}
-    files = [(_place(bpy.path.abspath(clip.filepath)), clip) for clip in bpy.data.movieclips]
-    same = [clip for file, clip in files if file in sources]
-    beside = [clip for file, clip in files if clip.source == "SEQUENCE" and os.path.dirname(file) in folders]
-    shown = next(iter([*same, *beside]), None)
-    return int(shown.frame_start) - exchange.first_number(shown) if shown is not None else 0
-
-
-def _place(path: str) -> str:
-    """What two paths of one file have in common."""
-    return os.path.normcase(os.path.realpath(path))
+    sources = [Path(path) for path in told if os.path.isabs(path)]
+    shown = next((clip for clip in bpy.data.movieclips if same_footage.shows(clip, sources)), None)
+    if shown is None:
+        return 0
+    return int(shown.frame_start) - exchange.first_number(shown) - state.shift

@@ -211,6 +211,17 @@ def test_a_mask_follows_its_clip_wherever_the_project_lies(addon, scene, shot, t
     assert addon("solve.drawn_masks")._shift(addon("solve.drawn_masks").contract.ShotFolder(shot)) == -1000
 
 
+def test_a_mask_follows_its_clip_in_a_shot_that_counts_from_a_start_of_its_own(addon, shot, tmp_path, pictures):
+    """The file 0005 is frame 1005 of the shot, and frame 1 of a scene whose clip starts there."""
+    for number in (5, 6):
+        pictures.write(tmp_path / f"take.{number:04d}.png", np.zeros((12, 16, 3), np.uint8))
+    info, listing = shot / "shot.json", shot / "frames" / "frames.json"
+    info.write_text(json.dumps({**json.loads(info.read_text()), "source": str(tmp_path / "take.0005.png")}))
+    listing.write_text(json.dumps({**json.loads(listing.read_text()), "shift": 1000}))
+    bpy.data.movieclips.load(str(tmp_path / "take.0006.png"))
+    assert addon("solve.drawn_masks")._shift(addon("solve.drawn_masks").contract.ShotFolder(shot)) == 1 - 1006
+
+
 def test_of_two_sequences_in_a_folder_a_mask_follows_the_one_that_was_imported(addon, shot, tmp_path, pictures):
     for name in ("a.0001.png", "b.1001.png"):
         pictures.write(tmp_path / name, np.zeros((12, 16, 3), np.uint8))

@@ -1,0 +1,96 @@
+"""Whether an image or a movie clip shows some footage, however its path is spelled.
+
+Files are the same if the system says so (links, other case, another mount), or if they are copies of each other.
+Sequences are the same if their files are: which of them a path names says nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import bpy
+
+from ...torch_backend import contract
+
+_NUMBER = re.compile(r"(.*?)(\d+|#+|@+|%0?\d*d)([^\d#@%]*)", re.DOTALL)
+"""Name of a picture of a sequence. Its number is the last one, as Blender has it: `plate.v001.0005.exr` is frame 5."""
+
+
+def shows(data: bpy.types.Image | bpy.types.MovieClip | None, footage: Iterable[Path]) -> bool:
+    """True if a data-block shows one of these: a video, a folder of pictures, or a picture or the pattern of a
+    sequence. A still picture of a sequence is not the sequence."""
+    if data is None or not data.filepath:
+        return False
+    path = Path(os.path.abspath(bpy.path.abspath(data.filepath, library=data.library)))
+    if data.source == "SEQUENCE":
+        return any(_same_sequence(path, known) for known in footage)
+    is_moving = data.source == "MOVIE"
+    return any(_same_file(path, known, by_content=is_moving) for known in footage)
+
+
+def _same_file(one: Path, other: Path, by_content: bool) -> bool:
+    """True if two paths lead to one file, or, if content counts, to two copies of it."""
+    if _place(one) == _place(other):
+        return True
+    try:
+        if os.path.samefile(one, other):
+            return True
+        sizes = one.stat().st_size, other.stat().st_size
+        if not by_content or not (one.is_file() and other.is_file()) or sizes[0] != sizes[1] or not sizes[0]:
+            return False
+        return contract.file_digest(one) == contract.file_digest(other)
+    except (OSError, ValueError):  # one of them is not there, or cannot be read
+        return False
+
+
+def _same_sequence(one: Path, other: Path) -> bool:
+    """True if two paths name pictures of one sequence, or of two copies of it."""
+    if _folder_of(one, other):
+        return True
+    here, there = _pictures(one), _pictures(other)
+    if here is None or there is None:
+        return False
+    if _place(here[0]) == _place(there[0]) and here[1] == there[1]:
+        return True
+    common = sorted(here[2].keys() & there[2].keys())
+    if not common:
+        return False
+    # Several, far apart: the first frames of two clips may both be black.
+    looked_at = {common[0], common[len(common) // 2], common[-1]}
+    return all(_same_file(here[2][n], there[2][n], by_content=True) for n in looked_at)
+
+
+def _folder_of(picture: Path, folder: Path) -> bool:
+    """True if a folder is that of a picture: footage is chosen by its folder where that holds one sequence alone."""
+    return folder.is_dir() and _same_file(picture.parent, folder, by_content=False)
+
+
+def _pictures(path: Path) -> tuple[Path, tuple[str, str], dict[int, Path]] | None:
+    """Folder, (name before the number, name after it), and pictures by number of the sequence that a picture or a
+    pattern names; None if there is no number in it."""
+    found = _NUMBER.fullmatch(path.name)
+    if found is None:
+        return None
+    before, after = os.path.normcase(found[1]), os.path.normcase(found[3])
+    numbered: dict[int, Path] = {}
+    try:
+        with os.scandir(path.parent) as entries:
+            for entry in entries:
+                name = os.path.normcase(entry.name)
+                digits = name[len(before) : len(name) - len(after)]
+                if name.startswith(before) and name.endswith(after) and digits.isdecimal():
+                    numbered[int(digits)] = path.parent / entry.name
+    except (OSError, ValueError):  # the folder is gone: the name is all there is
+        pass
+    return path.parent, (before, after), numbered
+
+
+def _place(path: Path) -> str:
+    """What all ways to write a path have in common that the system can tell without the file."""
+    try:
+        return os.path.normcase(os.path.realpath(path))
+    except (OSError, ValueError):
+        return os.path.normcase(os.path.normpath(path))
