@@ -36,14 +36,13 @@ from .freeze.frozen import (
     FrozenGaussians,
     FrozenImage,
     OutputFrame,
-    best_instants,
     freeze_at,
-    rank_instants,
     render_frozen,
     span_of,
 )
 from .freeze.sightings import SightingConfig, motion_mattes
-from .scene import Scene, frame_table, load_scene
+from .freeze.take_plan import suggested_instants
+from .scene import Scene, load_scene
 from .shot import Shot
 from .train import LoadedRun, load_run
 from .train.device import decide_device, unused_words
@@ -132,14 +131,11 @@ class LiveSession:
         self.scene = load_scene(shot)
         self._span = span_of(self.scene, self.run)
         self._frozen: OrderedDict[tuple[int, tuple[int, ...] | None], FrozenGaussians] = OrderedDict()
-        self._sharpness = {frame: row["sharpness"] for frame, row in frame_table(shot).items()}
         self._details = _Details(shot, self.run, self.scene)
 
     def facts(self) -> dict[str, Any]:
         """Header of the `ready` message."""
         trained = self.run.train_frames
-        times = np.array([self.scene.time_of_frame(frame) for frame in trained])
-        ranking = rank_instants(self.run.model, times, np.array([self._sharpness.get(f, 0.0) for f in trained]))
         return {
             "kind": "ready",
             "run": self.run.folder.name,
@@ -152,8 +148,8 @@ class LiveSession:
             "moving": len(self.run.model.open_rows()),
             "note": self._note,
             "suggestions": [
-                {"frame": trained[i.index], "seen": round(i.seen, 3), "sharpness": round(i.sharpness, 3)}
-                for i in best_instants(ranking)
+                {"frame": frame, "seen": round(instant.seen, 3), "sharpness": round(instant.sharpness, 3)}
+                for frame, instant in suggested_instants(self._shot, self.scene, self.run)
             ],
         }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import bpy
 
@@ -62,7 +61,7 @@ class Bake(Step):
             shown = f"take {take}" if take else f"another shot, {scene_objects.name_of(there[0].parent.parent)}"
             lines = [f"Your compositor shows {shown}: the one that was baked last."]
             return View(False, True, lines, "Baking puts this take in its place.")
-        lines = ["The freeze is in your compositor.", *unsure(state.takes[settings_of(scene).take_name])]
+        lines = ["The freeze is in your compositor."]
         if shown_take.stale_scale(scene, state.folder):
             lines.append("The shot was scaled since: its depth is stale until you bake again.")
         if not scene_setup.keeps_plate_colours(scene):
@@ -124,12 +123,6 @@ def shown(take: Path) -> bool:
     wanted = os.path.abspath(take)
     used = (image.filepath for image in bpy.data.images if image.users and image.filepath)
     return any(paths.same(os.path.dirname(paths.absolute(file)), wanted) for file in used)
-
-
-def unsure(take: dict[str, Any]) -> list[str]:
-    """What a take's verdict says, if that is not that all is well: there is no need to hear it again."""
-    verdict = contract.verdict_of(take)
-    return [] if verdict is None or verdict.word == "good" else verdict.lines()
 
 
 STEP = Bake()

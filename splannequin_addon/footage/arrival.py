@@ -23,7 +23,7 @@ def imported(scene: bpy.types.Scene, shot: Path) -> list[str]:
     selection.see(scene, state)
     first, last = state.frame_range
     if not first <= props.t_star <= last:
-        props.t_star = (first + last) // 2
+        props.t_star = min(max(scene.frame_current, first), last)
     changes, camera = fit(scene, state), plate.show(scene, shot)
     if camera is not None:
         changes.append(f"{camera.name} shows the clip until the camera is solved.")

@@ -102,8 +102,11 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The take's name, what it is made of, its size, and where it is seen from."""
         props = settings_of(scene_in(context))
-        for name in ("take_name", "detail", "develop", "freeze_width", "overscan", "path_camera"):
+        for name in ("take_name", "detail", "develop", "freeze_width", "overscan"):
             layout.prop(props, name)
+        if props.overscan == "PERCENT":
+            layout.prop(props, "overscan_percent")
+        layout.prop(props, "path_camera")
         if props.path_camera is not None and present(camera_of(props.path_camera).dof).use_dof:
             wrap(
                 layout,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import bpy
 
 from ...torch_backend import contract
-from ..access import scene_holding
+from ..access import OneShot, scene_holding, settings_of
 from ..process import job_timer
-from ..properties import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from ..properties import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 from ..shot import selection
 from ..translations import tr
 
@@ -20,6 +20,26 @@ def takes_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
     return [(name, tr(f"t* {take['t_star_frame']}, run {take['run']}")) for name, take in takes]
 
 
+def _instant_chosen(props: OneShot, context: bpy.types.Context) -> None:
+    """The artist ticked t*: an instant that was never set becomes the current frame, not frame 1."""
+    if props.choose_t_star and not props.is_property_set("t_star"):
+        props.t_star = scene_holding(props).frame_current
+
+
+def _instant_set(props: OneShot, context: bpy.types.Context) -> None:
+    """t* was set: it is held within the clip, whose range only the shot knows."""
+    scene = scene_holding(props)
+    if props != settings_of(scene) or selection.is_switching():  # of a shot that waits in the list
+        return
+    folder = selection.shot_folder(scene)
+    state = job_timer.watch_of(folder).state if folder else None
+    if state is not None and state.frames:
+        first, last = state.frame_range
+        within = min(max(props.t_star, first), last)
+        if within != props.t_star:  # setting it calls this function again
+            props.t_star = within
+
+
 class FreezeSettings:
     """Instant, camera and take of a shot."""
 
@@ -28,10 +48,12 @@ class FreezeSettings:
         description="Set the frame at which time stands still yourself; off: the best supported one is taken",
         default=False,
         options=set(),
+        update=_instant_chosen,
     )
     t_star = IntProperty(
         **contract.panel(contract.FreezeParams, "t_star", 1),
         options={"ANIMATABLE"},
+        update=_instant_set,
     )
     path_camera = PointerProperty(
         name="Camera",
@@ -61,7 +83,16 @@ class FreezeSettings:
         items=[
             ("OFF", "Off", "Frozen frames end where the plate ends"),
             ("LENS", "What the Lens Needs", "As much more on every side as the original, distorted frame shows"),
+            ("PERCENT", "In Percent", "As much more on every side as you say, in percent of width and height"),
         ],
+        options=set(),
+    )
+    overscan_percent = FloatProperty(
+        name="Percent",
+        description="Picture beyond the frame on every side, in percent of its width and height",
+        default=10.0,
+        min=0.0,
+        max=100.0,
         options=set(),
     )
     live_show = EnumProperty(

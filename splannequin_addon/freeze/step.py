@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ...torch_backend import contract
 from ..access import settings_of
 from ..process import jobs
 from ..process.steps import Step, View
 from ..shot.shot_state import ShotState
-from . import operators, panel, takes, viewport
+from . import hidden_points, operators, own_camera, panel, takes, viewport
 
 if TYPE_CHECKING:
     import bpy
@@ -26,7 +26,7 @@ class Freeze(Step):
     again = "Freeze Again"
     needs = "Train first."
     classes = (*operators.CLASSES, *panel.CLASSES)
-    parts = (viewport,)
+    parts = (viewport, hidden_points)
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:
         """The instant, and what the frames are made of."""
@@ -38,12 +38,19 @@ class Freeze(Step):
             return View(False, False, [], self.needs)
         take = state.takes.get(settings_of(scene).take_name)
         if take is None:
+            if own_camera.name_of(scene):
+                return View(False, True, [], "Render your camera's move with time standing still.")
             return View(False, True, [], "Render the clip's move with time standing still.")
         frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
         instant = f"Time stands still at frame {take['t_star_frame']}"
+        if take["t_star_per_frame"]:
+            instant = "Time stands still as t* was keyed"
         across, down = take.get("margin", (0, 0))
         beyond = [f"Overscan: {across} pixels on each side, {down} above and below"] if across or down else []
-        lines = [frames, *beyond, instant, *contract.verdict_lines(take)]
+        lines = [frames, *beyond, instant, *_own_verdict(state, take)]
+        outdated = takes.outdated(scene, take)
+        if outdated:
+            return View(False, True, [*lines, outdated], "Freeze again to bring it up to date.")
         return View(True, True, lines, "Next: bake it into your compositor.")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
@@ -58,6 +65,13 @@ class Freeze(Step):
         if session is not None and folder == contract.ShotFolder(shot).runs / session.run and session.shot == shot:
             return "You are scrubbing through this run: stop scrubbing first"
         return ""
+
+
+def _own_verdict(state: ShotState, take: dict[str, Any]) -> list[str]:
+    """Lines of a take's verdict that do not stand under Train already: a take repeats what its run's found amiss."""
+    run = contract.verdict_of(state.runs.get(take["run"], {}))
+    told = [*run.sentences, *run.advice] if run is not None else []
+    return [line for line in contract.verdict_lines(take) if line not in told]
 
 
 STEP = Freeze()

@@ -32,7 +32,7 @@ def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
         t_star=props.t_star if props.choose_t_star else None,
         t_star_per_frame=keyed_instants(scene),
         width=props.freeze_width,
-        overscan=-1.0 if props.overscan == "LENS" else 0.0,
+        overscan={"OFF": 0.0, "LENS": -1.0, "PERCENT": props.overscan_percent}[props.overscan],
         detail="on" if props.detail else "off",
         develop="on" if props.develop else "off",
         only_missing=True,
@@ -102,6 +102,30 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         detail="on" if facts.get("detail") else "off",
         develop="on" if facts.get("developed") is not None else "off",
     )
+
+
+def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
+    """What a take lacks of what Freeze would make now, in one sentence; empty if it is that.
+
+    Args:
+        scene: the scene whose settings are compared.
+        take: an entry of `ShotState.takes`.
+    """
+    asked, camera = params_of(scene), own_camera.name_of(scene)
+    if take["run"] != asked.run:
+        return f"It was frozen from the run {take['run']}, now {asked.run} is chosen."
+    if bool(take["camera_path"]) != bool(camera):
+        return "It is seen from another camera than the one chosen now."
+    ramp = {int(n): float(at) for n, at in take["t_star_per_frame"].items()}
+    wanted = {int(n): at for n, at in asked.t_star_per_frame.items()}
+    if bool(ramp) != bool(wanted) or any(abs(ramp[n] - wanted[n]) > 1e-4 for n in ramp.keys() & wanted.keys()):
+        return "Its t* is not the one that is keyed now." if wanted else "Its t* was keyed, now it is not."
+    if not wanted and asked.t_star not in (None, take["t_star_frame"], take["t_star_asked"]):
+        return f"Its t* is frame {take['t_star_frame']}, now frame {asked.t_star} is chosen."
+    if abs(take["overscan"] - asked.overscan) > 1e-6:
+        return "Its overscan is not the one chosen now."
+    lacking = 0 if camera else take["frames_in_all"] - take["frame_count"]
+    return f"{lacking} of its {take['frames_in_all']} frames are not rendered yet." if lacking > 0 else ""
 
 
 def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool:

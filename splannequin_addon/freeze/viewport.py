@@ -23,7 +23,7 @@ from ...torch_backend import contract
 from ..access import scene_in, settings_of
 from ..process import backend, job_timer
 from ..shot import scene_objects, selection
-from . import live, own_camera
+from . import hidden_points, live, own_camera
 
 TICK_SECONDS = 1 / 60
 QUICK_PIXELS = 320 * 180
@@ -66,7 +66,7 @@ def begin(scene: bpy.types.Scene) -> None:
     end()
     _told = None
     _session = live.open_session(shot, run, backend.python(), backend.package_root())
-    _show_points(scene, shot, False)
+    hidden_points.begin(scene, shot)  # its dots would cover the picture
     _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
     job_timer.pulse(_tick)
 
@@ -76,8 +76,7 @@ def end() -> None:
     global _session, _handler
     if _session is not None:
         _session.close()
-        for scene in bpy.data.scenes:  # also where another shot was chosen since
-            _show_points(scene, _session.shot, True)
+        hidden_points.end()
         _session = None
     if _handler is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
@@ -87,14 +86,6 @@ def end() -> None:
     _rested.clear()
     job_timer.drop(_tick)
     redraw()
-
-
-def _show_points(scene: bpy.types.Scene, shot: Path, shown: bool) -> None:
-    """Opens or closes the eye of our point cloud: its dots would cover the picture."""
-    cloud = scene_objects.part(scene, shot, "points")
-    for layer in scene.view_layers:
-        if cloud is not None and cloud.name in layer.objects:
-            cloud.hide_set(not shown, view_layer=layer)
 
 
 def instant(scene: bpy.types.Scene) -> float | None:

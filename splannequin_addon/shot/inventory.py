@@ -201,6 +201,10 @@ class _Take:
     margin: list[Any] = field(default_factory=lambda: [0, 0])
     camera_path: str = ""
     overscan: float = 0.0
+    frames_in_all: int = 0
+    """Frames that the take can have; 0 of a take from before this was noted."""
+    t_star_asked: int | None = None
+    """t* as it was asked for, which `t_star_frame` may be near; None: suggested, or not noted."""
 
     def __post_init__(self) -> None:
         numbers = [*self.margin, *self.t_star_per_frame.values()]

@@ -34,6 +34,11 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     )
     scaled = BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
     collection = PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
+    points_hidden_in = StringProperty(
+        name="Points Hidden In",
+        description="View layers in which scrubbing hid the points, as JSON",
+        options={"HIDDEN"},
+    )
     marks = StringProperty(name="Marks", description="Markers that were put on the timeline, as JSON", options=set())
 
 

@@ -27,6 +27,7 @@ _T_STAR = "splannequin.t_star"
 _ITEMS_OWN = ("rna_type", "name", "scene_settings")
 """What an item of the list has beside a shot's settings."""
 _LOOK_SECONDS = 1.0
+_switching = False
 _beside: dict[Path, tuple[float, Path]] = {}
 """Clip -> when its shot folder was looked up, monotonic seconds, and the folder."""
 
@@ -81,10 +82,26 @@ def folders(scene: bpy.types.Scene) -> list[Path | None]:
     return [folder_of(one) for one in settings(scene)]
 
 
-def label(one: OneShot) -> str:
-    """What a shot is called: as its folder, which is called as its clip."""
-    folder = folder_of(one)
-    return scene_objects.name_of(folder) if folder is not None else "New shot"
+def labels(scene: bpy.types.Scene) -> list[str]:
+    """What the shots of a scene are called: as their folders, with their parent folder where two names are equal."""
+    found = folders(scene)
+    called = [scene_objects.name_of(folder) if folder is not None else "New shot" for folder in found]
+    return [
+        f"{name} ({_apart(folder, [o for o, other in zip(found, called, strict=True) if other == name and o])})"
+        if folder is not None and called.count(name) > 1
+        else name
+        for folder, name in zip(found, called, strict=True)
+    ]
+
+
+def _apart(folder: Path, among: list[Path | None]) -> str:
+    """The shortest end of a folder's parent path that no other of `among` has; all of it if they are the same."""
+    others = [other.parent.parts for other in among if other is not None and other != folder]
+    parts = folder.parent.parts
+    for count in range(1, len(parts)):
+        if all(other[-count:] != parts[-count:] for other in others):
+            return "/".join(parts[-count:])
+    return str(folder.parent)
 
 
 def add(scene: bpy.types.Scene) -> None:
@@ -138,9 +155,23 @@ def _path(index: int) -> str:
     return f"splannequin.shots[{index}].t_star"
 
 
+def is_switching() -> bool:
+    """True while the settings of one shot are being put in place of another's."""
+    return _switching
+
+
 def _copy(one: OneShot, other: OneShot) -> None:
-    for name in names():
-        setattr(other, name, getattr(one, name))
+    """Copies the settings of a shot; those that were never set stay so."""
+    global _switching
+    _switching = True
+    try:
+        for name in names():
+            if one.is_property_set(name):
+                setattr(other, name, getattr(one, name))
+            else:
+                other.property_unset(name)
+    finally:
+        _switching = False
 
 
 def _rename(scene: bpy.types.Scene, paths: Mapping[str, str]) -> None:

@@ -35,7 +35,11 @@ class SPLANNEQUIN_UL_shots(bpy.types.UIList):
         one = selection.settings(scene_in(context))[index]
         folder = selection.folder_of(one)
         running = job_timer.watch_of(folder).running() if folder is not None else None
-        layout.label(text=selection.label(one), icon="SORTTIME" if running else "FILE_MOVIE", translate=False)
+        layout.label(
+            text=selection.labels(scene_in(context))[index],
+            icon="SORTTIME" if running else "FILE_MOVIE",
+            translate=False,
+        )
 
 
 class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
@@ -144,7 +148,7 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
         props = settings_of(scene_in(context))
         row = layout_of(self).row()
         if len(props.shots) < 2:
-            row.label(text=selection.label(props), icon="FILE_MOVIE", translate=False)
+            row.label(text=selection.labels(scene_in(context))[0], icon="FILE_MOVIE", translate=False)
             row.operator("splannequin.shot_add", icon="ADD")
             return
         row.template_list(

@@ -20,7 +20,7 @@ def handlers() -> int:
 
 def test_unregister_leaves_nothing_and_register_twice_registers_once(package):
     before, hooks = ours(), handlers()
-    assert {"SPLANNEQUIN_OT_import_clip", "SPLANNEQUIN_PT_bake", "SPLANNEQUIN_PG_scene"} <= before and hooks == 11
+    assert {"SPLANNEQUIN_OT_import_clip", "SPLANNEQUIN_PT_bake", "SPLANNEQUIN_PG_scene"} <= before and hooks >= 11
     try:
         package.unregister()
         assert ours() == set() and handlers() == 0
@@ -42,5 +42,6 @@ def test_the_panels_stand_in_order_in_one_tab(addon):
 
 
 def test_handlers_and_timer_survive_another_file(addon):
+    before = handlers()
     bpy.ops.wm.read_homefile(use_factory_startup=True)
-    assert handlers() == 11
+    assert handlers() == before >= 11

@@ -38,6 +38,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     values = {"run_name": "b", "preset": "final", "use_range": True, "first": 3, "last": 9, "t_star": 6}
     values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
     values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
+    values |= {"overscan_percent": 4.0}
     values |= {"detail": False, "develop": False}
     values |= {"cameras_from": "FILE", "cameras_path": "//model", "tracking_clip": tracked}
     values |= {"shot_seen": "//first.splannequin", "solve_step": 2, "fps": 25.0, "colour_space": "x"}
@@ -55,7 +56,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     assert props.set_up_scene, "what is the scene's own stays"
     props.shot_path, props.t_star = str(other), 7
     assert shot_list.folders(scene) == [shot, other] and addon("shot.selection").shot_folder(scene) == other
-    assert [shot_list.label(one) for one in shot_list.settings(scene)] == ["my shot é", "second"]
+    assert shot_list.labels(scene) == ["my shot é", "second"]
     props.active_shot = 0
     assert addon("shot.selection").shot_folder(scene) == shot and {n: getattr(props, n) for n in values} == values
     assert shot_list.folders(scene) == [shot, other]
@@ -256,9 +257,9 @@ def ended(addon, contract, folder, step, kind, params, result):
 
 def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene, shot, other):
     props, supervisor, cameras = scene.splannequin, addon("process.job_timer"), addon("solve.cameras")
-    props.shot_path, props.t_star = str(shot), 2
+    props.shot_path, props.t_star = str(shot), 5
     bpy.ops.splannequin.shot_add()
-    props.shot_path, props.t_star = str(other), 3
+    props.shot_path, props.t_star = str(other), 7
     frozen = ended(addon, contract, shot, "freeze", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
     solved = ended(addon, contract, shot, "solve", "solve", contract.SolveParams(), {})
     baked = ended(addon, contract, shot, "bake", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
@@ -266,7 +267,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
         supervisor.tick()
         if all(job.ended for job in (frozen, solved, baked)):
             break
-    assert solved.ended and baked.ended and props.t_star == 3 and props.shots[0].t_star == 2
+    assert solved.ended and baked.ended and props.t_star == 7 and props.shots[0].t_star == 5
     assert cameras.find(scene, shot, "CAMERA") is None and set(supervisor.watch_of(shot).pending) == {
         "freeze", "solve", "bake",
     }  # fmt: skip
@@ -280,7 +281,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
     props.t_star = 7
     supervisor.tick()
     assert props.t_star == 7, "it is applied once"
-    assert props.shots[1].t_star == 3
+    assert props.shots[1].t_star == 7
 
 
 def test_a_camera_read_for_one_shot_freezes_no_other(addon, contract, two, shot, other):

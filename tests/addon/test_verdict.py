@@ -19,7 +19,7 @@ def add(path, **more):
     path.write_text(json.dumps(json.loads(path.read_text()) | more))
 
 
-def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_under_bake(addon, with_shot, shot):
+def test_a_verdict_stands_once_a_runs_under_train_and_a_takes_under_freeze(addon, with_shot, shot):
     shots = addon("shot.inventory")
     add(shot / "runs" / "main" / "summary.json", verdict=RUN)
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE, detail={"plate_share": 0.98})
@@ -33,13 +33,12 @@ def test_verdicts_stand_under_train_and_freeze_and_a_good_one_is_not_repeated_un
         == "Good. 98 % of the picture is plate, 2 % is a guess."
     )
     addon("bake.insertion").insert_freeze(with_shot, shot, "freeze")
-    assert not any("plate, 2 %" in line for line in addon("process.steps").STEPS["bake"].view(with_shot, state).state)
-    add(shot / "takes" / "freeze" / "take.json", verdict=TAKE | {"word": "poor"})
-    state = shots.read(shot)
-    assert (
-        "Poor. 98 % of the picture is plate, 2 % is a guess."
-        in addon("process.steps").STEPS["bake"].view(with_shot, state).state
-    )
+    inherited = TAKE | {"word": "fair", "sentences": TAKE["sentences"] + RUN["sentences"], "advice": RUN["advice"]}
+    add(shot / "takes" / "freeze" / "take.json", verdict=inherited)
+    views = {name: step.view(with_shot, shots.read(shot)) for name, step in addon("process.steps").STEPS.items()}
+    lines = [line.removeprefix("Fair. ") for view in views.values() for line in view.state]
+    for sentence in [*inherited["sentences"], *RUN["advice"]]:
+        assert lines.count(sentence) == 1, sentence
 
 
 def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):

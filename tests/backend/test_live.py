@@ -26,7 +26,9 @@ from torch_backend.contract import (
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.freeze.take_plan import choose_t_star
 from torch_backend.live import _TINT, _TINTED, LiveSession, Superseded, _Waiting
+from torch_backend.shot import write_json
 from torch_backend.train import device
 from torch_backend.train.self_test import SelfTest
 
@@ -86,6 +88,21 @@ def test_ready_tells_what_there_is_to_freeze(session, trained):
     assert len(frames) == len(set(frames))
     assert set(frames) <= set(header["trained"])
     assert all(0 <= s["seen"] <= 1 and 0 <= s["sharpness"] <= 1 for s in header["suggestions"])
+
+
+def test_only_instants_that_the_runs_verdict_recommends_are_suggested(trained, quiet):
+    world, _ = trained
+    record = world.shot.run("main") / "summary.json"
+    before = json.loads(record.read_text())
+    advised = {"word": "fair", "sentences": ["It does not hold in frames 101 to 109, left."], "instants": [110, 114]}
+    write_json(record, {**before, "verdict": advised})
+    try:
+        session = LiveSession(world.shot, "main", "cpu")
+        frames = [s["frame"] for s in session.facts()["suggestions"]]
+        chosen = choose_t_star(world.shot, session.scene, session.run, FreezeParams(), quiet())
+    finally:
+        write_json(record, before)
+    assert frames and all(110 <= frame <= 114 for frame in frames) and chosen == frames[0]
 
 
 def test_ready_says_why_the_card_is_not_used(session, trained, monkeypatch):

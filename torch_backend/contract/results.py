@@ -41,6 +41,8 @@ class Verdict:
     """Where it will not hold, worst first: `first` and `last` frame number, and `region` of the picture in words."""
     advice: list[str] = field(default_factory=list[str])
     """What to do about it."""
+    instants: list[int] = field(default_factory=list[int])
+    """First and last frame number of the span that t* should be chosen from; empty if any frame will do."""
 
     def lines(self) -> list[str]:
         """All of it as it is printed and drawn; the word stands before the first sentence."""
@@ -60,7 +62,8 @@ def verdict_of(facts: Mapping[str, Any]) -> Verdict | None:
     if found.word not in VERDICT_WORDS or not found.sentences or not all(isinstance(text, str) for text in texts):
         return None
     shown, advice = ([printable(text, 300) for text in part[:_MOST_LINES]] for part in (found.sentences, found.advice))
-    return Verdict(found.word, shown, found.where, advice)
+    span = found.instants if len(found.instants) == 2 and all(type(n) is int for n in found.instants) else []
+    return Verdict(found.word, shown, found.where, advice, span)
 
 
 def verdict_lines(*facts: Mapping[str, Any]) -> list[str]:

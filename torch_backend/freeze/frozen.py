@@ -215,11 +215,6 @@ class CandidateInstant:
     """Share of the trained frames whose plates are not sharper, 0 to 1."""
 
 
-def suggest_t_star(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> int:
-    """Index of the frame to freeze: the best of `rank_instants`, which has the arguments."""
-    return max(rank_instants(model, times, sharpness), key=lambda instant: instant.score).index
-
-
 def best_instants(instants: list[CandidateInstant], count: int = 5, apart: float = 0.08) -> list[CandidateInstant]:
     """Up to `count` of a ranking, best first, at least `apart` of the trained frames from each other."""
     chosen: list[CandidateInstant] = []

@@ -20,8 +20,6 @@ from ..contract import (
     TakeFolder,
     Verdict,
     path_error,
-    read_json,
-    verdict_of,
 )
 from ..footage.images import read_png
 from ..gaussians.ply import write_ply
@@ -29,8 +27,6 @@ from ..scene import Scene
 from ..shot import Shot, disk_error, is_disk_full, remove_file, write_json
 from ..solve.stmap import write_take_map
 from ..torch_types import from_numpy
-from ..train import LoadedRun
-from ..train.anew import SUMMARY_FILE
 from .contact_sheet import write_contact_sheet
 from .exr import read_frozen_exr
 from .footage_facts import footage_facts
@@ -38,7 +34,7 @@ from .frozen import FrozenGaussians, OutputFrame
 from .take_cameras import in_range, intrinsics
 from .take_folder import clear, place_of, take_over
 from .take_frames import make_ready, render_frames, small_share
-from .take_plan import FrameSpec, PlannedTake, planned
+from .take_plan import FrameSpec, PlannedTake, planned, run_verdict
 from .verdict import judge_take, unsure
 from .video import write_video
 
@@ -128,6 +124,8 @@ def _finish(
         "first": numbers[0],
         "last": numbers[-1],
         "frames": len(numbers),
+        "frames_in_all": len(take.whole),
+        **({} if params.t_star is None else {"t_star_asked": params.t_star}),
         "fps": shot.info().fps,
         "scale": scene.scale,
         "grain": None if spec.grain is None else spec.grain.to_json(),
@@ -156,14 +154,6 @@ def missable(what: str, report: Reporter) -> Generator[None]:
         if told is None:
             raise
         report.warning(f"The {what} is not written: {told.message}", "The frames are. Close it, then freeze again.")
-
-
-def run_verdict(run: LoadedRun) -> Verdict | None:
-    """The verdict on the run as it was trained last; None if its summary has none, or cannot be read."""
-    try:
-        return verdict_of(read_json(run.folder / SUMMARY_FILE))
-    except (OSError, ValueError):
-        return None
 
 
 def _made_of(folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]) -> dict[str, Any]:

@@ -10,13 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from ..contract import (
+    SUMMARY_FILE,
     ExitCode,
     FreezeParams,
     JobError,
     Reporter,
     TakeFolder,
+    Verdict,
     later,
     parse_timecode,
+    read_json,
+    verdict_of,
 )
 from ..footage.color import LIGHTS
 from ..footage.importing import load_frames
@@ -30,7 +34,7 @@ from ..train import LoadedRun, choose_device, load_run, static_views
 from .detail import Detailer
 from .developed_instants import Instants
 from .footage_facts import footage_light
-from .frozen import OutputFrame, suggest_t_star
+from .frozen import CandidateInstant, OutputFrame, best_instants, rank_instants
 from .grain import Grain, measure_plate
 from .take_cameras import intrinsics, output_size, plan
 
@@ -190,14 +194,35 @@ def plate_grain(shot: Shot, scene: Scene) -> Grain:
     return measure_plate([path for path in files if path.is_file()], scene.display)
 
 
+def run_verdict(run: LoadedRun) -> Verdict | None:
+    """The verdict on the run as it was trained last; None if its summary has none, or cannot be read."""
+    try:
+        return verdict_of(read_json(run.folder / SUMMARY_FILE))
+    except (OSError, ValueError):
+        return None
+
+
+def suggested_instants(shot: Shot, scene: Scene, run: LoadedRun) -> list[tuple[int, CandidateInstant]]:
+    """(frame number, figures) of the trained frames that are good instants to freeze, best first.
+
+    Only frames of the span that the run's verdict recommends are suggested: elsewhere the run does not show the clip.
+    """
+    trained, table = run.train_frames, frame_table(shot)
+    sharpness = np.array([table[f]["sharpness"] if f in table else 0.0 for f in trained])
+    ranking = rank_instants(run.model, np.array([scene.time_of_frame(f) for f in trained]), sharpness)
+    verdict = run_verdict(run)
+    if verdict is not None and len(verdict.instants) == 2:
+        first, last = verdict.instants
+        # A verdict of other frames than these recommends none of them: all are ranked then.
+        ranking = [i for i in ranking if first <= trained[i.index] <= last] or ranking
+    return [(trained[i.index], i) for i in best_instants(ranking)]
+
+
 def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, report: Reporter) -> int:
     """The frame to freeze at, snapped to a trained one: a time that no frame constrains is a guess."""
     trained = np.array(run.train_frames)
     if params.t_star is None:
-        table = frame_table(shot)
-        sharpness = np.array([table[int(f)]["sharpness"] if int(f) in table else 0.0 for f in trained])
-        times = np.array([scene.time_of_frame(f) for f in trained])
-        return int(trained[suggest_t_star(run.model, times, sharpness)])
+        return suggested_instants(shot, scene, run)[0][0]
     if not scene.frames[0] <= params.t_star <= scene.frames[-1]:
         raise JobError(
             f"t* is frame {params.t_star}, the shot has frames {scene.frames[0]} to {scene.frames[-1]}.",

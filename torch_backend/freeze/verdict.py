@@ -69,7 +69,8 @@ def judge_take(
     if not places and 1.0 - float(worst["plate_share"]) >= limits.named:
         sentences.append(f"Most of it in frame {worst['frame']}: {_percent(1.0 - float(worst['plate_share']))} %.")
     steady = bool(lost.any(axis=0).any()) and float(lost.mean(axis=0).max()) >= limits.steady
-    return _with_run(Verdict(word, sentences, places, _advice(facts, frames, places, steady, word)), run)
+    span = run.instants if run is not None else []
+    return _with_run(Verdict(word, sentences, places, _advice(facts, frames, places, steady, word, span)), run)
 
 
 def _with_run(take: Verdict, run: Verdict | None) -> Verdict:
@@ -80,7 +81,7 @@ def _with_run(take: Verdict, run: Verdict | None) -> Verdict:
     word = max(take.word, run.word, key=words.index)
     run_sentences = [sentence for sentence in run.sentences if sentence != EXPLAINED]
     advice = [*take.advice, *(line for line in run.advice if line not in take.advice)]
-    return Verdict(word, [*take.sentences, *run_sentences], [*take.where, *run.where], advice)
+    return Verdict(word, [*take.sentences, *run_sentences], [*take.where, *run.where], advice, run.instants)
 
 
 def unsure(verdict: Verdict, frames: list[int]) -> set[int]:
@@ -94,9 +95,10 @@ def _percent(share: float) -> int:
 
 
 def _advice(
-    facts: Mapping[str, Any], frames: list[int], places: list[dict[str, Any]], steady: bool, word: str
-) -> list[str]:
-    """What to do about the worst of them."""
+    facts: Mapping[str, Any], frames: list[int], places: list[dict[str, Any]], steady: bool, word: str,
+    advised: list[int],
+) -> list[str]:  # fmt: skip
+    """What to do about the worst of them. `advised`: `Verdict.instants` of the run."""
     if not places and word == "good":
         return []
     sentences: list[str] = []
@@ -107,6 +109,8 @@ def _advice(
         sentences.append("Keep the camera nearer to the clip's own path there.")
     elif worst is not None and not steady:
         middle = (worst["first"] + worst["last"]) // 2
+        if advised:  # never advise an instant that the run's own verdict warns of
+            middle = min(max(middle, advised[0]), advised[1])
         if not facts.get("t_star_per_frame"):
             sentences.append(f"Try a t* nearer to frame {middle}.")
         span = _longer_part(frames, worst)

@@ -108,7 +108,11 @@ def judge(figures: RunFigures, limits: RunLimits | None = None) -> Verdict:
     poor = dim or float(lost.any(axis=(1, 2)).mean()) > limits.poor_lost
     word = "poor" if poor else "fair" if places or walks else "good"
     sentences = _sentences(figures, limits, dim, places, walks)
-    return Verdict(word, sentences, [*places, *walks], _advice(figures, dim, np.asarray(bad), places, walks, limits))
+    span = _longest_good(figures.frames, np.asarray(bad)) if places or walks else None
+    advice = _advice(figures, dim, span, places, walks, limits)
+    # A dim run is advised to be trained anew: no span of it is recommended.
+    advised = [*span] if span is not None and not dim else []
+    return Verdict(word, sentences, [*places, *walks], advice, advised)
 
 
 def _sentences(
@@ -136,13 +140,12 @@ def _sentences(
 
 
 def _advice(
-    figures: RunFigures, dim: bool, bad: NDArray[np.bool_], places: list[dict[str, Any]], walks: list[dict[str, Any]],
-    limits: RunLimits,
+    figures: RunFigures, dim: bool, span: tuple[int, int] | None, places: list[dict[str, Any]],
+    walks: list[dict[str, Any]], limits: RunLimits,
 ) -> list[str]:  # fmt: skip
-    """What to do about it."""
+    """What to do about it. `span`: first and last frame of the longest span in which nothing is lost or walks."""
     if figures.sway < limits.still and not places and not dim:
         return ["Any frame will do as t*."]
-    span = _longest_good(figures.frames, bad)
     if dim or (places and span is None):
         still = figures.still_unexplained
         return [_LOOK if still is None else _SOLVE if still > limits.still_lost else _HOLD]

@@ -56,6 +56,7 @@ def test_a_walker_is_told_with_frames_place_and_what_to_do():
         "Something does not hold still: it travels up to 141 of 640 pixels in frames 10 to 40, middle.",
     ]
     assert verdict.advice == ["Choose t* in frames 43 to 73, or train on that range alone."]
+    assert verdict.instants == [43, 73] and judge(figures()).instants == []
 
 
 def test_one_who_walks_and_is_followed_is_told_too():

@@ -1,0 +1,99 @@
+"""Hides the shot's point cloud while the frozen instant is drawn over it, without leaving a trace in a saved file.
+
+Which view layers were changed is kept in the scene, so that undo, a saved file, an autosave and a file that another
+Blender left behind after a crash can all be put right.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..access import library_of, settings_of
+from ..shot import scene_objects, selection
+
+_shot: Path | None = None
+"""Shot folder that is being scrubbed."""
+
+
+def begin(scene: bpy.types.Scene, shot: Path) -> None:
+    """Hides the points of a shot, in a scene, until `end`."""
+    global _shot
+    _shot = shot
+    _hide(scene, shot)
+
+
+def end() -> None:
+    """Shows in all scenes of the file the points that were hidden; those that the artist hid stay hidden."""
+    global _shot
+    _shot = None
+    _restore()
+
+
+def _hide(scene: bpy.types.Scene, shot: Path) -> None:
+    """Hides the points of a shot in every view layer that shows them, and notes which ones."""
+    entry, cloud = scene_objects.of(scene, shot), scene_objects.part(scene, shot, "points")
+    if entry is None or cloud is None:
+        return
+    shown = [layer for layer in scene.view_layers if cloud.name in layer.objects]
+    shown = [layer for layer in shown if not cloud.hide_get(view_layer=layer)]
+    for layer in shown:
+        cloud.hide_set(True, view_layer=layer)
+    if shown:
+        entry.points_hidden_in = json.dumps([layer.name for layer in shown])
+
+
+@persistent
+def _restore(*_: object) -> None:
+    """Shows what `_hide` hid. Before a save, too: a file must never hold points hidden by us."""
+    for scene in bpy.data.scenes:
+        for entry in settings_of(scene).made if not library_of(scene) else ():
+            cloud = entry.points
+            if cloud is None or not entry.points_hidden_in:
+                continue
+            for layer in scene.view_layers:
+                if layer.name in _names(entry.points_hidden_in) and cloud.name in layer.objects:
+                    cloud.hide_set(False, view_layer=layer)
+            entry.points_hidden_in = ""
+
+
+def _names(told: str) -> list[str]:
+    """View layers that `_hide` noted; none where the file was edited by hand."""
+    try:
+        names: object = json.loads(told)
+    except ValueError:
+        return []
+    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []  # pyright: ignore[reportUnknownVariableType]
+
+
+@persistent
+def _agree(*_: object) -> None:
+    """After a save, an undo or a file load: the points are hidden exactly while their shot is scrubbed."""
+    _restore()
+    if _shot is not None:
+        for scene in selection.scenes_of(_shot):
+            _hide(scene, _shot)
+
+
+def _handlers() -> list[tuple[Any, Any]]:
+    """(list of Blender's, function) of everything that is listened to."""
+    lists = bpy.app.handlers
+    after = [lists.save_post, lists.save_post_fail, lists.undo_post, lists.redo_post, lists.load_post]
+    return [(lists.save_pre, _restore), *((one, _agree) for one in after)]
+
+
+def register() -> None:
+    """Listens to saving, undo and file loads."""
+    for functions, function in _handlers():
+        functions.append(function)
+
+
+def unregister() -> None:
+    """Shows the points, and listens no more."""
+    end()
+    for functions, function in _handlers():
+        functions.remove(function)
