@@ -46,13 +46,18 @@ def error_of(source: Any = oiio) -> str:
         return "it is damaged"
 
 
-def write_png(path: str | Path, pixels: NDArray[Any]) -> None:
-    """Writes [H, W, 3] uint8 or uint16 as PNG of the same depth, whole or not at all. OSError if it cannot."""
+def write_png(path: str | Path, pixels: NDArray[Any], key: str = "") -> None:
+    """Writes [H, W, 3] uint8 or uint16 as PNG of the same depth, whole or not at all. OSError if it cannot.
+
+    `key` is kept in the file as the text `splannequin:key`.
+    """
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype.type not in (np.uint8, np.uint16):
         raise ValueError(f"pixels should be [H, W, 3] uint8 or uint16, got {pixels.shape} {pixels.dtype}")
     buffer = oiio.ImageBuf(np.ascontiguousarray(pixels))
     buffer.specmod().attribute("png:compressionLevel", PNG_COMPRESSION)
     buffer.specmod().attribute("oiio:ColorSpace", "sRGB")
+    if key:
+        buffer.specmod().attribute("splannequin:key", key)
     with atomic_path(path) as beside:
         # OpenImageIO's writer says nothing when the disk is full.
         if not (buffer.write(str(beside)) and _has_end(beside)):

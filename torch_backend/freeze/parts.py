@@ -11,7 +11,6 @@ takes, and of one, do not wait for each other.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from ..contract import (
@@ -24,10 +23,10 @@ from ..contract import (
     remove_file,
 )
 from ..shot import Shot, content_key, write_json
-from .exr import read_key
+from .frozen import OutputFrame
 from .take import finish
 from .take_cameras import in_range
-from .take_folder import files_of, frames_of, is_whole, make_folders
+from .take_folder import files_of, frames_of, made_before, make_folders, right_frames, stored_key, stored_keys
 from .take_frames import render_frames
 from .take_plan import PlannedTake, planned
 
@@ -42,9 +41,11 @@ def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, A
     take.spec.instants.prepare((f.t_star for f in take.whole), report)
     _refuse_undeveloped(take)
     chosen = in_range(take.whole, params)
-    told = take.folder.facts
-    if told.is_file() and not _same_take(told, take):
-        remove_file(told)  # what it tells of goes, frame by frame
+    keys = stored_keys(take.folder, take.spec.detail is not None)
+    if "" in keys.values():
+        report.warning(*made_before(params.take))
+    if set(keys) - right_frames(take, keys):
+        remove_file(take.folder.facts)  # what it tells of goes, frame by frame
     state = {"version": 1, "key": take.key, "t_star": take.t_star, "frames": _all_keys(take)}
     write_json(take.folder.state, state)
     return {"t_star": take.t_star, "first": chosen[0].frame, "last": chosen[-1].frame, "frames": len(chosen)}
@@ -62,7 +63,7 @@ def freeze_part(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
         frames = in_range(take.whole, params)
     except JobError:
         frames = []
-    done = {f.frame for f in frames if is_right(take, f.frame)}
+    done = _right_of(take, frames)
     render_frames(take, frames, done, report)
     if take.spec.run.stale:
         raise JobError(
@@ -79,7 +80,7 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     """
     take = _opened(shot, params, report)
     wanted = in_range(take.whole, params)
-    right = {f.frame for f in take.whole if is_right(take, f.frame)}
+    right = _right_of(take, take.whole)
     lacking = [f.frame for f in wanted if f.frame not in right]
     if lacking:
         raise JobError(
@@ -95,10 +96,10 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     return finish(shot, params, take, [f for f in take.whole if f.frame in right], {}, report)
 
 
-def is_right(take: PlannedTake, frame: int) -> bool:
-    """True if a frame of the take is on disk as it would be rendered now."""
-    key = read_key(take.folder.frame(frame)) if frame in take.keys else None
-    return key is not None and key == take.keys[frame] and is_whole(take.folder, frame, take.spec.detail is not None)
+def _right_of(take: PlannedTake, frames: list[OutputFrame]) -> set[int]:
+    """Those of some frames that are on disk as they would be rendered now."""
+    with_warps = take.spec.detail is not None
+    return right_frames(take, {f.frame: stored_key(take.folder, f.frame, with_warps) for f in frames})
 
 
 def _all_keys(take: PlannedTake) -> str:
@@ -136,10 +137,3 @@ def _refuse_undeveloped(take: PlannedTake) -> None:
             "Run the step `open` again; it says why, if it cannot be written.",
             ExitCode.FREEZE,
         )
-
-
-def _same_take(told: Path, take: PlannedTake) -> bool:
-    try:
-        return read_json(told).get("key") == take.key
-    except (OSError, ValueError):
-        return False

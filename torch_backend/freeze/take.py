@@ -32,7 +32,7 @@ from .exr import read_frozen_exr
 from .footage_facts import footage_facts
 from .frozen import FrozenGaussians, OutputFrame
 from .take_cameras import in_range, intrinsics
-from .take_folder import clear, place_of, take_over
+from .take_folder import clear, made_before, place_of, take_over
 from .take_frames import make_ready, render_frames, small_share
 from .take_plan import FrameSpec, PlannedTake, planned, run_verdict
 from .verdict import judge_take, unsure
@@ -47,6 +47,8 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     take = planned(shot, params, report)
     frames = in_range(take.whole, params)
     place = place_of(take, params)
+    if place.of_before:
+        report.warning(*made_before(params.take))
     done = place.right_here | place.right_beside
     make_ready(take, frames, done, report)  # what can fail, or be cancelled, before anything of before goes
     if place.beside is None:

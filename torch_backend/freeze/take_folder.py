@@ -15,7 +15,6 @@ from ..contract import (
     JobError,
     TakeFolder,
     frame_number,
-    read_json,
     remove_file,
     replace_file,
     sweep_half_written,
@@ -37,6 +36,8 @@ class Place:
     """Frames in the take's own folder that are as they would be rendered now."""
     right_beside: set[int]
     """Those in `beside`: it was begun before."""
+    of_before: bool = False
+    """There are frames of an earlier version, whose files do not say which belong together: they are made anew."""
 
 
 def place_of(take: PlannedTake, params: FreezeParams) -> Place:
@@ -46,8 +47,11 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
     """
     folder, with_warps = take.folder, take.spec.detail is not None
     make_folders(folder, with_warps)
-    here, beside = _right_frames(take, folder, params), folder.next
-    there = _right_frames(take, beside, params) if beside.root.is_dir() else set[int]()
+    keys = stored_keys(folder, with_warps) if params.only_missing else {}
+    here, beside, of_before = right_frames(take, keys), folder.next, "" in keys.values()
+    there = set[int]()
+    if params.only_missing and beside.root.is_dir():
+        there = right_frames(take, stored_keys(beside, with_warps))
     for n in set(_numbers(beside)) - there:
         for file in files_of(beside, n):
             remove_file(file)
@@ -56,24 +60,38 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
         place = Place(folder, beside, here, there)
         if beside.root.is_dir():  # killed while it took over
             take_over(take, place)
-        return Place(folder, None, here | there, set())
+        return Place(folder, None, here | there, set(), of_before)
     _prepare(beside, with_warps)
-    return Place(beside, beside, here, there)
+    return Place(beside, beside, here, there, of_before)
 
 
-def _right_frames(take: PlannedTake, folder: TakeFolder, params: FreezeParams) -> set[int]:
-    """The frames in a folder that are as they would be rendered now, and whole; none if all are to be made anew."""
-    keys, with_warps = take.keys, take.spec.detail is not None
-    state = folder.state
-    # Frames without a key of their own are of before grain, too.
-    old_are_right = not params.grain and not with_warps and state.is_file() and read_json(state).get("key") == take.key
-    right: set[int] = set()
-    for n in frames_of(folder) if params.only_missing else ():
-        stored_key = read_key(folder.frame(n))
-        known = n in keys and (stored_key == keys[n] or (stored_key == "" and old_are_right))
-        if known and is_whole(folder, n, with_warps):
-            right.add(n)
-    return right
+def right_frames(take: PlannedTake, keys: dict[int, str | None]) -> set[int]:
+    """The frames that are as they would be rendered now, of `stored_keys`."""
+    return {n for n, key in keys.items() if key is not None and key == take.keys.get(n)}
+
+
+def stored_keys(folder: TakeFolder, with_warps: bool) -> dict[int, str | None]:
+    """Frame -> `stored_key`, of all frames of a take's folder."""
+    return {n: stored_key(folder, n, with_warps) for n in frames_of(folder)}
+
+
+def stored_key(folder: TakeFolder, frame: int, with_warps: bool) -> str | None:
+    """The key that all files of a frame carry; None if one lacks, or is of another frame or take than the rest: a
+    process was killed between them. Empty if one carries none: an earlier version wrote it."""
+    files = [folder.frame(frame), folder.preview(frame), *([folder.warp(frame)] if with_warps else [])]
+    keys = {read_key(file) for file in files}
+    if None in keys:
+        return None
+    return "" if "" in keys else keys.pop() if len(keys) == 1 else None
+
+
+def made_before(take: str) -> tuple[str, str]:
+    """What to say of a take with frames of an earlier version, and why."""
+    return (
+        f"Frames of the take {take} were made by an earlier version, whose files do not say which belong together: "
+        "they are made again.",
+        "Name another take to keep them.",
+    )
 
 
 def clear(take: PlannedTake, done: Set[int]) -> None:
@@ -119,19 +137,15 @@ def _prepare(folder: TakeFolder, with_warps: bool) -> None:
         sweep_half_written(used)
 
 
-def is_whole(folder: TakeFolder, frame: int, with_warps: bool) -> bool:
-    """True if what belongs beside a frame of a take is there."""
-    return (not with_warps or folder.warp(frame).is_file()) and folder.preview(frame).is_file()
-
-
 def frames_of(folder: TakeFolder) -> list[int]:
     """Numbers of the frames that a take's folder has, ascending."""
     return _frames_in(folder.root.glob("*" + LAYERS))
 
 
 def _numbers(folder: TakeFolder) -> list[int]:
-    """Those of frames and previews."""
-    return _frames_in([*folder.root.glob("*" + LAYERS), *folder.previews.glob("*" + PICTURE)])
+    """Those of all files of frames."""
+    files = folder.root.glob("*" + LAYERS), folder.previews.glob("*" + PICTURE), folder.warps.glob("*" + LAYERS)
+    return sorted({n for found in files for n in _frames_in(found)})
 
 
 def _frames_in(paths: Iterable[Path]) -> list[int]:

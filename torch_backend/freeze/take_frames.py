@@ -86,7 +86,8 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
 def _write(
     folder: TakeFolder, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
 ) -> None:
-    """All files of a frame, the EXR last: a frame that has one has the others."""
+    """All files of a frame. Each carries the frame's key, by which `take_folder.stored_key` tells a whole frame from
+    files of two; the EXR comes last, so that readers who look for it alone find the others."""
     if isinstance(image, DetailedFrame):
         _write_warp(folder, output, image, spec, key)
     _write_frame(folder, output, image, scene, spec, key)
@@ -96,7 +97,7 @@ def _write_frame(
     folder: TakeFolder, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
 ) -> None:
     """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
-    write_png(folder.preview(output.frame), _preview(image, spec))
+    write_png(folder.preview(output.frame), _preview(image, spec), key)
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ from_numpy(scene.centre)
     size = tuple(image.alpha.shape)
@@ -174,7 +175,6 @@ def _preview(image: FrozenImage | DetailedFrame, spec: FrameSpec) -> np.ndarray:
 
 
 def _write_warp(folder: TakeFolder, output: OutputFrame, made: DetailedFrame, spec: FrameSpec, key: str) -> None:
-    """Before its frame: a frame that is there has its warp."""
     assert spec.detail is not None
     plates = spec.detail.plates
     write_warp(

@@ -2,6 +2,10 @@
 
 import os
 import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -110,3 +114,47 @@ def test_frames_of_before_stay_until_the_take_is_finished(own, quiet):
     finish_take(own, params, quiet())
     assert sorted(p.name for p in own.take("again").glob("*.exr")) == ["000103.exr"]
     assert not (own.take("again") / "preview" / "000104.png").exists()
+
+
+KILLED = """
+import os, signal, sys
+from torch_backend.contract import FreezeParams
+from torch_backend.freeze import freeze_part, open_take
+from torch_backend.shot import Shot
+
+class Quiet:
+    def progress(self, *words): ...
+    metric = image = warning = check_cancelled = progress
+
+root, take, writes = sys.argv[1], sys.argv[2], int(sys.argv[3])
+shot, replace, seen = Shot.open(root), os.replace, []
+params = FreezeParams(take=take, t_star=110, first=103, last=104, only_missing=True, develop="off")
+open_take(shot, params, Quiet())
+
+def counted(source, target):
+    replace(source, target)
+    seen.append(target)
+    if len(seen) == writes:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+os.replace = counted
+freeze_part(shot, params, Quiet())
+"""
+"""Freezes two frames at another instant, and kills itself after so many files have taken their names."""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
+@pytest.mark.parametrize("writes", [1, 2])
+def test_what_a_killed_part_of_another_instant_left_is_in_no_frame(own, quiet, writes):
+    take = f"mixed{writes}"
+    params = FreezeParams(take=take, **{**ASK, "last": 104, "develop": "off"})
+    freeze_shot(own, params, quiet())
+    before = files(own.take(take))
+    environ = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
+    command = [sys.executable, "-P", "-c", KILLED, str(own.root), take, str(writes)]
+    assert subprocess.run(command, env=environ).returncode == -signal.SIGKILL
+    assert not (own.take(take) / "take.json").exists() and files(own.take(take)) != before
+    open_take(own, params, quiet())
+    freeze_part(own, params, quiet())
+    finish_take(own, params, quiet())
+    assert files(own.take(take)) == before

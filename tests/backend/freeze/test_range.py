@@ -1,15 +1,18 @@
 """Parts of a take: range and step, which frames are stale, and the grain beside the picture."""
 
 import json
+import shutil
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
 from torch_backend.contract import CameraFrame, CameraPath, FreezeParams
+from torch_backend.footage.images import read_png, write_png
 from torch_backend.freeze import freeze_shot
-from torch_backend.freeze.exr import GRAIN_CHANNELS, read_frozen_exr, read_key
-from torch_backend.shot import write_json
+from torch_backend.freeze.exr import GRAIN_CHANNELS, read_frozen_exr
+from torch_backend.shot import Shot, write_json
+from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 
 
 def times(folder):
@@ -76,33 +79,63 @@ def test_a_newer_run_makes_every_frame_stale(trained, quiet):
     ask = FreezeParams(take="run", t_star=104, develop="off", first=101, last=103, only_missing=True)
     freeze_shot(world.shot, ask, quiet())
     before = times(folder)
-    (world.shot.run("main") / "checkpoint.safetensors").touch()
+    checkpoint = world.shot.run("main") / "checkpoint.safetensors"
+    checkpoint.touch()
+    freeze_shot(world.shot, ask, quiet())
+    assert times(folder) == before, "a time alone makes no other run"
+    tensors, meta = load_checkpoint(checkpoint)
+    save_checkpoint(checkpoint, tensors, {**meta, "trained_seconds": meta["trained_seconds"] + 1.0})
     freeze_shot(world.shot, ask, quiet())
     assert all(before[n] != t for n, t in times(folder).items())
 
 
-def test_a_take_of_before_frames_had_keys_stays_until_grain_or_plates_are_wanted(trained, quiet):
+def test_frames_of_an_earlier_version_are_made_anew_and_that_is_said_once(trained, quiet):
+    """Their previews say nothing of the take that they are of."""
     world, _ = trained
     folder = world.shot.take("old")
-    ask = dict(take="old", t_star=104, develop="off", first=101, last=103, only_missing=True)
-    old = FreezeParams(**ask, grain=False, detail="off")
-    for wanted in (FreezeParams(**ask, detail="off"), FreezeParams(**ask, grain=False)):
-        freeze_shot(world.shot, old, quiet())
-        _forget_keys(folder)
-        before = times(folder)
-        freeze_shot(world.shot, old, quiet())
-        assert times(folder) == before
-        freeze_shot(world.shot, wanted, quiet())
-        assert all(before[n] != t for n, t in times(folder).items())
+    ask = FreezeParams(
+        take="old", t_star=104, develop="off", detail="off", grain=False, first=101, last=103, only_missing=True
+    )
+    freeze_shot(world.shot, ask, quiet())
+    for path in folder.glob("preview/*.png"):
+        write_png(path, read_png(path))
+    before, report = times(folder), quiet()
+    freeze_shot(world.shot, ask, report)
+    assert all(before[n] != t for n, t in times(folder).items())
+    assert [event for event in report.events if "made by an earlier version" in str(event)]
+    before, report = times(folder), quiet()
+    freeze_shot(world.shot, ask, report)
+    assert times(folder) == before and "earlier version" not in str(report.events)
 
 
-def _forget_keys(folder):
-    for path in folder.glob("*.exr"):
-        image = oiio.ImageBuf(str(path))
-        image.read(0, 0, True)
-        image.specmod().erase_attribute("splannequin:key")
-        image.write(str(path))
-        assert read_key(path) == ""
+@pytest.mark.parametrize("kind", ["preview", "warp"])
+def test_a_frame_with_a_file_of_another_take_is_rendered_again(trained, quiet, kind):
+    world, _ = trained
+    ask = dict(develop="off", first=101, last=102, only_missing=True)
+    for take, t_star in (("here", 104), ("there", 110)):
+        freeze_shot(world.shot, FreezeParams(take=take, t_star=t_star, **ask), quiet())
+    here, there = (next(world.shot.take(take).glob(f"{kind}/000102.*")) for take in ("here", "there"))
+    data = here.read_bytes()
+    assert data != there.read_bytes()
+    here.write_bytes(there.read_bytes())
+    before = times(world.shot.take("here"))
+    freeze_shot(world.shot, FreezeParams(take="here", t_star=104, **ask), quiet())
+    after = times(world.shot.take("here"))
+    assert here.read_bytes() == data and before[101] == after[101] and before[102] != after[102]
+
+
+def test_a_copied_shot_has_the_frames_that_it_had(trained, quiet, tmp_path):
+    """As `cp -r` copies it: run and frames have other times."""
+    world, _ = trained
+    ask = FreezeParams(take="copied", t_star=104, first=101, last=103, only_missing=True)
+    freeze_shot(world.shot, ask, quiet())
+    copy = Shot.open(shutil.copytree(world.shot.root, tmp_path / "tiny.splannequin", copy_function=shutil.copyfile))
+    before, instants = times(copy.take("copied")), copy.run("main") / "developed"
+    developed = {p.name: p.stat().st_mtime_ns for p in instants.iterdir()}
+    report = quiet()
+    freeze_shot(copy, ask, report)
+    assert times(copy.take("copied")) == before and developed
+    assert {p.name: p.stat().st_mtime_ns for p in instants.iterdir()} == developed
 
 
 def test_a_damaged_frame_is_rendered_again(trained, quiet):
