@@ -297,6 +297,7 @@ def test_a_station_imports_only_stations_before_it(path: Path):
         *STATIONS[: STATIONS.index(station) + 1],
         "contract",
         "shot",
+        "replaced",
         "replacing",
         "cards",
         "kernel_text",

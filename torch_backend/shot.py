@@ -40,6 +40,7 @@ from .contract import (
     write_atomic,
     write_json,
 )
+from .replaced import keep_replaced
 from .replacing import settle_solve
 
 __all__ = [
@@ -129,9 +130,10 @@ class Shot(ShotFolder):
         return folder
 
     def publish_frames(self) -> None:
-        """Removes the solve of frames that an import replaced, and tells shot.json of the new ones (UNPUBLISHED_FILE).
+        """Ends an import: moves work on the frames that it replaced to SHOT/replaced, and updates shot.json.
 
-        For the shot's only writer: an import that was killed between its two last steps is ended by the next job.
+        UNPUBLISHED_FILE orders it. For the shot's only writer: an import that was killed between its two last steps is
+        ended by the next job.
         """
         news = self.frames / UNPUBLISHED_FILE
         if not news.is_file():
@@ -139,6 +141,8 @@ class Shot(ShotFolder):
         with contextlib.suppress(ValueError, KeyError, TypeError):  # damaged by no hand of ours: frames.json holds
             told = read_json(news)
             info = from_dict(ShotInfo, {**dataclasses.asdict(self.info()), **{name: told[name] for name in IMPORTED}})
+            if told.get("replaced"):
+                keep_replaced(self, str(told["replaced"]), [int(frame) for frame in told["same"]])
             shutil.rmtree(self.own(self.solve), ignore_errors=True)
             self.save(info)
         remove_file(news)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import OneShot, Outcome, layout_of, scene_in, settings_of
-from ..process import job_timer
+from ..process import job_timer, jobs, steps
 from ..properties import BoolProperty, StringProperty
 from ..scene import paths
 from ..shot import selection, source
@@ -122,23 +123,42 @@ class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator)
     bl_options = {"REGISTER"}
     step = "import"
 
+    replace = BoolProperty(
+        name="Replace",
+        description="Import other frames into a shot on which work was done: that work moves to a folder in the shot",
+        default=False,
+        options={"SKIP_SAVE"},
+    )
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks first where the shot is of another clip: a script that says both has said what it wants."""
+        """Asks first where frames on which work was done may be replaced. A script consents with `replace`."""
         question = replaces(scene_in(context))
         if not question:
             return self.execute(context)
+        self.replace = True
         return context.window_manager.invoke_confirm(
-            self, event, title="Import Another Clip", message=tr(question), confirm_text="Import", icon="WARNING"
+            self, event, title="Import Other Frames", message=tr(question), confirm_text="Import", icon="WARNING"
         )
+
+    def params(self, scene: bpy.types.Scene) -> jobs.Params | None:
+        """What the scene's settings say, with the consent."""
+        params = steps.STEPS[self.step].params(scene)
+        return dataclasses.replace(params, replace=self.replace)
 
 
 def replaces(scene: bpy.types.Scene) -> str:
-    """What an import would replace, in a sentence, if the scene's shot was made of another clip than is chosen."""
+    """What an import would or may replace in the scene's shot, in words; empty if nothing."""
     clip, folder = paths.absolute(settings_of(scene).clip), selection.shot_folder(scene)
-    if not clip or folder is None or source.is_of(folder, clip) is not False:
+    if folder is None:
         return ""
-    other = contract.printable(source.named(folder))
-    return f"{folder.name} is the shot of {other}: its frames are replaced, and its solve is removed."
+    work = ", ".join(contract.work_words(contract.ShotFolder(folder)))
+    if clip and source.is_of(folder, clip) is False:
+        other = contract.printable(source.named(folder))
+        question = f"{folder.name} is the shot of {other}: its frames are replaced."
+        return f"{question} What was made from them moves to its folder replaced: {work}." if work else question
+    if not work:
+        return ""
+    return f"{folder.name} holds work. Where other frames are imported, it moves to the shot's folder replaced: {work}."
 
 
 CLASSES = (

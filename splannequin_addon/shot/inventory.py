@@ -89,6 +89,14 @@ def plate_range(folder: Path) -> tuple[int, int] | None:
     return (min(numbers), max(numbers)) if numbers else None
 
 
+def picture_of(shot: Path, frame: int) -> str:
+    """Digest of the picture that a frame of a shot has; empty if the import noted none."""
+    try:
+        return file_cache.of(ShotFolder(shot).listing, _digests).get(frame, "")
+    except (OSError, ValueError):
+        return ""
+
+
 def burnt_in(shot: Path) -> Path | None:
     """Mask of what the import found to be burnt into the clip; None if it found nothing."""
     mask = ShotFolder(shot).burnt_in
@@ -106,6 +114,13 @@ def _listed(path: Path) -> tuple[int, str, list[str], str, int]:
     told = _read_typed(path, _Listing, contract.LONGEST_JSON)
     read_as = [contract.printable(line, 300) for line in told["read_as"][:_MOST_SENTENCES] if isinstance(line, str)]
     return len(told["frames"]), told["beside"], read_as, contract.parse_timecode(told["timecode"]), told["shift"]
+
+
+def _digests(path: Path) -> dict[int, str]:
+    """Frame number -> digest of its picture, of frames.json."""
+    rows = _read_typed(path, _Listing, contract.LONGEST_JSON)["frames"]
+    found = [cast("dict[str, Any]", row) for row in rows if isinstance(row, dict)]
+    return {row["frame"]: str(row.get("digest", "")) for row in found if isinstance(row.get("frame"), int)}
 
 
 def _frame_count(take: Path, told: float) -> int:

@@ -26,6 +26,8 @@ from ..shot import inventory, scene_objects
 
 _FRAME = "splannequin_matte"
 """Property of the images that are painted on: frame number. `MATTE_SHOT` is another."""
+_PICTURE = "splannequin_picture"
+"""Another: digest of the picture that the frame had. Another clip may have been imported into the shot since."""
 
 
 def found_file(shot: Path, frame: int) -> Path:
@@ -67,6 +69,7 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
     if image is None:
         image = bpy.data.images.new(f"Motion {scene_objects.name_of(shot)} {frame}", width, height, alpha=True)
         image[_FRAME], image[MATTE_SHOT] = frame, paths.blend_path(shot)
+        image[_PICTURE] = inventory.picture_of(shot, frame)
     _fill(image, pixels)
     return image
 
@@ -107,7 +110,11 @@ def find_image(shot: Path, frame: int) -> bpy.types.Image | None:
 
 
 def _is_of(image: bpy.types.Image, shot: Path, frame: int) -> bool:
-    return _of(image) == (os.path.abspath(shot), frame)
+    # Files of before have no digest: their images are believed.
+    return _of(image) == (os.path.abspath(shot), frame) and image.get(_PICTURE) in (
+        None,
+        inventory.picture_of(shot, frame),
+    )
 
 
 def _lost(image: bpy.types.Image) -> bool:

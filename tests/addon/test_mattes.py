@@ -1,5 +1,6 @@
 """The motion matte in Blender: shown as a sequence, painted on a copy, kept in the shot whole or not at all."""
 
+import json
 import os
 import struct
 import zlib
@@ -251,3 +252,26 @@ def test_an_image_whose_file_is_gone_is_filled_anew(matted, addon):
     bpy.ops.splannequin.paint_motion()
     assert (values(mattes.find_image(matted, 6)) == labels(6)).all()
     assert len([i for i in bpy.data.images if i.get("splannequin_matte") == 6]) == 1
+
+
+def test_paint_that_a_blend_file_keeps_is_not_offered_for_another_clip(matted, addon):
+    mattes, listing = addon("solve.mattes"), matted / "frames" / "frames.json"
+    record = json.loads(listing.read_text())
+
+    def imported(digest):
+        rows = [{**row, "digest": digest} for row in record["frames"]]
+        listing.write_text(json.dumps({**record, "frames": rows}))
+        os.utime(listing, ns=(1, hash(digest) % 10**15))
+
+    imported("one")
+    bpy.ops.splannequin.paint_motion()
+    image = mattes.find_image(matted, 6)
+    image.pixels.foreach_set(np.ones(len(image.pixels), np.float32))
+    imported("two")
+    assert mattes.find_image(matted, 6) is None
+    with pytest.raises(RuntimeError, match="Nothing is painted on frame 6"):
+        bpy.ops.splannequin.save_motion()
+    bpy.ops.splannequin.paint_motion()
+    assert (values(mattes.find_image(matted, 6)) == labels(6)).all(), "the matte that was found, not the other paint"
+    imported("one")
+    assert mattes.find_image(matted, 6) == image

@@ -344,6 +344,21 @@ def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_wi
     assert not replaces(a_few), "its own clip is taken"
 
 
+def test_work_on_a_shot_is_replaced_with_consent_alone(addon, a_few, clip, tmp_path):
+    """Another clip of the same name, which the panel cannot know: it asks, and the backend refuses a script."""
+    folder = imported(addon, a_few, clip, tmp_path / "a.mp4")
+    (folder / "solve").mkdir()
+    (folder / "solve" / "cameras.json").write_text("{}")
+    told = addon("footage.operators").replaces(a_few)
+    assert "a solved camera" in told and "gelöste Kamera" in addon("translations").translate(told, "de_DE")
+    a_few.splannequin.use_range, a_few.splannequin.first, a_few.splannequin.last = True, 3, 12
+    with pytest.raises(RuntimeError, match="--replace"):
+        bpy.ops.splannequin.import_clip()
+    assert (folder / "solve" / "cameras.json").is_file()
+    assert bpy.ops.splannequin.import_clip(replace=True) == {"FINISHED"}
+    assert (folder / "replaced" / "001" / "solve" / "cameras.json").is_file() and not (folder / "solve").exists()
+
+
 def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, shot, tmp_path):
     bpy.ops.splannequin.insert_freeze()
     with_shot.frame_start = with_shot.frame_end = 5

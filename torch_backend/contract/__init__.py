@@ -8,6 +8,7 @@
     lock            one writer per shot
     path_rules      where files of another computer lie on this one
     shot_folder     where everything of a shot lies
+    shot_work       what of it belongs to its present frames
     unborn          what a failed import leaves behind
     files, typed    reading what may come from anywhere, and plain JSON into dataclasses
     identity        what a file is known by: its content
@@ -197,6 +198,7 @@ from .shot_folder import (
     COLMAP_LOG,
     CONFIG_FILE,
     DEVELOPED_FOLDER,
+    DRAWN_FOLDER,
     EXTENSION_FILE,
     FRAMES_FILE,
     FRAMES_FOLDER,
@@ -230,6 +232,10 @@ from .shot_folder import (
     RunFolder,
     ShotFolder,
     TakeFolder,
+)
+from .shot_work import (
+    FOLDERS_OF_FRAMES,
+    work_words,
 )
 from .timecode import (
     later,
@@ -269,6 +275,7 @@ from .writing import (
     need_disk,
     remove_file,
     replace_file,
+    replaced_folder,
     replacing_folder,
     restore_folder,
     sweep_half_written,
@@ -299,8 +306,10 @@ __all__ = [
     "DETECTORS",
     "DEVELOPED_FOLDER",
     "DEVICES",
+    "DRAWN_FOLDER",
     "EVENTS_FILE",
     "EXTENSION_FILE",
+    "FOLDERS_OF_FRAMES",
     "FORECAST",
     "FRAMES_FILE",
     "FRAMES_FOLDER",
@@ -460,6 +469,7 @@ __all__ = [
     "remove_file",
     "remove_link",
     "replace_file",
+    "replaced_folder",
     "replacing_folder",
     "requested_params",
     "restore_folder",
@@ -476,6 +486,7 @@ __all__ = [
     "verdict_lines",
     "verdict_of",
     "words_of",
+    "work_words",
     "working_on",
     "write_atomic",
     "write_json",

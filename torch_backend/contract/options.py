@@ -194,6 +194,15 @@ class ImportParams:
         },
     )
     """Range of a video's codes: auto, video or full."""
+    replace: bool = option(
+        False,
+        flag="--replace",
+        switch=True,
+        help="import other frames into a shot on which work was done: its solve, runs, takes and paint move to "
+        "`replaced/` in the shot folder",
+        words="refused",
+    )
+    """Consent to other frames in a shot on which work was done; that work is kept in SHOT/replaced/."""
 
 
 @dataclass

@@ -13,6 +13,7 @@ jobs/ID/                         requests and what became of them: `jobs`
 paths/, tracking/                cameras that Blender sent
 farm/                            what tasks of a render farm took
 trash/                           what was removed and is being deleted
+replaced/NNN/                    what an import of other frames replaced, a whole shot folder
 """
 
 from __future__ import annotations
@@ -52,9 +53,10 @@ TAKE_UNDISTORT = Path("stmap") / "undistort.exr"
 """Of a take: from the footage as it was filmed to the plate without the lens, as large as the footage."""
 LIVE_LOG = "live.log"
 FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER = "farm", "trash", "tracking", "paths"
+REPLACED_FOLDER = "replaced"
 SHOT_NAMES = frozenset({
     INFO_FILE, WRITER_FILE, FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER, PAINTED_FOLDER,
-    DRAWN_FOLDER, FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER,
+    DRAWN_FOLDER, FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER, REPLACED_FOLDER,
 })  # fmt: skip
 """All that lies in a shot folder."""
 PICTURE, LAYERS, SURFACE = ".png", ".exr", ".npz"
@@ -185,6 +187,11 @@ class ShotFolder:
     def trash(self) -> Path:
         """What was removed, until it is deleted."""
         return self.root / TRASH_FOLDER
+
+    @property
+    def replaced(self) -> Path:
+        """Takes a shot folder for each import that replaced frames on which work had been done."""
+        return self.root / REPLACED_FOLDER
 
     @property
     def tracking(self) -> Path:

@@ -95,14 +95,16 @@ def sweep_half_written(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def replacing_folder(path: str | Path) -> Generator[Path]:
+def replacing_folder(path: str | Path, keep: bool = False) -> Generator[Path]:
     """Yields an empty folder beside `path`, which takes its place if the block ends well, whole or not at all.
+
+    `keep`: the old folder is left as `replaced_folder(path)`, for the caller to move.
 
     Until then, and if the block fails, `path` stays as it was. What a killed process left is swept by the next one:
     a folder that had been moved aside is put back if nothing took its place.
     """
     path = Path(path)
-    fresh, aside = path.with_name(f".{path.name}.new"), path.with_name(f".{path.name}.old")
+    fresh, aside = path.with_name(f".{path.name}.new"), replaced_folder(path)
     restore_folder(path)
     _discard(fresh)
     make_folder(fresh)
@@ -116,12 +118,18 @@ def replacing_folder(path: str | Path) -> Generator[Path]:
         raise
     finally:
         _discard(fresh)
-    _discard(aside)
+    if not keep:
+        _discard(aside)
+
+
+def replaced_folder(path: Path) -> Path:
+    """Where `replacing_folder` puts the folder that it replaces."""
+    return path.with_name(f".{path.name}.old")
 
 
 def restore_folder(path: Path) -> None:
     """Puts back the folder that `replacing_folder` moved aside and was killed; if it was replaced, removes it."""
-    aside = path.with_name(f".{path.name}.old")
+    aside = replaced_folder(path)
     if aside.is_dir() and not os.path.lexists(path):
         replace_file(aside, path)
     _discard(aside)

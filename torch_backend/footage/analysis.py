@@ -47,6 +47,8 @@ class FrameMeasures:
     """Every other pixel of luma in [0, 1]."""
     brightest: float = 1.0
     """The largest number in it, 0 to 1."""
+    digest: str = ""
+    """Identifies the picture by its pixels."""
 
 
 def measure(frame: int, pixels: NDArray[Any], display: Display = PLAIN) -> FrameMeasures:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..contract import (
     BURNT_IN_FILE,
+    FOLDERS_OF_FRAMES,
     FRAMES_FILE,
     LAST_FRAME,
     PICTURE,
@@ -35,6 +36,7 @@ from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, 
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
 from .burnt_in import WIDTH, find_mark, looked_at
 from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
+from .earlier_work import EarlierWork, SamePictures, digest_of, footage_key
 from .images import is_whole_png, read_frame, resize, working_size, write_png
 from .numbering import renumbered, shift_of
 from .ocio import Colours
@@ -75,7 +77,9 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     Frames are frames/raw/NNNNNN.png, 8-bit sRGB, or 16-bit where the source is deeper, with a shoulder (`display` in
     frames.json) where it holds light; `seconds` in frames.json count from the first frame of the range. A finished
     import of the same source and configuration is left alone, also one of before there was a shoulder. Another one
-    takes its place once it is whole, and the solve made from it is removed; files that are not ours stay.
+    takes its place once it is whole; files that are not ours stay. If work was done on the old frames, `config.replace`
+    has to consent, and the old frames and that work are kept in SHOT/replaced. An import that gives the same pictures
+    replaces nothing.
 
     Returns {frames, solved_frames, first, last, step, width, height, fps, colour, reading,
     read_as, source}.
@@ -86,10 +90,10 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     shift = shift_of(opened.info, config)
     _check_range(opened, config, shift)
     key = import_key(opened.info, config, shift=shift)
-    restore_folder(shot.frames)
-    for folder in (shot.raw, shot.solve):
+    for folder in (shot.raw, *(shot.root / name for name in FOLDERS_OF_FRAMES)):
         shot.own(folder)
     shot.publish_frames()
+    restore_folder(shot.frames)
     done = _finished(shot, {k for d in (None, PLAIN) for k in import_keys(opened.info, config, d, shift)})
     if done is not None:
         report.progress("import", 1, 1, "already imported")
@@ -97,18 +101,35 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
             shot.update(source=str(source))
         return _result(shot, done)
     opened = renumbered(opened, shift)  # from here on all numbers are the shot's
-    with replacing_folder(shot.frames) as fresh:
-        extracted = _extract(shot, opened, _in_the_shots_numbers(config, shift), fresh / RAW_FOLDER, report)
-        _refuse_unusable(extracted.measures, shift)
-        for message, hint in opened.warnings + _remarks(extracted):
-            report.warning(message, hint)
-        record = _record(opened, config, extracted, key, shift)
-        record["beside"] = _beside(shot, source)
-        record |= _marked(shot, record, fresh, report)
-        write_json(fresh / FRAMES_FILE, record)
-        write_json(fresh / UNPUBLISHED_FILE, _news(record, source))
-        _keep_strangers(shot.frames, fresh, record)
+    numbered = _in_the_shots_numbers(config, shift)
+    earlier = EarlierWork.of(shot, _listed_before(shot))
+    if earlier is not None and not config.replace and not earlier.may_be_same(_recorded(numbered), opened.info):
+        raise earlier.refusal()
+    order: dict[str, Any] = {}
+    try:
+        with replacing_folder(shot.frames, keep=earlier is not None) as fresh:
+            extracted = _extract(shot, opened, numbered, fresh / RAW_FOLDER, report)
+            _refuse_unusable(extracted.measures, shift)
+            record = _record(opened, config, extracted, key, shift)
+            record["beside"] = _beside(shot, source)
+            if earlier is not None:
+                earlier.stop_if_same(record, fresh)
+                if not config.replace:
+                    raise earlier.refusal()
+                order = earlier.order(record)
+            for message, hint in opened.warnings + _remarks(extracted):
+                report.warning(message, hint)
+            record |= _marked(shot, record, fresh, report)
+            write_json(fresh / FRAMES_FILE, record)
+            write_json(fresh / UNPUBLISHED_FILE, _news(record, source) | order)
+            _keep_strangers(shot.frames, fresh, record)
+    except SamePictures:
+        report.progress("import", 1, 1, "already imported")
+        shot.update(source=str(source))
+        return _result(shot, load_frames(shot))
     shot.publish_frames()
+    if earlier is not None:
+        report.warning(*earlier.kept(order))
     return _result(shot, record)
 
 
@@ -145,8 +166,16 @@ def _import_key(footage: list[Any], config: FootageConfig, display: Display, shi
 
 
 def _recorded(config: FootageConfig) -> dict[str, Any]:
-    """What was taken of the footage, wherever that lies by now."""
-    return {name: value for name, value in asdict(config).items() if name != "source"}
+    """What was taken of the footage, wherever that lies by now, and whatever it was allowed to replace."""
+    return {name: value for name, value in asdict(config).items() if name not in ("source", "replace")}
+
+
+def _listed_before(shot: Shot) -> dict[str, Any]:
+    """frames.json of the frames that the shot has; {} if there are none, or it is damaged."""
+    try:
+        return load_frames(shot)
+    except JobError:
+        return {}
 
 
 def _in_the_shots_numbers(config: FootageConfig, shift: int) -> FootageConfig:
@@ -273,6 +302,7 @@ def _work(frame: SourceFrame, width: int, height: int, display: Display, into: P
     pixels = display.codes_of(frame.pixels, width, height) if bends else resize(frame.pixels, width, height)
     write_png(into / frame_file(frame.number, PICTURE), pixels)
     measures = measure(frame.number, pixels, display)
+    measures.digest = digest_of(pixels)
     if frame.corrupt:
         measures.flags.append("corrupt")
     return measures
@@ -376,6 +406,7 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
             "sharpness": round(m.sharpness, 3),
             "exposure": round(m.exposure, 4),
             "flags": m.flags,
+            "digest": m.digest,
         }
         for m, seconds in zip(measures, extracted.seconds, strict=True)
     ]
@@ -397,6 +428,7 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "step": step,
         "config": _recorded(config),
         "key": key,
+        "footage": footage_key(info, shift),
         "frames": frames,
     }
 

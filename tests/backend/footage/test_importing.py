@@ -333,7 +333,7 @@ def test_frames_json_is_plain(shot, clip, recorder):
     import_footage(shot, clip, FootageConfig(), recorder())
     record = json.loads((shot.frames / "frames.json").read_text())
     assert record["version"] == 1
-    assert set(record["frames"][0]) == {"frame", "seconds", "file", "solve", "sharpness", "exposure", "flags"}
+    assert set(record["frames"][0]) == {"frame", "seconds", "file", "solve", "sharpness", "exposure", "flags", "digest"}
 
 
 def test_an_import_is_known_by_what_version_0_2_noted_of_it(shot, clip, recorder):
@@ -405,7 +405,7 @@ def test_an_import_killed_between_its_frames_and_shot_json_is_ended_by_the_next_
     child = os.fork()
     if not child:
         Shot.save = lambda *_: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[method-assign]
-        import_footage(shot, clip, FootageConfig(first=5), recorder())
+        import_footage(shot, clip, FootageConfig(first=5, replace=True), recorder())
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
     assert load_frames(shot)["frames"][0]["frame"] == 5 and shot.info().first == 1
@@ -416,6 +416,8 @@ def test_an_import_killed_between_its_frames_and_shot_json_is_ended_by_the_next_
     info = shot.info()
     assert (info.first, info.last, info.source, info.fps, info.width) == (5, 20, clip, 10.0, 64)
     assert not shot.cameras.exists(), "cameras of other frames"
+    kept = Shot(shot.replaced / "001")
+    assert kept.cameras.exists() and kept.info().last == 12 and load_frames(kept)["frames"][-1]["frame"] == 12
     assert files(shot.frames)[0] == "frames.json" and "unpublished.json" not in files(shot.frames)
     shot.solve.mkdir(exist_ok=True)
     shot.cameras.write_text("{}")
