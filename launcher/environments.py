@@ -108,7 +108,7 @@ def home() -> Path:
 
 def backend_environment(testing: bool = False) -> Environment:
     """The backend's environment, with the test tools on request."""
-    probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, fileseq, safetensors, scipy"
+    probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, safetensors, scipy"
     files = ("backend.txt", "test.txt") if testing else ("backend.txt",)
     return Environment("the backend", home() / ".venv", files, probe, BACKEND_DISK_GB, torch=True)
 

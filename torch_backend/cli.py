@@ -206,7 +206,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     import importlib.metadata
 
     facts: dict[str, Any] = {"python": sys.version.split()[0], "packages": {}}
-    for name in ("torch", "warp-lang", "pycolmap", "OpenImageIO", "av", "fileseq", "safetensors", "numpy", "scipy"):
+    for name in ("torch", "warp-lang", "pycolmap", "OpenImageIO", "av", "safetensors", "numpy", "scipy"):
         try:
             facts["packages"][name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

@@ -74,7 +74,7 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
 
 def _there(path: Path) -> bool:
     """True if footage is there: a file, a folder of pictures, or a pattern in a folder that is there."""
-    return path.exists() or (("#" in path.name or "%0" in path.name) and path.parent.is_dir())
+    return path.exists() or (contract.is_pattern(path.name) and path.parent.is_dir())
 
 
 def _holders() -> Iterator[tuple[Any, str]]:

@@ -7,7 +7,6 @@ nerfstudio transforms.json, whose camera axes are Blender's. Out: the backend wr
 from __future__ import annotations
 
 import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -96,11 +95,18 @@ def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
 
 def first_number(clip: bpy.types.MovieClip) -> int:
     """Our number of what a clip calls its frame 1."""
-    number = 1
-    if clip.source == "SEQUENCE":
-        digits = re.findall(r"\d+", Path(clip.filepath).stem)
-        number = int(digits[-1]) if digits else 1
+    number = _file_number(Path(bpy.path.abspath(clip.filepath))) if clip.source == "SEQUENCE" else 1
     return number + clip.frame_offset
+
+
+def _file_number(path: Path) -> int:
+    """Frame number of a picture among its neighbours, as the import reads it; 1 if its name has none."""
+    try:
+        names = os.listdir(path.parent)
+    except OSError:
+        names = []
+    found = contract.numbered_files({path.name, *names})
+    return next((n for s in found for n, name in s.files.items() if name == path.name), 1)
 
 
 def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:

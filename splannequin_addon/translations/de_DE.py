@@ -390,6 +390,7 @@ MESSAGES: dict[str, str] = {
     "Full": "Voll",
     "Black is 0 and white 255": "Schwarz ist 0 und Weiß 255",
     "Frame {} of the shot is frame {} of the footage.": "Bild {} des Shots ist Bild {} des Materials.",
+    "Frames {} to {} are read from {}.": "Die Bilder {} bis {} werden aus {} gelesen.",
     "Read as {}.": "Gelesen als {!l}.",
     "square pixels": "quadratische Pixel",
     "pixels {} times as wide": "Pixel {} mal so breit",

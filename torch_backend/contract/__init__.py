@@ -16,6 +16,7 @@
     camera_path     a pinhole camera over frames
     live_messages   what Blender and a live session say to each other
     colour          a colour by which two programs know that they mean the same space, and the display of light
+    frame_names     frame numbers in file names
     timecode        SMPTE timecode: the footage's start, and the code of each frame after it
     frame_layers    what the layers of a frozen frame hold
     checkpoint_header   what a checkpoint says of itself
@@ -83,6 +84,14 @@ from .frame_layers import (
     FrameLayer,
     channels_of,
     layers_of,
+)
+from .frame_names import (
+    NumberedFiles,
+    ending,
+    file_as_blender_counts,
+    is_pattern,
+    matching_files,
+    numbered_files,
 )
 from .hosts import (
     host_names,
@@ -393,6 +402,7 @@ __all__ = [
     "JobRequest",
     "Limit",
     "LiveView",
+    "NumberedFiles",
     "Option",
     "Process",
     "Reporter",
@@ -422,6 +432,8 @@ __all__ = [
     "discard_unborn",
     "disk_error",
     "end_with_starter",
+    "ending",
+    "file_as_blender_counts",
     "file_digest",
     "files_digest",
     "frame_file",
@@ -435,6 +447,7 @@ __all__ = [
     "is_disk_full",
     "is_half_written",
     "is_link",
+    "is_pattern",
     "is_shot",
     "later",
     "layers_of",
@@ -442,10 +455,12 @@ __all__ = [
     "locked",
     "make_folder",
     "mapped",
+    "matching_files",
     "measured",
     "need_disk",
     "new_job",
     "notes",
+    "numbered_files",
     "open_regular",
     "option",
     "options_for",

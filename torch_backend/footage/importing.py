@@ -42,10 +42,19 @@ from .numbering import renumbered, shift_of
 from .ocio import Colours
 from .opening import open_source
 from .reading import read_as
-from .sources import FASTEST_FPS, SLOWEST_FPS, Source, SourceFrame, SourceInfo, footage_error, frame_words, told_in
+from .sources import (
+    FASTEST_FPS,
+    LEAST_FRAMES,
+    SLOWEST_FPS,
+    Source,
+    SourceFrame,
+    SourceInfo,
+    footage_error,
+    frame_words,
+    told_in,
+)
 
 FRAMES_VERSION = 1
-LEAST_FRAMES = 8
 MANY_FRAMES = 1500
 EXPOSURE_DRIFT_STOPS = 1.0
 CLIPPED_SHARE = 0.01
@@ -197,9 +206,14 @@ def load_frames(shot: Shot) -> dict[str, Any]:
         numbers = [number for number, *_ in rows]
         whole = bool(rows) and numbers == sorted(set(numbers)) and int(record["width"]) * int(record["height"]) > 0
     except (ValueError, TypeError, KeyError, OverflowError):
-        record, whole = {}, False
+        record, numbers, whole = {}, [], False
     if not whole:
         raise footage_error(f"{path} is damaged.", "Import the clip again.")
+    if numbers[0] < 0 or numbers[-1] > LAST_FRAME:  # earlier versions took a dash in a name for a minus
+        raise footage_error(
+            f"The frames of this shot are numbered {numbers[0]} to {numbers[-1]}: Blender's go from 0 to {LAST_FRAME}.",
+            "Import the clip again.",
+        )
     return record
 
 
@@ -237,7 +251,7 @@ def _check_range(opened: Source, config: FootageConfig, shift: int) -> None:
     if first > info.last or last < info.first:
         raise footage_error(f"Frames {first} to {last} lie outside of the clip, which has {info.first} to {info.last}.")
     first, last = max(first, info.first) + shift, min(last, info.last) + shift
-    if last > LAST_FRAME or first < -LAST_FRAME:
+    if last > LAST_FRAME or first < 0:
         raise footage_error(
             f"The frames are numbered {first} to {last}: Blender's frames end at {LAST_FRAME}.",
             "Number the shot from 1001 (Start, or --start 1001), or choose a range below that.",

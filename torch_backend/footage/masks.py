@@ -18,14 +18,15 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from ..contract import MASK_ALPHA, MASK_KINDS, JobError, Reporter
+from ..contract import MASK_ALPHA, MASK_KINDS, JobError, Reporter, is_pattern
 from ..shot import Shot, content_key
 from . import plate_encoding
 from .images import error_of
 from .importing import FootageConfig, load_frames, source_places
 from .layers import find_layer
 from .numbering import recorded_shift
-from .sequence import PICTURES, SequenceSource, find_sequence
+from .opening import open_video, opens_as_video
+from .sequence import SequenceSource, find_sequence, sequence_of_file
 from .sources import footage_error, frame_words
 from .video import VideoSource
 
@@ -141,9 +142,9 @@ class _Reading:
     def _pictures(self) -> Iterator[tuple[int | None, NDArray[np.float32]]]:
         """(frame, [h, w] in 0..1) of each frame; a frame of None is for all of them."""
         path = Path(self.source)
-        if not path.exists() and not any(mark in path.name for mark in ("#", "%", "@", "*")):
+        if not path.exists() and not is_pattern(path.name):
             raise footage_error(f"{self.name} does not exist.", "Check the path.")
-        if path.is_file() and path.suffix.lower() not in PICTURES:
+        if path.is_file() and opens_as_video(path):
             yield from self._video(path)
             return
         files = self._files(path)
@@ -160,15 +161,10 @@ class _Reading:
 
     def _files(self, path: Path) -> dict[int | None, Path]:
         """Number -> file; None for a picture that is none of a sequence."""
-        try:
-            sequence = find_sequence(path)
-        except JobError:
-            if not path.is_file():
-                raise
-            return {None: path}
-        numbers = sequence.frameSet() or ()
-        files = {int(n): Path(sequence.frame(n)) for n in numbers}
-        return {n: file for n, file in files.items() if file.is_file()}
+        if path.is_file():
+            sequence = sequence_of_file(path)
+            return {None: path} if sequence is None else {**sequence.files}
+        return {**find_sequence(path).files}
 
     def _matched(self, theirs: list[int]) -> dict[int, int]:
         """Frame -> number of the mask's picture. JobError names the frames that have none."""
@@ -200,7 +196,7 @@ class _Reading:
         return grey, None if alpha is None else pixels[..., alpha]
 
     def _video(self, path: Path) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        video = VideoSource(path)
+        video = open_video(path)
         count = sum(1 for _ in video.frames(None, None))
         wanted = {theirs: frame for frame, theirs in self._matched(list(range(1, count + 1))).items()}
         for one in video.frames(None, max(wanted)):
@@ -248,14 +244,15 @@ class _Reading:
         for place in source_places(self.shot, self.frames):
             path = Path(place)
             try:
-                if path.is_file() and path.suffix.lower() not in PICTURES:
+                if path.is_file() and opens_as_video(path):
                     return VideoSource(path)
                 sequence = find_sequence(path)
                 SequenceSource(sequence, settings.fps, settings.layer)
             except (JobError, OSError):
                 continue
-            files = {number: Path(sequence.frame(number - self.shift)) for number in self.numbers}
-            if all(file.is_file() for file in files.values()):
+            own = sequence.files
+            if own.keys() >= {number - self.shift for number in self.numbers}:
+                files = {number: own[number - self.shift] for number in self.numbers}
                 return files, settings.layer
         raise footage_error(
             f"The footage {self.shot.info().source} cannot be read any more: its alpha is not known.",

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import os
+from itertools import islice
 from pathlib import Path
 
+import av
+import OpenImageIO as oiio
+from av.error import FFmpegError
+
+from ..contract import JobError, is_pattern
+from .images import error_of
 from .ocio import Colours
-from .sequence import PICTURES, SequenceSource, find_sequence
+from .sequence import PICTURES, SequenceSource, find_sequence, numbered_neighbours, unreadable_pictures
 from .sources import Source, Told, footage_error
 from .video import VideoSource
 
@@ -27,26 +34,79 @@ def open_source(
         )
     path, colours = Path(source), colours or Colours()
     try:
-        is_pattern = not path.exists() and any(mark in path.name for mark in ("#", "%", "@", "*"))
+        wanted = not path.exists() and is_pattern(path.name)
         if path.is_dir():
             os.listdir(path)
     except (OSError, ValueError) as error:  # no permission, too long a name, a zero byte in it
         reason = getattr(error, "strerror", None) or error
         raise footage_error(f"The footage {source!r} cannot be opened: {reason}.", "Check the path.") from error
-    special = path.exists() and not path.is_file() and not path.is_dir()
-    if is_pattern or path.is_dir() or (path.suffix.lower() in PICTURES and not special):
+    if wanted or path.is_dir() or (path.is_file() and not opens_as_video(path)):
         return _pictures(path, fps, layer, colours, told)
-    if special:
+    if path.exists() and not path.is_file():
         raise footage_error(f"{source} is neither a file nor a folder.", "Choose a video file or an image sequence.")
     if not path.is_file():
         raise footage_error(
             f"The footage {source} does not exist.", "Check the path; a clip on a server must be mounted."
         )
-    video = VideoSource(path, colours, told)
+    video = open_video(path, colours, told)
     for value, what, own in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
         if value:
             video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {own}.", ""))
     return video
+
+
+def opens_as_video(path: Path) -> bool:
+    """True if a file is opened as a video: all but still pictures that OpenImageIO reads."""
+    if path.suffix.lower() not in PICTURES:
+        return True
+    picture = oiio.ImageInput.open(str(path))
+    if picture is None:  # damaged: its sequence says so
+        error_of()
+        return False
+    try:
+        if picture.format_name() == "png":  # OpenImageIO reads the first picture of an animated PNG alone
+            with av.open(str(path)) as container:
+                return container.format.name == "apng"
+        return bool(picture.spec().get_int_attribute("oiio:Movie"))
+    except FFmpegError:
+        return False
+    finally:
+        picture.close()
+
+
+def open_video(path: Path, colours: Colours | None = None, told: Told | None = None) -> VideoSource:
+    """A video. JobError says of a picture, animated or not, that it is one."""
+    try:
+        video = VideoSource(path, colours, told)
+    except JobError as error:
+        if path.suffix.lower() in PICTURES:
+            raise footage_error(
+                f"{path.name} is an animated picture that cannot be read as a clip.",
+                "Convert it to a video (MP4) or to numbered PNG pictures.",
+            ) from error
+        _refuse_pictures(path)
+        raise
+    if (video.info.last or 1) <= 1 and not _is_clip(path):
+        _refuse_pictures(path)
+        raise footage_error(
+            f"{path.name} is a single picture.", "A freeze needs a clip: choose a video or a numbered sequence."
+        )
+    return video
+
+
+def _refuse_pictures(path: Path) -> None:
+    """JobError if a file is one of numbered pictures that OpenImageIO does not read, and not of numbered videos."""
+    found = numbered_neighbours(path)
+    if found is not None and not any(_is_clip(path.parent / name) for name in list(found.files.values())[:3]):
+        raise unreadable_pictures(found.pattern)
+
+
+def _is_clip(path: Path) -> bool:
+    """True if a file is a video of two frames or more."""
+    try:
+        return len(list(islice(VideoSource(path).frames(None, 2), 2))) == 2
+    except JobError:
+        return False
 
 
 def _pictures(path: Path, fps: float, layer: str, colours: Colours, told: Told | None) -> SequenceSource:

@@ -40,4 +40,7 @@ def read_as(info: SourceInfo, timecode: str = "") -> list[str]:
     if matrix == "RGB":
         assumed = [name for name in assumed if name not in ("matrix", "levels")]
     sentences = [f"Read as {', '.join(part for part in parts if part)}."]
+    if reading.get("files"):
+        first, last = reading["numbers"]
+        sentences.append(f"Frames {first} to {last} are read from {reading['files']}.")
     return sentences + [f"Assumed, for the footage does not say: {', '.join(assumed)}."] * bool(assumed)

@@ -5,6 +5,8 @@ What was made for a display and is not 8-bit sRGB already becomes 16-bit sRGB.
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -13,11 +15,17 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-from fileseq.exceptions import FileSeqException
-from fileseq.filesequence import FileSequence
 from numpy.typing import NDArray
 
-from ..contract import parse_timecode
+from ..contract import (
+    JobError,
+    NumberedFiles,
+    ending,
+    file_as_blender_counts,
+    matching_files,
+    numbered_files,
+    parse_timecode,
+)
 from . import plate_encoding
 from .color import LIGHTS, InputSpace, named_space, space_of_chromaticities
 from .images import error_of, resize
@@ -27,6 +35,7 @@ from .ocio import Colours
 from .oiio_types import attribute, bits_of, channel_names
 from .sources import (
     FASTEST_FPS,
+    LEAST_FRAMES,
     SLOWEST_FPS,
     Known,
     PlateReader,
@@ -39,56 +48,125 @@ from .sources import (
     square_size,
 )
 
-PICTURES = {
-    ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
-}  # fmt: skip
 DEFAULT_FPS = 24.0
 FEW = 2
+_NO_PICTURES = {"null", "term"}
+"""Formats of OpenImageIO that hold none: one makes pictures up, one writes text."""
 
 
-def find_sequence(path: Path) -> FileSequence:
-    """The sequence that a folder, one file of it, or a pattern (shot.####.exr, shot.%04d.png) stands for.
+def _picture_endings() -> frozenset[str]:
+    formats = (one.partition(":") for one in oiio.get_string_attribute("extension_list").split(";"))
+    readable = set(oiio.get_string_attribute("input_format_list").split(",")) - _NO_PICTURES
+    return frozenset(f".{end}" for name, _, ends in formats if name in readable for end in ends.split(","))
 
-    JobError if there is none, if a file has no number, or if a folder holds several.
+
+PICTURES = _picture_endings()
+"""Endings of files that OpenImageIO reads, lower case."""
+
+
+@dataclass(frozen=True)
+class PictureSequence:
+    """The files of a numbered image sequence."""
+
+    folder: Path
+    numbered: NumberedFiles
+
+    @property
+    def pattern(self) -> str:
+        """Name of its files with # for the frame number."""
+        return self.numbered.pattern
+
+    @property
+    def files(self) -> dict[int, Path]:
+        """Frame number -> file, ascending."""
+        return {number: self.folder / name for number, name in self.numbered.files.items()}
+
+
+def find_sequence(path: Path) -> PictureSequence:
+    """The sequence that a folder, one file of it, or a pattern (shot.####.exr, *_left.%04d.png) stands for.
+
+    JobError if there is none, if a file has no number, or if several are meant.
     """
     if path.is_dir():
-        return _only_sequence(path)
-    if path.exists():
-        return _sequence_of_file(path)
-    try:
-        if "*" in path.name or "?" in path.name:  # fileseq takes a star for a part of the name
-            raise FileSeqException("a wildcard")
-        return FileSequence.findSequenceOnDisk(str(path), strictPadding=False)
-    except FileSeqException as error:
-        raise footage_error(
+        return _only(path, _sequences_in(path, _names_in(path)), f"The folder {path} holds", _no_sequence_in(path))
+    if not path.exists():
+        found = matching_files(_names_in(path.parent), path.name)
+        missing = footage_error(
             f"No pictures match {path}.", "Check the folder and the pattern: # or %04d stands for the frame number."
-        ) from error
-
-
-def _only_sequence(folder: Path) -> FileSequence:
-    found = [s for s in FileSequence.findSequencesOnDisk(str(folder)) if s.extension().lower() in PICTURES]
-    found = [s for s in found if s.frameSet() and len(s) >= FEW]
-    if not found:
-        raise footage_error(
-            f"The folder {folder} holds no numbered image sequence.", "Choose a folder with frames, or a video."
         )
+        return _only(path.parent, [s for s in found if _is_readable(s)], f"{path} means", missing)
+    found = sequence_of_file(path)
+    if found is None:
+        raise footage_error(
+            f"{path.name} is a single picture, not part of a numbered sequence.",
+            "A freeze needs a clip: choose a video or a sequence.",
+        )
+    return found
+
+
+def sequence_of_file(path: Path) -> PictureSequence | None:
+    """The sequence that a picture belongs to; None if it is a single one. JobError if it belongs to several."""
+    found = [s for s in _sequences_in(path.parent, _names_in(path.parent)) if path.name in s.files.values()]
+    return _only(path.parent, found, f"{path.name} belongs to", None) if found else None
+
+
+def numbered_neighbours(path: Path) -> NumberedFiles | None:
+    """The numbered files, of whatever ending, that a file belongs to; None if it stands alone."""
+    found = numbered_files(_names_in(path.parent))
+    return next((s for s in found if len(s.files) >= FEW and path.name in s.files.values()), None)
+
+
+def unreadable_pictures(pattern: str) -> JobError:
+    """The refusal of numbered files that OpenImageIO does not read."""
+    return footage_error(
+        f"{pattern} cannot be read: OpenImageIO does not know the ending {ending(pattern) or 'of these pictures'}.",
+        "Convert them to PNG, TIFF or EXR.",
+    )
+
+
+def _names_in(folder: Path) -> list[str]:
+    try:
+        with os.scandir(folder) as entries:
+            # A dot: what macOS and programs keep beside a file under its name.
+            return [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
+    except OSError:
+        return []
+
+
+def _sequences_in(folder: Path, names: list[str]) -> list[NumberedFiles]:
+    readable = [name for name in names if Path(name).suffix.lower() in PICTURES]
+    return [s for s in numbered_files(readable) if len(s.files) >= FEW or s.twice]
+
+
+def _is_readable(numbered: NumberedFiles) -> bool:
+    """True if OpenImageIO reads such files."""
+    return Path(numbered.pattern).suffix.lower() in PICTURES
+
+
+def _only(folder: Path, found: list[NumberedFiles], who: str, missing: JobError | None) -> PictureSequence:
+    """The one of the sequences found. JobError if there are several, or files with the same number."""
+    if not found and missing is not None:
+        raise missing
     if len(found) > 1:
-        names = ", ".join(sorted(f"{s.basename()}{'#' * s.zfill()}{s.extension()}" for s in found)[:4])
+        names = ", ".join(s.pattern for s in found[:4]) + (", ..." if len(found) > 4 else "")
         raise footage_error(
-            f"The folder {folder} holds {len(found)} image sequences ({names}).",
-            "Choose one picture of the sequence you mean.",
+            f"{who} {len(found)} image sequences ({names}).",
+            f"Choose one by its pattern, such as {found[0].pattern}, or by one of its pictures.",
         )
-    return found[0]
+    if found[0].twice:
+        raise footage_error(
+            f"{found[0].twice[0]} and {found[0].twice[1]} have the same frame number.",
+            "Move one of the two sequences to another folder.",
+        )
+    return PictureSequence(folder, found[0])
 
 
-def _sequence_of_file(path: Path) -> FileSequence:
-    for sequence in FileSequence.findSequencesOnDisk(str(path.parent)):
-        numbered = bool(sequence.frameSet()) and len(sequence) >= FEW
-        if numbered and path.name in {Path(name).name for name in sequence}:
-            return sequence
-    raise footage_error(
-        f"{path.name} is a single picture, not part of a numbered sequence.",
-        "A freeze needs a clip: choose a video or a sequence.",
+def _no_sequence_in(folder: Path) -> JobError:
+    others = sorted(numbered_files(_names_in(folder)), key=lambda s: -len(s.files))
+    if others and len(others[0].files) >= LEAST_FRAMES and not _is_readable(others[0]):
+        return unreadable_pictures(others[0].pattern)
+    return footage_error(
+        f"The folder {folder} holds no numbered image sequence.", "Choose a folder with frames, or a video."
     )
 
 
@@ -97,19 +175,24 @@ class SequenceSource:
 
     def __init__(
         self,
-        sequence: FileSequence,
+        sequence: PictureSequence,
         fps: float = 0.0,
         layer: str = "",
         colours: Colours | None = None,
         told_aspect: Fraction | None = None,
     ) -> None:
         self.warnings: list[tuple[str, str]] = []
-        frame_set = sequence.frameSet()
-        numbers = sorted(int(n) for n in frame_set) if frame_set else []
-        self._files = {n: Path(sequence.frame(n)) for n in numbers}
-        self._files = {n: file for n, file in self._files.items() if file.is_file()}
+        self._files = sequence.files
         if len(self._files) < FEW:
-            raise footage_error(f"{sequence} holds fewer than {FEW} pictures.", "Choose a longer sequence.")
+            raise footage_error(f"{sequence.pattern} is a single picture.", "A freeze needs a clip: choose a sequence.")
+        if sequence.numbered.others_vary:
+            self.warnings.append(
+                (
+                    f"Several numbers vary in the names: the frame number was read where # stands in "
+                    f"{sequence.pattern}.",
+                    "If another one counts the frames, name the clip by a pattern with # in its place.",
+                )
+            )
         first, spec, self._layer, names = self._first_readable(layer)
         self._channels = channel_names(spec)
         self._space = _input_space(first, spec, colours or Colours(), self.warnings)
@@ -139,13 +222,15 @@ class SequenceSource:
             # By content: footage may be copied or moved. What is read otherwise than it used to be is imported again.
             key=content_key_of(self._files) + ([] if ordinary else reading_key),
             former_key=[
-                Path(str(sequence)).name,
+                _former_name(sequence),
                 len(stats),
                 sum(s.st_size for s in stats),
                 max(s.st_mtime_ns for s in stats),
             ]
             + ([] if ordinary else reading_key),
             reading={
+                "files": sequence.pattern,
+                "numbers": [min(self._files), max(self._files)],
                 "colour": space.name,
                 "colour_told": space.declared,
                 **space.origin,
@@ -162,7 +247,7 @@ class SequenceSource:
             },
             file=str(first),
             probe=space.probe,
-            unlike=_unlike(spec, len(names), self._aspect),
+            unlike=_unlike(spec, len(names), self._aspect) or _named_unlike(first.name, self._files),
         )
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
@@ -335,6 +420,24 @@ def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction) -> str:
     if _data_window(spec) != (slice(0, spec.full_height), slice(0, spec.full_width)) or spec.full_x or spec.full_y:
         return "its pictures fill only a part of their frame"
     return "" if (spec.width, spec.height) == (spec.full_width, spec.full_height) else "its pictures exceed their frame"
+
+
+def _named_unlike(name: str, files: dict[int, Path]) -> str:
+    """The same by the files' names: Blender is given one of them and looks for the others under its name."""
+    if all(file.name == file_as_blender_counts(name, number) for number, file in files.items()):
+        return ""
+    return "Blender reads another number in its files' names"
+
+
+def _former_name(sequence: PictureSequence) -> str:
+    """What earlier versions called a sequence without gaps in a shot's key: `shot.1001-1010#.exr`."""
+    numbers = list(sequence.files)
+    hashes = re.search(r"#+", sequence.pattern)
+    if hashes is None or sequence.numbered.others_vary:
+        return sequence.pattern
+    width = len(hashes[0])
+    pad = "#" * (width // 4) if width % 4 == 0 else "@" * width
+    return f"{sequence.pattern[: hashes.start()]}{numbers[0]}-{numbers[-1]}{pad}{sequence.pattern[hashes.end() :]}"
 
 
 def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:

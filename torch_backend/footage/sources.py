@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from ..contract import ExitCode, ImportParams, JobError, files_digest
 
+LEAST_FRAMES = 8
+"""Frames that a freeze needs."""
 LONGEST_PIXEL = 4
 """Anamorphic pixels are at most about 2 times as wide as high."""
 

@@ -243,6 +243,16 @@ def test_numbers_beyond_blenders_last_frame_are_refused(shot, sequence, recorder
     assert shot.info().last == 1_048_574
 
 
+def test_a_shot_of_before_whose_frames_count_backwards_is_to_be_imported_again(shot, sequence, recorder):
+    import_footage(shot, str(sequence(1)), FootageConfig(step=1), recorder())
+    record = json.loads(shot.listing.read_text())
+    for row in record["frames"]:
+        row["frame"] -= 20
+    shot.listing.write_text(json.dumps(record))
+    with pytest.raises(JobError, match="numbered -19 to -8: Blender's go from 0 to 1048574"):
+        load_frames(shot)
+
+
 def test_a_sequence_has_the_rate_that_is_asked_for(shot, sequence, recorder):
     folder = str(sequence(1))
     assert import_footage(shot, folder, FootageConfig(step=1), recorder())["fps"] == 24.0
@@ -311,6 +321,7 @@ def test_an_import_says_how_it_read_the_footage_and_what_it_assumed(shot, clip, 
     told = import_footage(shot, str(sequence(1)), chosen, report)["read_as"]
     assert told == [
         "Read as 128 x 48, pixels 2 times as wide, 24 fps, 8 bits, sRGB, Rec.709, no alpha.",
+        "Frames 1 to 12 are read from shot.####.png.",
         "Assumed, for the footage does not say: rate.",
     ]
     assert "The matrix 'bt709' is passed over: pictures hold RGB as it is." in report.warnings

@@ -2,6 +2,7 @@
 
 import struct
 
+import av
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -82,11 +83,142 @@ def test_folder_file_and_patterns_mean_the_same_sequence(exrs, name):
     assert (source.info.first, source.info.last, source.info.width, source.info.height) == (1001, 1010, 64, 48)
 
 
-@pytest.mark.parametrize("name", ["*.exr", "shot.*.exr", "shot.100?.exr"])
-def test_a_wildcard_is_no_pattern_and_the_sentence_says_what_is(exrs, name):
+@pytest.mark.parametrize(("name", "numbers"), [("*.exr", (1001, 1010)), ("shot.100?.exr", (1001, 1009))])
+def test_a_wildcard_chooses_among_the_files(exrs, name, numbers):
+    write(exrs / "other.png", np.zeros((8, 8, 3), np.uint8))
+    info = open_source(str(exrs / name)).info
+    assert (info.first, info.last) == numbers
+
+
+def test_a_pattern_that_matches_nothing_says_how_one_is_written(exrs):
     with pytest.raises(JobError, match="No pictures match") as error:
-        open_source(str(exrs / name))
+        open_source(str(exrs / "none.*.exr"))
     assert "# or %04d stands for the frame number" in error.value.hint
+
+
+def write_shades(folder, names):
+    """Pictures of which each is brighter than the one before."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for n, name in enumerate(names):
+        write(folder / name, flat(*[10 * n + 5] * 3, kind=np.uint8))
+
+
+def shades_of(source):
+    return [(f.number, int(f.pixels[4, 4, 0]) // 10) for f in source.frames(None, None)]
+
+
+@pytest.mark.parametrize(
+    "template",
+    ["frame-{:04d}.png", "2026-11-28-{:04d}.png", "clip_v02-{:04d}.png", "photo ({}).png", "f_{:04d}_left.png"],
+)
+@pytest.mark.parametrize("how", ["folder", "file", "pattern"])
+def test_frames_come_in_their_order_whatever_stands_around_the_number(tmp_path, template, how):
+    folder = tmp_path / "#1 [a]{b}+(c) 50%"
+    write_shades(folder, [template.format(n) for n in range(5, 15)])
+    pattern = template.replace("{:04d}", "####").replace("{}", "#")
+    asked = {"folder": folder, "file": folder / template.format(9), "pattern": folder / pattern}[how]
+    source = open_source(str(asked))
+    assert shades_of(source) == [(n + 5, n) for n in range(10)]
+    assert (source.info.reading["files"], source.warnings, source.info.unlike) == (pattern, [], "")
+
+
+def test_endings_of_one_format_are_one_sequence_that_blender_does_not_find(tmp_path):
+    write_shades(tmp_path, [f"f_{n:04d}.{'tif' if n % 2 else 'TIFF'}" for n in range(10)])
+    source = open_source(str(tmp_path))
+    assert shades_of(source) == [(n, n) for n in range(10)]
+    assert source.info.unlike
+
+
+@pytest.mark.parametrize(("first", "second"), [("left_{:04d}", "right_{:04d}"), ("s_v1_{:04d}", "s_v2_{:04d}")])
+def test_two_sequences_are_named_and_either_can_be_chosen(tmp_path, first, second):
+    write_shades(tmp_path, [f"{template}.png".format(n) for template in (first, second) for n in range(8)])
+    words = [template.replace("{:04d}", "####") + ".png" for template in (first, second)]
+    with pytest.raises(JobError) as error:
+        open_source(str(tmp_path))
+    assert f"holds 2 image sequences ({words[0]}, {words[1]})." in error.value.message
+    for chosen in (words[1], f"{second}.png".format(3)):
+        assert shades_of(open_source(str(tmp_path / chosen))) == [(n, n + 8) for n in range(8)]
+
+
+def test_a_second_number_that_varies_is_told_and_keeps_the_plate_out_of_blender(tmp_path):
+    write_shades(tmp_path, [f"f_{n:04d}_t{n * 41}.png" for n in range(1, 9)])
+    source = open_source(str(tmp_path))
+    assert shades_of(source) == [(n + 1, n) for n in range(8)]
+    assert "read where # stands in f_####_t*.png." in said(source)[0] and source.info.unlike
+
+
+def test_numbers_of_which_either_may_count_the_frames_are_refused(tmp_path):
+    write_shades(tmp_path, [f"a{n}_b{10 - n}.png" for n in range(1, 10)])
+    for asked in (tmp_path, tmp_path / "a3_b7.png"):
+        with pytest.raises(JobError, match=r"2 image sequences \(a#_b\*\.png, a\*_b#\.png\)"):
+            open_source(str(asked))
+    assert shades_of(open_source(str(tmp_path / "a*_b#.png")))[0] == (1, 8)
+
+
+def test_one_number_twice_is_refused(tmp_path):
+    write_shades(tmp_path, [*(f"f_{n}.png" for n in range(1, 9)), "f_003.png"])
+    with pytest.raises(JobError, match=r"f_003\.png and f_3\.png have the same frame number"):
+        open_source(str(tmp_path))
+
+
+@pytest.mark.parametrize("suffix", ["jxl", "ppm", "sgi", "webp"])
+def test_whatever_openimageio_reads_is_a_sequence(tmp_path, pan, suffix):
+    pictures = pan(3)
+    for n, pixels in enumerate(pictures):
+        write(tmp_path / f"f.{n}.{suffix}", pixels)
+    for asked in (tmp_path, tmp_path / f"f.1.{suffix}"):
+        frames = list(open_source(str(asked)).frames(None, None))
+        assert [f.number for f in frames] == [0, 1, 2]
+        off = [np.abs(f.pixels.astype(int) - pixels).mean() for f, pixels in zip(frames, pictures)]
+        assert max(off) < 3
+
+
+def test_pictures_that_are_not_read_are_named_with_what_to_do(tmp_path, pan):
+    """QOI is to OpenImageIO and FFmpeg what AVIF is: the one does not know it, the other takes it for a short video."""
+    qoi = av.CodecContext.create("qoi", "w")
+    qoi.width, qoi.height, qoi.pix_fmt = 64, 48, "rgb24"
+    picture = bytes(qoi.encode(av.VideoFrame.from_ndarray(pan(1)[0], "rgb24"))[0])
+    for n in range(1, 10):
+        (tmp_path / f"f_{n:04d}.qoi").write_bytes(picture)
+        (tmp_path / f"raw-{n:04d}.dng").write_bytes(b"II*\0not a picture that FFmpeg opens")
+    for asked, pattern in (("f_0004.qoi", "f_####.qoi"), ("raw-0004.dng", "raw-####.dng"), ("", "f_####.qoi")):
+        with pytest.raises(JobError) as error:
+            open_source(str(tmp_path / asked))
+        assert error.value.message.startswith(f"{pattern} cannot be read") and "PNG" in error.value.hint
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    (alone / "f.qoi").write_bytes(picture)
+    with pytest.raises(JobError, match=r"f\.qoi is a single picture"):
+        open_source(str(alone / "f.qoi"))
+
+
+def test_a_damaged_video_among_numbered_ones_is_not_called_a_picture(tmp_path, pan, write_video):
+    for n in range(1, 10):
+        write_video(tmp_path / f"take_{n}.mp4", pan(3))
+    (tmp_path / "take_4.mp4").write_bytes(b"damaged")
+    with pytest.raises(JobError, match=r"take_4\.mp4"):
+        open_source(str(tmp_path / "take_4.mp4"))
+
+
+def write_animation(path, pictures):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(path.suffix[1:], rate=10)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "rgb24" if path.suffix == ".apng" else "rgb8"
+        for pixels in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, "rgb24").reformat(format=stream.pix_fmt)))
+        container.mux(stream.encode())
+
+
+@pytest.mark.parametrize("suffix", ["apng", "gif"])
+def test_animated_pictures_are_clips(tmp_path, pan, suffix):
+    write_animation(tmp_path / f"a1.{suffix}", pan(6))
+    write_animation(tmp_path / f"a2.{suffix}", pan(6))
+    if suffix == "apng":
+        (tmp_path / "a1.apng").rename(tmp_path / "a1.png")
+        write(tmp_path / "a2.png", flat(1, 2, 3, kind=np.uint8))
+    source = open_source(str(tmp_path / f"a1.{suffix[-3:]}"))
+    assert [f.number for f in source.frames(None, None)] == [1, 2, 3, 4, 5, 6]
 
 
 def test_linear_pictures_are_read_as_the_light_that_they_hold(exrs):

@@ -1,0 +1,207 @@
+"""Frame numbers in file names: the one reading for footage, masks and cameras.
+
+The frame number is the run of digits that varies between names which are otherwise alike. A version or a date is
+constant, so it is none. A dash before a number is a separator, never a minus.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+_RUN = re.compile(r"[0-9]+")
+_ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]*$")
+_MARK = re.compile(r"#+|@+|%0?[0-9]*d")
+"""What stands for the number in a pattern: `####`, `@@@@`, `%04d`, `%d`."""
+_WILDCARD = {"*": ".*", "?": "."}
+_ALIKE = {".jpeg": ".jpg", ".tiff": ".tif"}
+"""Endings that cameras and programs use for the same format."""
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class NumberedFiles:
+    """Names that differ in their frame number."""
+
+    pattern: str
+    """As people write it: `shot_v2.####.exr`; other numbers that vary are `*`."""
+    files: dict[int, str]
+    """Frame number -> name, ascending."""
+    twice: tuple[str, str] | None = None
+    """Two names with the same number (`f_1.png`, `f_01.png`), if there are any."""
+    others_vary: bool = False
+    """True if another number in the names varies too, such as a time."""
+
+
+def numbered_files(names: Iterable[str]) -> list[NumberedFiles]:
+    """The sequences among names, in the order of their patterns; also those of a single name.
+
+    Names without digits belong to none. Names where two numbers could count the frames, in different orders, are
+    returned once for each of the two.
+    """
+    shapes = _grouped(names, lambda name: (ending(name), *_RUN.split(_stem(name))))
+    found = [s for members in shapes for part in _without_twins(members) for s in _sequences(part)]
+    return sorted(found, key=lambda s: s.pattern)
+
+
+def matching_files(names: Iterable[str], pattern: str) -> list[NumberedFiles]:
+    """The sequences among names that a pattern means: `shot.####.exr`, `shot.%04d.png`, `*_left.jpg`.
+
+    A mark stands for a number of any width. `*` and `?` are wildcards. A pattern without a mark only chooses names.
+    """
+    names, wanted = list(names), ending(pattern)
+    stem = _stem(pattern)
+    if wanted:
+        names = [name for name in names if ending(name) == wanted]
+    marks = list(_MARK.finditer(stem))
+    if not marks:
+        rule = re.compile(_rule(stem))
+        return numbered_files(name for name in names if rule.fullmatch(_stem(name)))
+    for other in (None, "[0-9]+"):  # a second mark is a part of the name (`take#2.####`), else a number
+        for mark in reversed(marks):
+            rule = _marked_rule(stem, marks, mark, other)
+            found = [(match, name) for name in names if (match := rule.fullmatch(_stem(name)))]
+            if found:
+                return _by_mark(found, pattern)
+    return []
+
+
+def is_pattern(name: str) -> bool:
+    """True if a file name that does not exist may be a pattern."""
+    return bool(_MARK.search(name)) or any(mark in name for mark in _WILDCARD)
+
+
+def ending(name: str) -> str:
+    """Lower-case ending of a name, with `.jpeg` as `.jpg` and `.tiff` as `.tif`; empty if it has none."""
+    found = _ENDING.search(name)
+    text = found[0].lower() if found else ""
+    return _ALIKE.get(text, text)
+
+
+def file_as_blender_counts(name: str, number: int) -> str:
+    """The file that Blender shows at a frame of a sequence of which it was given one file.
+
+    Blender replaces the last digits before the ending, in their width.
+    """
+    runs = list(_RUN.finditer(_stem(name)))
+    if not runs:
+        return name
+    last = runs[-1]
+    return f"{name[: last.start()]}{number:0{len(last[0])}d}{name[last.end() :]}"
+
+
+def _stem(name: str) -> str:
+    return _ENDING.sub("", name)
+
+
+def _grouped(items: Iterable[Item], key: Callable[[Item], object]) -> list[list[Item]]:
+    groups: dict[object, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return list(groups.values())
+
+
+def _without_twins(names: list[str]) -> list[list[str]]:
+    """Names of one shape; by their exact ending if some differ in nothing else (`f_1.jpg`, `f_1.JPG`)."""
+    if len({_stem(name) for name in names}) == len(names):
+        return [names]
+    return _grouped(names, lambda name: name[len(_stem(name)) :])
+
+
+def _sequences(names: list[str]) -> list[NumberedFiles]:
+    """The sequences among names that are alike but for their digits."""
+    columns = list(zip(*([int(run) for run in _RUN.findall(_stem(name))] for name in names), strict=True))
+    if not columns:
+        return []
+    varying = [n for n, column in enumerate(columns) if len(set(column)) > 1]
+    telling = [n for n in varying if len(set(columns[n])) == len(names)]
+    if telling:  # of an index and a time, the index: it has the fewest gaps
+        spans = [max(columns[n]) - min(columns[n]) for n in telling]
+        closest = [n for n, span in zip(telling, spans, strict=True) if span == min(spans)]
+        orders = {tuple(sorted(range(len(names)), key=columns[n].__getitem__)) for n in closest}
+        places = closest if len(orders) > 1 else closest[-1:]
+    else:  # several versions, eyes or cameras: what varies most counts their frames
+        places = [max(varying, key=lambda n: (len(set(columns[n])), n))] if varying else [len(columns) - 1]
+    return [s for place in places for s in _counted(names, columns, place, telling)]
+
+
+def _counted(names: list[str], columns: list[tuple[int, ...]], place: int, telling: list[int]) -> list[NumberedFiles]:
+    """The sequences among names whose frame number is the one at `place`."""
+    order = sorted(range(len(names)), key=columns[place].__getitem__)
+    # A time or a date that goes along with the number does not part a sequence; a version does.
+    parting = [
+        n
+        for n, column in enumerate(columns)
+        if n != place and not (place in telling and (n in telling or _is_steady([column[i] for i in order])))
+    ]
+    groups = _grouped(order, lambda i: tuple(columns[n][i] for n in parting))
+    return [_numbered([names[i] for i in rows], [columns[place][i] for i in rows], place) for rows in groups]
+
+
+def _is_steady(values: Sequence[int]) -> bool:
+    """True if values only rise or only fall."""
+    return list(values) in (sorted(values), sorted(values, reverse=True))
+
+
+def _numbered(names: list[str], numbers: list[int], place: int) -> NumberedFiles:
+    runs = [_RUN.findall(_stem(name)) for name in names]
+    texts = _RUN.split(_stem(names[0]))
+    words: list[str] = []
+    for n, column in enumerate(zip(*runs, strict=True)):
+        widths = {len(run) for run in column}
+        hashes = "#" * (min(widths) if len(widths) == 1 else 1)
+        words += [texts[n], hashes if n == place else column[0] if len(set(column)) == 1 else "*"]
+    pattern = "".join([*words, texts[-1]]) + names[0][len(_stem(names[0])) :]
+    others = any(len(set(column)) > 1 for n, column in enumerate(zip(*runs, strict=True)) if n != place)
+    return NumberedFiles(pattern, *_table(names, numbers), others_vary=others)
+
+
+def _table(names: list[str], numbers: list[int]) -> tuple[dict[int, str], tuple[str, str] | None]:
+    """Number -> name, ascending, and two names that have the same number, if there are any."""
+    files: dict[int, str] = {}
+    twice = None
+    for number, name in sorted(zip(numbers, names, strict=True)):
+        if number in files:
+            twice = twice or (files[number], name)
+        files.setdefault(number, name)
+    return files, twice
+
+
+def _rule(text: str) -> str:
+    """Regular expression of a piece of a pattern without marks."""
+    return "".join(_WILDCARD.get(letter) or re.escape(letter) for letter in text)
+
+
+def _marked_rule(stem: str, marks: list[re.Match[str]], number: re.Match[str], other: str | None) -> re.Pattern[str]:
+    """What stems of names have to be, the number as a group. `other`: what other marks stand for, None: themselves."""
+    parts: list[str] = []
+    at = 0
+    for mark in marks:
+        parts.append(_rule(stem[at : mark.start()]))
+        parts.append("([0-9]+)" if mark is number else other or re.escape(mark[0]))
+        at = mark.end()
+    return re.compile("".join([*parts, _rule(stem[at:])]))
+
+
+def _by_mark(found: list[tuple[re.Match[str], str]], pattern: str) -> list[NumberedFiles]:
+    """The sequences among names that a pattern's rule found: several if wildcards leave numbers twice."""
+    groups = _grouped(found, lambda one: (one[0].string[: one[0].start(1)], one[0].string[one[0].end(1) :]))
+    numbers = [int(match[1]) for match, _ in found]
+    if len(groups) > 1 and len(set(numbers)) == len(numbers):
+        return [NumberedFiles(pattern, *_table([name for _, name in found], numbers), others_vary=True)]
+    return [s for members in groups for s in _of_mark(members)]
+
+
+def _of_mark(members: list[tuple[re.Match[str], str]]) -> list[NumberedFiles]:
+    """Names that are alike but for the number of a mark."""
+    found: list[NumberedFiles] = []
+    of_name = {name: match for match, name in members}
+    for names in _without_twins(list(of_name)):
+        match = of_name[names[0]]
+        widths = {len(of_name[name][1]) for name in names}
+        hashes = "#" * (min(widths) if len(widths) == 1 else 1)
+        shown = f"{names[0][: match.start(1)]}{hashes}{names[0][match.end(1) :]}"
+        found.append(NumberedFiles(shown, *_table(names, [int(of_name[name][1]) for name in names])))
+    return found
