@@ -76,6 +76,8 @@ def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
         name = Path(str(told["file"])).name
         if told["unlike"]:
             return None, f"{name}: {told['unlike']}"
+        if told.get("orientation", 1) != 1 and not compat.TURNS_VIDEOS:
+            return None, f"{name}: it is turned by its header"
         places = [Path(str(told["file"])), *([shot / str(told["beside"])] if told["beside"] else [])]
         file = next((place for place in places if place.is_file()), None)
         if file is None:

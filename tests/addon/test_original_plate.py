@@ -190,6 +190,25 @@ def test_a_video_shows_frame_n_at_frame_n(addon, scene, footage, tmp_path):
         assert np.abs(shown - (levels.level(frame) - 16) / 219 * 255).max() < 1.2
 
 
+@pytest.mark.parametrize("code, rows", [(3, (-1, 0, 0, 0, -1, 0)), (6, (0, 1, 0, -1, 0, 0)), (8, (0, -1, 0, 1, 0, 0))])
+def test_a_turned_video_is_the_plate_where_blender_turns_it_and_working_frames_elsewhere(
+    addon, scene, footage, tmp_path, code, rows
+):
+    data = bytearray((DATA / "levels.mp4").read_bytes())
+    at = data.find(b"tkhd") + 44
+    data[at : at + 24] = np.array([65536 * value for value in rows], ">i4").tobytes()
+    (tmp_path / "turned.mp4").write_bytes(bytes(data))
+    size = [levels.WIDTH, levels.HEIGHT] if code == 3 else [levels.HEIGHT, levels.WIDTH]
+    told = {"file": str(tmp_path / "turned.mp4"), "size": size, "first": 1, "last": levels.FRAMES, "orientation": code}
+    said = addon("bake.insertion").insert_freeze(scene, footage(**told, probe=list(SRGB)), "detail")
+    turns = addon("compat").TURNS_VIDEOS
+    image = bpy.data.images.load(str(tmp_path / "turned.mp4"))
+    if code != 3:
+        assert (list(image.size) == size) == turns, "what this Blender does is what is known of it"
+    itself = any(line.startswith("The plate is turned.mp4 itself") for line in said)
+    assert itself == turns and turns != any("it is turned by its header" in line for line in said)
+
+
 @pytest.mark.parametrize(
     "told, why",
     [

@@ -26,6 +26,7 @@ from .importing import FootageConfig, load_frames, source_places
 from .layers import find_layer
 from .numbering import recorded_shift
 from .opening import open_video, opens_as_video
+from .orientation import UPRIGHT, orientation_of_picture
 from .sequence import SequenceSource, find_sequence, sequence_of_file
 from .sources import footage_error, frame_words
 from .video import VideoSource
@@ -261,7 +262,7 @@ class _Reading:
 
 
 def _read(file: Path, part: int = 0) -> tuple[NDArray[np.float32], int | None]:
-    """A picture over its whole frame, [h, w, C] with colour multiplied by alpha, and which channel alpha is."""
+    """A whole picture, upright, [h, w, C] with colour multiplied by alpha, and which channel alpha is."""
     buffer = oiio.ImageBuf(str(file), part, 0)
     spec = buffer.spec()
     if buffer.has_error:
@@ -271,4 +272,5 @@ def _read(file: Path, part: int = 0) -> tuple[NDArray[np.float32], int | None]:
     pixels = buffer.get_pixels(oiio.FLOAT, roi)
     if pixels is None or buffer.has_error:
         raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Write it again.")
-    return np.asarray(pixels, np.float32), spec.alpha_channel if spec.alpha_channel >= 0 else None
+    upright = (orientation_of_picture(spec) or UPRIGHT).upright(np.asarray(pixels, np.float32))
+    return upright, spec.alpha_channel if spec.alpha_channel >= 0 else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .orientation import Orientation
 from .sources import SourceInfo
 
 _MATRICES = {"ITU709": "BT.709", "ITU601": "BT.601", "BT2020": "BT.2020", "SMPTE240M": "SMPTE 240M"}
@@ -30,8 +31,8 @@ def read_as(info: SourceInfo, timecode: str = "") -> list[str]:
     parts.append("alpha left out" if reading.get("alpha") else "no alpha")
     if reading.get("interlaced"):
         parts.append("deinterlaced")
-    if reading.get("turned"):
-        parts.append(f"turned by {reading['turned']} degrees")
+    if words := Orientation(int(reading.get("orientation", 1))).words:
+        parts.append(words)
     if reading.get("focal_35mm"):
         parts.append(f"a lens of {reading['focal_35mm']:.4g} mm (on 35 mm film)")
     if timecode:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from .layers import Layer, find_layer, shown
 from .lens_tags import focal_of_picture
 from .ocio import Colours
 from .oiio_types import attribute, bits_of, channel_names
+from .orientation import UPRIGHT, Orientation, orientation_of_picture
 from .sources import (
     FASTEST_FPS,
     LEAST_FRAMES,
@@ -170,6 +171,12 @@ def _no_sequence_in(folder: Path) -> JobError:
     )
 
 
+_NO_ORIENTATION = (
+    "The pictures' header has an orientation that EXIF does not know: they are read as they are stored.",
+    "Write them upright if they look turned.",
+)
+
+
 class SequenceSource:
     """A numbered sequence. Frame numbers are those of the files; missing and unreadable ones are left out."""
 
@@ -198,8 +205,12 @@ class SequenceSource:
         self._space = _input_space(first, spec, colours or Colours(), self.warnings)
         aspect = told_aspect or _pixel_aspect(spec)
         self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
+        orientation = orientation_of_picture(spec)
+        if orientation is None:
+            self.warnings.append(_NO_ORIENTATION)
+        self._orientation = orientation or UPRIGHT
         self._stored = spec.full_width, spec.full_height
-        width, height = square_size(*self._stored, self._aspect)
+        width, height = self._orientation.size(*square_size(*self._stored, self._aspect))
         self._describe(names, layer, (width, height))
         rate = attribute(spec, "framesPerSecond") or attribute(spec, "FramesPerSecond")
         if isinstance(rate, tuple):  # a rational, as OpenEXR stores it
@@ -209,6 +220,9 @@ class SequenceSource:
         reading_key = [space.name, self._layer.name, float(self._aspect), "straight", *space.origin.values()]
         ordinary = space.as_it_stands or space == InputSpace("lin", declared=space.declared)
         ordinary = ordinary and self._aspect == 1 and self._layer.alpha is None and len(names) == 1
+        reading_key = [] if ordinary else reading_key
+        if self._orientation != UPRIGHT:
+            reading_key.append(f"orientation {self._orientation.code}")
         stats = [f.stat() for f in self._files.values()]
         self.info = SourceInfo(
             width=width,
@@ -220,14 +234,14 @@ class SequenceSource:
             extended=light or not space.as_it_stands or str(spec.format) in ("half", "float", "double"),
             colour="linear" if light else "srgb",
             # By content: footage may be copied or moved. What is read otherwise than it used to be is imported again.
-            key=content_key_of(self._files) + ([] if ordinary else reading_key),
+            key=content_key_of(self._files) + reading_key,
             former_key=[
                 _former_name(sequence),
                 len(stats),
                 sum(s.st_size for s in stats),
                 max(s.st_mtime_ns for s in stats),
             ]
-            + ([] if ordinary else reading_key),
+            + reading_key,
             reading={
                 "files": sequence.pattern,
                 "numbers": [min(self._files), max(self._files)],
@@ -243,11 +257,12 @@ class SequenceSource:
                 "fps_told": bool(fps or rate),
                 "timecode": parse_timecode(str(spec.get_string_attribute("smpte:TimeCode"))),
                 "bits": bits_of(spec),
+                "orientation": self._orientation.code,
                 **({"focal_35mm": lens} if (lens := focal_of_picture(spec)) else {}),
             },
             file=str(first),
             probe=space.probe,
-            unlike=_unlike(spec, len(names), self._aspect) or _named_unlike(first.name, self._files),
+            unlike=_unlike(spec, len(names), self._aspect, self._orientation) or _named_unlike(first.name, self._files),
         )
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
@@ -276,6 +291,11 @@ class SequenceSource:
         if unreadable:
             words = frame_words(unreadable).capitalize()
             self.warnings.append((f"{words} cannot be read: left out of the shot.", "Render or copy it again."))
+        if len(findings.orientations) > 1:
+            self.info.reading["orientations"] = sorted(one.code for one in findings.orientations)
+            words = ", ".join(sorted(one.words or "as they are stored" for one in findings.orientations))
+            message = f"The pictures' headers differ in orientation: each is shown by its own ({words})."
+            self.warnings.append((message, ""))
         if findings.transparent:
             self.warnings.append(
                 ("The pictures are transparent in places: their colour is taken, their alpha is not.", "")
@@ -355,10 +375,14 @@ class SequenceSource:
         if failed:
             raise OSError(f"{file}: {failed}")
         size = spec.full_width, spec.full_height
-        if size != self._stored:
+        orientation = orientation_of_picture(spec) or UPRIGHT
+        findings.orientations.add(orientation)
+        if orientation.size(*square_size(*size, self._aspect)) != (self.info.width, self.info.height):
+            began = f"{self._stored[0]}x{self._stored[1]}"
+            turned = [f", {one.words}" if one.words else "" for one in (orientation, self._orientation)]
             raise footage_error(
-                f"{file.name} is {size[0]}x{size[1]}, the sequence began with {self._stored[0]}x{self._stored[1]}.",
-                "All pictures of a sequence need one size.",
+                f"{file.name} is {size[0]}x{size[1]}{turned[0]}, the sequence began with {began}{turned[1]}.",
+                "All pictures of a sequence need one size, once each is turned as its header says.",
             )
         channels = [*layer.channels] if layer.alpha is None else [*layer.channels, layer.alpha]
         first, beyond = min(channels), max(channels) + 1
@@ -378,7 +402,7 @@ class SequenceSource:
             findings.transparent |= bool((alpha[inner] < opaque).any())
             if not spec.get_int_attribute("oiio:UnassociatedAlpha"):
                 rgb = _straight(rgb, alpha, opaque)
-        return rgb
+        return orientation.upright(rgb)
 
     def _same_layer(self, file: Path) -> Layer:
         """Where the sequence's layer lies in a file whose channels are others than the first one's."""
@@ -397,6 +421,8 @@ class _Findings:
 
     transparent: bool = False
     cropped: bool = False
+    orientations: set[Orientation] = field(default_factory=set[Orientation])
+    """Those that occur."""
 
 
 _AS_STORED = oiio.ImageSpec()
@@ -411,8 +437,10 @@ def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
     return spec, buffer, (error_of(buffer) or "it is damaged") if buffer.has_error else ""
 
 
-def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction) -> str:
+def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction, orientation: Orientation) -> str:
     """Why other programs show such pictures otherwise, see `SourceInfo.unlike`."""
+    if orientation != UPRIGHT:  # no Blender turns pictures by their header, up to 5.2
+        return f"its pictures are {orientation.words} by their header"
     if aspect != 1:
         return "its pixels are not square"
     if layers > 1:

@@ -23,6 +23,7 @@ from .frame_rgb import BT601, MATRICES, RGB, Coding, coding_of, depth_of, exact_
 from .images import resize, resize_float
 from .lens_tags import focal_of_video
 from .ocio import Colours
+from .orientation import UPRIGHT, Orientation, display_matrix, orientation_of_matrix
 from .seeking import VideoReader
 from .sources import (
     Known,
@@ -53,6 +54,13 @@ NEAR_REC709 = {4: "BT.470 M", 5: "BT.601 625", 6: "BT.601 525", 7: "SMPTE 240M",
 """Primaries of standard definition: taken as Rec.709's, as editors and Blender do; the difference is small."""
 
 
+_NO_ORIENTATION = (
+    "The clip's header asks to show the picture at an angle or stretched, which is neither a quarter turn nor a "
+    "mirroring: frames are read as they are stored.",
+    "Export the clip upright if its frames should look otherwise.",
+)
+
+
 class VideoSource:
     """A video file. Frame numbers count from 1 in presentation order; an undecodable one keeps its number.
 
@@ -66,26 +74,28 @@ class VideoSource:
         with self._open() as container:
             stream = _best_stream(container, path)
             frame = _first_frame(container, stream, path)
-            self._quarter_turns = round(_rotation(frame) / 90.0) % 4
-            aspect = told.pixel_aspect or _pixel_aspect(stream)
+            matrix = display_matrix(frame)
+            orientation = UPRIGHT if matrix is None else orientation_of_matrix(matrix)
+            self._orientation, self._rotation = orientation or UPRIGHT, frame.rotation
+            # FFmpeg makes the stream's pixel aspect of the matrix: of one that is not applied it means nothing.
+            aspect = told.pixel_aspect or _pixel_aspect(stream if orientation else stream.codec_context)
             self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
             self._space = _chosen_space(path, colours or Colours()) or _input_space(frame, self.warnings)
             self._coding = coding_of(frame, told.matrix, told.levels)
             self._deep = depth_of(frame) > 8 or self._space.is_light
-            width, height = square_size(frame.width, frame.height, self._aspect)
-            if self._quarter_turns % 2:
-                width, height = height, width
+            self._size = width, height = self._shown_size(frame)
             rate = stream.average_rate or stream.guessed_rate
             rate_told, rate = bool(rate), rate or Fraction(24)
             count = stream.frames or _count_from_duration(container, stream, rate)
             self._interlaced = bool(frame.interlaced_frame)
-            self._size = frame.width, frame.height
             self._promise = _promise(container, stream, rate)
             self._alpha_decoder = _alpha_decoder_of(stream)
             held = any(component.is_alpha for component in frame.format.components)
             self.has_alpha = held or bool(self._alpha_decoder)
             """True if the clip has an alpha that `alphas` can read."""
             self._warn_about(frame)
+            if orientation is None:
+                self.warnings.append(_NO_ORIENTATION)
             reading = {
                 **_reading(frame, self._space, self._coding),
                 "fps_told": rate_told,
@@ -94,11 +104,13 @@ class VideoSource:
                 "alpha": self.has_alpha,
                 "interlaced": self._interlaced,
                 "timecode": _timecode(container, stream),
-                "turned": 90 * self._quarter_turns,
+                "orientation": self._orientation.code,
                 **({"focal_35mm": lens} if (lens := focal_of_video(container, stream)) else {}),
             }
         stat = path.stat()
         reading_key = _reading_key(self._space) + (["deinterlaced"] if self._interlaced else [])
+        if self._orientation.is_mirrored:
+            reading_key.append(f"orientation {self._orientation.code}")
         self.info = SourceInfo(
             width=width,
             height=height,
@@ -114,16 +126,16 @@ class VideoSource:
             reading=reading,
             file=str(path),
             probe=self._space.probe,
-            unlike=self._unlike(frame),
+            unlike=self._unlike(frame, orientation),
         )
 
-    def _unlike(self, frame: av.VideoFrame) -> str:
+    def _unlike(self, frame: av.VideoFrame, orientation: Orientation | None) -> str:
         """Why other programs show the clip otherwise, see `SourceInfo.unlike`."""
         tagged = coding_of(frame)
         if self._aspect != 1:
             return "its pixels are not square"
-        if self._quarter_turns:
-            return "it is turned by its header"
+        if orientation is None or orientation.is_mirrored:  # Blender 5 takes a mirrored picture for a turned one
+            return f"its header says that it is {orientation.words if orientation else 'turned or stretched'}"
         if self._interlaced:
             return "it is interlaced, and frames are made of its fields here"
         if (tagged.matrix, tagged.is_full) != (self._coding.matrix, self._coding.is_full):
@@ -147,7 +159,7 @@ class VideoSource:
                 if isinstance(frame, FFmpegError):
                     lost.append(number)
                     continue
-                if (frame.width, frame.height) != self._size:
+                if self._shown_size(frame) != self._size:
                     self._stop_at_change(number, got, frame)
                     break
                 at = seconds_of(frame)
@@ -190,12 +202,14 @@ class VideoSource:
                     return
                 if isinstance(frame, FFmpegError):
                     continue
-                if (frame.width, frame.height) != self._size:
+                if self._shown_size(frame) != self._size:
                     raise footage_error(f"{self.path.name} changes its size at frame {number}.", "Export it in one.")
                 alpha = frame.reformat(format="rgba").to_ndarray()[..., 3].astype(np.float32) * np.float32(1 / 255)
-                if self._quarter_turns % 2:  # its pixels would be as much too high as they are too wide
-                    alpha = resize_float(alpha[..., None], *square_size(*self._size, self._aspect))[..., 0]
-                yield number, np.ascontiguousarray(np.rot90(alpha, self._quarter_turns))
+                orientation = self._orientation_of(frame)
+                if orientation.swaps_sides:  # its pixels would be as much too high as they are too wide
+                    size = square_size(frame.width, frame.height, self._aspect)
+                    alpha = resize_float(alpha[..., None], *size)[..., 0]
+                yield number, orientation.upright(alpha)
 
     def plates(self, known: Known) -> PlateReader:
         """See `Source.plates`."""
@@ -203,14 +217,14 @@ class VideoSource:
 
     def plate_of(self, frame: av.VideoFrame) -> NDArray[Any]:
         """A decoded frame as a plate, see `plate_encoding`. JobError if its size is not the clip's."""
-        if (frame.width, frame.height) != self._size:
+        if self._shown_size(frame) != self._size:
             raise footage_error(f"{self.path.name} is not the clip that was imported: its size changes.")
         if self._space.as_it_stands:
             pixels = rgb_codes(frame, self._coding, deep=self._deep)
         else:
             pixels = plate_encoding.half_of(exact_rgb(frame, self._coding), self._space)
         pixels = plate_encoding.resize_plate(pixels, *square_size(frame.width, frame.height, self._aspect))
-        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
+        return self._orientation_of(frame).upright(pixels)
 
     def decode(self, container: Any, stream: Any) -> Iterator[Any]:
         """Frames from where a container of `open` stands, and errors in the place of what cannot be decoded."""
@@ -231,7 +245,8 @@ class VideoSource:
 
     def _stop_at_change(self, number: int, got: int, frame: av.VideoFrame) -> None:
         """A stream may change its size midway; the shot has one, and ends there."""
-        sizes = f"{frame.width}x{frame.height} pixels instead of {self._size[0]}x{self._size[1]}"
+        width, height = self._shown_size(frame)
+        sizes = f"{width}x{height} pixels instead of {self._size[0]}x{self._size[1]}"
         if got < 1:
             raise footage_error(
                 f"The clip changes its size before the range begins: from frame {number} on it is {sizes}.",
@@ -277,8 +292,20 @@ class VideoSource:
             values = np.rint(values * np.float32(65535.0 if self._deep else 255.0))
             pixels = values.astype(np.uint16 if self._deep else np.uint8)
         width, height = square_size(frame.width, frame.height, self._aspect)
-        pixels = resize(pixels, width, height)
-        return np.ascontiguousarray(np.rot90(pixels, self._quarter_turns))
+        return self._orientation_of(frame).upright(resize(pixels, width, height))
+
+    def _orientation_of(self, frame: av.VideoFrame) -> Orientation:
+        """Of one frame: its own, else that of the clip."""
+        # Only a frame that differs is asked for its matrix: PyAV's side data holds the frame that holds it, so that its
+        # memory waits for the garbage collector.
+        if frame.rotation == self._rotation:
+            return self._orientation
+        matrix = display_matrix(frame)
+        return (None if matrix is None else orientation_of_matrix(matrix)) or self._orientation
+
+    def _shown_size(self, frame: av.VideoFrame) -> tuple[int, int]:
+        """Width and height of a frame, upright and with square pixels."""
+        return self._orientation_of(frame).size(*square_size(frame.width, frame.height, self._aspect))
 
     def _warn_about(self, frame: av.VideoFrame) -> None:
         space = self._space
@@ -355,11 +382,6 @@ def _first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:
         if not isinstance(frame, FFmpegError):
             return frame
     raise _no_video(path)
-
-
-def _rotation(frame: Any) -> float:
-    """Counterclockwise angle in degrees that the container asks players to turn the picture by."""
-    return float(getattr(frame, "rotation", 0) or 0)
 
 
 def _pixel_aspect(stream: Any) -> Fraction | None:

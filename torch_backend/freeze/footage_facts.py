@@ -23,7 +23,8 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     the shot's numbers; absent if they are the same. probe: linear Rec.709 light that
     `contract.PROBE` means in it. space: the name of its colour space. map: the ST map in the take's folder that takes
     the lens away, which this writes; empty if there is no lens. unlike: why a program that shows the files would not
-    show what the freeze was made from, a clause; empty if it would.
+    show what the freeze was made from, a clause; empty if it would. orientation: how its header says that a video is
+    turned, as EXIF counts it; 1: not at all.
 
     JobError (DISK), OSError if the map cannot be written.
     """
@@ -31,7 +32,8 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     info, lens = plates.original(), plates.lens()
     if info is None:
         return {}
-    unlike = info.unlike or _unsteady(shot, info.fps) or ("its lens changes between frames" if lens is None else "")
+    unlike = info.unlike or _unsteady(shot, info.fps) or _differently_turned(shot)
+    unlike = unlike or ("its lens changes between frames" if lens is None else "")
     shift = recorded_shift(load_frames(shot))
     facts = {
         "file": os.path.abspath(info.file),
@@ -44,6 +46,7 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
         "space": info.reading.get("colour", ""),
         "map": "",
         "unlike": unlike,
+        "orientation": info.reading.get("orientation", 1),
     }
     if lens is not None and not lens.is_none and not unlike:
         key = content_key(1, plates.key, info.width, info.height)
@@ -64,6 +67,12 @@ def _unsteady(shot: Shot, fps: float) -> str:
     rows = load_frames(shot)["frames"]
     off = [float(row["seconds"]) - (int(row["frame"]) - int(rows[0]["frame"])) / fps for row in rows]
     return "its rate varies" if max(off) - min(off) > 0.5 / fps else ""
+
+
+def _differently_turned(shot: Shot) -> str:
+    """Why programs that do not turn pictures by their headers would show others; empty if they would not."""
+    reading: dict[str, Any] = load_frames(shot).get("reading") or {}
+    return "its pictures are turned differently by their headers" if reading.get("orientations") else ""
 
 
 def _beside(root: Path, file: str) -> str:

@@ -122,3 +122,9 @@ def test_footage_that_is_gone_or_another_is_not_named(tmp_path, shot_of):
     for file in (tmp_path / "plate").iterdir():
         file.rename(file.with_suffix(".away"))
     assert facts_of(shot)[0] == {}
+
+
+def test_how_a_picture_is_turned_is_told(tmp_path, shot_of):
+    """Blender shows pictures as they are stored."""
+    facts = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr", Orientation=6)))[0]
+    assert facts["size"] == [96, 128] and facts["unlike"] == "its pictures are turned clockwise by their header"
