@@ -240,8 +240,8 @@ class SequenceSource:
                 len(stats),
                 sum(s.st_size for s in stats),
                 max(s.st_mtime_ns for s in stats),
-            ]
-            + reading_key,
+                *reading_key,
+            ],
             reading={
                 "files": sequence.pattern,
                 "numbers": [min(self._files), max(self._files)],
