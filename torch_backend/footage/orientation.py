@@ -12,6 +12,7 @@ import OpenImageIO as oiio
 from av.sidedata.sidedata import Type
 from numpy.typing import NDArray
 
+from .av_types import side_data
 from .oiio_types import attribute
 
 _NEARLY = 0.02
@@ -98,6 +99,5 @@ def orientation_of_matrix(matrix: NDArray[np.int32]) -> Orientation | None:
 
 def display_matrix(frame: av.VideoFrame) -> NDArray[np.int32] | None:
     """The display matrix of a decoded frame: its own, or its stream's; None if neither has one."""
-    found = (bytes(one) for one in frame.side_data if one.type == Type.DISPLAYMATRIX)
-    data = next(found, b"")
+    data = side_data(frame, Type.DISPLAYMATRIX)
     return np.frombuffer(data, np.int32, 9) if len(data) >= 36 else None
