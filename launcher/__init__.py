@@ -5,6 +5,7 @@
     errors          the one exception
     children        processes
     pip_output      what pip prints, in an artist's words
+    repair          what of an environment is not whole
     environments    the virtual environments
     blender         a Blender for the add-on
     summary         DIR/summary.json

@@ -78,15 +78,18 @@ def python_for(series: str) -> str | None:
     return find_python(lambda version: version == needed, (f"python{dotted(needed)}",))
 
 
-def get_blender(testing: bool = False) -> tuple[Blender, float]:
-    """A Blender for the add-on, set up if need be, and the seconds that took. LauncherError if none can be had."""
-    wheels = choose_wheels()
+def get_blender(testing: bool = False, wheels: Path | None = None) -> tuple[Blender, float]:
+    """A Blender for the add-on, set up if need be, and the seconds that took. LauncherError if none can be had.
+
+    wheels: a folder to install from, in place of a package index.
+    """
+    choices = choose_wheels()
     refused: LauncherError | None = None
     took = 0.0
-    for series, python in wheels:
+    for series, python in choices:
         environment = bpy_environment(series, testing)
         try:
-            took += set_up(environment, python or environment.python)
+            took += set_up(environment, python or environment.python, wheels)
         except LauncherError as error:
             refused = error
             say(f"  note: {error}")
@@ -104,11 +107,11 @@ def get_blender(testing: bool = False) -> tuple[Blender, float]:
     )
 
 
-def set_up_wheel(series: str, testing: bool) -> tuple[Blender, float]:
+def set_up_wheel(series: str, testing: bool, wheels: Path | None = None) -> tuple[Blender, float]:
     """The named bpy wheel, set up with a Python that fits it."""
     environment = bpy_environment(series, testing)
     python = environment.python if environment.ready() else python_for(series)
     if python is None:
         needed = dotted(BPY_WHEELS[series])
         raise LauncherError(f"The bpy wheel {series} needs Python {needed}, which is not on the PATH: install it.")
-    return Blender(f"bpy {series}", (environment.python,)), set_up(environment, python)
+    return Blender(f"bpy {series}", (environment.python,)), set_up(environment, python, wheels)

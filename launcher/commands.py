@@ -112,13 +112,26 @@ def closing_figures(summary: dict[str, Any], output: Path) -> None:
         say(line)
 
 
-def setup(series: Sequence[str], testing: bool, backend_only: bool, output: Path) -> int:
-    """Makes the environments: the backend's, and the named bpy wheels (the one that fits, if none is named)."""
-    stages = {"backend": round(set_up(backend_environment(testing), sys.executable), 2)}
+def setup(series: Sequence[str], testing: bool, backend_only: bool, output: Path, wheels: str | None = None) -> int:
+    """Makes the environments: the backend's, and the named bpy wheels (the one that fits, if none is named).
+
+    Args:
+        series: Blender series of bpy wheels.
+        testing: with what `test` needs.
+        backend_only: no bpy wheel.
+        output: folder for summary.json.
+        wheels: folder to install from, in place of a package index.
+    """
+    folder = None if wheels is None else Path(os.path.abspath(wheels))
+    if folder is not None and not any(folder.glob("*.whl")):
+        raise LauncherError(
+            f"There are no wheels (*.whl) in {folder}: name the folder that holds them.", ExitCode.USAGE
+        )
+    stages = {"backend": round(set_up(backend_environment(testing), sys.executable, folder), 2)}
     for name in series:
-        stages[f"bpy-{name}"] = round(set_up_wheel(name, testing)[1], 2)
+        stages[f"bpy-{name}"] = round(set_up_wheel(name, testing, folder)[1], 2)
     if not series and not backend_only:
-        blender, took = get_blender(testing)
+        blender, took = get_blender(testing, folder)
         stages[blender.label.replace(" ", "-")] = round(took, 2)
     write_json(output / "summary.json", {"command": "setup", "exit_code": 0, "wall_seconds_by_stage": stages})
     say("Ready: " + ", ".join(stages))

@@ -6,7 +6,9 @@ import functools
 import hashlib
 import json
 import os
+import platform
 import queue
+import re
 import shutil
 import subprocess
 import sys
@@ -18,9 +20,24 @@ import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch_backend.cards import nvidia_cards
-from torch_backend.contract import ExitCode, brings_cuda, program, python_child, torch_index
+from torch_backend.contract import (
+    CPU_INDEX,
+    CUDA_INDEX,
+    SETUP_BEGUN,
+    SETUP_NOTES,
+    SETUP_STAMP,
+    ExitCode,
+    brings_cuda,
+    changed_packages,
+    package_name,
+    program,
+    python_child,
+    record_packages,
+    torch_index,
+)
 from torch_backend.shot import is_disk_full, locked, write_json
 
 from .children import child_environ, close_input, say, start_child, stop_child, tied_command
@@ -28,12 +45,15 @@ from .errors import LauncherError
 from .interpreters import NEEDED_PYTHON, python_version
 from .pip_output import condense_pip, refuse
 from .places import REQUIREMENTS, ROOT, WINDOWS
+from .repair import drop_damaged, needs_cuda
 
 BACKEND_DISK_GB = 4.0
 """Free disk that setting up the backend may need: the environment and pip's downloads (Linux, CPU build of torch)."""
 CUDA_DISK_GB = 5.0
 """What CUDA adds to that: the environment takes 6 GB then, not 1.5."""
 BPY_DISK_GB = 2.0
+TORCH_LOCKS = ("torch", "torch-cpu", "torch-cu130", "cuda")
+"""Locks of an environment with torch: PyPI's torch, those of its own index, and the libraries of PyPI's for Linux."""
 HEARTBEAT_SECONDS = 15.0
 """A set-up that has printed nothing for this long says that it is still at work."""
 
@@ -47,13 +67,11 @@ class Environment:
     folder: Path
     """Where it stands."""
     requirements: tuple[str, ...]
-    """Requirement files in requirements/, installed together."""
+    """Names of the locks in requirements/ that it is made of: ("backend", "test")."""
     probe: str
     """Python source that imports what must work."""
     disk_gb: float
     """Free disk that setting it up may need, in GB; without CUDA, if it has torch."""
-    complete: bool = False
-    """The requirement files name every package that is needed, so nothing else is installed."""
     torch: bool = False
     """It has torch, which is another one where there is a card for it."""
 
@@ -65,7 +83,7 @@ class Environment:
     @property
     def state(self) -> Path:
         """The launcher's notes on it: the stamp, the log of the last set-up."""
-        return self.folder / ".splannequin"
+        return self.folder / SETUP_NOTES
 
     @property
     def log(self) -> Path:
@@ -74,31 +92,41 @@ class Environment:
 
     @property
     def stamp(self) -> Path:
-        """What the last finished set-up installed: JSON, hash by requirement file."""
-        return self.state / "installed.json"
+        """What the last finished set-up installed: JSON, hash by lock, and what `record_packages` found."""
+        return self.state / SETUP_STAMP
 
     @property
     def begun(self) -> Path:
         """A file that stands here while packages are being written."""
-        return self.state / "installing"
+        return self.state / SETUP_BEGUN
+
+    @property
+    def locks(self) -> list[str]:
+        """Files in requirements/ that decide what is installed."""
+        return [f"{name}.lock" for name in (*self.requirements, *(TORCH_LOCKS if self.torch else ()))]
 
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of every file that decides what is installed."""
-        names = (*self.requirements, "constraints.txt")
-        return {name: hashlib.sha256((REQUIREMENTS / name).read_bytes()).hexdigest() for name in names}
+        """SHA-256 of every lock."""
+        return {name: hashlib.sha256((REQUIREMENTS / name).read_bytes()).hexdigest() for name in self.locks}
 
-    def installed(self) -> dict[str, str]:
-        """`hashes` as of the last finished set-up, {} if none finished or the venv was made anew since."""
+    def finished(self) -> dict[str, Any]:
+        """The stamp of the last finished set-up, {} if none finished or the venv was made anew since."""
         try:
             stamp = json.loads(self.stamp.read_text(encoding="utf-8"))
             same = stamp["venv"] == (self.folder / "pyvenv.cfg").read_text(encoding="utf-8")
-            return dict(stamp["files"]) if same and not self.begun.exists() else {}
+            whole = isinstance(stamp["files"], dict) and isinstance(stamp["packages"], dict)
+            return stamp if same and whole and not self.begun.exists() else {}
         except (OSError, ValueError, KeyError, TypeError):
             return {}
 
+    def changed(self) -> list[str]:
+        """Packages that were removed, exchanged or damaged since the last finished set-up."""
+        return changed_packages(self.folder, self.finished().get("packages", {}))
+
     def ready(self) -> bool:
-        """True if a finished set-up of exactly these requirements stands here. Starts no process."""
-        return self.hashes().items() <= self.installed().items() and os.path.exists(self.python)
+        """True if a finished set-up of exactly these locks stands here, unchanged. Starts no process."""
+        done = self.hashes().items() <= self.finished().get("files", {}).items()
+        return done and os.path.exists(self.python) and not self.changed()
 
 
 def home() -> Path:
@@ -109,27 +137,32 @@ def home() -> Path:
 def backend_environment(testing: bool = False) -> Environment:
     """The backend's environment, with the test tools on request."""
     probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, safetensors, scipy"
-    files = ("backend.txt", "test.txt") if testing else ("backend.txt",)
-    return Environment("the backend", home() / ".venv", files, probe, BACKEND_DISK_GB, torch=True)
+    names = ("backend", "test") if testing else ("backend",)
+    return Environment("the backend", home() / ".venv", names, probe, BACKEND_DISK_GB, torch=True)
 
 
 def bpy_environment(series: str, testing: bool = False) -> Environment:
     """The environment of the bpy wheel of a Blender series ("5.0"), with pytest on request."""
-    files = (f"bpy-{series}.txt", "test-bpy.txt") if testing else (f"bpy-{series}.txt",)
-    return Environment(f"Blender {series}", home() / f".venv-bpy-{series}", files, "import bpy, numpy", BPY_DISK_GB)
+    names = (f"bpy-{series}", "test-bpy") if testing else (f"bpy-{series}",)
+    return Environment(f"Blender {series}", home() / f".venv-bpy-{series}", names, "import bpy, numpy", BPY_DISK_GB)
 
 
 def bench_environment() -> Environment:
     """The backend's environment with the benchmark's packages in it; `backend_environment` is to be ready before."""
     probe = "import anny, ffmpeg, flip_evaluator, imageio, matplotlib, PIL, tqdm"
-    return Environment("the benchmark's packages", home() / ".venv", ("bench.txt",), probe, 1.0, complete=True)
+    return Environment("the benchmark's packages", home() / ".venv", ("bench",), probe, 1.0)
 
 
-def set_up(environment: Environment, python: str) -> float:
+def set_up(environment: Environment, python: str, wheels: Path | None = None) -> float:
     """Makes `environment` with `python` unless it is ready; returns the seconds it took.
 
-    Raises LauncherError with the step, the log and what to do. What an interrupted set-up left is used again, packages
-    that pip had not finished writing are installed anew.
+    Raises LauncherError with the step, the log and what to do. What an interrupted set-up left is used again; packages
+    that pip had not finished writing, or that were changed since, are installed anew.
+
+    Args:
+        environment: what is made.
+        python: the interpreter that makes it.
+        wheels: a folder of wheels to install from, in place of any package index; None: from the index.
     """
     started = time.monotonic()
     if environment.ready():
@@ -138,7 +171,7 @@ def set_up(environment: Environment, python: str) -> float:
         wait = functools.partial(say, "another set-up is at work in this folder; waiting for it")
         with locked(environment.folder.parent / ".splannequin-setup.lock", wait):
             if not environment.ready():
-                _make(environment, python)
+                _make(environment, python, wheels)
     except OSError as error:
         where = error.filename2 or error.filename or environment.folder
         advice = "free some disk" if is_disk_full(error) else "make it writable"
@@ -150,32 +183,93 @@ def set_up(environment: Environment, python: str) -> float:
     return time.monotonic() - started
 
 
-def _make(environment: Environment, python: str) -> None:
-    say(f"Setting up {environment.name} in {environment.folder} (once)")
+def _make(environment: Environment, python: str, wheels: Path | None) -> None:
+    changed = environment.changed()
+    if changed:
+        say(f"Packages of {environment.name} were changed since they were installed: {', '.join(changed)}")
+    say(f"{'Repairing' if changed else 'Setting up'} {environment.name} in {environment.folder} (once)")
     usable = environment.folder.is_dir() and _has_pip(environment)
-    index = _reachable_index() if environment.torch else ""
+    index = _reachable_index() if environment.torch and wheels is None else ""
     if not usable:
         _make_room(environment, disk_gb(environment, index))
     environment.state.mkdir(parents=True, exist_ok=True)
     environment.log.write_bytes(b"")
+    before = environment.finished()
     if not usable:
         _step(environment, "making the virtual environment", tied_command(python, "venv", str(environment.folder)))
-    elif environment.begun.exists():
-        command = [environment.python, "-P", "-c", DROP_UNFINISHED]
-        _step(environment, "checking what an interrupted set-up left", command)
-    before = environment.installed()
+    elif changed or environment.begun.exists():
+        for name in drop_damaged(environment.folder, before.get("packages", {})):
+            say(f"  {name} is not whole: it is installed anew")
     environment.begun.touch()
-    pip = tied_command(environment.python, "pip", "install", "--no-input", "--progress-bar", "off")
-    pip += ["--disable-pip-version-check", "--only-binary=:all:"]
-    pip += ["--no-deps"] if environment.complete else []
-    pip += ["--extra-index-url", index] if index else []
-    for name in environment.requirements:
-        pip += ["-r", str(REQUIREMENTS / name)]
-    _step(environment, "installing packages", pip, condense_pip)
+    options = ["--no-input", "--progress-bar", "off", "--disable-pip-version-check", "--only-binary=:all:"]
+    options += ["--no-index", "--find-links", str(wheels)] if wheels is not None else []
+
+    def install(step: str, *arguments: str) -> None:
+        command = tied_command(environment.python, "pip", "install", *options, *arguments)
+        _step(environment, step, command, condense_pip, wheels)
+
+    exactly = ("--no-deps", "--require-hashes")
+    lists = [word for name in environment.requirements for word in ("-r", str(REQUIREMENTS / f"{name}.lock"))]
+    install("installing packages", *exactly, *lists)
+    if environment.torch:
+        lock, own = _torch(environment, options, index)
+        if lock:
+            install("installing PyTorch", *exactly, "-r", str(REQUIREMENTS / lock), *own)
+            if needs_cuda(environment.folder):
+                install("installing PyTorch's CUDA libraries", *exactly, "-r", str(REQUIREMENTS / "cuda.lock"))
+        else:
+            # Its dependencies are installed already, but for libraries of another CUDA: that index has them.
+            say(f"  the PyTorch of {index} is not in this version's list of hashes: pip checks what that index states")
+            install("installing PyTorch", _torch_pin(), *own)
     _step(environment, "importing what was installed", [environment.python, "-P", "-c", environment.probe])
     venv = (environment.folder / "pyvenv.cfg").read_text(encoding="utf-8")
-    write_json(environment.stamp, {"files": {**before, **environment.hashes()}, "venv": venv})
+    files = {**before.get("files", {}), **environment.hashes()}
+    names = [name for lock in files if (REQUIREMENTS / lock).is_file() for name in locked_packages(lock)]
+    packages = record_packages(environment.folder, names)
+    write_json(environment.stamp, {"files": files, "packages": packages, "venv": venv})
     environment.begun.unlink()
+
+
+def locked_packages(lock: str) -> list[str]:
+    """Names of the packages in a file of requirements/."""
+    lines = (REQUIREMENTS / lock).read_text(encoding="utf-8").splitlines()
+    return [package_name(name) for line in lines if (name := line.partition("==")[0]) != line and name[0].isalnum()]
+
+
+def _torch_pin() -> str:
+    """torch's requirement without its hashes: torch==2.13.0."""
+    lines = (REQUIREMENTS / "torch.lock").read_text(encoding="utf-8").splitlines()
+    return next(line.split()[0] for line in lines if line.startswith("torch=="))
+
+
+def _torch(environment: Environment, options: list[str], index: str) -> tuple[str, tuple[str, ...]]:
+    """The lock that torch is installed by, "" for none, and pip's options for its index.
+
+    Where torch's own index is out of reach, or a folder of wheels is used, pip may still be set to a place that has
+    the build of that index; it is taken then, not PyPI's with 4 GB of CUDA.
+    """
+    if index:
+        version = python_version(environment.python) or NEEDED_PYTHON
+        return torch_lock(index, version), ("--index-url", index)
+    build = this_machines_index().rpartition("/")[2]
+    if f"torch-{build}" in TORCH_LOCKS:
+        asked = ("--dry-run", "--no-deps", "--retries", "1", f"{_torch_pin()}+{build}")
+        command = python_child(environment.python, "pip", "install", *options, *asked)
+        done = subprocess.run(command["args"], cwd=command["cwd"], env=child_environ(), capture_output=True)
+        if done.returncode == 0:
+            return f"torch-{build}.lock", ()
+    return "torch.lock", ()
+
+
+def torch_lock(
+    index: str, python: tuple[int, int], system: str = sys.platform, machine: str = platform.machine()
+) -> str:
+    """The lock with the hash of the torch that its own index has for a Python of this machine; "" if none has it."""
+    if index not in (CPU_INDEX, CUDA_INDEX):
+        return ""  # the user's own, in SPLANNEQUIN_TORCH_INDEX
+    lock, of = f"torch-{index.rpartition('/')[2]}.lock", "win_amd64" if system == "win32" else machine
+    wheel = rf"-cp{python[0]}{python[1]}-\S+{re.escape(of)}\.whl"
+    return lock if re.search(wheel, (REQUIREMENTS / lock).read_text(encoding="utf-8")) else ""
 
 
 def _has_pip(environment: Environment) -> bool:
@@ -212,16 +306,6 @@ def _make_room(environment: Environment, needed: float) -> None:
         )
 
 
-DROP_UNFINISHED = """
-import importlib.metadata, pathlib, shutil
-for package in importlib.metadata.distributions():
-    folder = pathlib.Path(str(package._path))
-    if folder.name.endswith(".dist-info") and not (folder / "RECORD").is_file():
-        shutil.rmtree(folder)
-"""
-"""pip writes a package's RECORD last: without one the package is not all there, and pip must not believe it is."""
-
-
 def this_machines_index(system: str = sys.platform) -> str:
     """Package index, beside pip's own, that this machine's torch comes from; empty for none."""
     return torch_index(system, program("nvidia-smi") is not None, lambda: any(c.fits for c in nvidia_cards()[0]))
@@ -248,7 +332,11 @@ def _reachable(index: str) -> bool:
 
 
 def _step(
-    environment: Environment, step: str, command: list[str], condense: Callable[[str], str | None] | None = None
+    environment: Environment,
+    step: str,
+    command: list[str],
+    condense: Callable[[str], str | None] | None = None,
+    wheels: Path | None = None,
 ) -> None:
     """Runs one step of a set-up, its output to the log and what `condense` makes of each line to the screen."""
     started = time.monotonic()
@@ -293,6 +381,6 @@ def _step(
         close_input(child)
     if code:
         printed = "\n".join([*said[:5], *said[-40:]])  # pip names its indexes first
-        refuse(environment.name, environment.log, step, printed)
+        refuse(environment.name, environment.log, step, printed, wheels)
     if condense is None:
         say(f"  {time.monotonic() - started:5.0f} s  {step}: done")

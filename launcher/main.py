@@ -57,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
         if name == "setup":
             command.add_argument("--tests", action="store_true", help="with what `test` needs")
             command.add_argument("--backend", action="store_true", help="the backend alone (for the add-on)")
+            command.add_argument("--wheels", metavar="FOLDER", help="install from this folder of wheels, not online")
         names = ("--output", "--results") if name == "bench" else ("--output",)
         command.add_argument(*names, metavar="DIR", help="folder for summary.json and results (output/...)")
     return top
@@ -145,7 +146,7 @@ def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
     if args.command == "freeze":
         return freeze(args.clip, output, rest)
     if args.command == "setup":
-        return setup([args.bpy] if args.bpy else [], args.tests, args.backend, output)
+        return setup([args.bpy] if args.bpy else [], args.tests, args.backend, output, args.wheels)
     if args.command == "bench":
         return bench(rest, output)
     if args.command == "test":

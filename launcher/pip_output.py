@@ -32,8 +32,16 @@ BROKEN_CONNECTION = re.compile(
 """What pip says of an index that it cannot ask. What it says last is that no version was found."""
 
 
-def refuse(name: str, log: Path, step: str, output: str) -> None:
-    """Raises the sentence for a failed step of a set-up, from what it printed."""
+def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = None) -> None:
+    """Raises the sentence for a failed step of a set-up, from what it printed.
+
+    Args:
+        name: the environment that is set up.
+        log: where pip's whole output is.
+        step: what failed.
+        output: what it printed.
+        wheels: the folder that packages come from, in place of an index.
+    """
     lines = [line.strip() for line in output.splitlines() if line.strip()] or ["no output"]
     telling = [line for line in lines if re.search(r"error|not found|cannot|No space", line, re.I)]
     last = re.sub(r"^(ERROR: |\w*Error: )", "", (telling or lines)[-1]).rstrip(".")
@@ -41,6 +49,12 @@ def refuse(name: str, log: Path, step: str, output: str) -> None:
     answered = re.search(r"from versions: (?!none)", output)
     if re.search(r"No space left|Errno 28|not enough space", output, re.I):
         code, advice = ExitCode.DISK, "free some disk, or name a folder on another disk in SPLANNEQUIN_HOME"
+    elif "DO NOT MATCH THE HASHES" in output:
+        last, advice = _other_hash(output, wheels)
+    elif wheels is not None and re.search(r"No matching distribution|from versions:", output):
+        lacking = re.search(r"No matching distribution found for ([\w.=+-]+)", output)
+        last = f"{wheels} has no wheel of {lacking.group(1) if lacking else 'a package'} for this Python and system"
+        advice = "put it there (docs/user-guide.md, Without a network, says how), then start the same command again"
     elif BROKEN_CONNECTION.search(output) and not answered:
         last, advice = _unreachable(output)
     elif re.search(r"ensurepip|python3-venv", output):
@@ -52,6 +66,16 @@ def refuse(name: str, log: Path, step: str, output: str) -> None:
     else:
         advice = "read the log, and start the same command again: it goes on where it stopped"
     raise LauncherError(f"Setting up {name} failed at {step} ({last[:200]}): {advice}. Log: {log}", code)
+
+
+def _other_hash(output: str, wheels: Path | None) -> tuple[str, str]:
+    """What to say and do about a file whose SHA-256 is not in the lock, from what pip printed."""
+    named = re.search(r"^([\w.-]+)\S* from (\S+)", output.partition("DO NOT MATCH THE HASHES")[2], re.M)
+    package = named.group(1) if named else "a package"
+    where = wheels or (named and urllib.parse.urlsplit(named.group(2)).hostname) or "the package index"
+    last = f"the file of {package} in {where} is not the one that this version was tested with: its SHA-256 differs"
+    advice = "nothing of it was installed; take that file from PyPI" if wheels else "nothing of it was installed"
+    return last, f"{advice}. If it is the index of a company, ask who runs it"
 
 
 def _unreachable(output: str) -> tuple[str, str]:

@@ -70,7 +70,7 @@ def _bodies(texture_step: int) -> Bodies:
         return Bodies(texture_step)
     except ModuleNotFoundError as missing:
         raise ModuleNotFoundError(
-            f"{missing.name} is missing: `python -m pip install --no-deps -r requirements/bench.txt` installs it."
+            f"{missing.name} is missing: `python -m pip install --no-deps -r requirements/bench.lock` installs it."
         ) from missing
 
 

@@ -61,10 +61,6 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
             column = box.column(align=True)
             column.alert = True
             wrap(column, context, trouble.message, "ERROR")
-            if not bpy.app.online_access:
-                wrap(
-                    column, context, "Blender may not go online: allow it in Preferences > System > Network.", "BLANK1"
-                )
             box.operator("splannequin.set_up", icon=icons.of("splannequin.set_up"))
             box.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = backend.PACKAGE
 

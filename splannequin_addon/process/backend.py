@@ -57,14 +57,16 @@ def device() -> str:
 
 
 def python() -> str:
-    """The backend's interpreter. JobError if there is none, or only a half-made one, or the chosen one is missing."""
-    unfinished: Path | None = None
+    """The backend's interpreter. JobError if there is none, or only one that is half-made or was changed, or the chosen
+    one is missing."""
+    wrong = ""
     for where, path in candidates():
         chosen = where in ("the add-on's preferences", PYTHON_VARIABLE)
         if path.is_file():
-            if not environment.half_made(path):
+            trouble = _wrong_with(path)
+            if not trouble:
                 return str(path)
-            unfinished = unfinished or path.parent.parent
+            wrong = wrong or trouble
             if chosen:
                 break
         elif chosen:
@@ -73,9 +75,9 @@ def python() -> str:
                 "Correct the path, or clear it to have the backend found by itself.",
                 contract.ExitCode.ENVIRONMENT,
             )
-    if unfinished is not None:
+    if wrong:
         raise contract.JobError(
-            f"The backend's set-up has not finished: the environment in {unfinished} is half-made.",
+            wrong,
             "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
             contract.ExitCode.ENVIRONMENT,
         )
@@ -85,6 +87,15 @@ def python() -> str:
         f"(or name it in {PYTHON_VARIABLE}).",
         contract.ExitCode.ENVIRONMENT,
     )
+
+
+def _wrong_with(python: Path) -> str:
+    """Why an interpreter's environment cannot be used, a sentence; "" if it can."""
+    folder = python.parent.parent
+    if environment.half_made(python):
+        return f"The backend's set-up has not finished: the environment in {folder} is half-made."
+    changed = ", ".join(environment.changed(python))
+    return f"The backend in {folder} was changed since it was set up: {changed}." if changed else ""
 
 
 def trouble() -> contract.JobError | None:

@@ -8,12 +8,15 @@ the environment away again.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
 import subprocess
 import sys
 import threading
+import time
+import urllib.parse
 import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,8 +27,8 @@ from . import children
 SIZE = "about 1.5 GB on disk (6 GB with CUDA)"
 LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp (Apache) and what they need"
 _STATE = "setup"
-_NOTES = ".splannequin"
-"""The launcher's notes in an environment that it makes (launcher/environments.py)."""
+_LOOK_SECONDS = 60.0
+"""An environment's packages are looked at this often while it is asked for, or when it was set up since."""
 _REMOVED = ".venv-removed-"
 """Begins the name of an environment that was taken away and is being deleted."""
 _SHOWN = 6
@@ -39,8 +42,9 @@ def default_folder() -> Path:
 
 
 def sources(system: str = sys.platform) -> str:
-    """Where the packages may come from, in words. Whether a card fits is asked by the launcher: Blender cannot wait."""
-    return "PyPI and PyTorch's own index" if contract.torch_index(system, nvidia_card(), lambda: True) else "PyPI"
+    """Where the packages may come from. Whether a card fits is asked by the launcher: Blender cannot wait."""
+    index = contract.torch_index(system, nvidia_card(), lambda: True)
+    return f"pypi.org, {urllib.parse.urlsplit(index).hostname or index}" if index else "pypi.org"
 
 
 def nvidia_card() -> bool:
@@ -73,13 +77,14 @@ class SetUp:
         return self.folder / _STATE / "summary.json"
 
 
-def start(folder: Path, python: str, package_root: Path) -> SetUp:
+def start(folder: Path, python: str, package_root: Path, wheels: Path | None = None) -> SetUp:
     """Starts a set-up in `folder`, or goes on with one that was interrupted.
 
     Args:
         folder: holds the environment afterwards.
         python: a Python that makes the environment; Blender's own will do.
         package_root: holds `splannequin.py`.
+        wheels: a folder of wheels to install from, in place of the internet.
 
     Raises:
         contract.JobError: the folder cannot be written, or Python not started.
@@ -89,6 +94,7 @@ def start(folder: Path, python: str, package_root: Path) -> SetUp:
     python = os.path.abspath(python)
     launcher = str(package_root / "splannequin.py")
     command = [python, "-P", launcher, "setup", "--backend", "--output", str(setup.log.parent.absolute())]
+    command += ["--wheels", str(wheels.absolute())] if wheels is not None else []
     try:
         setup.log.parent.mkdir(parents=True, exist_ok=True)
         with open(setup.log, "wb") as log:
@@ -138,10 +144,28 @@ def cancel(setup: SetUp) -> None:
 def half_made(python: Path) -> bool:
     """True of an interpreter whose environment the launcher has begun and not finished; one without notes is believed.
 
-    As the launcher has it: `installing` stands there while packages are written, `installed.json` once all is there.
+    As the launcher has it: SETUP_BEGUN stands there while packages are written, SETUP_STAMP once all is there.
     """
-    notes = python.parent.parent / _NOTES
-    return notes.is_dir() and ((notes / "installing").exists() or not (notes / "installed.json").is_file())
+    state = python.parent.parent / contract.SETUP_NOTES
+    return state.is_dir() and ((state / contract.SETUP_BEGUN).exists() or not (state / contract.SETUP_STAMP).is_file())
+
+
+_seen: dict[Path, tuple[float, int, list[str]]] = {}
+"""Environment -> when its packages were looked at, the time of its stamp then, and those that had changed."""
+
+
+def changed(python: Path) -> list[str]:
+    """Packages of an interpreter's environment that were removed, exchanged or damaged since the launcher set it up."""
+    folder = python.parent.parent
+    try:
+        stamp = os.stat(folder / contract.SETUP_NOTES / contract.SETUP_STAMP).st_mtime_ns
+    except OSError:
+        return []  # not of the launcher
+    when, before, names = _seen.get(folder, (-math.inf, 0, []))
+    if before != stamp or time.monotonic() - when > _LOOK_SECONDS:
+        names = contract.changed_since_set_up(folder)
+        _seen[folder] = (time.monotonic(), stamp, names)
+    return names
 
 
 class AtWork(Exception):
@@ -161,7 +185,7 @@ def remove(folder: Path, wait: bool = False) -> bool:
     environment = folder / ".venv"
     if not environment.is_dir():
         return False
-    if not (environment / _NOTES).is_dir():
+    if not (environment / contract.SETUP_NOTES).is_dir():
         raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
     _nobody_in(environment)
     # Renamed first: whatever is interrupted, no half of it passes for an environment.

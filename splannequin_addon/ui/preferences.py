@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -10,7 +11,7 @@ import bpy
 from ...torch_backend import contract
 from ..access import Icon, Outcome, layout_of
 from ..process import backend, children, environment, job_timer
-from ..properties import EnumProperty, StringProperty
+from ..properties import BoolProperty, EnumProperty, StringProperty
 from ..translations import tr
 from .sentences import wrap
 
@@ -35,6 +36,11 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
     backend_folder = StringProperty(
         name="Folder",
         description="Where Set Up Backend puts the environment; empty: a short path in your home folder",
+        subtype="DIR_PATH",
+    )
+    backend_wheels = StringProperty(
+        name="Wheels",
+        description="Folder of wheels that Set Up Backend installs from, without a network; empty: from the internet",
         subtype="DIR_PATH",
     )
     device = EnumProperty(
@@ -73,6 +79,9 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         row.prop(self, "backend_folder")
         if not self.backend_folder:
             self._say(box, f"Without a folder it goes to {environment.default_folder()}.", "INFO")
+        row = box.row()
+        row.enabled = not busy()
+        row.prop(self, "backend_wheels")
         row = box.row(align=True)
         ours = backend.venv_python(backend.folder() / ".venv").is_file()
         if busy():
@@ -93,12 +102,30 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         elif not there:
             self._say(box, f"Makes a Python environment of its own, {environment.SIZE}.", "INFO")
             self._say(box, f"It installs {environment.LICENCES}.", "BLANK1")
-        if not bpy.app.online_access:
-            self._say(box, "Blender may not go online: allow it in Preferences > System > Network.", "ERROR")
+        if _is_offline():
+            self._say(box, _OFFLINE, "ERROR")
 
     def _say(self, layout: bpy.types.UILayout, text: str, icon: Icon = "NONE") -> None:
         """A sentence in as many lines as the page is wide for: Blender sets it in by the boxes around it."""
         wrap(layout, bpy.context, text, icon, margin=_INSET)
+
+
+_OFFLINE = (
+    "Blender may not go online: allow it in Preferences > System > Network, "
+    "or choose a folder of wheels in the add-on's preferences."
+)
+
+
+def _wheels() -> Path | None:
+    """The folder of wheels to install from; None for the internet."""
+    addon = bpy.context.preferences.addons.get(backend.PACKAGE)
+    chosen = str(getattr(addon.preferences, "backend_wheels", "")) if addon and addon.preferences else ""
+    return Path(bpy.path.abspath(chosen)) if chosen else None
+
+
+def _is_offline() -> bool:
+    """True if a set-up needs the internet and Blender may not go there."""
+    return not bpy.app.online_access and _wheels() is None
 
 
 def busy() -> bool:
@@ -118,34 +145,52 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
     bl_label = "Set Up Backend"
     bl_options = {"REGISTER"}
 
+    allow_online = BoolProperty(
+        name="Allow Online Access",
+        description="Tick Allow Online Access in Preferences > System > Network",
+        options={"SKIP_SAVE"},
+    )
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Only where Blender may go online, and one at a time."""
-        if not bpy.app.online_access:
-            cls.poll_message_set(tr("Blender may not go online: allow it in Preferences > System > Network"))
-            return False
+        """One at a time."""
         return not busy()
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
         """Asks first."""
-        return context.window_manager.invoke_props_dialog(self, width=_DIALOG, confirm_text="Download and Install")
+        return context.window_manager.invoke_props_dialog(self, width=_DIALOG, confirm_text="Install")
 
     def draw(self, context: bpy.types.Context) -> None:
-        """What is asked."""
+        """What is asked: what is fetched from where, how it is checked, and to be let online."""
         column = layout_of(self).column(align=True)
+        wheels = _wheels()
+        size, places = environment.SIZE, environment.sources()
+        source = f"Needs {size}, downloaded from {places}." if wheels is None else f"Needs {size}, taken from {wheels}."
         for text in (
             f"Makes a Python environment in {backend.folder()}",
-            f"Needs {environment.SIZE}, downloaded from {environment.sources()}.",
+            source,
             f"Installs {environment.LICENCES}.",
+            "The SHA-256 of each file is compared with this add-on's list before it is installed.",
+            "A build of PyTorch that is not in the list is compared with what its own index states.",
             "Nothing is changed in Blender's own Python.",
         ):
             wrap(column, context, text, width=_DIALOG)
+        if _is_offline():
+            column = layout_of(self).column(align=True)
+            wrap(column, context, _OFFLINE, "ERROR", width=_DIALOG)
+            if not bpy.app.online_access_override:
+                column.prop(self, "allow_online")
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Starts it; headless, waits for its end."""
         global _setup
+        if _is_offline() and self.allow_online and not bpy.app.online_access_override:
+            context.preferences.system.use_online_access = True
+        if _is_offline():
+            self.report({"ERROR"}, tr(_OFFLINE))
+            return {"CANCELLED"}
         try:
-            _setup = environment.start(backend.folder(), sys.executable, backend.package_root())
+            _setup = environment.start(backend.folder(), sys.executable, backend.package_root(), _wheels())
         except contract.JobError as error:
             self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
             return {"CANCELLED"}

@@ -157,8 +157,64 @@ def test_what_a_process_begins_with_while_it_is_being_removed_is_put_back(addon,
     assert environment.remove(made, wait=True) and not list(made.iterdir())
 
 
-def test_the_button_needs_leave_to_go_online(addon):
-    assert bpy.ops.splannequin.set_up.poll() == bool(bpy.app.online_access)
+@pytest.fixture
+def system(addon, tmp_path, monkeypatch):
+    """Blender's own setting of online access, off; a folder for the environment, and a pip that finds nothing."""
+    monkeypatch.setattr(addon("process.backend"), "folder", lambda: tmp_path / "backend")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
+    system = bpy.context.preferences.system
+    before = system.use_online_access
+    system.use_online_access = False
+    yield system
+    system.use_online_access = before
+
+
+@pytest.mark.skipif(bpy.app.online_access_override, reason="this Blender was started online or offline for good")
+def test_offline_the_button_says_so_and_goes_online_only_when_it_is_told_to(system, tmp_path):
+    assert bpy.ops.splannequin.set_up.poll(), "a grey button offers nothing"
+    with pytest.raises(RuntimeError, match="may not go online"):
+        bpy.ops.splannequin.set_up()
+    assert not system.use_online_access and not (tmp_path / "backend").exists()
+    with pytest.raises(RuntimeError, match="failed at installing packages"):
+        bpy.ops.splannequin.set_up(allow_online=True)
+    assert bpy.app.online_access
+
+
+@pytest.mark.skipif(bpy.app.online_access_override, reason="this Blender was started online or offline for good")
+def test_from_a_folder_of_wheels_the_button_works_offline(addon, system, tmp_path, monkeypatch):
+    wheels = tmp_path / "whéels"
+    monkeypatch.setattr(addon("ui.preferences"), "_wheels", lambda: wheels)
+    with pytest.raises(RuntimeError, match=r"no wheels .* in .*whéels"):
+        bpy.ops.splannequin.set_up()
+    wheels.mkdir()
+    (wheels / "other-1.0-py3-none-any.whl").touch()
+    with pytest.raises(RuntimeError, match="whéels has no wheel of"):
+        bpy.ops.splannequin.set_up()
+    assert not bpy.app.online_access
+
+
+def test_a_backend_that_was_changed_since_its_set_up_is_not_started(addon, contract, tmp_path, monkeypatch):
+    backend, environment = addon("process.backend"), addon("process.environment")
+    venv = tmp_path / ".venv"
+    python, site = backend.venv_python(venv), venv / "lib" / "python3.11" / "site-packages"
+    for package in ("one", "two"):
+        (site / f"{package}-1.0.dist-info").mkdir(parents=True)
+        (site / f"{package}.py").write_text("value = 1")
+        (site / f"{package}-1.0.dist-info" / "RECORD").write_text(f"{package}.py,sha256=abc,9\n")
+    python.parent.mkdir()
+    python.touch()
+    (venv / contract.SETUP_NOTES).mkdir()
+    stamp = {"packages": contract.record_packages(venv, ["one", "two"])}
+    contract.write_json(venv / contract.SETUP_NOTES / contract.SETUP_STAMP, stamp)
+    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(python))
+    assert backend.python() == str(python)
+    (site / "two.py").unlink()
+    environment._seen.clear()  # as Blender begins
+    with pytest.raises(contract.JobError, match="changed since it was set up: two") as refused:
+        backend.python()
+    assert "Press Repair" in refused.value.hint
 
 
 def test_check_says_what_the_backend_can_do(addon):

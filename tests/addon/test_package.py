@@ -37,7 +37,10 @@ def test_source_and_zip_are_valid_and_hold_what_is_needed(packager, root, tmp_pa
         "LICENSE", "README.md", "__init__.py", "blender_manifest.toml", "launcher", "pyproject.toml", "requirements",
         "splannequin.py", "splannequin_addon", "torch_backend",
     }  # fmt: skip
-    assert {"splannequin_addon/registration.py", "requirements/backend.txt"} <= set(names)
+    needed = {"backend.txt", "backend.lock", "torch.lock", "torch-cpu.lock", "torch-cu130.lock", "cuda.lock"}
+    assert {"splannequin_addon/registration.py", *(f"requirements/{name}" for name in needed)} <= set(names)
+    for_developers = ("torch_backend/report/", "requirements/test", "requirements/bench")
+    assert not [n for n in names if n.startswith(for_developers)]
     assert {"torch_backend/contract/__init__.py", "torch_backend/contract/options.py"} <= set(names)
     assert {"splannequin_addon/translations/__init__.py", "splannequin_addon/translations/de_DE.py"} <= set(names)
     # Kernels are no Python, and the rasteriser reads them at its first picture.
@@ -51,4 +54,5 @@ def test_manifest_agrees_with_the_package(root):
     version = re.search(r'__version__ = "(.+)"', (root / "torch_backend" / "__init__.py").read_text())
     assert version and manifest["version"] == version.group(1)
     assert manifest["id"] == "splannequin" and manifest["license"] == ["SPDX:GPL-3.0-or-later"]
+    assert all(host in manifest["permissions"]["network"] for host in ("pypi.org", "pytorch.org"))
     assert len(manifest["tagline"]) <= 64 and not manifest["tagline"].endswith(".")

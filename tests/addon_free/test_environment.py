@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="the stand-ins are shell
 GOOD = "NVIDIA GeForce RTX 3090, 580.65.06, 8.6"
 OLD_DRIVER = "NVIDIA GeForce RTX 3090, 535.183.01, 8.6"
 OLD_CARD = "Tesla P100-PCIE-16GB, 580.65.06, 6.0"
-OWN, BOTH = "PyPI", "PyPI and PyTorch's own index"
+OWN, BOTH = "pypi.org", "pypi.org, download.pytorch.org"
 
 
 @pytest.mark.parametrize("variable", [None, "", "https://download.pytorch.org/whl/cu126"])

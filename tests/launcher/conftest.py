@@ -1,6 +1,7 @@
 """Real virtual environments, made offline from a wheel that the test writes."""
 
 import base64
+import dataclasses
 import hashlib
 import subprocess
 import sys
@@ -43,17 +44,41 @@ def requirements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A requirements folder of the test's own, and a pip that looks nowhere else."""
     folder = tmp_path / "requirements"
     folder.mkdir()
-    (folder / "constraints.txt").write_text("")
     monkeypatch.setattr(environments, "REQUIREMENTS", folder)
     monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
     return folder
 
 
 @pytest.fixture
-def environment(tmp_path: Path, requirements: Path, write_wheel) -> environments.Environment:
+def write_lock(requirements: Path):
+    """write_lock(name, wheels...) writes a lock of wheels that lie in the test's folder, with their hashes."""
+
+    def write(name: str, *wheels: Path) -> None:
+        with open(requirements / f"{name}.lock", "w") as lock:
+            for wheel in wheels:
+                package, version, *_ = wheel.name.split("-")
+                digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+                lock.write(f"{package}=={version} \\\n    --hash=sha256:{digest}\n")
+
+    return write
+
+
+@pytest.fixture
+def environment(tmp_path: Path, write_lock, write_wheel) -> environments.Environment:
     """An environment of one small package, not made yet."""
-    (requirements / "small.txt").write_text(f"{write_wheel('smallthing', '1.0', 'value = 1')}\n")
-    return environments.Environment("the test", tmp_path / "home" / ".venv", ("small.txt",), "import smallthing", 0.01)
+    write_lock("small", write_wheel("smallthing", "1.0", "value = 1"))
+    return environments.Environment("the test", tmp_path / "home" / ".venv", ("small",), "import smallthing", 0.01)
+
+
+@pytest.fixture
+def with_torch(environment: environments.Environment, write_lock, write_wheel) -> environments.Environment:
+    """An environment of that package and of a torch, not made yet."""
+    write_lock("torch", write_wheel("torch", "2.13.0", ""))
+    write_lock("torch-cpu")
+    write_lock("torch-cu130")
+    write_lock("cuda", write_wheel("nvidia_small", "1.0", ""))
+    return dataclasses.replace(environment, disk_gb=environments.BACKEND_DISK_GB, torch=True)
 
 
 @pytest.fixture

@@ -258,13 +258,13 @@ SETTING_UP = """
 import pathlib, sys
 from launcher import environments
 environments.REQUIREMENTS = pathlib.Path(sys.argv[1])
-environments.set_up(environments.Environment("x", pathlib.Path(sys.argv[2]), ("small.txt",), "", 0.01), sys.executable)
+environments.set_up(environments.Environment("x", pathlib.Path(sys.argv[2]), ("small",), "", 0.01), sys.executable)
 """
 
 
 def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent, made):
     """pip waits for an index that does not answer; that sees how long it is waited for."""
-    (requirements / "small.txt").write_text("there-is-no-such-package==1.0\n")
+    (requirements / "small.lock").write_text(f"there-is-no-such-package==1.0 --hash=sha256:{'0' * 64}\n")
     made(tmp_path / "home" / ".venv")
     with socket.create_server(("127.0.0.1", 0)) as index:
         index.settimeout(120)

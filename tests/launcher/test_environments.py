@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from launcher import blender, environments
+from launcher import blender, environments, main
 from launcher.environments import Environment, set_up
 from launcher.errors import LauncherError
 
@@ -37,34 +38,163 @@ def test_set_up_once_then_nothing_is_started(
     assert set_up(environment, "no such python") == 0
 
 
-def test_changed_requirements_are_installed(environment: Environment, requirements: Path, write_wheel):
+def test_changed_requirements_are_installed(environment: Environment, write_lock, write_wheel):
     set_up(environment, sys.executable)
-    (requirements / "small.txt").write_text(f"{write_wheel('smallthing', '2.0', 'value = 2')}\n")
+    write_lock("small", write_wheel("smallthing", "2.0", "value = 2"))
     assert not environment.ready()
     set_up(environment, sys.executable)
     assert value_of(environment) == "2"
 
 
-def test_a_superset_of_the_requirements_is_ready_for_the_subset(environment: Environment, requirements, write_wheel):
-    (requirements / "more.txt").write_text(f"{write_wheel('otherthing', '1.0', '')}\n")
-    more = dataclasses.replace(environment, requirements=("small.txt", "more.txt"))
+def test_a_superset_of_the_requirements_is_ready_for_the_subset(environment: Environment, write_lock, write_wheel):
+    write_lock("more", write_wheel("otherthing", "1.0", ""))
+    more = dataclasses.replace(environment, requirements=("small", "more"))
     set_up(environment, sys.executable)
     assert not more.ready()
     set_up(more, sys.executable)
     assert more.ready() and environment.ready()
 
 
-def test_a_complete_list_is_installed_into_what_is_there_and_nothing_else(
-    environment: Environment, requirements: Path, write_wheel
-):
+def test_nothing_is_installed_that_the_lock_does_not_name(environment: Environment, write_lock, write_wheel, made):
+    made(environment.folder)
     set_up(environment, sys.executable)
-    wheel = write_wheel("otherthing", "1.0", "", needs="there-is-no-such-package")
-    (requirements / "more.txt").write_text(f"{wheel}\n")
-    more = dataclasses.replace(environment, requirements=("more.txt",), probe="import smallthing, otherthing")
-    with pytest.raises(LauncherError, match="no-such-package"):
-        set_up(more, sys.executable)
-    set_up(dataclasses.replace(more, complete=True), sys.executable)
-    assert more.ready()
+    write_wheel("hanger_on", "1.0", "")
+    write_lock("more", write_wheel("otherthing", "1.0", "", needs="hanger-on"))
+    more = dataclasses.replace(environment, requirements=("more",), probe="import smallthing, otherthing")
+    set_up(more, sys.executable)
+    assert more.ready() and not list(site_packages(environment).glob("hanger_on*"))
+
+
+def test_a_file_with_another_hash_is_not_installed(environment: Environment, write_wheel, tmp_path: Path, made):
+    """The package index, or a folder of wheels, has something else under the same name and version."""
+    made(environment.folder)
+    write_wheel("smallthing", "1.0", "value = 'of somebody else'")
+    for wheels in (None, tmp_path):
+        with pytest.raises(LauncherError, match="smallthing .*SHA-256 differs") as refused:
+            set_up(environment, sys.executable, wheels)
+        assert refused.value.exit_code == 9 and not environment.ready()
+    assert not list(environment.folder.rglob("smallthing*"))
+
+
+def test_a_requirement_without_a_hash_is_not_installed(environment: Environment, requirements: Path, made):
+    made(environment.folder)
+    (requirements / "small.lock").write_text("smallthing==1.0\n")
+    with pytest.raises(LauncherError, match="installing packages"):
+        set_up(environment, sys.executable)
+    assert not list(environment.folder.rglob("smallthing*"))
+
+
+def test_from_a_folder_of_wheels_no_index_is_asked(
+    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, write_lock, write_wheel, made
+):
+    made(environment.folder)
+    monkeypatch.delenv("PIP_NO_INDEX")
+    monkeypatch.delenv("PIP_FIND_LINKS")
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")  # nobody listens
+    (tmp_path / "whéels 1").mkdir()
+    for wheel in tmp_path.glob("*.whl"):
+        wheel.rename(tmp_path / "whéels 1" / wheel.name)
+    set_up(environment, sys.executable, tmp_path / "whéels 1")
+    assert value_of(environment) == "1" and environment.ready()
+
+    write_lock("small", write_wheel("smallthing", "2.0", "value = 2"))
+    with pytest.raises(LauncherError, match="has no wheel of smallthing==2.0") as refused:
+        set_up(environment, sys.executable, tmp_path / "whéels 1")
+    assert refused.value.exit_code == 9
+    assert main.main(["setup", "--wheels", str(tmp_path / "absent"), "--output", str(tmp_path / "o")]) == 2
+
+
+def test_torch_alone_is_asked_of_its_index(
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made, write_lock, write_wheel
+):
+    """Nothing else of that index comes in, however high its version."""
+    made(with_torch.folder)
+    index = tmp_path / "whl" / "cpu"
+    theirs = write_wheel("torch", "2.13.0+cpu", "build = 'cpu'")
+    write_lock("torch-cpu", theirs)
+    for wheel in (theirs, write_wheel("smallthing", "9.0", "value = 9")):
+        folder = index / wheel.name.split("-")[0]
+        folder.mkdir(parents=True)
+        wheel.rename(folder / wheel.name)
+        (folder / "index.html").write_text(f'<a href="{wheel.name}">{wheel.name}</a>')
+    monkeypatch.setattr(environments, "CPU_INDEX", index.as_uri())
+    monkeypatch.setattr(environments, "torch_lock", lambda index, python: "torch-cpu.lock")
+    monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", index.as_uri())
+    monkeypatch.setenv("PIP_NO_INDEX", "0")
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")
+    set_up(with_torch, sys.executable)
+    assert with_torch.ready() and value_of(with_torch) == "1"
+    assert (site_packages(with_torch) / "torch.py").read_text() == "build = 'cpu'"
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere PyPI's build is the one without CUDA")
+def test_the_build_of_an_index_out_of_reach_is_taken_where_pip_finds_it(
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made, write_lock, write_wheel
+):
+    """Here and in CI: a folder that pip is set to has it. A file of that name with another hash is refused."""
+    made(with_torch.folder)
+    monkeypatch.delenv("SPLANNEQUIN_TORCH_INDEX", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))  # no NVIDIA driver
+    monkeypatch.setattr(environments, "_reachable", lambda _: False)
+    wheel = write_wheel("torch", "2.13.0+cpu", "build = 'cpu'")
+    write_lock("torch-cpu", wheel)
+    set_up(with_torch, sys.executable)
+    assert (site_packages(with_torch) / "torch.py").read_text() == "build = 'cpu'"
+
+    shutil.rmtree(next(site_packages(with_torch).glob("torch-*")))
+    write_wheel("torch", "2.13.0+cpu", "build = 'of somebody else'")
+    with pytest.raises(LauncherError, match=r"torch.* SHA-256 differs"):
+        set_up(with_torch, sys.executable)
+
+
+def test_cuda_libraries_come_only_with_a_torch_that_asks_for_them(
+    with_torch: Environment, write_lock, write_wheel, made
+):
+    made(with_torch.folder)
+    set_up(with_torch, sys.executable)
+    packages = site_packages(with_torch)
+    assert not list(packages.glob("nvidia_small*"))
+    write_lock("torch", write_wheel("torch", "2.14.0", "", needs='nvidia-small==1.0; platform_system == "Linux"'))
+    set_up(with_torch, sys.executable)
+    assert list(packages.glob("nvidia_small*"))
+
+
+def damage(packages: Path, how: str) -> None:
+    info = packages / "smallthing-1.0.dist-info"
+    if how == "removed":
+        shutil.rmtree(info)
+        (packages / "smallthing.py").unlink()
+    elif how == "file removed":
+        (packages / "smallthing.py").unlink()
+    elif how == "exchanged":
+        info.rename(packages / "smallthing-0.9.dist-info")
+        (packages / "smallthing.py").write_text("value = 9\n")
+    elif how == "cut off":
+        (packages / "smallthing.py").write_text("")
+    elif how == "record forged":
+        (packages / "smallthing.py").write_text("value = 7")
+        record = (info / "RECORD").read_text().splitlines(keepends=True)
+        (info / "RECORD").write_text("".join(line for line in record if not line.startswith("smallthing.py")))
+
+
+def test_a_package_that_was_changed_is_noticed_and_repaired(environment: Environment, capsys, made):
+    made(environment.folder)
+    set_up(environment, sys.executable)
+    for how in ("removed", "file removed", "exchanged", "cut off", "record forged"):
+        damage(site_packages(environment), how)
+        assert environment.changed() == ["smallthing"] and not environment.ready(), how
+        capsys.readouterr()
+        set_up(environment, sys.executable)
+        assert environment.ready() and value_of(environment) == "1", how
+        assert "smallthing" in capsys.readouterr().out
+
+
+def test_what_somebody_installs_besides_is_no_change(environment: Environment, write_wheel, tmp_path: Path, made):
+    made(environment.folder)
+    set_up(environment, sys.executable)
+    other = write_wheel("otherthing", "1.0", "")
+    subprocess.run([environment.python, "-m", "pip", "install", "-q", str(other)], check=True)
+    assert environment.ready()
 
 
 def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment):
@@ -106,7 +236,7 @@ def test_a_folder_of_someone_else_is_left_alone(environment: Environment):
 
 
 def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Environment, requirements: Path):
-    (requirements / "small.txt").write_text("there-is-no-such-package==1.0\n")
+    (requirements / "small.lock").write_text(f"there-is-no-such-package==1.0 --hash=sha256:{'0' * 64}\n")
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)
     message = str(refused.value)
@@ -118,8 +248,8 @@ def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Env
     assert not environment.ready()
 
 
-def test_a_package_that_does_not_import_is_not_ready(environment: Environment, requirements: Path, write_wheel):
-    (requirements / "small.txt").write_text(f"{write_wheel('smallthing', '3.0', 'import absent_library')}\n")
+def test_a_package_that_does_not_import_is_not_ready(environment: Environment, write_lock, write_wheel):
+    write_lock("small", write_wheel("smallthing", "3.0", "import absent_library"))
     with pytest.raises(LauncherError, match="absent_library"):
         set_up(environment, sys.executable)
     assert not environment.ready()
@@ -134,9 +264,9 @@ def test_a_full_disk_is_said_before_anything_is_written(environment: Environment
 
 @pytest.mark.parametrize(("index", "needed"), [("/whl/cpu", 4), ("/whl/cu130", 9)])
 def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
-    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, index: str, needed: int
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, index: str, needed: int
 ):
-    backend = dataclasses.replace(environment, disk_gb=environments.BACKEND_DISK_GB, torch=True)
+    backend = with_torch
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", f"file://{tmp_path}{index}")
     disk = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 - 1e8)))
@@ -156,10 +286,10 @@ def test_without_an_index_it_is_that_of_what_pypi_has(system: str, needed: float
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="PyPI has CUDA for Linux alone")
 def test_an_index_out_of_reach_is_not_reckoned_with(
-    environment: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
 ):
     """Then torch comes from the usual index, which on Linux has the one with CUDA."""
-    backend = dataclasses.replace(environment, disk_gb=environments.BACKEND_DISK_GB, torch=True)
+    backend = with_torch
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "http://127.0.0.1:9/whl/cpu")
     disk = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(5e9)))
@@ -186,6 +316,54 @@ def test_every_requirement_is_pinned_exactly():
             assert not line.strip() or line.startswith(("#", "-c ")) or line.count("==") == 1, f"{path.name}: {line}"
 
 
+def pins(path: Path) -> dict[str, str]:
+    """Version by name of a list of requirements."""
+    found = re.findall(r"^([\w.-]+)==(\S+)", path.read_text(), re.M)
+    return {environments.package_name(name): version for name, version in found}
+
+
+def test_every_package_of_a_lock_has_hashes():
+    locks = sorted(environments.REQUIREMENTS.glob("*.lock"))
+    lists = {p.stem for p in environments.REQUIREMENTS.glob("*.txt")} - {"constraints"}
+    assert {p.stem for p in locks} == {*lists, *environments.TORCH_LOCKS}
+    for path in locks:
+        entry = r"[\w.-]+==\S+( ; [^\\]+)?( \\\n    --hash=sha256:[0-9a-f]{64})+\n"
+        text = "".join(line for line in path.read_text().splitlines(keepends=True) if not line.startswith("#"))
+        assert re.fullmatch(f"({entry})+", text), f"{path.name} has a line that pip would take on trust"
+
+
+def test_locks_have_the_versions_that_were_asked_for():
+    """Whoever edits a list and does not run tools/lock_requirements.py is told here."""
+    folder = environments.REQUIREMENTS
+    constraints = pins(folder / "constraints.txt")
+    for path in folder.glob("*.txt"):
+        if path.stem != "constraints":
+            locks = [path.stem, *(("torch", "cuda") if path.stem == "backend" else ())]
+            got = {name: version for lock in locks for name, version in pins(folder / f"{lock}.lock").items()}
+            asked = pins(path)
+            assert asked.items() <= got.items(), f"{path.name}: run tools/lock_requirements.py"
+            agreed = {name: version for name, version in constraints.items() if name in got and name not in asked}
+            assert agreed.items() <= got.items(), f"{path.name}: run tools/lock_requirements.py"
+    # These lie in one environment.
+    together = [pins(folder / f"{lock}.lock") for lock in ("backend", "torch", "cuda", "test", "bench")]
+    for name in set().union(*together):
+        assert len({lock[name] for lock in together if name in lock}) == 1, name
+
+
+def test_torch_of_this_version_is_known_by_its_hash_but_for_one_wheel():
+    lock, cpu, cuda = environments.torch_lock, environments.CPU_INDEX, environments.CUDA_INDEX
+    assert re.fullmatch(r"torch==[\d.]+", environments._torch_pin())
+    for build in ("cpu", "cu130"):
+        assert pins(environments.REQUIREMENTS / f"torch-{build}.lock") == {
+            "torch": f"{environments._torch_pin().partition('==')[2]}+{build}"
+        }
+    for python in ((3, 11), (3, 12), (3, 13), (3, 14)):
+        assert lock(cpu, python, "linux", "x86_64") == lock(cpu, python, "linux", "aarch64") == "torch-cpu.lock"
+        assert lock(cuda, python, "win32", "AMD64") == ("torch-cu130.lock" if python != (3, 11) else "")
+        assert not lock("https://download.pytorch.org/whl/cu126", python, "linux", "x86_64")
+        assert not lock("https://somewhere.else/simple", python)
+
+
 def test_an_index_that_does_not_answer_is_not_asked_for_every_package(tmp_path: Path):
     assert environments._reachable(tmp_path.as_uri())
     assert not environments._reachable("https://packages.invalid/whl/cpu")
@@ -208,7 +386,7 @@ def test_an_index_that_cannot_be_reached_is_what_is_wrong(
     environment: Environment, requirements: Path, offline, made, monkeypatch: pytest.MonkeyPatch
 ):
     made(environment.folder)
-    (requirements / "small.txt").write_text("smallthing==1.0\n")
+    (requirements / "small.lock").write_text(f"smallthing==1.0 --hash=sha256:{'0' * 64}\n")
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)
     message = str(refused.value)

@@ -21,6 +21,7 @@
     frame_layers    what the layers of a frozen frame hold
     checkpoint_header   what a checkpoint says of itself
     torch_source    which PyTorch a set-up takes
+    installed       what a set-up installed, and whether it is unchanged
     results         verdicts and the figures of a run
 
 Their public names are this package's own. Everything that is written carries a version; a newer one than ours is
@@ -99,6 +100,16 @@ from .hosts import (
 from .identity import (
     file_digest,
     files_digest,
+)
+from .installed import (
+    SETUP_BEGUN,
+    SETUP_NOTES,
+    SETUP_STAMP,
+    changed_packages,
+    changed_since_set_up,
+    package_name,
+    record_packages,
+    site_packages,
 )
 from .jobs import (
     BLEND_FILE,
@@ -364,6 +375,9 @@ __all__ = [
     "RULES_VARIABLE",
     "RUNS_FOLDER",
     "SCENE_FILE",
+    "SETUP_BEGUN",
+    "SETUP_NOTES",
+    "SETUP_STAMP",
     "SHORT_JSON",
     "SHOT_SUFFIX",
     "SHOULDER",
@@ -419,6 +433,8 @@ __all__ = [
     "atomic_path",
     "brings_cuda",
     "busy",
+    "changed_packages",
+    "changed_since_set_up",
     "channels_of",
     "check_params",
     "check_version",
@@ -467,6 +483,7 @@ __all__ = [
     "options_of",
     "overscan",
     "own_input",
+    "package_name",
     "panel",
     "parse_timecode",
     "path_error",
@@ -480,6 +497,7 @@ __all__ = [
     "read_lines",
     "read_message",
     "read_writer",
+    "record_packages",
     "refuse_foreign",
     "remove_file",
     "remove_link",
@@ -492,6 +510,7 @@ __all__ = [
     "runs_job",
     "runs_still",
     "said_of",
+    "site_packages",
     "summarise",
     "sweep_half_written",
     "take_figures",
