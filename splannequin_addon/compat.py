@@ -30,6 +30,9 @@ CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
 TURNS_VIDEOS = bpy.app.version >= (5, 0, 0)
 """True if a video is turned by quarter turns as its header says. 4.2 and 4.3 show it as it is stored."""
 
+HAS_PATH_TEMPLATES = HAS_COMPOSITING_GROUP
+"""True where braces in an output path are templates (5.0 on)."""
+
 POINT_SHADERS = ("POINT_FLAT_COLOR", "FLAT_COLOR") if bpy.app.version >= (4, 5, 0) else ("FLAT_COLOR",)
 """Built-in shaders that colour points, the best first: points have one of their own since 4.5."""
 
@@ -40,6 +43,22 @@ PATH_OPTIONS: set[PropertyFlagItems] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.a
 def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree | None:
     """The scene's compositor tree, or None if it has none."""
     return scene.compositing_node_group if HAS_COMPOSITING_GROUP else _own_tree(scene)
+
+
+def own_compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+    """The scene's compositor tree, copied first if another scene has it, too (5.0 on). Only for a scene with one."""
+    if not HAS_COMPOSITING_GROUP:
+        return _own_tree(scene)
+    tree = scene.compositing_node_group
+    assert tree is not None
+    sharing = [other for other in bpy.data.scenes if other != scene and other.compositing_node_group == tree]
+    if not sharing:
+        return tree
+    fresh = scene.compositing_node_group = tree.copy()
+    for node in fresh.nodes:  # what showed one of these scenes in the shared tree stood for the scene itself
+        if isinstance(node, bpy.types.CompositorNodeRLayers) and node.scene in sharing:
+            node.scene = scene
+    return fresh
 
 
 def _own_tree(scene: Any) -> bpy.types.NodeTree:
@@ -305,6 +324,11 @@ def sized(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, size: tuple[i
     return node.outputs[0]
 
 
+def literal(path: str) -> str:
+    """An output path that means these very letters: braces are doubled where Blender would fill something in."""
+    return path.replace("{", "{{").replace("}", "}}") if HAS_PATH_TEMPLATES else path
+
+
 def set_png(settings: bpy.types.ImageFormatSettings) -> None:
     """8-bit RGB PNG as a scene's output format. RGB, so that holes come out black instead of divided by alpha."""
     if hasattr(settings, "media_type"):
@@ -313,6 +337,7 @@ def set_png(settings: bpy.types.ImageFormatSettings) -> None:
     settings.color_mode = "RGB"
     settings.color_depth = "8"
     settings.compression = 15
+    settings.color_management = "FOLLOW_SCENE"
 
 
 _PROBE = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n" + bytes((*(int(256 * v) for v in PROBE), 128))
@@ -419,7 +444,12 @@ def fcurves(datablock: _Animated) -> Iterator[bpy.types.FCurve]:
         yield from curves
 
 
-def _curves(animation: bpy.types.AnimData) -> list[Any]:
+def curves_of_strip(strip: bpy.types.NlaStrip) -> list[bpy.types.FCurve]:
+    """The F-curves of the action that an NLA strip plays."""
+    return [curve for curves in _curves(strip) for curve in curves] if strip.action is not None else []
+
+
+def _curves(animation: bpy.types.AnimData | bpy.types.NlaStrip) -> list[Any]:
     """Collections of the F-curves of an action: one for each of its strips (4.4 on), or the one it has."""
     action: Any = animation.action  # whose types know the strips of one Blender, and curves of another
     if hasattr(action, "layers") and action.layers:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import bpy
 
 from . import properties, settings, translations
+from .bake import render_settings
 from .bake.step import STEP as BAKE
 from .command_line import command
 from .footage.step import STEP as IMPORT
@@ -34,6 +35,7 @@ _PARTS: tuple[steps.Part, ...] = (
 """Before the classes."""
 _PARTS_AFTER: tuple[steps.Part, ...] = (
     menu,
+    render_settings,  # before what looks at the output path of a file that is saved
     places,
     *(part for step in _STEPS for part in step.parts),
     job_timer,

@@ -14,6 +14,9 @@ RECORDS = ("dict[str, Any]", "Mapping[str, Any]")
 """What was read from JSON: whoever takes a value out of it looks at what it is."""
 OPEN = {
     "bake/freeze_group.py: _factor(socket)": "Blender's types know the plain subtype of a socket alone",
+    "bake/render_settings.py: _picture(value)": "the value of any setting",
+    "bake/render_settings.py: _set(owner)": "whatever has settings",
+    "bake/render_settings.py: set_noted(value)": "the value of any setting",
     "compat.py: _own_tree(scene)": "a Blender older than its types",
     "process/children.py: start(streams)": "what Popen takes, by name",
     "scene/scene_setup.py: _neutral(view)": "Blender's types know the views of one colour configuration",

@@ -67,6 +67,9 @@ def insert(
     frozen, flow, stream = _frozen_image(take), _warp_image(take) if wanted else None, None
     if plate is not None and freeze_group.shows_plate(scene):
         stream = original_plate.plate_of(take, _shot_of(take), plate)
+    if compat.compositor_tree(scene) is not None:  # now that nothing stands against the change
+        freeze_group.own_tree(scene)
+        behind = placing.place_of(scene, footage, where)
     enabled = compat.compositor_enabled(scene)
     before = {**compat.compositor_switches(scene), "made_tree": False}
     tree = compat.compositor_tree(scene)
@@ -166,7 +169,9 @@ def combine_cg(scene: bpy.types.Scene) -> list[str]:
 
     The view layer must have its depth pass. JobError as `may_combine_cg`.
     """
-    node, tree = may_combine_cg(scene), present(compat.compositor_tree(scene))
+    may_combine_cg(scene)
+    tree = freeze_group.own_tree(scene)
+    node = present(freeze_group.group_node(tree))
     layers: Any = tree.nodes.new("CompositorNodeRLayers")
     layers[TAG] = _CG
     layers.scene = scene
@@ -183,6 +188,8 @@ def remove(scene: bpy.types.Scene) -> bool:
     node = freeze_group.group_node(tree) if tree else None
     if tree is None or node is None or library_of(tree):
         return False
+    tree = freeze_group.own_tree(scene)
+    node = present(freeze_group.group_node(tree))
     group = present(node.node_tree)
     before = json.loads(group.get(freeze_group.BEFORE, "{}"))
     placing.lead_past(tree, node)

@@ -85,8 +85,25 @@ def shown(scene: bpy.types.Scene) -> tuple[Path, float] | None:
 
 def set_depth_scale(scene: bpy.types.Scene, scale: float) -> None:
     """Has the freeze group multiply depth by another scale. Only where `shown` says that there is one."""
-    node = present(group_node(present(compat.compositor_tree(scene))))
+    node = present(group_node(own_tree(scene)))
     set_value(present(node.node_tree).nodes[DEPTH].inputs[1], scale)
+
+
+def own_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
+    """The scene's compositor tree, after which it shares neither the tree nor our group with another scene.
+
+    A copy of a scene shares our group, and since 5.0 a linked copy shares the whole tree: a change for one scene would
+    change the other. What is shared is copied. Only for a scene that has a tree.
+    """
+    tree = compat.own_compositor_tree(scene)
+    nodes = [n for n in tree.nodes if isinstance(n, bpy.types.CompositorNodeGroup) and _is_ours(n.node_tree)]
+    for group in {present(n.node_tree) for n in nodes}:
+        here = [n for n in nodes if n.node_tree == group]
+        if group.users - int(group.use_fake_user) > len(here):
+            fresh = group.copy()
+            for node in here:
+                node.node_tree = fresh
+    return tree
 
 
 def _is_ours(group: bpy.types.NodeTree | None) -> bool:

@@ -15,7 +15,7 @@ from ..process import job_timer
 from ..scene import paths, rollback, scene_setup, session
 from ..shot import inventory, places, scene_objects
 from ..shot.shot_state import ShotState
-from . import compositor, freeze_group, rendering, take_files
+from . import cg_camera, compositor, freeze_group, rendering, take_files
 from .take_files import Take
 
 
@@ -37,6 +37,10 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
     footage = _footage(scene, shot, plate)
     changes = compositor.insert(scene, frozen, plate, footage, settings_of(scene).insert_at, warp)
     lacking = inventory.missing_frames(shot, take, rendering.frames_of(scene))
+    if cg_camera.is_led_in(scene):
+        numbers = rendering.frames_of(scene)
+        wrong = cg_camera.difference(scene, frozen.folder, [numbers[0], numbers[-1]]) if numbers else ""
+        changes += [wrong] if wrong else []
     if lacking:
         changes.append(f"{len(lacking)} frames of the scene's range are not in the take, the first is {lacking[0]}.")
     return changes
@@ -150,7 +154,18 @@ def combine_cg(scene: bpy.types.Scene, shot: Path) -> list[str]:
     compositor.may_combine_cg(scene)
     with rollback.scene_of(scene):
         changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
+        changes += cg_camera.use_matching_camera(scene, _shown_take(scene), rendering.frames_of(scene))
         return compositor.combine_cg(scene) + changes
+
+
+def _shown_take(scene: bpy.types.Scene) -> Path:
+    """Folder of the take that the compositor shows. JobError if its picture is gone."""
+    shown = freeze_group.shown(scene)
+    if shown is None:
+        raise contract.JobError(
+            "The freeze in this compositor shows no take.", "Insert it again.", contract.ExitCode.BAKE
+        )
+    return shown[0]
 
 
 def bring_in(scene: bpy.types.Scene, shot: Path, take: str, alone: bool = True) -> None:

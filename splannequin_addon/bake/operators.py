@@ -14,7 +14,7 @@ from ..process import backend, begin, job_timer, jobs
 from ..shot import selection
 from ..translations import tr
 from ..ui import step_operator
-from . import freeze_group, insertion, progress, rendering
+from . import cg_camera, freeze_group, insertion, progress, rendering
 
 
 class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
@@ -59,8 +59,14 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
         """Inserts the freeze, then renders."""
         notes = super().after(scene, job)
         notes += rendering.choose_output(scene, job.shot, job.params["take"])
-        bpy.ops.render.render(animation=True, scene=scene.name)
-        return notes
+        run = rendering.Run(scene, check=cg_camera.check)
+        run.begin(scene)
+        try:
+            bpy.ops.render.render(animation=True, scene=scene.name)
+        except RuntimeError as error:
+            run.refused(error)
+        run.finish(scene)
+        return notes + run.said
 
 
 class SPLANNEQUIN_OT_render(bpy.types.Operator):
@@ -87,19 +93,24 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
         notes = rendering.choose_output(scene, folder, settings_of(scene).take_name)
         if notes:
             job_timer.undo_step("bake")
-        progress.began(folder, len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)))
+        run = rendering.Run(scene, check=cg_camera.check)
         try:
-            refused = "CANCELLED" in bpy.ops.render.render(how, animation=True, scene=scene.name) and "it was cancelled"
-        except RuntimeError as error:
-            refused = str(error).strip()
-        if refused:
-            progress.refused(folder)
-            self.report({"ERROR"}, tr(f"Blender did not render the scene: {refused}"))
+            run.begin(scene)
+        except contract.JobError as error:
+            self.report({"ERROR"}, tr(f"{error.message} {error.hint}".strip()))
             return {"CANCELLED"}
-        if how == "EXEC_DEFAULT" and progress.end_untold(folder):
+        progress.began(folder, run)
+        try:
+            if "CANCELLED" in bpy.ops.render.render(how, animation=True, scene=scene.name) and not run.done:
+                run.refused(RuntimeError("it was cancelled"))
+        except RuntimeError as error:
+            run.refused(error)
+        if how == "EXEC_DEFAULT" or run.error is not None:
+            progress.finish(folder)
+        if run.error is not None or (how == "EXEC_DEFAULT" and "bake" in job_timer.watch_of(folder).failures):
             self.report({"ERROR"}, tr(" ".join(job_timer.watch_of(folder).failures["bake"])))
             return {"CANCELLED"}
-        for note in notes:
+        for note in (*notes, *run.said):
             self.report({"INFO"}, tr(note))
         return {"FINISHED"}
 

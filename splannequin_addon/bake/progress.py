@@ -1,4 +1,4 @@
-"""How far a render of a baked shot is: Blender renders by itself, and tells handlers of every frame."""
+"""How far a render of a baked shot is, and its end: Blender renders by itself, and tells handlers of every frame."""
 
 from __future__ import annotations
 
@@ -7,88 +7,115 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from ...torch_backend import contract
 from ..process import job_timer
-from ..process.job_timer import Progress, Watch, Work
-from ..shot import selection
+from ..process.job_timer import Progress, Work
+from ..scene import session
+from . import render_settings, rendering
 
 _IDLE_TURNS = 2
 """Turns of the timer without a render job after which a render that told no end is over: one may be before it."""
+_runs: dict[Path, rendering.Run] = {}
+"""Shot -> its render that goes on."""
+_ended: dict[Path, bool] = {}
+"""Shot -> whether its render was cancelled, once a handler told its end. The scene is put back by the timer, since
+handlers of a window's render run in a thread of its own."""
 
 
-def began(shot: Path, frames: int) -> None:
-    """A render of a baked shot begins."""
-    job_timer.watch_of(shot).work = Work("bake", None, _progress(0, frames))
+def began(shot: Path, run: rendering.Run) -> None:
+    """A render of a baked shot begins, for which the scene is set up."""
+    _runs[shot] = run
+    _ended.pop(shot, None)
+    watch = job_timer.watch_of(shot)
+    watch.work = Work("bake", None, _progress(run))
     idle = 0
+
+    def tell(*_: int) -> None:
+        if watch.work is not None:
+            watch.work = Work("bake", None, _progress(run))
+            watch.redraw = True
+
+    run.on_frame = tell
 
     def look() -> bool:
         nonlocal idle
-        idle = 0 if bpy.app.is_job_running("RENDER") else idle + 1
-        return going_on(shot) and (idle < _IDLE_TURNS or not end_untold(shot))
+        if _runs.get(shot) is not run:
+            return False
+        if bpy.app.is_job_running("RENDER"):
+            idle = 0
+            return True
+        idle += 1
+        # Cancel takes the work away; a movie's file that cannot be begun ends a render without a word.
+        if shot not in _ended and job_timer.watch_of(shot).work is not None and idle < _IDLE_TURNS:
+            return True
+        finish(shot)
+        return False
 
     job_timer.meanwhile(look)
 
 
-def going_on(shot: Path) -> bool:
-    """True while nothing has told the end of a shot's render."""
-    work = job_timer.watch_of(shot).work
-    return work is not None and work.turns is None
-
-
-def end_untold(shot: Path) -> bool:
-    """Ends a render that is over without a word of its handlers, as Blender leaves it where it cannot begin a movie's
-    file. True if there was one."""
-    if not going_on(shot):
-        return False
+def finish(shot: Path) -> None:
+    """Puts the scene of a render that is over back, and has the panel tell how it ended."""
+    run = _runs.pop(shot, None)
+    if run is None:
+        return
     watch = job_timer.watch_of(shot)
+    is_cancelled = _ended.pop(shot, False) or watch.work is None
     watch.work = None
-    places = [scene.render.filepath for scene in selection.scenes_of(shot)]
-    watch.failures["bake"] = (
-        f"Blender rendered nothing: can {', '.join(places)} be written to?",
-        "Choose another output path, or see the console for Blender's own words.",
-    )
     watch.redraw = True
-    return True
+    try:
+        run.finish(session.scene_of(run.scene_uid), is_cancelled)
+    except contract.JobError as error:
+        watch.fail("bake", error)
+    except (OSError, RuntimeError, ValueError) as error:
+        watch.failures["bake"] = f"The render of this shot ended in an error: {error}", "Bake again."
+    notes = [f"{len(run.done)} of {len(run.wanted)} frames rendered.", *run.said]
+    watch.notes.setdefault("bake", []).extend(note for note in notes if note not in watch.notes.get("bake", []))
 
 
-def refused(shot: Path) -> None:
-    """It did not begin: nothing else would tell the panel."""
-    job_timer.watch_of(shot).work = None
-
-
-def _progress(done: int, total: int) -> Progress:
+def _progress(run: rendering.Run) -> Progress:
+    done, total = len(run.done), len(run.wanted)
     return Progress(f"Rendering, frame {done} of {total}", done, total, "Press Esc in the render window to stop.")
 
 
-def _renders() -> list[tuple[Watch, Progress]]:
-    """Shots that are being rendered, and how far they are."""
-    works = [(watch, watch.work) for watch in job_timer.watches()]
-    return [(w, k.progress) for w, k in works if k is not None and k.turns is None and k.progress is not None]
+@persistent
+def _on_complete(scene: bpy.types.Scene, *_: object) -> None:
+    _end(scene, False)
 
 
 @persistent
-def _on_frame(*_: object) -> None:
-    for watch, now in _renders():
-        watch.work = Work("bake", None, _progress(now.done + 1, now.total))
-        watch.redraw = True
+def _on_cancel(scene: bpy.types.Scene, *_: object) -> None:
+    _end(scene, True)
+
+
+def _end(scene: bpy.types.Scene, is_cancelled: bool) -> None:
+    for shot, run in list(_runs.items()):
+        if run.is_of(scene):
+            _ended[shot] = is_cancelled
 
 
 @persistent
-def _on_end(*_: object) -> None:
-    for watch, now in _renders():
-        watch.work = None
-        watch.redraw = True
-        watch.notes.setdefault("bake", []).append(f"{now.done} of {now.total} frames rendered.")
+def _on_load(*_: object) -> None:
+    """Another file: the renders of the one before are over."""
+    for shot, run in list(_runs.items()):
+        if session.scene_of(run.scene_uid) is None:
+            _ended[shot] = True
+            finish(shot)
+
+
+_HANDLERS = (
+    ("render_complete", _on_complete), ("render_cancel", _on_cancel),
+    ("load_post", _on_load), ("save_post", render_settings.on_saved), ("save_post_fail", render_settings.on_saved),
+)  # fmt: skip
 
 
 def register() -> None:
     """Listens to renders."""
-    bpy.app.handlers.render_write.append(_on_frame)
-    bpy.app.handlers.render_complete.append(_on_end)
-    bpy.app.handlers.render_cancel.append(_on_end)
+    for name, handler in _HANDLERS:
+        getattr(bpy.app.handlers, name).append(handler)
 
 
 def unregister() -> None:
     """Undoes `register`."""
-    bpy.app.handlers.render_cancel.remove(_on_end)
-    bpy.app.handlers.render_complete.remove(_on_end)
-    bpy.app.handlers.render_write.remove(_on_frame)
+    for name, handler in _HANDLERS:
+        getattr(bpy.app.handlers, name).remove(handler)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 import signal
 import sys
 import time
@@ -25,11 +26,10 @@ import bpy
 from ...torch_backend import contract
 from ...torch_backend.contract import ExitCode
 from ..access import scene_in, settings_of
-from ..bake import farm_job, insertion, rendering
+from ..bake import cg_camera, farm_job, insertion, rendering
 from ..freeze import takes
 from ..process import backend, begin, jobs, steps
-from ..scene import paths, scene_setup, sequences
-from ..scene.ownership import DIGITS
+from ..scene import scene_setup, sequences
 from ..shot import inventory
 from ..solve import arrival, cameras, exchange, stmaps
 
@@ -260,9 +260,7 @@ def _bake_a_part(
     _set_up(scene, fresh, shot, args.take, console, span, args.as_warp or None)
     folder = output / rendering.COMPOSITED
     if args.part == "frames":
-        rendering.render_beside(
-            scene, folder, fresh, lambda done, total: console.progress("baking", done, total), _stop_if_interrupted
-        )
+        _render(scene, folder, fresh, console, is_part=True)
         return ExitCode.OK
     numbers = rendering.gathered(scene, folder, fresh)
     _save(scene, output / "shot.blend", folder)
@@ -357,11 +355,23 @@ def _bake(
     """Compositor, render of `span` (None: the scene's range), shot.blend; returns what the summary tells of it."""
     _set_up(scene, fresh, shot, take, console, span, warp)
     folder = output / rendering.COMPOSITED
-    numbers = rendering.render(
-        scene, folder, fresh, lambda done, total: console.progress("baking", done, total), _stop_if_interrupted
-    )
+    numbers = _render(scene, folder, fresh, console)
     _save(scene, output / "shot.blend", folder)
     return _told(output, numbers)
+
+
+def _render(scene: bpy.types.Scene, folder: Path, fresh: bool, console: Console, is_part: bool = False) -> list[int]:
+    """The scene's range into a folder; the frames that were written."""
+    return rendering.render(
+        scene,
+        folder,
+        fresh,
+        lambda done, total: console.progress("baking", done, total),
+        _stop_if_interrupted,
+        is_part,
+        lambda line: console.say(f"  {line}"),
+        cg_camera.check,
+    )
 
 
 def _set_up(
@@ -396,12 +406,13 @@ def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
         files.save_version = 0
         scene = scene_in(bpy.context)
         sequences.relative_images()
-        scene.render.filepath = paths.blend_path(frames / DIGITS)
+        scene.render.filepath = rendering.output_path(frames)
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
     except RuntimeError as error:
-        raise contract.JobError(
-            f"{blend} could not be saved: {str(error).strip()}", "Is the disk full?", ExitCode.BAKE
-        ) from error
+        said = f"{blend.name} could not be saved: {str(error).strip()}"
+        if rendering.is_full(blend.parent, os.path.getsize(bpy.data.filepath) if bpy.data.filepath else 1 << 20):
+            raise contract.disk_error(blend.parent, said) from error
+        raise contract.JobError(f"{said}.", f"Can {blend.parent} be written to?", ExitCode.BAKE) from error
     finally:
         files.save_version = backups
 

@@ -16,7 +16,7 @@ from .. import compat
 from ..access import settings_of
 from ..process import backend, begin, job_timer, steps
 from ..scene import session
-from ..shot import inventory, selection
+from ..shot import inventory, seen_camera, selection
 from . import own_camera
 
 READING_SECONDS = 0.02
@@ -93,7 +93,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         t_star_per_frame=facts.get("t_star_per_frame", {}),
         first=facts.get("first"),
         last=facts.get("last"),
-        camera_path=_path_of(shot, facts),
+        camera_path=seen_camera.path_of(shot, facts),
         query=facts["query"],
         width=facts["width"],
         overscan=facts.get("overscan", 0.0),
@@ -165,16 +165,9 @@ def may_be_stale(shot: Path, take: str) -> bool:
     return trained.stat().st_mtime > told.stat().st_mtime  # frozen by an earlier version, which did not say of what
 
 
-def _path_of(shot: Path, facts: dict[str, Any]) -> str:
-    """File of the camera path that a take was seen from: as it was named, or in the shot, if that was moved since."""
-    named = str(facts.get("camera_path", ""))
-    moved = contract.ShotFolder(shot).camera_path(str(facts.get("take", "")))
-    return str(moved) if named and not Path(named).is_file() and moved.is_file() else named
-
-
 def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
     """Frames that a take can have: those of its camera's path, or the clip's."""
-    path = _path_of(shot, facts)
+    path = seen_camera.path_of(shot, facts)
     if path and Path(path).is_file():
         return {f.frame for f in contract.CameraPath.load(path).frames}
     first, last = (facts["first"], facts["last"]) if path else inventory.read(shot).frame_range

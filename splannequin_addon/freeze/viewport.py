@@ -22,8 +22,8 @@ from mathutils import Matrix
 from ...torch_backend import contract
 from ..access import scene_in, settings_of
 from ..process import backend, job_timer
-from ..shot import scene_objects, selection
-from . import hidden_points, live, own_camera
+from ..shot import scene_objects, seen_camera, selection
+from . import hidden_points, live
 
 TICK_SECONDS = 1 / 60
 QUICK_PIXELS = 320 * 180
@@ -215,7 +215,7 @@ def view_of(
         return None
     shrink = min(1.0, (pixels / max(1, size[0] * size[1])) ** 0.5)
     width, height = max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
-    viewmat, K = own_camera.in_solve(scene, shot, matrices[0], matrices[1], width, height)
+    viewmat, K = seen_camera.in_solve(scene, shot, matrices[0], matrices[1], width, height)
     return contract.LiveView(0, 0, viewmat, K, width, height, t_star, show=settings_of(scene).live_show)
 
 

@@ -18,7 +18,7 @@ _SETTINGS = {
         "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "fps", "fps_base",
         "dither_intensity", "film_transparent", "filepath",
     ),
-    "view_settings": ("view_transform", "look", "exposure", "gamma", "use_curve_mapping"),
+    "view_settings": ("view_transform", "look", "exposure", "gamma", "use_curve_mapping", "use_white_balance"),
     "scene": ("frame_start", "frame_end", "frame_current"),
     "layer": ("use_pass_z",),
 }  # fmt: skip
@@ -33,7 +33,7 @@ def scene_of(scene: bpy.types.Scene) -> Generator[None, None, None]:
     """
     there = {kind: {block.session_uid for block in getattr(bpy.data, kind)} for kind in _KINDS}
     names = [(owner, name) for owner, names in _SETTINGS.items() for name in names]
-    values = {(owner, name): getattr(_owner(scene, owner), name) for owner, name in names}
+    values = {(o, name): getattr(_owner(scene, o), name) for o, name in names if hasattr(_owner(scene, o), name)}
     camera = scene.camera.session_uid if scene.camera is not None else None
     switches = compat.compositor_switches(scene)
     own = {key: scene[key] for key in scene.keys() if key.startswith("splannequin_")}  # noqa: SIM118

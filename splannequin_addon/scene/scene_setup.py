@@ -27,9 +27,10 @@ _SHOTS = {
     "scene": ("frame_start", "frame_end"),
 }  # fmt: skip
 """Settings that each shot of a scene has its own of, by owner; first before last."""
-_NEUTRAL = ("Standard", "Un-tone-mapped")
+NEUTRAL_VIEWS = ("Standard", "Un-tone-mapped")
 """Views that show colours as they are: Blender's own, that of the ACES configurations."""
-_VIEW = {"look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False}
+NEUTRAL_VIEW = {"look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False, "use_white_balance": False}
+"""The other settings of a view that shows colours as they are. Blender before 4.3 has no white balance."""
 
 
 def untouched(scene: bpy.types.Scene) -> bool:
@@ -121,7 +122,8 @@ def keep_plate_colours(scene: bpy.types.Scene) -> list[str]:
     if not keeps_plate_colours(scene):
         view = present(scene.view_settings)
         was, neutral = view.view_transform, _neutral(view)
-        _set(scene, "view", {"view_transform": neutral, **_VIEW})
+        values = {name: value for name, value in NEUTRAL_VIEW.items() if hasattr(view, name)}
+        _set(scene, "view", {"view_transform": neutral, **values})
         changes.append(f"View transform set from {was} to {neutral}, so that the plate keeps its colours.")
     if scene.render.dither_intensity:
         _set(scene, "render", {"dither_intensity": 0.0})
@@ -148,16 +150,16 @@ def note(scene: bpy.types.Scene, text: str) -> list[str]:
 def _neutral(view: Any) -> str:
     """Name of the view that shows colours as they are. JobError if there is none for the display that is chosen."""
     was = view.view_transform
-    for name in (was, *_NEUTRAL):
+    for name in (was, *NEUTRAL_VIEWS):
         try:
             view.view_transform = name
         except TypeError:  # what an enumeration says to a value it lacks; which ones it has, it does not tell
             continue
         view.view_transform = was
-        if name in _NEUTRAL:
+        if name in NEUTRAL_VIEWS:
             return name
     raise contract.JobError(
-        f"This Blender's colour configuration has no view that leaves colours alone ({', '.join(_NEUTRAL)}).",
+        f"This Blender's colour configuration has no view that leaves colours alone ({', '.join(NEUTRAL_VIEWS)}).",
         "Use Blender's own configuration, or switch Keep Plate Colours off.",
         contract.ExitCode.BAKE,
     )
@@ -178,7 +180,9 @@ def render_cg(scene: bpy.types.Scene) -> list[str]:
 def keeps_plate_colours(scene: bpy.types.Scene) -> bool:
     """True if pictures leave the scene with the colours they came in with."""
     view: Any = present(scene.view_settings)
-    return view.view_transform in _NEUTRAL and all(getattr(view, name) == value for name, value in _VIEW.items())
+    return view.view_transform in NEUTRAL_VIEWS and all(
+        getattr(view, name, value) == value for name, value in NEUTRAL_VIEW.items()
+    )
 
 
 def restore(scene: bpy.types.Scene) -> bool:

@@ -1,8 +1,8 @@
 """The timer: work of Blender's own in turns, questions to the backend, jobs that end, renders that are followed."""
 
-import contextlib
 import json
 import os
+from pathlib import Path
 
 import bpy
 import pytest
@@ -231,18 +231,39 @@ def test_a_job_that_had_ended_before_it_was_met_renders_nothing(addon, contract,
     assert watch.work is None and baked(addon) == []
 
 
-def test_a_render_is_followed_by_its_handlers(addon, watch, shot):
-    progress = addon("bake.progress")
-    progress.began(shot, 3)
-    assert watch.running() == "bake"
-    progress._on_frame()
-    progress._on_frame()
-    assert (watch.work.progress.done, watch.work.progress.text) == (2, "Rendering, frame 2 of 3") and watch.redraw
-    progress._on_end()
-    assert watch.running() is None and watch.notes["bake"] == ["2 of 3 frames rendered."]
-    progress.began(shot, 3)
-    progress.refused(shot)
-    assert watch.running() is None
+@pytest.fixture
+def small(addon, scene, tmp_path):
+    """A scene of three small frames, and a render of it that has begun."""
+    scene.render.resolution_x = scene.render.resolution_y = 32
+    scene.frame_end = 3
+    scene.render.filepath = str(tmp_path / "out" / "f_####")
+    tree = addon("compat").new_compositor_tree(scene, "Mine")
+    colour = tree.nodes.new("CompositorNodeRGB")
+    tree.links.new(colour.outputs[0], addon("compat").output_socket(tree))
+    addon("compat").enable_compositor(scene)
+    run = addon("bake.rendering").Run(scene)
+    run.begin(scene)
+    return scene, run
+
+
+def test_a_render_is_followed_by_its_handlers(addon, supervisor, watch, shot, small):
+    scene, run = small
+    seen = []
+
+    def see(*_) -> None:
+        seen.append((watch.running(), watch.work.progress.text, watch.redraw))
+
+    addon("bake.progress").began(shot, run)
+    bpy.app.handlers.render_write.append(see)
+    try:
+        bpy.ops.render.render(animation=True)
+    finally:
+        bpy.app.handlers.render_write.remove(see)
+    assert seen[1] == ("bake", "Rendering, frame 2 of 3", True)
+    supervisor.tick()
+    assert watch.running() is None and watch.notes["bake"][0] == "3 of 3 frames rendered."
+    assert scene.render.filepath.endswith("f_####") and not supervisor._meanwhile
+    assert len(list(Path(bpy.path.abspath(scene.render.filepath)).parent.iterdir())) == 3
 
 
 @pytest.fixture
@@ -259,32 +280,30 @@ def movie_to_nowhere(scene, tmp_path):
     return scene
 
 
-def test_a_render_that_tells_no_end_is_over(addon, supervisor, watch, shot, movie_to_nowhere):
-    addon("bake.progress").began(shot, 2)
-    with contextlib.suppress(RuntimeError):  # some Blenders say so, but not in a window
-        bpy.ops.render.render(animation=True)
+def test_a_render_that_tells_no_end_is_over(addon, supervisor, watch, shot, small):
+    """As Blender leaves it where it cannot begin a movie's file."""
+    scene, run = small
+    addon("bake.progress").began(shot, run)
     supervisor.tick()
     assert watch.running() == "bake", "the job of a render may be about to begin"
     supervisor.tick()
     assert watch.running() is None and not supervisor._meanwhile
-    sentence, _ = watch.failures["bake"]
-    assert "rendered nothing" in sentence and movie_to_nowhere.render.filepath in sentence
-    addon("bake.progress").began(shot, 2)
-    addon("bake.progress")._on_end()
-    supervisor.tick()
-    assert not supervisor._meanwhile, "one that told its end is not looked after"
+    assert "wrote no picture for frame 1" in watch.failures["bake"][0]
+    assert scene.render.filepath.endswith("f_####")
 
 
 def test_a_render_that_wrote_nothing_is_no_success(watch, movie_to_nowhere):
-    with pytest.raises(RuntimeError, match="Blender (rendered nothing|did not render)"):
+    with pytest.raises(RuntimeError, match="where a folder is needed"):
         bpy.ops.splannequin.render("EXEC_DEFAULT")
     assert watch.running() is None
 
 
-def test_cancel_ends_a_render_that_is_no_more(addon, watch, shot):
-    addon("bake.progress").began(shot, 2)
+def test_cancel_ends_a_render_that_is_no_more(addon, supervisor, watch, shot, small):
+    addon("bake.progress").began(shot, small[1])
     assert bpy.ops.splannequin.cancel(step="bake") == {"FINISHED"}
-    assert watch.running() is None and not watch.failures
+    assert watch.running() is None
+    supervisor.tick()
+    assert not watch.failures and small[0].render.filepath.endswith("f_####")
 
 
 def test_another_file_ends_what_blender_itself_was_doing(supervisor, watch, shot):

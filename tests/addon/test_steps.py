@@ -364,7 +364,7 @@ def test_a_render_that_does_not_start_leaves_the_panel_free(addon, with_shot, sh
     with_shot.frame_start = with_shot.frame_end = 5
     (tmp_path / "file").write_text("in the way")
     with_shot.render.filepath = str(tmp_path / "file" / "######")
-    with pytest.raises(RuntimeError, match="Blender did not render the scene"):
+    with pytest.raises(RuntimeError, match="is a file where a folder is needed"):
         bpy.ops.splannequin.render()
     assert addon("process.job_timer").watch_of(shot).running() is None
 
@@ -414,7 +414,7 @@ def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path
 
 def test_a_view_that_the_colour_configuration_lacks_is_said(addon, contract, scene, monkeypatch):
     setup = addon("scene.scene_setup")
-    monkeypatch.setattr(setup, "_NEUTRAL", ("Plain",))
+    monkeypatch.setattr(setup, "NEUTRAL_VIEWS", ("Plain",))
     with pytest.raises(contract.JobError, match=r"no view that leaves colours alone \(Plain\)"):
         setup.keep_plate_colours(scene)
     assert scene.view_settings.view_transform == "AgX"

@@ -1,0 +1,185 @@
+"""Compares the camera that the scene's objects are rendered through with the one that the frozen take was seen from.
+
+CG that is combined with a take by depth has to be seen from the very camera of the take, in every frame: the clip's
+solved camera, or the artist's own that the take was frozen from. Otherwise it slides over the frozen picture.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...torch_backend import contract
+from .. import compat
+from ..scene import scene_setup
+from ..shot import inventory, scene_objects, seen_camera
+from . import freeze_group, placing
+
+TOLERANCE_PX = 0.5
+"""Largest distance, in pixels of the render, between where the two cameras show a point of the scene."""
+
+
+def is_led_in(scene: bpy.types.Scene) -> bool:
+    """True if a render of a scene is led into the freeze's input CG."""
+    return bool(_layers(scene))
+
+
+def check(scene: bpy.types.Scene, frames: Sequence[int]) -> bool:
+    """True if CG is led into the freeze. JobError if it is seen by another camera than the take, in any frame."""
+    layers = _layers(scene)
+    shown = freeze_group.shown(scene)
+    if not layers or shown is None:
+        return False
+    for node in layers:
+        rendered = node.scene or scene
+        layer = next((one for one in rendered.view_layers if one.name == node.layer), None)
+        if layer is None or not layer.use:
+            raise contract.JobError(
+                f"The view layer {node.layer}, which is led into the freeze as CG, is not used for rendering.",
+                "Switch it on in the view layer's properties, or take it out of the compositor.",
+                contract.ExitCode.BAKE,
+            )
+        why = difference(rendered, shown[0], frames)
+        if why:
+            right = matching_camera(rendered, shown[0], frames)
+            hint = f"Make {right.name} the scene's camera" if right is not None else "Freeze a take from this camera"
+            raise contract.JobError(why, f"{hint}, or take CG out of the freeze.", contract.ExitCode.BAKE)
+    return True
+
+
+def difference(scene: bpy.types.Scene, take: Path, frames: Sequence[int], camera: str = "") -> str:
+    """How the scene's camera differs from the one that a take was seen from, a sentence; empty if they agree.
+
+    Args:
+        scene: the scene. Its current frame is put back.
+        take: folder of the take.
+        frames: frames to compare, those of them that the take's camera has.
+        camera: name of another camera of the scene; empty: the scene's own, as markers switch it.
+
+    Raises:
+        contract.JobError: it is not known what the take was seen from.
+    """
+    shot, before = take.parent.parent, scene.frame_current
+    path = seen_from(shot, take.name)
+    known = {frame.frame: frame for frame in path.frames}
+    size, depth = scene_setup.render_size(scene), _typical_depth(shot, path)
+    try:
+        for number in (n for n in frames if n in known):
+            try:
+                seen = seen_camera.sampled(scene, camera, shot, number, size)
+            except contract.JobError as error:
+                return error.message
+            away = _pixels_apart(seen, known[number], size, (path.width, path.height), depth)
+            if not away <= TOLERANCE_PX:
+                name = camera or (scene.camera.name if scene.camera is not None else "")
+                far = f"{away:.0f} px" if away < 10 * max(size) else "far"
+                return (
+                    f"CG would slide: at frame {number} the camera {name} of {scene.name} is {far} away from the "
+                    f"camera that take {take.name} was frozen from."
+                )
+    finally:
+        if scene.frame_current != before:
+            scene.frame_set(before)
+    return ""
+
+
+def matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int]) -> bpy.types.Object | None:
+    """The camera of the scene that sees what a take was frozen from, if it has one and no marker switches cameras."""
+    if any(marker.camera is not None for marker in scene.timeline_markers):
+        return None
+    some = [frames[0], frames[len(frames) // 2], frames[-1]]
+    first = scene_objects.part(scene, take.parent.parent, "camera")
+    every = sorted((o for o in scene.objects if o.type == "CAMERA"), key=lambda o: o != first)
+    return next((camera for camera in every if not difference(scene, take, some, camera.name)), None)
+
+
+def use_matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int]) -> list[str]:
+    """Makes the camera that a take was seen from the scene's, if it is not; says so. JobError if there is none."""
+    why = difference(scene, take, frames)
+    if not why:
+        return []
+    right = matching_camera(scene, take, frames)
+    if right is None:
+        raise contract.JobError(
+            why,
+            "No camera of this scene sees the same: bring that camera back, or freeze a take from this one.",
+            contract.ExitCode.BAKE,
+        )
+    scene.camera = right
+    return [f"{right.name} is the scene's camera now: take {take.name} was frozen from it."]
+
+
+def seen_from(shot: Path, take: str) -> contract.CameraPath:
+    """The camera that a take was seen from: the clip's, or the artist's own. JobError if it is not known any more."""
+    facts = inventory.read(shot).takes.get(take, {})
+    own = seen_camera.path_of(shot, facts)
+    try:
+        path = contract.CameraPath.load(own or contract.ShotFolder(shot).cameras)
+        if path.frames:
+            return path
+    except (OSError, ValueError):
+        pass
+    raise contract.JobError(
+        f"The camera that take {take} was frozen from is not known any more.",
+        "Freeze the take again, or solve the shot.",
+        contract.ExitCode.BAKE,
+    )
+
+
+def _layers(scene: bpy.types.Scene) -> list[Any]:
+    """The Render Layers nodes whose picture gets to the freeze's input CG."""
+    tree = compat.compositor_tree(scene)
+    node = freeze_group.group_node(tree) if tree is not None else None
+    found: list[Any] = []
+    for link in placing.links_of(node.inputs["CG"]) if node is not None and "CG" in node.inputs else ():
+        found += [n for n in placing.upstream(link.from_node) if n.bl_idname == "CompositorNodeRLayers" and not n.mute]
+    return found
+
+
+def _pixels_apart(
+    seen: contract.CameraFrame,
+    wanted: contract.CameraFrame,
+    size: tuple[int, int],
+    taken: tuple[int, int],
+    depth: float,
+) -> float:
+    """Largest distance in pixels between where two cameras show a point, of those that the second one shows in the
+    middle and the corners of the picture.
+
+    Args:
+        seen: a camera, K in pixels of the render.
+        wanted: another one, K in pixels of a take.
+        size: width and height of the render in pixels.
+        taken: those of the take, which is brought to the render's width.
+        depth: of the points, solve units.
+    """
+    (width, height), larger = size, size[0] / taken[0]
+    fx, fy, cx, cy = wanted.K
+    fx, fy, cx, cy = larger * fx, larger * fy, larger * cx, 0.5 * height + larger * (cy - 0.5 * taken[1])
+    us, vs = (np.array([0.5, 0.0, 1.0, 0.0, 1.0]) * width, np.array([0.5, 0.0, 0.0, 1.0, 1.0]) * height)
+    points = depth * np.stack([(us - cx) / fx, (vs - cy) / fy, np.ones(5)])
+    one, other = (np.array(frame.viewmat, dtype=np.float64).reshape(4, 4) for frame in (seen, wanted))
+    world = other[:3, :3].T @ (points - other[:3, 3:])
+    x, y, z = one[:3, :3] @ world + one[:3, 3:]
+    if z.min() <= 0.0:
+        return float("inf")  # behind the camera
+    u, v = seen.K[0] * x / z + seen.K[2], seen.K[1] * y / z + seen.K[3]
+    return float(np.hypot(u - us, v - vs).max())
+
+
+def _typical_depth(shot: Path, path: contract.CameraPath) -> float:
+    """Median depth of the solve's points from the first pose, solve units; 1 if they cannot be read."""
+    try:
+        with np.load(contract.ShotFolder(shot).points) as data:
+            xyz = np.asarray(data["xyz"], dtype=np.float64)
+        view = np.array(path.frames[0].viewmat, dtype=np.float64).reshape(4, 4)
+        depth = float(np.median(xyz @ view[2, :3] + view[2, 3]))
+        return depth if np.isfinite(depth) and depth > 1e-6 else 1.0
+    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile, zlib.error):
+        return 1.0

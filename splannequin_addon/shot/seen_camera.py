@@ -1,0 +1,88 @@
+"""Cameras in the solve's coordinates: what a view of the scene shows, and what a take was seen from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...torch_backend import contract
+from ..access import camera_of, named, present
+from ..scene import axes
+from . import scene_objects
+
+
+def in_solve(
+    scene: bpy.types.Scene,
+    shot: Path,
+    view_matrix: Matrix,
+    window_matrix: Matrix,
+    width: int,
+    height: int,
+    graph: bpy.types.Depsgraph | None = None,
+) -> tuple[list[float], list[float]]:
+    """(viewmat, K) in solve units of what a view of the scene shows.
+
+    Args:
+        scene: the scene, in which the shot's root says where the solve stands.
+        shot: shot folder.
+        view_matrix: world to view, Blender's axes, [4, 4].
+        window_matrix: perspective projection, [4, 4].
+        width: of the picture in pixels.
+        height: of the picture in pixels.
+        graph: where the root stands by it; None: in the window's scene, which is the scene then.
+
+    Returns:
+        viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
+        K: fx, fy, cx, cy in pixels.
+    """
+    root = scene_objects.placed_root(scene, shot, graph)
+    placed = np.array(root.matrix_world if root else Matrix(), dtype=np.float64)
+    scale = scene_objects.depth_scale(scene, shot, graph)
+    return axes.in_solve(view_matrix, window_matrix, placed, scale, (width, height))
+
+
+def sampled(
+    scene: bpy.types.Scene | None, name: str, shot: Path, number: int, size: tuple[int, int]
+) -> contract.CameraFrame:
+    """A camera at one frame, as `sample_path` reads it; without a name the scene's own, as markers switch it."""
+    if scene is not None:
+        scene.frame_set(number)
+    camera = None if scene is None else named(scene.objects, name) if name else scene.camera
+    if scene is None or camera is None or camera.type != "CAMERA" or camera_of(camera).type != "PERSP":
+        name = name or (camera.name if camera is not None else "The scene's camera")
+        raise contract.JobError(
+            f"{name} is not a perspective camera of this scene.",
+            "Choose another camera to freeze from.",
+            contract.ExitCode.USAGE,
+        )
+    # The context's may be another scene's, where the camera stands still.
+    graph = present(_layer(scene, camera).depsgraph)
+    seen = camera.evaluated_get(graph)
+    if not seen.is_evaluated:
+        raise contract.JobError(
+            f"{camera.name} does not move: it is disabled in viewports, or its collection is excluded.",
+            "Enable it in the Outliner, or make it the scene's camera.",
+            contract.ExitCode.USAGE,
+        )
+    aspect = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
+    window = seen.calc_matrix_camera(graph, x=size[0], y=size[1], scale_x=aspect[0], scale_y=aspect[1])
+    view = seen.matrix_world.normalized().inverted()
+    return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size, graph), "blender")
+
+
+def _layer(scene: bpy.types.Scene, camera: bpy.types.Object) -> bpy.types.ViewLayer:
+    """A view layer of the scene in which a camera moves: the context's, if it is one of them, else the first."""
+    layers = [layer for layer in scene.view_layers if named(layer.objects, camera.name) == camera]
+    shown = bpy.context.view_layer
+    return next((layer for layer in layers if layer == shown), (layers or list(scene.view_layers))[0])
+
+
+def path_of(shot: Path, facts: dict[str, Any]) -> str:
+    """File of the camera path that a take was seen from: as it was named, or in the shot, if that was moved since."""
+    named = str(facts.get("camera_path", ""))
+    moved = contract.ShotFolder(shot).camera_path(str(facts.get("take", "")))
+    return str(moved) if named and not Path(named).is_file() and moved.is_file() else named
