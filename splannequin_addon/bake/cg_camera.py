@@ -48,8 +48,10 @@ def check(scene: bpy.types.Scene, frames: Sequence[int]) -> bool:
         why = difference(rendered, shown[0], frames)
         if why:
             right = matching_camera(rendered, shown[0], frames)
-            hint = f"Make {right.name} the scene's camera" if right is not None else "Freeze a take from this camera"
-            raise contract.JobError(why, f"{hint}, or take CG out of the freeze.", contract.ExitCode.BAKE)
+            hint = "Freeze a take from this camera, or take CG out of the freeze."
+            if right is not None:
+                hint = f"Make {right.name} the scene's camera, or take CG out of the freeze."
+            raise contract.JobError(why, hint, contract.ExitCode.BAKE)
     return True
 
 
@@ -78,10 +80,10 @@ def difference(scene: bpy.types.Scene, take: Path, frames: Sequence[int], camera
             away = _pixels_apart(seen, known[number], size, (path.width, path.height), depth)
             if not away <= TOLERANCE_PX:
                 name = camera or (scene.camera.name if scene.camera is not None else "")
-                far = f"{away:.0f} px" if away < 10 * max(size) else "far"
+                pixels = min(away, 9999.0)  # infinite: it looks another way
                 return (
-                    f"CG would slide: at frame {number} the camera {name} of {scene.name} is {far} away from the "
-                    f"camera that take {take.name} was frozen from."
+                    f"CG would slide: at frame {number} the camera {name} of {scene.name} sees things {pixels:.1f} px "
+                    f"beside where the camera of take {take.name} saw them."
                 )
     finally:
         if scene.frame_current != before:

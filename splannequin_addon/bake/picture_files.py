@@ -19,8 +19,8 @@ _LINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 
 """OpenEXR: compression -> scan lines in a chunk."""
 
 
-def what_lacks(path: Path) -> str:
-    """Why a file is no whole picture or movie, as words behind its name; empty if it is whole.
+def is_whole(path: Path) -> bool:
+    """True if a file is a whole picture or movie; False too if it is not there.
 
     Of a format without a trailer, a stated size or a table, only an empty file is noticed.
     """
@@ -28,18 +28,13 @@ def what_lacks(path: Path) -> str:
         with contract.open_regular(path) as file:
             size = file.seek(0, 2)
             file.seek(0)
-            head = file.read(32)
-            if not size:
-                return "is empty"
-            check = _check_of(head, path.suffix.lower())
-            if check is None:
-                return ""
+            check = _check_of(file.read(32), path.suffix.lower())
             file.seek(0)
-            return "" if check(file, size) else "is cut off"
+            return size > 0 and (check is None or check(file, size))
     except FileNotFoundError:
-        return "is missing"
+        return False
     except (ValueError, struct.error, IndexError, KeyError):
-        return "is damaged"
+        return False  # what it states of itself makes no sense
 
 
 def _check_of(head: bytes, suffix: str) -> Callable[[BinaryIO, int], bool] | None:

@@ -146,7 +146,8 @@ class Run:
                 self._publish_movie(is_whole)
             lost = [n for n in self.wanted if n not in set(self.done)]
             if is_whole and lost:
-                raise self._failed(f"Blender wrote no picture for frame {lost[0]} in {self._folder_name()}", None)
+                message = f"Blender wrote no picture for frame {lost[0]} in {self._folder_name()}."
+                raise self._or_full(message, None)
             if self.error is not None:
                 raise self.error
         finally:
@@ -156,8 +157,7 @@ class Run:
         """Notes what Blender says of a scene that it does not render, or of a picture that it could not write."""
         said = " ".join(str(error).split()).removeprefix("Error: ")
         said = said.replace(str(self._beside), str(self._folder_name()))
-        failure = self._failed(f"Blender could not render the scene: {said}", None)
-        self.error = self.error or failure
+        self.error = self.error or self._or_full(f"Blender could not render the scene: {said}", None)
 
     def is_of(self, scene: bpy.types.Scene) -> bool:
         """True if it renders this scene."""
@@ -198,9 +198,8 @@ class Run:
 
     def _publish(self, made: Path, place: Path, what: str) -> None:
         """Gives a whole file its name. JobError if it is not whole; OSError."""
-        lacks = picture_files.what_lacks(made)
-        if lacks:
-            raise self._failed(f"The picture that Blender wrote for {what} {lacks}", made)
+        if not picture_files.is_whole(made):
+            raise self._or_full(f"Blender wrote {what} only in part to {place.parent}.", made)
         with open(made, "rb+") as file:
             os.fsync(file.fileno())
         contract.make_folder(place.parent)
@@ -217,16 +216,19 @@ class Run:
                 except (contract.JobError, OSError) as error:
                     self.error = self.error or (_in_words(error) if isinstance(error, OSError) else error)
 
-    def _failed(self, what: str, made: Path | None) -> contract.JobError:
-        """What to say of a picture that Blender did not write, or not whole: is it the disk?"""
+    def _or_full(self, message: str, made: Path | None) -> contract.JobError:
+        """What to say of a picture that Blender did not write, or not whole: that the disk is full, if it is.
+
+        Args:
+            message: what to say otherwise.
+            made: what there is of the picture.
+        """
         folder = self._folder_name()
         # What is cut off is there still, and takes what room there was.
         if is_full(self._beside, self._room if made is None or not made.exists() else 1 << 18):
-            return contract.disk_error(folder, what[0].lower() + what[1:])
+            return contract.disk_error(folder)
         return contract.JobError(
-            f"{what.rstrip('.')}.",
-            f"Can {folder} be written to? Blender's console may say more.",
-            contract.ExitCode.BAKE,
+            message, f"Can {folder} be written to? Blender's console may say more.", contract.ExitCode.BAKE
         )
 
     def _folder_name(self) -> Path:
@@ -305,11 +307,10 @@ def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
     if png:
         compat.set_png(scene.render.image_settings)
     wanted = list(frames_of(scene))
-    lost = [(n, lacks) for n, p in _places(scene, wanted, folder).items() if (lacks := picture_files.what_lacks(p))]
+    lost = [n for n, path in _places(scene, wanted, folder).items() if not picture_files.is_whole(path)]
     if lost:
-        number, lacks = lost[0]
         raise contract.JobError(
-            f"{folder} lacks {len(lost)} of {len(wanted)} frames, the first is {number}, which {lacks}.",
+            f"{folder} lacks {len(lost)} of {len(wanted)} frames, the first is {lost[0]}.",
             "Bake the part that it belongs to again.",
             contract.ExitCode.BAKE,
         )
