@@ -89,6 +89,7 @@ def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
                 "transform_matrix": [list(row[:]) for row in camera.matrix],
             }
             for camera in cameras
+            if first + camera.frame > 0  # an offset may begin before the footage does
         ],
     }
 

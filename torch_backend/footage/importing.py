@@ -438,6 +438,7 @@ def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: s
         "extended": info.extended,
         **_displayed(info, measures),
         **({"shift": shift} if shift else {}),
+        "clip": [info.first, info.last],
         "start": start,
         "step": step,
         "config": _recorded(config),

@@ -24,9 +24,9 @@ from . import plate_encoding
 from .images import error_of
 from .importing import FootageConfig, load_frames, source_places
 from .layers import find_layer
-from .numbering import recorded_shift
 from .opening import open_video, opens_as_video
 from .orientation import UPRIGHT, orientation_of_picture
+from .pairing import counted_of, pair, pairing_words
 from .sequence import SequenceSource, find_sequence, sequence_of_file
 from .sources import footage_error, frame_words
 from .video import VideoSource
@@ -98,9 +98,9 @@ class _Reading:
 
     def __init__(self, shot: Shot, frames: dict[str, Any], kind: str, source: str, report: Reporter) -> None:
         self.shot, self.frames, self.kind, self.source, self.report = shot, frames, kind, source, report
-        self.numbers = [int(row["frame"]) for row in frames["frames"]]
         self.size = int(frames["width"]), int(frames["height"])
-        self.shift = recorded_shift(frames)
+        self.counted = counted_of(frames)
+        self.numbers = self.counted.frames
         self.name = f"The mask {source}" if source != MASK_ALPHA else "The footage's alpha"
 
     def mask(self) -> Mask:
@@ -169,25 +169,17 @@ class _Reading:
 
     def _matched(self, theirs: list[int]) -> dict[int, int]:
         """Frame -> number of the mask's picture. JobError names the frames that have none."""
-        missing = sorted(set(self.numbers) - set(theirs))
-        if missing and self.shift and not {n - self.shift for n in self.numbers} - set(theirs):
-            self.report.warning(
-                f"{self.name} is numbered as the footage, not as the shot: its picture {theirs[0]} is taken for frame "
-                f"{theirs[0] + self.shift}."
+        paired = pair(theirs, self.counted, needs_all=True)
+        missing = sorted(set(self.numbers) - set(paired.numbers))
+        if missing:
+            raise footage_error(
+                f"{self.name} has no picture for {frame_words(missing)}, of {len(self.numbers)} frames.",
+                "Number it as the clip's frames, or give one picture, without a number in its name, for all of them.",
             )
-            return {n: n - self.shift for n in self.numbers}
-        if not missing:
-            return {n: n for n in self.numbers}
-        if len(theirs) == len(self.numbers):
-            self.report.warning(
-                f"{self.name} is numbered {theirs[0]} to {theirs[-1]}, the frames {self.numbers[0]} to "
-                f"{self.numbers[-1]}: its pictures are taken in order, as there are as many."
-            )
-            return dict(zip(self.numbers, theirs, strict=True))
-        raise footage_error(
-            f"{self.name} has no picture for {frame_words(missing)}, of {len(self.numbers)} frames.",
-            "Number it as the clip's frames, or give one picture, without a number in its name, for all of them.",
-        )
+        words = pairing_words(self.name, theirs, paired)
+        if words is not None:
+            self.report.warning(*words)
+        return paired.numbers
 
     def _picture(self, file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """Brightness, less what its alpha takes away, and alpha, [h, w] each in 0..1."""
@@ -227,8 +219,8 @@ class _Reading:
                 f"{video.path.name} has no alpha to mask by.", "Give the mask as pictures of their own, or a video."
             )
         missing = set(self.numbers)
-        for own_number, alpha in video.alphas(self.numbers[-1] - self.shift):
-            number = own_number + self.shift
+        for own_number, alpha in video.alphas(self.numbers[-1] - self.counted.shift):
+            number = own_number + self.counted.shift
             if number in missing:
                 missing.remove(number)
                 yield number, alpha
@@ -252,8 +244,8 @@ class _Reading:
             except (JobError, OSError):
                 continue
             own = sequence.files
-            if own.keys() >= {number - self.shift for number in self.numbers}:
-                files = {number: own[number - self.shift] for number in self.numbers}
+            if own.keys() >= {number - self.counted.shift for number in self.numbers}:
+                files = {number: own[number - self.counted.shift] for number in self.numbers}
                 return files, settings.layer
         raise footage_error(
             f"The footage {self.shot.info().source} cannot be read any more: its alpha is not known.",

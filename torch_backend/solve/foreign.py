@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraPath, ExitCode, JobError, read_json
+from ..contract import CameraPath, ExitCode, JobError, numbered_files, read_json
+from ..footage.pairing import Counted, Pairing, pair, pairing_words
 from ..footage.sources import frame_words
 from .colmap_files import ColmapModel, model_files, read_model
 from .poses import camera_centre
@@ -93,8 +93,8 @@ class Matched:
     """By frame number."""
     missing: list[int]
     """Frame numbers without a camera."""
-    shift: int = 0
-    """What was added to the file's numbers."""
+    said: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    """(sentence, hint) about how they were matched, where the file's numbers are not the frames' for certain."""
 
 
 # ------------------------------------------------------------------------------------------------- what there is
@@ -265,77 +265,38 @@ def _rigid(matrix: NDArray[Any], name: str) -> NDArray[np.float64]:
 # ------------------------------------------------------------------------------------------------- to the clip
 
 
-def frame_numbers(names: Sequence[str]) -> list[int | None]:
-    """The frame number in each file name; None where it has no digits.
-
-    The last digits of the name before its ending (shot.0012.png, frame_00012.jpg); if those do not tell the names
-    apart (frame_0012_v2.png), the ones before them. ValueError if none do.
-    """
-    stems = [Path(name.replace("\\", "/")).stem for name in names]
-    if all(re.fullmatch(r"-?\d+", stem) for stem in stems):
-        plain = [int(stem) for stem in stems]
-        if len(set(plain)) == len(plain):
-            return list(plain)
-    runs = [re.findall(r"\d+", stem) for stem in stems]
-    first: list[int | None] | None = None
-    for place in range(1, max(map(len, runs), default=0) + 1):
-        numbers = [int(run[-place]) if len(run) >= place else None for run in runs]
-        numbered = [n for n in numbers if n is not None]
-        if numbered and len(set(numbered)) == len(numbered):
-            return numbers
-        first = first or numbers
-    if first is None:
-        return [None] * len(names)
-    numbered = [n for n in first if n is not None]
-    twice = next(n for n in numbered if numbered.count(n) > 1)
-    both = [name for name, n in zip(names, first, strict=True) if n == twice]
-    raise ValueError(f"{both[0]} and {both[1]} have the same frame number {twice}")
-
-
-def match(
-    solve: ForeignSolve,
-    frames: Sequence[int],
-    size: tuple[int, int],
-    solved: Sequence[int] | None = None,
-    renumbered: int = 0,
-) -> Matched:
-    """Finds the camera of each frame by its number.
-
-    A file that holds as many pictures as the clip has frames, counted from 0 or 1, is taken in order.
+def match(solve: ForeignSolve, counted: Counted, size: tuple[int, int], solved: Sequence[int] | None = None) -> Matched:
+    """Finds the camera of each frame by the numbers of all pictures, see `pairing`.
 
     Args:
         solve: what was read.
-        frames: frame numbers of the clip, ascending.
+        counted: the shot's frames.
         size: width and height of the working frames in pixels.
-        solved: of `frames`, those that are trained on; None: all.
-        renumbered: what the import added to the footage's own numbers (`footage.numbering`). The cameras are taken by
-            the footage's numbers if more frames have a camera then.
+        solved: of the frames, those that are trained on; None: all.
 
     Raises:
-        JobError: too few of these have a camera, or the pictures had another shape.
+        JobError: too few of these have a camera, several sequences could be meant, or the pictures had another shape.
     """
-    numbers = [c.number for c in solve.cameras]
-    if None in numbers:
-        try:
-            numbers = frame_numbers([c.name for c in solve.cameras])
-        except ValueError as error:
-            raise _refusal(
-                f"The cameras cannot be told apart by frame: {error}.", "Use a solve of this one clip alone."
-            ) from error
-    table = {n: camera for n, camera in zip(numbers, solve.cameras, strict=True) if n is not None}
-    shift = 0
-    if table and solve.kind != "camera path" and len(table) == len(frames) and min(table) in (0, 1):
-        step = frames[0] - min(table)
-        if sorted(n + step for n in table) == list(frames):
-            shift = step
-    wanted = set(frames)
-    if shift == 0 and sum(n + renumbered in wanted for n in table) > sum(n in wanted for n in table):
-        shift = renumbered
-    cameras = {n + shift: camera for n, camera in table.items() if n + shift in wanted}
-    missing = [n for n in frames if n not in cameras]
+    frames = counted.frames
     needed = list(frames if solved is None else solved)
+    least = max(min(LEAST_CAMERAS, len(needed)), LEAST_SHARE * len(needed))
+    tables = _tables(solve)
+    shifts = solve.kind != "camera path"  # which has the numbers of frames, not of pictures
+    paired = [(name, table, pair(sorted(table), counted, may_shift=shifts)) for name, table in tables.items()]
+    fitting = [one for one in paired if sum(n in one[2].numbers for n in needed) >= least]
+    fitting = [one for one in fitting if one[2].by_own_number] or fitting
+    if len(fitting) > 1:
+        names = ", ".join(name for name, _, _ in fitting[:4])
+        raise _refusal(
+            f"The cameras' pictures are {len(fitting)} sequences that could be this clip: {names}.",
+            "Use a solve of this one clip alone.",
+        )
+    closest = max(fitting or paired, key=lambda one: len(one[1]), default=None)
+    table, chosen = closest[1:] if closest else ({}, Pairing({}))
+    cameras = {frame: table[number] for frame, number in chosen.numbers.items()}
+    missing = [n for n in frames if n not in cameras]
     found = sum(n in cameras for n in needed)
-    if found < min(LEAST_CAMERAS, len(needed)) or found < LEAST_SHARE * len(needed):
+    if not fitting:
         held = f"its pictures are numbered {min(table)} to {max(table)}" if table else "its pictures have no numbers"
         raise _refusal(
             f"Only {found} of the {len(needed)} frames needed, from {frames[0]} to {frames[-1]}, have a camera in "
@@ -350,21 +311,34 @@ def match(
                 f"shape, {size[0]} x {size[1]}.",
                 "Use cameras of the same, uncropped clip.",
             )
-    return Matched(cameras, missing, shift)
+    words = pairing_words("The cameras' file", sorted(table), chosen)
+    return Matched(cameras, missing, [words] if words else [])
+
+
+def _tables(solve: ForeignSolve) -> dict[str, dict[int, ForeignCamera]]:
+    """Cameras by number, of each sequence of pictures in the file by its pattern. JobError for one number twice."""
+    if all(c.number is not None for c in solve.cameras):
+        return {"": {c.number: c for c in solve.cameras if c.number is not None}}
+    of_name: dict[str, ForeignCamera] = {}
+    for camera in solve.cameras:
+        name = camera.name.replace("\\", "/")
+        if name in of_name:
+            raise _refusal(f"{name} has two cameras in {solve.path.name}.", "Use a solve of this one clip alone.")
+        of_name[name] = camera
+    tables: dict[str, dict[int, ForeignCamera]] = {}
+    for found in numbered_files(of_name):
+        if found.twice:
+            raise _refusal(
+                f"The pictures {found.twice[0]} and {found.twice[1]} of the cameras have the same frame number.",
+                "Use a solve of this one clip alone.",
+            )
+        tables[found.pattern] = {number: of_name[name] for number, name in found.files.items()}
+    return tables
 
 
 def remarks(solve: ForeignSolve, matched: Matched) -> list[tuple[str, str]]:
     """(sentence, hint) of what the artist should know about the matching."""
-    remarks: list[tuple[str, str]] = []
-    if matched.shift:
-        first = min(matched.cameras)
-        remarks.append(
-            (
-                f"The cameras' pictures are numbered from {first - matched.shift}, the clip's frames from {first}: "
-                "they were taken in order.",
-                "",
-            )
-        )
+    remarks = list(matched.said)
     if matched.missing:
         remarks.append(
             (

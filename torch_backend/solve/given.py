@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..array_types import save_arrays
 from ..contract import POINTS_FILE, REQUEST_FILE, ExitCode, JobError, Reporter
-from ..footage.numbering import recorded_shift
+from ..footage.pairing import counted_of
 from ..shot import Shot, write_json
 from . import foreign
 from .child import run_worker
@@ -45,9 +45,8 @@ def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> Taken:
     """
     solve = foreign.read(cameras)
     listed = frames["frames"]
-    numbers, solved = [f["frame"] for f in listed], [f["frame"] for f in listed if f["solve"]]
-    size, shift = (frames["width"], frames["height"]), recorded_shift(frames)
-    matched = foreign.match(solve, numbers, size, solved, shift)
+    size, solved = (frames["width"], frames["height"]), [f["frame"] for f in listed if f["solve"]]
+    matched = foreign.match(solve, counted_of(frames), size, solved)
     for message, hint in foreign.remarks(solve, matched):
         report.warning(message, hint)
     return Taken(solve, matched)

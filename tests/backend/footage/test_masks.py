@@ -70,7 +70,7 @@ def test_as_many_pictures_as_frames_are_taken_in_order_and_that_is_said(shot, re
     report = recorder()
     mask = read_masks(shot, {"people": write_masks(tmp_path / "m", range(10))}, report)["people"]
     assert (mask.of(110) == np.roll(COVERED, 9, axis=1)).all()
-    assert "is numbered 0 to 9, the frames 101 to 110: its pictures are taken in order" in report.warnings[0]
+    assert "is numbered 0 to 9, the frames 101 to 110: picture 0 is taken for frame 101" in report.warnings[0]
 
 
 def test_a_larger_mask_is_brought_to_the_frames_size(shot, recorder, tmp_path):

@@ -11,6 +11,7 @@ from torch_backend.contract import MASK_ALPHA, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.masks import read_masks
+from torch_backend.footage.pairing import Counted
 from torch_backend.footage.plates import Plates
 from torch_backend.shot import Shot
 from torch_backend.solve import foreign
@@ -143,6 +144,6 @@ def test_cameras_may_be_numbered_as_the_footage_or_as_the_shot(tmp_path, counted
     names = [f"f_{n:04d}.png" for n in range(counted_from, counted_from + 30)]
     cameras = [foreign.ForeignCamera(name, np.eye(4)[:3], 0) for name in names]
     solve = foreign.ForeignSolve(tmp_path, "COLMAP model", [lens], cameras)
-    matched = foreign.match(solve, list(range(1003, 1023)), (128, 96), renumbered=1000)
-    assert matched.shift == shift and not matched.missing
+    matched = foreign.match(solve, Counted(list(range(1003, 1023)), shift=1000), (128, 96))
+    assert not matched.missing
     assert matched.cameras[1003].name == f"f_{1003 - shift:04d}.png"

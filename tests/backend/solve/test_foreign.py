@@ -10,6 +10,7 @@ import pytest
 from torch_backend.contract import CameraFrame, CameraPath, ExitCode, JobError, read_json
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png
+from torch_backend.footage.pairing import Counted
 from torch_backend.shot import Shot
 from torch_backend.solve import SolveConfig, foreign, load_points, solve_shot
 from torch_backend.solve.colmap_files import read_model, write_model
@@ -129,7 +130,7 @@ def test_a_colmap_model_reads_as_pycolmap_wrote_it(solved):
     """solve/colmap is written by COLMAP itself; cameras.json is what came out of it by another way."""
     solve = foreign.read(solved.shot.solve / "colmap")
     path = {f.frame: f for f in CameraPath.load(solved.shot.solve / "cameras.json").frames}
-    numbers = foreign.frame_numbers([c.name for c in solve.cameras])
+    numbers = [int(c.name.rpartition(".")[0]) for c in solve.cameras]
     assert sorted(numbers) == list(range(101, 122, 2))
     for number, camera in zip(numbers, solve.cameras, strict=True):
         np.testing.assert_allclose(camera.pose, np.reshape(path[number].viewmat, (4, 4))[:3], atol=1e-9)
@@ -203,51 +204,67 @@ def test_nothing_there_is_a_sentence(tmp_path, make):
 
 
 @pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (["000001.png", "000002.png"], [1, 2]),
-        (["images/frame_00012.jpg", "images/frame_00013.jpg"], [12, 13]),
-        (["shot.1001.exr", "shot.1002.exr"], [1001, 1002]),
-        (["f_0012_v2.png", "f_0013_v2.png"], [12, 13]),
-        (["cam2\\x7.png", "poster.png"], [7, None]),
-        (["-00003.png", "000004.png"], [-3, 4]),
-    ],
+    "template",
+    ["{:06d}.png", "images/frame_{:05d}.jpg", "shot.{:d}.exr", "f_{:04d}_v2.png", "frame-{:04d}.png", "a\\({:d}).png"],
 )
-def test_numbers_in_names(names, expected):
-    assert foreign.frame_numbers(names) == expected
+def test_cameras_are_found_by_the_numbers_in_the_names_of_their_pictures(template):
+    solve = fake_solve(20, first=1001)
+    for n, camera in enumerate(solve.cameras):
+        camera.name = template.format(1001 + n)
+    solve.cameras.append(foreign.ForeignCamera("poster.png", solve.cameras[0].pose, 0))
+    matched = foreign.match(solve, Counted(list(range(1001, 1021))), (640, 480))
+    assert [matched.cameras[n].name for n in range(1001, 1021)] == [template.format(n) for n in range(1001, 1021)]
+    assert not matched.missing and not foreign.remarks(solve, matched)
 
 
-def test_the_same_number_twice_is_said():
-    with pytest.raises(JobError, match=r"left/0001\.png and right/0001\.png"):
-        solve = fake_solve(2)
-        solve.cameras[0].name, solve.cameras[1].name = "left/0001.png", "right/0001.png"
-        foreign.match(solve, [1, 2], (640, 480))
+def test_cameras_of_two_clips_are_refused_by_their_names():
+    solve = fake_solve(40)
+    for n, camera in enumerate(solve.cameras):
+        camera.name = f"{'right' if n % 2 else 'left'}/{n // 2:04d}.png"
+    with pytest.raises(JobError, match=r"left/####\.png, right/####\.png"):
+        foreign.match(solve, Counted(list(range(20))), (640, 480))
+    for camera in solve.cameras[1::2]:
+        camera.name = camera.name.replace("/", "/9")
+    matched = foreign.match(solve, Counted(list(range(20))), (640, 480))
+    assert matched.cameras[7].name == "left/0007.png" and not matched.missing
+
+
+def test_a_picture_with_two_cameras_is_refused():
+    solve = fake_solve(20)
+    solve.cameras[3].name = solve.cameras[4].name
+    with pytest.raises(JobError, match=r"f_0105\.png has two cameras"):
+        foreign.match(solve, Counted(list(range(101, 121))), (640, 480))
 
 
 def test_matching_is_by_number_and_says_what_is_missing():
     solve = fake_solve(20)
-    matched = foreign.match(solve, list(range(105, 125)), (320, 240))
+    matched = foreign.match(solve, Counted(list(range(105, 125))), (320, 240))
     assert sorted(matched.cameras) == list(range(105, 121)) and matched.missing == [121, 122, 123, 124]
     assert matched.cameras[110].name == "f_0110.png"
     assert foreign.remarks(solve, matched)[0][0] == "4 frames have no camera in there: frames 121-124."
 
 
-def test_as_many_pictures_counted_from_another_number_are_taken_in_order():
+@pytest.mark.parametrize("lost", [[], [19], [3, 4, 11], [0]])
+def test_pictures_counted_from_zero_are_no_frame_late_however_many_have_a_camera(lost):
+    """The last case cannot be told from a count from 1: the first picture has no camera."""
     solve = fake_solve(20, first=0)
-    matched = foreign.match(solve, list(range(1, 21)), (640, 480))
-    assert matched.shift == 1 and matched.cameras[1].name == "f_0000.png" and not matched.missing
-    assert "numbered from 0" in foreign.remarks(solve, matched)[0][0]
+    solve.cameras = [c for n, c in enumerate(solve.cameras) if n not in lost]
+    matched = foreign.match(solve, Counted(list(range(1, 21)), clip=(1, 20)), (640, 480))
+    step = 0 if lost == [0] else 1
+    assert all(camera.name == f"f_{frame - step:04d}.png" for frame, camera in matched.cameras.items())
+    assert len(matched.cameras) == len(solve.cameras)
+    assert bool(step) == any("numbered 0 to" in words for words, _ in foreign.remarks(solve, matched))
 
 
 def test_too_few_or_another_shape_are_refused():
     with pytest.raises(JobError, match="Only 0 of the 20 frames.* numbered 500 to 509"):
-        foreign.match(fake_solve(10, first=500), list(range(1, 21)), (640, 480))
+        foreign.match(fake_solve(10, first=500), Counted(list(range(1, 21))), (640, 480))
     with pytest.raises(JobError, match="Only 5 of the 20 frames"):
-        foreign.match(fake_solve(20), list(range(101, 121)), (640, 480), solved=None) and foreign.match(
-            fake_solve(5), list(range(101, 121)), (640, 480)
+        foreign.match(fake_solve(20), Counted(list(range(101, 121))), (640, 480), solved=None) and foreign.match(
+            fake_solve(5), Counted(list(range(101, 121))), (640, 480)
         )
     with pytest.raises(JobError, match="640 x 480 pixels, the shot's frames have another shape, 640 x 360"):
-        foreign.match(fake_solve(20), list(range(101, 121)), (640, 360))
+        foreign.match(fake_solve(20), Counted(list(range(101, 121))), (640, 360))
 
 
 def test_frames_that_are_trained_on_are_what_is_counted():
@@ -255,7 +272,7 @@ def test_frames_that_are_trained_on_are_what_is_counted():
     solve = fake_solve(40)
     solve.cameras = solve.cameras[1::2]  # every other frame, and the step keeps the others
     with pytest.raises(JobError, match="Only 0 of the 20 frames"):
-        foreign.match(solve, frames, (640, 480), solved=frames[::2])
+        foreign.match(solve, Counted(frames), (640, 480), solved=frames[::2])
 
 
 def test_points_without_tracks_count_the_pictures_they_lie_in():
@@ -467,7 +484,7 @@ def test_how_much_agrees_decides():
 def test_refused_cameras_leave_the_solve_that_is_there(solved, tools, tmp_path):
     before = (solved.shot.solve / "cameras.json").read_bytes()
     file = transforms(tmp_path / "t.json", some_poses(10), [f"{n}.png" for n in range(10)], **the_lens())
-    with pytest.raises(JobError, match="Only 0 of the 11 frames"):
+    with pytest.raises(JobError, match="Only 5 of the 11 frames"):
         solve_shot(solved.shot, SolveConfig(features=1500), tools.recorder(), str(file))
     assert (solved.shot.solve / "cameras.json").read_bytes() == before
 
@@ -477,6 +494,6 @@ def test_a_camera_path_comes_in_by_its_frame_numbers(tmp_path):
     file = tmp_path / "path.json"
     file.write_text(json.dumps(CameraPath(640, 480, frames).to_json()))
     solve = foreign.read(file)
-    matched = foreign.match(solve, list(range(2, 13)), (320, 240))
-    assert solve.kind == "camera path" and matched.missing == [12] and matched.shift == 0
+    matched = foreign.match(solve, Counted(list(range(2, 13))), (320, 240))
+    assert solve.kind == "camera path" and matched.missing == [12] and not matched.said
     assert solve.lenses[0].scaled(320, 240).params == (200.0, 200.0, 160.0, 120.0)
