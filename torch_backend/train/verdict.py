@@ -110,8 +110,9 @@ def judge(figures: RunFigures, limits: RunLimits | None = None) -> Verdict:
     sentences = _sentences(figures, limits, dim, places, walks)
     span = _longest_good(figures.frames, np.asarray(bad)) if places or walks else None
     advice = _advice(figures, dim, span, places, walks, limits)
-    # A dim run is advised to be trained anew: no span of it is recommended.
-    advised = [*span] if span is not None and not dim else []
+    # Only where the run does not show the clip is an instant a bad one. Somebody who walks, and is shown, stands still
+    # at any instant. A dim run is advised to be trained anew: no span of it is recommended.
+    advised = [*span] if span is not None and places and not dim else []
     return Verdict(word, sentences, [*places, *walks], advice, advised)
 
 
@@ -149,8 +150,10 @@ def _advice(
     if dim or (places and span is None):
         still = figures.still_unexplained
         return [_LOOK if still is None else _SOLVE if still > limits.still_lost else _HOLD]
-    if span is not None and (places or walks):
+    if span is not None and places:
         return [f"Choose t* in frames {span[0]} to {span[1]}, or train on that range alone."]
+    if span is not None and walks:
+        return [f"If it shows in the freeze, train on frames {span[0]} to {span[1]} alone: there all hold still."]
     if walks:
         return ["Paint who walks in the motion matte, or take a range in which all hold still."]
     return []

@@ -57,6 +57,8 @@ def test_a_walker_is_told_with_frames_place_and_what_to_do():
     ]
     assert verdict.advice == ["Choose t* in frames 43 to 73, or train on that range alone."]
     assert verdict.instants == [43, 73] and judge(figures()).instants == []
+    followed = judge(figures(travel=travel, far=0.02, farthest=0.22))
+    assert followed.instants == [] and not any("t*" in line for line in followed.advice), "shown, it stands at any t*"
 
 
 def test_one_who_walks_and_is_followed_is_told_too():
