@@ -343,7 +343,9 @@ def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
 
 
 def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
+    from .footage import load_frames
     from .solve import SolveConfig, solve_shot
+    from .solve.progress import OneBar, weights_of
 
     config = SolveConfig(**{name: value for name, value in vars(params).items() if name != "cameras"})
 
@@ -352,7 +354,8 @@ def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
 
         return static_views(shot, report)
 
-    return solve_shot(shot, config, report, params.cameras, static_model)
+    one_bar = OneBar(report, weights_of(load_frames(shot)))
+    return solve_shot(shot, config, one_bar, params.cameras, static_model)
 
 
 def _train(shot: Shot, params: contract.TrainParams, report: Reporter) -> Any:

@@ -320,6 +320,11 @@ def _turn(watch: Watch, until: float) -> bool:
             continue
         if job.ended and not job.over:
             _ended(watch, step, job)
+        elif not job.applied and steps.STEPS[step].is_usable(job) and selection.scenes_of(watch.shot):
+            refresh(watch)
+            _apply(watch, step, job)
+            job.applied = step not in watch.failures  # else it is tried once more at the end
+            changed = True
     if watch.pending and selection.scenes_of(watch.shot):
         for step, job in watch.pending.items():
             _apply_late(watch, step, job)
@@ -338,7 +343,7 @@ def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
     steps.STEPS[step].ended(job)
     refresh(watch)
     scenes = selection.scenes_of(watch.shot)
-    if job.state != "done":
+    if job.state != "done" or job.applied:
         return
     if not scenes:
         watch.pending[step] = job

@@ -66,6 +66,10 @@ class Job:
     """What the job answered in its `done` event."""
     end: tuple[str, _Words] | None = None
     """State and last words of the job, as its events tell them."""
+    cameras_known: bool = False
+    """It is a solve that has written the shot's cameras, and may still run."""
+    applied: bool = False
+    """The scene has what the job made, although it may still run."""
     over: bool = False
     """It had ended before this Blender met it: what it made is there, and nothing follows from its end."""
     scene_uid: int = 0
@@ -386,6 +390,7 @@ def _take_in(job: Job, event: contract.Event) -> None:
     elif event.type == "metric":
         values = event.data["values"]
         job.metrics.update(values)
+        job.cameras_known |= event.data.get("stage") == contract.CAMERAS_KNOWN
         point = contract.measured(values)
         if point is not None:
             job.history.append(point)

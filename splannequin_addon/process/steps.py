@@ -82,6 +82,10 @@ class Step:
         """What a finished job changes in the scene; returns it in words."""
         return []
 
+    def is_usable(self, job: jobs.Job) -> bool:
+        """True if a job that still runs has left all that `finish` needs: the scene gets it at once."""
+        return False
+
     def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
         """Has the timer do the work of `finish` in turns, in a window. False if that is not needed."""
         return False

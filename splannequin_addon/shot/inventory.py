@@ -44,6 +44,7 @@ def read(folder: Path) -> ShotState:
         state.frames, state.beside, state.read_as, state.timecode, state.shift = told
     if there.cameras.is_file():
         state.solve = _typed(_Solve, there.solve_record)
+        state.lacks_motion = _is_unfinished(there.motion)
     state.runs = _named(_Run, there.runs, contract.SUMMARY_FILE, state.damaged["run"])
     for name, run in state.runs.items():
         run["extension"] = checkpoints.extension(there.runs / name)
@@ -73,13 +74,18 @@ def read(folder: Path) -> ShotState:
 def stamp(folder: Path) -> tuple[float, ...]:
     """Changes when something in the shot did: cheap to ask for on every tick."""
     there = ShotFolder(folder)
-    parts = (there.info_path, there.listing, there.solve_record, there.runs, there.takes, there.jobs)
+    parts = (there.info_path, there.listing, there.solve_record, there.motion, there.runs, there.takes, there.jobs)
     deep = [p for place in (there.runs, there.takes) if place.is_dir() for p in place.iterdir()]
     places = (contract.RunFolder(run).next for run in deep)
     anew = [p for place in places if place.is_dir() for p in place.iterdir()]
     # Windows dates no folder of a FAT or exFAT disk, as memory cards and portable disks are, when its files change.
     files = [place / name for place in [*deep, *anew] for name in _TOLD]
     return tuple(_mtime(p) for p in [*parts, *deep, *anew, *files])
+
+
+def _is_unfinished(motion: Path) -> bool:
+    """True if a search for what moves was begun and not ended."""
+    return (motion / contract.MOTION_UNFINISHED_FILE).is_file() and not (motion / contract.MOTION_FILE).is_file()
 
 
 def plate_range(folder: Path) -> tuple[int, int] | None:

@@ -29,6 +29,8 @@ class ShotState:
     """SMPTE timecode of the first frame; empty if the footage carries none."""
     solve: dict[str, Any] = field(default_factory=dict[str, Any])
     """solve.json; empty before the solve."""
+    lacks_motion: bool = False
+    """The search for what moves has not ended."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     """Trained runs: name -> summary.json, with `history`, `preview`, `extension`, `anew` (see `checkpoints`) and
     `other_cameras` added."""

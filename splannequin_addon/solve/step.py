@@ -64,9 +64,15 @@ class Solve(Step):
             return View(False, True, [], "Find where the camera was on every frame.")
         told = state.solve.get("result", state.solve)
         lines = [line for line in (told.get("quality"), guesses.told(told)) if line]
+        if state.lacks_motion:
+            lines.append("What moves is not found yet: the training finds it first.")
         if cameras.find(scene, state.folder, "CAMERA") is None:
             return View(True, True, lines, "The solve is not in this scene: load it.")
         return View(True, True, lines, "Look through the camera, then train.")
+
+    def is_usable(self, job: jobs.Job) -> bool:
+        """The cameras are there while the search for motion goes on."""
+        return job.cameras_known
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """Camera, plate and points come into the scene."""

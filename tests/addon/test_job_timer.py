@@ -1,7 +1,11 @@
 """The timer: work of Blender's own in turns, questions to the backend, jobs that end, renders that are followed."""
 
+import dataclasses
 import json
 import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import bpy
@@ -350,3 +354,59 @@ def test_a_pulse_that_fails_does_not_stop_the_timer(supervisor, watch, capsys):
     supervisor.pulse(broken)
     assert supervisor.tick() == supervisor.TICK_SECONDS
     assert "of no use" in capsys.readouterr().err
+
+
+@pytest.fixture
+def solving(addon, contract, supervisor, watch, shot):
+    """A solve that runs, of a shot whose cameras stand on the disk, and `tell`, which writes what it says."""
+    job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
+    job.process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    events = []
+
+    def tell(kind, in_all="running", /, **data):
+        now = time.time()
+        events.append(contract.Event(kind, len(events), now, data))
+        lines = [json.dumps(dataclasses.asdict(event)) for event in events]
+        (job.folder / contract.EVENTS_FILE).write_text("\n".join(lines) + "\n")
+        status = contract.Status("solve", in_all, job.process.pid, now, 0.0, now)
+        contract.write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
+        supervisor.tick()
+
+    supervisor.follow("solve", job)
+    yield job, tell
+    job.process.kill()
+    job.process.wait()
+
+
+def test_the_camera_arrives_while_the_solve_goes_on_and_its_end_leaves_it_alone(addon, scene, shot, watch, solving):
+    job, tell = solving
+    find = addon("solve.cameras").find
+    tell("progress", stage="solve", done=1, total=2, message="")
+    assert find(scene, shot, "CAMERA") is None
+    tell("metric", stage="cameras known", values={})
+    camera = find(scene, shot, "CAMERA")
+    assert watch.running() == "solve" and scene.camera == camera and camera.data.background_images[0].image
+    assert "is the scene's camera" in watch.notes["solve"][0]
+    own = scene.camera = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    camera.data.background_images[0].alpha = 0.5
+    tell("progress", stage="solve", done=3, total=4, message="")
+    tell("done", "done", state="done", result={})
+    assert job.ended and watch.running() is None and not watch.failures
+    assert scene.camera == own and camera.data.background_images[0].alpha == 0.5
+    assert find(scene, shot, "CAMERA") == camera
+
+
+@pytest.mark.parametrize("state", ["cancelled", "failed"])
+def test_a_solve_that_is_stopped_after_its_cameras_are_known_leaves_them(addon, scene, shot, watch, solving, state):
+    _, tell = solving
+    (shot / "solve" / "motion").mkdir()
+    (shot / "solve" / "motion" / "unfinished.json").write_text("{}")
+    tell("metric", stage="cameras known", values={})
+    tell("done", state, state=state, result=None)
+    assert watch.running() is None and addon("solve.cameras").find(scene, shot, "CAMERA") is not None
+    said = addon("process.steps").STEPS["solve"].view(scene, watch.state).state
+    assert any("What moves is not found yet" in line for line in said)
+    (shot / "solve" / "motion" / "motion.json").write_text("{}")
+    addon("process.job_timer").refresh(watch)
+    said = addon("process.steps").STEPS["solve"].view(scene, watch.state).state
+    assert not any("What moves" in line for line in said)

@@ -113,6 +113,7 @@ from .installed import (
 )
 from .jobs import (
     BLEND_FILE,
+    CAMERAS_KNOWN,
     CANCEL_FILE,
     EVENTS_FILE,
     FORECAST,
@@ -311,6 +312,7 @@ __all__ = [
     "BLEND_FILE",
     "BURNT_IN_FILE",
     "CAMERAS_FILE",
+    "CAMERAS_KNOWN",
     "CAMERA_MODELS",
     "CANCEL_FILE",
     "CARD_GAUSSIANS",

@@ -17,9 +17,11 @@ from ..array_types import save_arrays
 from ..contract import (
     CAMERA_MODELS,
     CAMERAS_FILE,
+    CAMERAS_KNOWN,
     COLMAP_FOLDER,
     MASK_FOUND,
     MASK_KINDS,
+    MOTION_UNFINISHED_FILE,
     PICTURE,
     POINTS_FILE,
     SOLVE_FILE,
@@ -142,7 +144,7 @@ def solve_shot(
     its world, frames without one interpolated.
 
     Then the motion matte of every frame is found (`motion.find_motion`, which `static_model` is for); the solve holds
-    without it.
+    without it. Between the two `report` hears a metric `CAMERAS_KNOWN`.
 
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
@@ -162,6 +164,7 @@ def solve_shot(
     done = _finished(shot, frames, key)
     if done is not None:
         report.progress("solve", 1, 1, "already solved")
+        report.metric(CAMERAS_KNOWN, dict(done["result"]))
         return _with_motion(shot, done["result"], report, static_model)
     taken = prepare(frames, cameras, report) if cameras else None
     lens = _lens_of_map(config, frames, report)
@@ -187,6 +190,7 @@ def solve_shot(
         mapped = any((shot.solve / name).is_file() for name in STMAP_FILES)
         with replacing_solve(shot) as staged:
             result = _finish(shot, frames, answer, masks, config, left, staged, key, report)
+            _mark_motion_unfinished(shot)
     except JobError as error:
         error.add_note(_log_end(shot.colmap_log))
         raise
@@ -194,6 +198,7 @@ def solve_shot(
         shutil.rmtree(scratch, ignore_errors=True)
     if mapped:
         report.warning("The ST maps of the solve before were of its lens: they are gone.", "Write them again.")
+    report.metric(CAMERAS_KNOWN, dict(result))
     result = _with_motion(shot, result, report, static_model)
     report.metric("solve", dict(result))
     return result
@@ -224,6 +229,17 @@ def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: 
     for name in new:
         settings.pop(name)
     return content_key(SOLVE_VERSION, settings, frames.get("key"), *source, *(mask.key for mask in masks.values()))
+
+
+def _mark_motion_unfinished(shot: Shot) -> None:
+    """Has later steps find what moves if the job ends after the cameras are written and before the search begins.
+
+    Mattes that belong to the shot's cameras are not made void by it: should the new solve not come to hold, they stay.
+    """
+    mark = shot.own(shot.motion) / MOTION_UNFINISHED_FILE
+    if not mark.is_file():
+        make_folder(mark.parent)
+        write_json(mark, {"version": 0})
 
 
 def _with_motion(
