@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from torch_backend.contract import INPUT, ExitCode, is_shot
+from torch_backend.contract import INPUT, SHOT_SUFFIX, ExitCode, is_imported_from, is_shot, path_digest
 from torch_backend.shot import is_disk_full, write_json
 
 from . import farm
@@ -118,15 +118,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _place_of(given: str, options: Sequence[str]) -> str:
-    """Folder in output/ for what `freeze` makes of a clip, or of a take of a shot: no two shots share one."""
+def _place_of(given: str, options: Sequence[str], folder: Path = Path("output")) -> str:
+    """Folder in output/ for what `freeze` makes of a clip, or of a take of a shot: no two clips or shots share one. It
+    is called as they are; where another one's is called so, with a digest of the path."""
     place = Path(given)
     name = place.stem
     if "://" not in given and is_shot(given):
         if name == "shot":  # `--shot-name` as it is unless said: the folder around it has the name
             name = place.absolute().parent.name
         name = f"{name}_{take_of(given, options)}"
-    return re.sub(r"[^\w.-]+", "_", name)
+    name = re.sub(r"[^\w.-]+", "_", name)
+    return f"{name}-{path_digest(_absolute(given))}" if _is_anothers(folder / name, given) else name
+
+
+def _is_anothers(folder: Path, given: str) -> bool:
+    """True if a folder holds what was made of another clip or shot than this one, as far as it tells."""
+    wanted, shots = _absolute(given), list(folder.glob("*" + SHOT_SUFFIX))
+    if "://" not in given and is_shot(given):
+        told = str(read_summary(folder).get("shot") or "")
+        return bool(shots) or (bool(told) and os.path.normcase(told) != os.path.normcase(wanted))
+    made_of_a_shot = not shots and bool(read_summary(folder).get("shot"))
+    return made_of_a_shot or any(is_imported_from(shot, wanted) is False for shot in shots)
+
+
+def _absolute(given: str) -> str:
+    return given if "://" in given else os.path.abspath(given)
 
 
 def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:

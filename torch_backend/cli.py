@@ -118,7 +118,9 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     started = time.perf_counter()
     requests = _requests(args)
     try:
-        shot = Shot.create(output / (args.shot_name + SHOT_SUFFIX), args.shot_name)
+        root = output / (args.shot_name + SHOT_SUFFIX)
+        _refuse_anothers(root, requests["import"])
+        shot = Shot.create(root, args.shot_name)
     except OSError as error:
         _give_up(error, output)
     stages: dict[str, float] = {}
@@ -136,6 +138,15 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     write_json(output / contract.SUMMARY_FILE, summary)
     print_summary(summary, console)
     return ExitCode.OK
+
+
+def _refuse_anothers(root: Path, asked: contract.ImportParams) -> None:
+    """JobError if a shot folder holds the shot of a clip that is neither the one asked for nor a copy of it."""
+    if contract.is_imported_from(root, asked.source) is False:
+        from .footage.importing import holds_footage
+
+        if not holds_footage(root, asked):
+            contract.refuse_anothers(root, asked.source)
 
 
 def _requests(args: argparse.Namespace) -> dict[str, Any]:

@@ -49,26 +49,16 @@ def folder_of(one: OneShot) -> Path | None:
 
 
 def beside(clip: Path) -> Path:
-    """The shot folder of a clip for which none was chosen: it is called as the clip, with the clip's ending where
-    another clip's shot is called so. Looked up once a second, since drawing asks all the time."""
+    """`contract.shot_beside`, looked up once a second, since drawing asks all the time."""
     found = _beside.get(clip)
     if found is None or time.monotonic() - found[0] > _LOOK_SECONDS:
-        found = _beside[clip] = (time.monotonic(), _free_beside(clip))
+        found = _beside[clip] = (time.monotonic(), contract.shot_beside(clip, source.is_of))
     return found[1]
 
 
 def look_again() -> None:
     """Has `beside` look at the disk when it is asked next: a shot may have been imported since."""
     _beside.clear()
-
-
-def _free_beside(clip: Path) -> Path:
-    plain = clip.with_name(clip.stem + contract.SHOT_SUFFIX)
-    if source.is_of(plain, clip):
-        return plain
-    # A folder of pictures has no ending.
-    whole = clip.with_name((clip.name if clip.suffix else f"{clip.name} 2") + contract.SHOT_SUFFIX)
-    return whole if source.is_of(plain, clip) is False or source.is_of(whole, clip) else plain
 
 
 def settings(scene: bpy.types.Scene) -> list[OneShot]:

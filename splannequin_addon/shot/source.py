@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import re
 from pathlib import Path
 
 from ...torch_backend import contract
@@ -18,26 +16,8 @@ def named(folder: Path) -> str:
 
 
 def is_of(folder: Path, clip: str | Path) -> bool | None:
-    """True if the shot in a folder was imported from a clip, False if from another one; None if nothing tells.
-
-    What lies where the shot's footage lay, seen from the shot, is its own: both were moved or copied together.
-
-    Args:
-        folder: shot folder.
-        clip: absolute path.
-    """
-    source = named(folder)
-    if not source:
-        return None
-    if _place(source) == _place(clip):
-        return True
-    beside = _told(ShotFolder(folder).listing, "beside", contract.LONGEST_JSON)
-    if beside and not os.path.isabs(beside):
-        if _place(folder / beside) == _place(clip):
-            return True
-        if os.path.exists(folder / beside):
-            return False
-    return _place(folder.parent / re.split(r"[\\/]", source)[-1]) == _place(clip)
+    """`contract.is_imported_from`, by what is remembered of the shot's files."""
+    return contract.is_imported_from(folder, clip, _told)
 
 
 def _told(file: Path, name: str, longest: int) -> str:
@@ -50,8 +30,3 @@ def _told(file: Path, name: str, longest: int) -> str:
 
 def _read(file: Path, name: str, longest: int) -> str:
     return str(contract.read_json(file, longest).get(name, ""))
-
-
-def _place(path: str | Path) -> str:
-    """What two ways to write the path of one file have in common; nothing is looked up."""
-    return os.path.normcase(os.path.normpath(path))

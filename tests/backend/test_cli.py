@@ -11,10 +11,11 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from torch_backend import cli
 from torch_backend.contract import HOSTS, ExitCode, host_names, python_child
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.display import ROLLED
-from torch_backend.footage.images import read_png, resize
+from torch_backend.footage.images import read_png, resize, write_png
 from torch_backend.freeze.exr import read_frozen_exr
 
 CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
@@ -165,6 +166,26 @@ def test_a_failed_import_leaves_no_empty_shot(tmp_path):
     assert run("freeze", wrong, "--output", tmp_path / "out").returncode == ExitCode.FOOTAGE
     assert not (tmp_path / "s.splannequin").exists() and not list((tmp_path / "out").iterdir())
     assert [p.name for p in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+
+
+def test_a_shot_of_another_clip_is_not_used_again(tmp_path, capsys):
+    """Nor is a copy of its own taken for another."""
+    shot, clips = tmp_path / "out" / "shot.splannequin", []
+    for place in "ab":
+        (tmp_path / place).mkdir()
+        wide = resize(np.random.default_rng(ord(place)).integers(0, 256, (6, 12, 3), np.uint8), 96, 48)
+        for n in range(12):
+            write_png(tmp_path / place / f"p.{n:04d}.png", np.ascontiguousarray(wide[:, 2 * n : 2 * n + 64]))
+        clips.append(str(tmp_path / place / "p.0000.png"))
+    shutil.copytree(tmp_path / "a", tmp_path / "copy")
+    assert cli.main(["import", str(shot), clips[0]]) == 0
+    before = (shot / "frames" / "frames.json").read_bytes()
+    assert cli.main(["freeze", clips[1], "--output", str(tmp_path / "out")]) == ExitCode.USAGE
+    assert f"is the shot of another clip: {clips[0]}" in capsys.readouterr().err
+    assert (shot / "frames" / "frames.json").read_bytes() == before
+    words = ["--output", str(tmp_path / "out"), "--t-star", "99"]
+    assert cli.main(["freeze", str(tmp_path / "copy" / "p.0000.png"), *words]) == ExitCode.USAGE
+    assert "t* is frame 99" in capsys.readouterr().err, "it was taken for the same clip"
 
 
 def test_a_shot_folder_that_cannot_be_is_one_sentence(tmp_path):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from torch_backend import cli
-from torch_backend.contract import ExitCode, JobError, ShotFolder
+from torch_backend.contract import ExitCode, JobError, ShotFolder, write_json
 from torch_backend.farm.work import FIRST_FRAMES, PER_WORKING
 from torch_backend.freeze.exr import read_frozen_exr
 
@@ -84,6 +84,18 @@ def test_what_a_task_says_and_its_exit_status_reach_the_engine(tmp_path):
 
 
 @pytest.fixture
+def imported_shots(tmp_path):
+    """Two shots called `shot` with the records of an import."""
+    roots = [tmp_path / place / "shot.splannequin" for place in "ab"]
+    for root in roots:
+        shot = ShotFolder(root)
+        write_json(shot.info_path, {"version": 1, "name": "shot"})
+        frames = [{"frame": n, "file": f"raw/{n:06d}.png"} for n in range(1, 9)]
+        write_json(shot.listing, {"frames": frames, "width": 64, "height": 48})
+    return roots
+
+
+@pytest.fixture
 def task(submitted, tmp_path, capsys):
     """task(step, *words) runs a task of the job in this process: (exit code, lines for the engine)."""
     template = json.loads((submitted / "job" / "template.json").read_text())
@@ -124,6 +136,28 @@ def test_a_host_without_blender_says_so(task, monkeypatch, submitted, tmp_path, 
     words = ["--shot", shot, "--request", str(tmp_path / "request.json"), "--t-star=104", "--output", str(tmp_path)]
     assert cli.main(["farm-task", "bake", *words]) == ExitCode.ENVIRONMENT
     assert "openjd_fail: tiny, bake a: This host was given no Blender." in capsys.readouterr().out
+
+
+def test_two_shots_of_one_name_are_baked_into_two_folders(imported_shots, tmp_path, monkeypatch, capsys):
+    from torch_backend.farm_task import BLENDER_VARIABLE
+
+    told = "import json, sys; print('Told:', json.dumps(sys.argv[2:]))"
+    monkeypatch.setenv(BLENDER_VARIABLE, json.dumps([sys.executable, "-c", told]))
+    roots = [str(root) for root in imported_shots]
+    assert cli.main(["farm", "export", *roots, "--bake", "--output", str(tmp_path / "job"), "--t-star", "4"]) == 0
+    capsys.readouterr()
+    places = set()
+    for step in json.loads((tmp_path / "job" / "template.json").read_text())["steps"]:
+        if step["name"].endswith(": deliver"):
+            (tmp_path / "request.json").write_text(step["script"]["embeddedFiles"][0]["data"])
+            shot = step["parameterSpace"]["taskParameterDefinitions"][0]["range"][0]
+            words = ["--shot", shot, "--request", str(tmp_path / "request.json"), "--t-star=4"]
+            assert cli.main(["farm-task", "deliver", *words, "--output", str(tmp_path / "baked")]) == 0
+            (line,) = [row for row in capsys.readouterr().out.splitlines() if row.startswith("Told: ")]
+            said = json.loads(line.removeprefix("Told: "))
+            assert said[said.index("--shot") + 1] == shot
+            places.add(said[said.index("--output") + 1])
+    assert len(places) == 2 and all(Path(place).parents[1] == tmp_path / "baked" for place in places)
 
 
 def test_paths_among_the_parameters_are_those_of_this_computer():

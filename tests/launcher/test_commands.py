@@ -14,6 +14,7 @@ import pytest
 from launcher import commands, doctor, environments, interpreters, main
 from launcher.summary import failed_job
 from torch_backend.cards import Card
+from torch_backend.contract import write_json
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCHER = ROOT / "splannequin.py"
@@ -169,6 +170,30 @@ def test_two_shots_and_two_takes_share_no_folder_unless_told_to(tmp_path: Path):
     assert where(str(tmp_path / "a" / "shot.splannequin"), []) == "a_freeze"
     assert where(str(tmp_path / "b" / "shot.splannequin"), ["--t-star", "9", "--take", "at9"]) == "b_at9"
     assert where(str(tmp_path / "walk.splannequin"), ["--take=x"]) == "walk_x"
+
+
+def test_clips_and_shots_of_one_name_have_folders_of_their_own_and_find_them_again(tmp_path: Path):
+    clips = [tmp_path / "in" / name for name in ("a.mov", "a.mp4", "b/a.mp4", "a_.mp4", "a .mp4")]
+    shots = [tmp_path / place / "walk.splannequin" for place in "ab"]
+    for shot in shots:
+        shot.mkdir(parents=True)
+
+    def froze(given: Path) -> str:
+        place = main._place_of(str(given), [], tmp_path / "output")
+        made = tmp_path / "output" / place
+        (made / "shot.splannequin").mkdir(parents=True, exist_ok=True)
+        if given in clips:
+            write_json(made / "shot.splannequin" / "shot.json", {"version": 1, "source": str(given)})
+        else:
+            (made / "shot.splannequin").rmdir()
+        write_json(made / "summary.json", {"shot": str(made / "shot.splannequin" if given in clips else given)})
+        return place
+
+    walk = tmp_path / "in" / "walk_freeze.mp4"
+    clips.append(walk)
+    first = {given: froze(given) for given in (*shots, *clips)}
+    assert len(set(first.values())) == len(first) and first[shots[0]] == "walk_freeze" and first[clips[0]] == "a"
+    assert {given: froze(given) for given in (*clips, *shots)} == first
 
 
 def test_what_only_a_clip_wants_is_refused_of_a_shot(tmp_path: Path):

@@ -9,6 +9,7 @@
     path_rules      where files of another computer lie on this one
     shot_folder     where everything of a shot lies
     shot_work       what of it belongs to its present frames
+    clip_shot       which shot folder is a clip's
     unborn          what a failed import leaves behind
     files, typed    reading what may come from anywhere, and plain JSON into dataclasses
     identity        what a file is known by: its content
@@ -37,6 +38,14 @@ from .camera_path import (
 )
 from .checkpoint_header import (
     checkpoint_facts,
+)
+from .clip_shot import (
+    is_imported_from,
+    path_digest,
+    readable_stem,
+    refuse_anothers,
+    same_name,
+    shot_beside,
 )
 from .colour import (
     PROBE,
@@ -464,6 +473,7 @@ __all__ = [
     "incomplete",
     "is_disk_full",
     "is_half_written",
+    "is_imported_from",
     "is_link",
     "is_pattern",
     "is_shot",
@@ -488,6 +498,7 @@ __all__ = [
     "package_name",
     "panel",
     "parse_timecode",
+    "path_digest",
     "path_error",
     "printable",
     "process",
@@ -499,7 +510,9 @@ __all__ = [
     "read_lines",
     "read_message",
     "read_writer",
+    "readable_stem",
     "record_packages",
+    "refuse_anothers",
     "refuse_foreign",
     "remove_file",
     "remove_link",
@@ -512,6 +525,8 @@ __all__ = [
     "runs_job",
     "runs_still",
     "said_of",
+    "same_name",
+    "shot_beside",
     "site_packages",
     "summarise",
     "sweep_half_written",

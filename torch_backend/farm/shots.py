@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import mimetypes
+import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,14 +24,23 @@ from ..contract import (
     check_params,
     checked_name,
     from_dict,
+    is_imported_from,
     is_shot,
+    path_digest,
     read_json,
+    readable_stem,
+    same_name,
     write_json,
 )
 from ..contract.files import is_json_object
+from ..contract.option_table import options_of
 from ..footage.numbering import renumbered, shift_of
 from ..footage.opening import open_source
+from ..footage.sequence import PICTURES
+from .request import shot_name
 
+_LONGEST = 40
+"""Letters of a shot's name in a job: a step's name may have 64."""
 TAKE_DIGITS = 4
 """Of the instant in the name of a take that is one of several."""
 
@@ -38,6 +51,12 @@ class FarmShot:
 
     name: str
     """What the steps of the job are called by; no two of a job have the same."""
+    called: str
+    """What the shot is called, or its clip."""
+    identity: str
+    """Absolute path of the shot folder; of the clip, or its first picture, if a shot is to be made of it."""
+    output: str
+    """Folder of its baked frames, in that of all shots; no two have the same."""
     root: Path
     """Shot folder, on the computer that submits."""
     clip: str
@@ -82,14 +101,11 @@ def gather(
     Raises:
         JobError: a shot or clip that cannot be used, or a name in the table that none has; ValueError: parameters.
     """
+    found = [_of_shot(path, requests) if is_shot(path) else _of_clip(path, requests, shots_folder) for path in given]
     shots: list[FarmShot] = []
-    for path in given:
-        shot = _of_shot(path, requests) if is_shot(path) else _of_clip(path, requests, shots_folder)
-        names = {one.name for one in shots}
-        name, count = shot.name, 2
-        while name in names:
-            name, count = f"{shot.name} {count}", count + 1
-        own = table.get(shot.name, list(instants))
+    base, names = requests["freeze"].take, _Names(table)
+    for shot in _distinct(found):
+        own = names.instants_of(shot, list(instants))
         for t_star in own:
             if not shot.first <= t_star <= shot.last:
                 raise JobError(
@@ -97,25 +113,83 @@ def gather(
                     "Choose a frame of the shot.",
                     ExitCode.USAGE,
                 )
-        base = requests["freeze"].take
         takes = {"": base} if not own else {str(own[0]): base}
         if len(own) > 1:
             takes = {str(t): f"{base}_{t:0{TAKE_DIGITS}d}" for t in dict.fromkeys(own)}
-        keep = shot.trained and trained_counts
-        shots.append(dataclasses.replace(shot, name=name, takes=takes, trained=keep))
-    known = {shot.name for shot in shots}
-    lost = sorted(set(table) - known)
-    if lost:
-        raise JobError(
-            f"The list of instants names {lost[0]}, which is none of the shots.",
-            f"The shots are {', '.join(sorted(known)[:10])}.",
-            ExitCode.USAGE,
-        )
+        for take in takes.values():  # said now, not by every task
+            checked_name(take, "take")
+        checked_name(requests["freeze"].run, "run")
+        shots.append(dataclasses.replace(shot, takes=takes, trained=shot.trained and trained_counts))
+    names.refuse_unknown(shots)
     return shots
 
 
+class _Names:
+    """A table of instants by the names of shots."""
+
+    def __init__(self, table: dict[str, list[int]]) -> None:
+        self._table, self._found = table, set[str]()
+
+    def instants_of(self, shot: FarmShot, otherwise: list[int]) -> list[int]:
+        """Those of a shot: by its name in the job, that of its folder, or what it was called before names were told
+        apart."""
+        for name in (shot.name, shot.output, shot.called, _plain(shot.called)):
+            if name in self._table:
+                self._found.add(name)
+                return self._table[name]
+        return otherwise
+
+    def refuse_unknown(self, shots: Sequence[FarmShot]) -> None:
+        """JobError if the table names what no shot is called."""
+        lost = sorted(set(self._table) - self._found)
+        if lost:
+            raise JobError(
+                f"The list of instants names {lost[0]}, which is none of the shots.",
+                f"The shots are {', '.join(sorted(shot.name for shot in shots)[:10])}.",
+                ExitCode.USAGE,
+            )
+
+
+def _distinct(found: Sequence[FarmShot]) -> list[FarmShot]:
+    """The shots, each once, with folders, names and output folders that no two of them share.
+
+    What is shared gets a digest of the shot's path, or its clip's, at all who share it: what a shot is called does not
+    depend on the order in which they are given.
+    """
+    given = {str(shot.root) for shot in found if not shot.clip}
+    # A clip whose own shot is given, too, is that shot.
+    found = [s for s in found if not (s.clip and str(s.root) in given and is_imported_from(s.root, s.clip))]
+    shots = list({shot.identity: shot for shot in found}.values())
+    seen = Counter(same_name(str(shot.root)) for shot in shots)
+    shots = [dataclasses.replace(s, root=_hashed(s)) if seen[same_name(str(s.root))] > 1 else s for s in shots]
+    digests = [path_digest(shot.identity) for shot in shots]
+    plain = [_plain(shot.called) for shot in shots]
+    names = _told_apart(plain, [f"{_cut(n, d)}-{d}" for n, d in zip(plain, digests, strict=True)])
+    folders = [shot_name(shot.root) for shot in shots]
+    outputs = _told_apart(folders, [f"{n}-{d}" for n, d in zip(folders, digests, strict=True)])
+    return [
+        dataclasses.replace(shot, name=name, output=output)
+        for shot, name, output in zip(shots, names, outputs, strict=True)
+    ]
+
+
+def _told_apart(plain: Sequence[str], longer: Sequence[str]) -> list[str]:
+    """Of each two names the plain one, where no other reads like it on some disk, else the longer. JobError if those
+    are alike, too."""
+    seen = Counter(map(same_name, plain))
+    names = [p if seen[same_name(p)] == 1 else q for p, q in zip(plain, longer, strict=True)]
+    twice = next((name for name, count in Counter(map(same_name, names)).items() if count > 1), None)
+    if twice is not None:
+        raise JobError(f"Two shots would be called {twice}.", "Rename one of them.", ExitCode.USAGE)
+    return names
+
+
+def _cut(name: str, digest: str) -> str:
+    return name[: _LONGEST - len(digest) - 1].rstrip()
+
+
 def _of_shot(path: str, requests: dict[str, Any]) -> FarmShot:
-    folder = ShotFolder(path)
+    folder = ShotFolder(os.path.abspath(path))  # without `..`, which would have no name
     try:
         info, record = read_json(folder.info_path), read_json(folder.listing)
         numbers = [int(row["frame"]) for row in record["frames"]]
@@ -137,7 +211,7 @@ def _of_shot(path: str, requests: dict[str, Any]) -> FarmShot:
     run = RunFolder(folder.run(requests["freeze"].run))
     name = str(info.get("name") or folder.root.name.removesuffix(SHOT_SUFFIX))
     return FarmShot(
-        _plain(name), folder.root, "", first, last, working, (int(width), int(height)), {}, asked,
+        "", name, str(folder.root), "", folder.root, "", first, last, working, (int(width), int(height)), {}, asked,
         folder.cameras.is_file(), run.summary.is_file() and run.checkpoint.is_file(),
     )  # fmt: skip
 
@@ -153,17 +227,58 @@ def _of_clip(path: str, requests: dict[str, Any], shots_folder: str) -> FarmShot
         raise JobError(f"{clip} does not say how many frames it has.", "Import it, and name the shot.", ExitCode.USAGE)
     first = info.first if taken.first is None else max(info.first, taken.first + shift)
     last = info.last if taken.last is None else min(info.last, taken.last + shift)
-    stem = _plain(re.split(r"[\\/]", clip.rstrip("\\/"))[-1].partition(".")[0])
-    folder = Path(shots_folder).absolute() if shots_folder else Path(clip).parent
+    identity = os.path.abspath(info.file or clip)
+    called = readable_stem(os.path.basename(identity), Path(identity).suffix.lower() in PICTURES)
     high = taken.working_height or min(720, info.height)
     asked = {kind: dataclasses.asdict(params) for kind, params in requests.items()}
     asked["import"]["source"] = clip
     if asked["freeze"]["camera_path"]:
         raise JobError("A camera path is for a shot that is solved.", "Name the shot folder.", ExitCode.USAGE)
     return FarmShot(
-        stem, folder / (stem + SHOT_SUFFIX), clip, first, last,
+        "", called, identity, "", _root_of(clip, called, identity, shots_folder), clip, first, last,
         (round(info.width * high / info.height), high), (info.width, info.height), {}, asked, False, False,
     )  # fmt: skip
+
+
+def _root_of(clip: str, called: str, identity: str, shots_folder: str) -> Path:
+    """The shot folder of a clip: beside it, called as it is where no other footage there is called so; in a folder for
+    the shots of clips from anywhere, with a digest of its path. It depends on the clip alone.
+
+    A shot that was made of the clip before, under its plain name, is that shot.
+    """
+    folder = Path(shots_folder).absolute() if shots_folder else Path(clip).parent
+    hashed = folder / _hashed_name(called, identity)
+    for name in dict.fromkeys((called, Path(clip).stem, Path(clip).name)):
+        plain = folder / (name + SHOT_SUFFIX)
+        if any(is_imported_from(plain, place) for place in (clip, identity)):
+            return plain
+    plain = folder / (called + SHOT_SUFFIX)
+    is_free = not shots_folder and called == _plain(called) and not os.path.lexists(plain)
+    return plain if is_free and not _is_shared(Path(clip).parent, called, identity) else hashed
+
+
+def _is_shared(folder: Path, called: str, identity: str) -> bool:
+    """True if a folder has other footage that is called as a clip is."""
+    wanted, number = same_name(called), re.compile(r"[0-9]+(?=\.[^.]*$)")
+    own = number.sub("#", os.path.basename(identity)) if Path(identity).suffix.lower() in PICTURES else ""
+    with contextlib.suppress(OSError):
+        for name in os.listdir(folder):
+            is_picture = Path(name).suffix.lower() in PICTURES
+            is_video = (mimetypes.guess_type(name)[0] or "").startswith("video/") or name.lower().endswith(".mxf")
+            is_own = name == os.path.basename(identity) or (is_picture and number.sub("#", name) == own)
+            if (is_picture or is_video) and not is_own and same_name(readable_stem(name, is_picture)) == wanted:
+                return True
+    return False
+
+
+def _hashed(shot: FarmShot) -> Path:
+    """The folder of a clip's shot where its plain name is another's, too."""
+    return shot.root.with_name(_hashed_name(shot.called, shot.identity)) if shot.clip else shot.root
+
+
+def _hashed_name(called: str, identity: str) -> str:
+    digest = path_digest(identity)
+    return f"{_cut(_plain(called), digest)}-{digest}{SHOT_SUFFIX}"
 
 
 def _keep_camera_path(folder: ShotFolder, freeze: dict[str, Any]) -> None:
@@ -177,8 +292,8 @@ def _keep_camera_path(folder: ShotFolder, freeze: dict[str, Any]) -> None:
 
 
 def _plain(name: str) -> str:
-    """A name that a step of a template may have: short, without control characters and braces."""
-    return re.sub(r"[\x00-\x1f\x7f-\x9f{}]", "_", name)[:40].strip() or "shot"
+    """A name that a step of a template may have: short, without control characters, braces and what is no UTF-8."""
+    return re.sub(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff{}]", "_", name)[:_LONGEST].strip() or "shot"
 
 
 def read_requests(path: str, requests: dict[str, Any]) -> dict[str, Any]:
@@ -193,6 +308,10 @@ def read_requests(path: str, requests: dict[str, Any]) -> dict[str, Any]:
                 if kind not in PARAMS or not is_json_object(values):
                     raise ValueError(f"{kind!r} is none of {', '.join(PARAMS)}")
                 requests[kind] = from_dict(PARAMS[kind], {**dataclasses.asdict(requests[kind]), **values})
+                for field, spec in options_of(PARAMS[kind]):
+                    value: Any = getattr(requests[kind], field.name)
+                    if spec.choices and value not in (*spec.choices, field.default):
+                        raise ValueError(f"{field.name} is {value!r}, none of {', '.join(spec.choices)}")
         except (OSError, ValueError) as error:
             raise JobError(f"{path} cannot be used as parameters: {error}.", "", ExitCode.USAGE) from error
     for params in requests.values():
@@ -227,5 +346,5 @@ def read_instants(path: str) -> dict[str, list[int]]:
                 "Write one line per shot, such as: kitchen 34, 60",
                 ExitCode.USAGE,
             )
-        found.setdefault(_plain(said.group(1).removesuffix(SHOT_SUFFIX)), []).extend(parse_instants(said.group(2)))
+        found.setdefault(said.group(1).removesuffix(SHOT_SUFFIX), []).extend(parse_instants(said.group(2)))
     return found

@@ -26,6 +26,8 @@ from .work import STEPS, Step
 VERSION = "jobtemplate-2023-09"
 TEMPLATE_FILE, PARAMETERS_FILE, VALUES_FILE = "template.json", "parameters.json", "parameter_values.json"
 """The template; its parameters as `openjd run --job-param file://...` takes them, and as a bundle of Deadline Cloud."""
+MOST_LETTERS = 1024
+"""Of a path, as Open Job Description has it."""
 NOTIFY_SECONDS = 60
 """A training that is cancelled has so long for its checkpoint."""
 _SAYS = {
@@ -62,7 +64,7 @@ def job_template(name: str, steps: Sequence[Step], needs: dict[str, Needs], bake
         bake: takes go through Blender, too: hosts are given one.
 
     Raises:
-        JobError: a path holds braces, which a template cannot say.
+        JobError: a path cannot stand in a template.
     """
     paths = paths_of([step.shot for step in steps])
     parameters: list[dict[str, Any]] = [
@@ -88,11 +90,13 @@ def job_template(name: str, steps: Sequence[Step], needs: dict[str, Needs], bake
 
 
 def job_values(software: Path, shots: Sequence[FarmShot], output: Path, bake: bool) -> dict[str, str]:
-    """Values of a template's job parameters, as they are on the computer that submits."""
+    """Values of a template's job parameters, as they are on the computer that submits. JobError names a path that the
+    engine would refuse."""
     values = {"Splannequin": str(software), "HostPython": "python3", "BackendPython": "", "Home": ""}
     if bake:
         values |= {"Blender": "", "OutputFolder": str(output)}
-    return values | paths_of(shots)
+    values |= paths_of(shots)
+    return {name: _refused_value(value) for name, value in values.items()}
 
 
 def write_job(folder: Path, template: dict[str, Any], values: dict[str, str]) -> list[Path]:
@@ -211,15 +215,49 @@ def _request(step: Step) -> str:
         if values[field] not in _NO_FILES and (asked, field) != ("freeze", "camera_path"):
             values[field] = ""
     amounts = {str(start): round(amount, 4) for start, amount in step.amounts.items()}
-    request: dict[str, Any] = {"version": REQUEST_VERSION, "name": shot.name, "amounts": amounts, asked: values}
+    request: dict[str, Any] = {
+        "version": REQUEST_VERSION,
+        "name": shot.name,
+        "output": shot.output,
+        "amounts": amounts,
+        asked: values,
+    }
     if asked == "freeze":
         request |= {"takes": shot.takes, "first": shot.first, "last": shot.last}
-    # Two braces begin a reference. JSON itself never has two: with an indent each stands on a line of its own.
-    return json.dumps(request, indent=1, sort_keys=True).replace("{{", "{\\u007b")
+    # Two braces begin or end a reference. JSON itself never has two: with an indent each stands on a line of its own.
+    # DEL is the one control character that JSON leaves as it is.
+    text = json.dumps(request, indent=1, sort_keys=True)
+    for mark, escaped in (("{{", "{\\u007b"), ("}}", "}\\u007d"), ("\x7f", "\\u007f")):
+        text = text.replace(mark, escaped)
+    return text
 
 
 def _refused(text: str) -> str:
-    """`text`, which stands in the template as it is. JobError if the engine would read a reference in it."""
-    if "{{" in text or re.search(r"[\x00-\x1f]", text):
-        raise JobError(f"{text!r} cannot stand in a template.", "Rename it without {{.", ExitCode.USAGE)
+    """`text`, a path or name that stands in the template as it is. JobError if the engine would refuse it, or read a
+    reference in it."""
+    said = "".join(c if c.isprintable() else "?" for c in text)
+    if "{{" in text or "}}" in text:
+        raise JobError(
+            f"{said} cannot stand in a job template: two braces mean a reference there.",
+            "Rename it without {{ and }}.",
+            ExitCode.USAGE,
+        )
+    return _refused_value(text)
+
+
+def _refused_value(text: str) -> str:
+    """`text`, a path as it stands in a value beside the template. JobError if the engine would refuse it."""
+    said = "".join(c if c.isprintable() else "?" for c in text)
+    if len(text) > MOST_LETTERS:
+        raise JobError(
+            f"{said[:100]}... has {len(text)} letters: a render farm's job takes {MOST_LETTERS}.",
+            "Move it to a folder with a shorter path.",
+            ExitCode.USAGE,
+        )
+    if re.search(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]", text):
+        raise JobError(
+            f"{said} cannot stand in a job template: its name holds control characters, or is not UTF-8.",
+            "Rename it.",
+            ExitCode.USAGE,
+        )
     return text

@@ -26,6 +26,7 @@ from ..contract import (
     ImportParams,
     JobError,
     Reporter,
+    ShotFolder,
     frame_file,
     is_half_written,
     later,
@@ -38,7 +39,7 @@ from .burnt_in import WIDTH, find_mark, looked_at
 from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
 from .earlier_work import EarlierWork, SamePictures, digest_of, footage_key
 from .images import is_whole_png, read_frame, resize, working_size, write_png
-from .numbering import renumbered, shift_of
+from .numbering import recorded_shift, renumbered, shift_of
 from .ocio import Colours
 from .opening import open_source
 from .reading import read_as
@@ -215,6 +216,17 @@ def load_frames(shot: Shot) -> dict[str, Any]:
             "Import the clip again.",
         )
     return record
+
+
+def holds_footage(root: Path, config: FootageConfig) -> bool:
+    """True if the shot in a folder was imported from footage of the content of `config.source`, wherever that lay.
+    JobError if the footage cannot be opened."""
+    try:
+        record = read_json(ShotFolder(root).listing)
+    except (OSError, ValueError):
+        return False
+    opened = open_source(config.source, config.fps, config.layer, Colours(config.colour_space), told_in(config))
+    return record.get("footage") == footage_key(opened.info, recorded_shift(record))
 
 
 def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:

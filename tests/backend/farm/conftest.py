@@ -7,7 +7,7 @@ import pytest
 from torch_backend.contract import FreezeParams, ImportParams, ShotFolder, SolveParams, TrainParams, write_json
 
 
-def imported(root, name, first=1, last=20, size=(640, 360), source=(1920, 1080)):
+def _imported(root, name, first=1, last=20, size=(640, 360), source=(1920, 1080)):
     """A shot folder with the records of an import."""
     shot = ShotFolder(root / f"{name}.splannequin")
     write_json(shot.info_path, {"version": 1, "name": name, "first": first, "last": last})
@@ -36,4 +36,10 @@ def requests():
 @pytest.fixture
 def shot(tmp_path):
     """shot(name, ...) makes an imported shot in the test's folder."""
-    return lambda name, **words: imported(tmp_path / "shots", name, **words)
+    return lambda name, **words: _imported(tmp_path / "shots", name, **words)
+
+
+@pytest.fixture
+def imported():
+    """imported(folder, name, ...) makes an imported shot in a folder."""
+    return _imported

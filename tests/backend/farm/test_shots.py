@@ -1,9 +1,16 @@
 """What `farm export` is given: shots, clips, instants."""
 
+import shutil
+import unicodedata
+
+import av
+import numpy as np
 import pytest
 
 from torch_backend.contract import JobError, write_json
+from torch_backend.farm.request import shot_name
 from torch_backend.farm.shots import gather, parse_instants, read_instants, read_requests
+from torch_backend.footage.images import write_png
 
 
 def test_takes_are_named_by_their_instants_where_there_are_several(shot, requests):
@@ -15,13 +22,106 @@ def test_takes_are_named_by_their_instants_where_there_are_several(shot, request
     assert one.takes == {"": "freeze"}, "suggested: known when it is opened"
 
 
-def test_shots_of_one_name_have_steps_of_two(shot, requests, tmp_path):
-    first = shot("hall").root
-    second = first.with_name("other.splannequin")
-    write_json(second / "shot.json", {"version": 1, "name": "hall"})
-    (second / "frames").mkdir()
-    (second / "frames" / "frames.json").write_bytes((first / "frames" / "frames.json").read_bytes())
-    assert [one.name for one in gather([str(first), str(second)], requests(), [], {}, "")] == ["hall", "hall 2"]
+def test_shots_of_one_name_have_steps_and_outputs_of_two_in_any_order(imported, requests, tmp_path):
+    roots = [str(imported(tmp_path / place, name).root) for place in "ab" for name in ("shot", "Shot", "hall")]
+    found = {str(one.root): one for one in gather(roots, requests(), [], {}, "")}
+    assert list(found) == roots
+    for names in ([one.name for one in found.values()], [one.output for one in found.values()]):
+        assert len({name.casefold() for name in names}) == 6
+    assert all(name.startswith(("shot-", "Shot-", "hall-")) for name in names)
+    again = gather(roots[::-1], requests(), [], {}, "")
+    assert {str(one.root): one for one in again} == found
+    (one,) = gather(roots[:1] * 2, requests(), [], {}, "")
+    assert (one.name, one.output) == ("shot", "shot"), "one shot that is named twice"
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """A video of three frames."""
+    path = tmp_path_factory.mktemp("video") / "clip.mp4"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mpeg4", rate=24)
+        stream.width = stream.height = 16
+        for n in range(3):
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((16, 16, 3), 20 * n, np.uint8), "rgb24")))
+        out.mux(stream.encode())
+    return path
+
+
+@pytest.fixture
+def clip(tmp_path, video):
+    """clip("a/plate.mp4") is the path of a video; of one with a # in its name, the pattern of a sequence."""
+
+    def made(name):
+        path = tmp_path / "clips" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if "#" in name:
+            for n in range(1, 4):
+                pixels = np.full((16, 16, 3), 20 * n, np.uint8)
+                write_png(path.with_name(path.name.replace("####", f"{n:04d}")), pixels)
+        else:
+            shutil.copyfile(video, path)
+        return str(path)
+
+    return made
+
+
+LONG = "the_long_and_winding_name_of_a_clip_that_somebody_gave_it"
+
+
+@pytest.mark.parametrize("in_one_folder", [True, False])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("plate.v001.mp4", "plate.v002.mp4"),
+        ("a/clip.mp4", "b/clip.mp4"),
+        ("clip.mp4", "clip.mov"),
+        (f"{LONG}_1.mp4", f"{LONG}_2.mp4"),
+        ("take.####.png", "take.mp4"),
+        ("a/{x.mp4", "b/_x.mp4"),
+        ("c/Hall.mp4", "d/hall.mp4", "e/h\u00e4ll.mp4", "f/ha\u0308ll.mp4"),
+    ],
+)
+def test_no_two_clips_have_one_shot_and_each_finds_its_own_again(clip, requests, tmp_path, names, in_one_folder):
+    clips = [clip(name) for name in names]
+    folder = str(tmp_path / "shots") if in_one_folder else ""
+    found = {one.clip: one for one in gather(clips, requests(), [], {}, folder)}
+    for values in ([str(one.root) for one in found.values()], [one.name for one in found.values()],
+                   [one.output for one in found.values()]):  # fmt: skip
+        assert len({unicodedata.normalize("NFC", value).casefold() for value in values}) == len(names), values
+    assert {one.clip: one for one in gather(clips[::-1], requests(), [], {}, folder)} == found
+    for path in clips:
+        (alone,) = gather([path], requests(), [], {}, folder)
+        assert alone.root == found[path].root, "as it is found alone"
+
+
+def test_a_clip_has_the_shot_that_was_made_of_it_and_no_other(clip, imported, requests, tmp_path):
+    path, folder = clip("hall.mp4"), tmp_path / "clips"
+    (one,) = gather([path], requests(), [], {}, "")
+    assert one.root == folder / "hall.splannequin" and (one.name, one.output) == ("hall", "hall")
+    (other,) = gather([path], requests(), [], {}, str(tmp_path / "shots"))
+    assert other.root.parent == tmp_path / "shots" and other.name == "hall" and other.output == shot_name(other.root)
+    made = imported(folder, "hall")
+    for source, root in ((path, made.root), (clip("else/hall.mp4"), None)):
+        write_json(made.info_path, {"version": 1, "name": "hall", "source": source})
+        (one,) = gather([path], requests(), [], {}, "")
+        assert (one.root == made.root) == (root is not None)
+    write_json(made.info_path, {"version": 1, "name": "hall", "source": path})
+    assert len(gather([str(made.root), path], requests(), [], {}, "")) == 1
+
+
+def test_an_instant_is_named_for_one_of_two_shots_of_a_name(imported, requests, tmp_path):
+    roots = [str(imported(tmp_path / place, "hall").root) for place in "ab"]
+    first = gather(roots, requests(), [], {}, "")[0]
+    found = gather(roots, requests(), [], {first.name: [3], "hall": [4]}, "")
+    assert [one.takes for one in found] == [{"3": "freeze"}, {"4": "freeze"}]
+
+
+@pytest.mark.parametrize("field", ["take", "run"])
+@pytest.mark.parametrize("name", ["../../evil", "a/b", "x" * 65, "a\\b", "CON", "{{Param.Home}}", ""])
+def test_names_that_every_task_would_refuse_are_refused_at_once(shot, requests, field, name):
+    with pytest.raises(ValueError, match=f"{field} name"):
+        gather([str(shot("hall").root)], requests(**{field: name}), [], {}, "")
 
 
 def test_what_is_done_is_told_from_what_is_not(shot, requests):
@@ -84,7 +184,8 @@ def test_parameters_of_a_file_stand_over_the_options(tmp_path, requests):
     write_json(file, {"freeze": {"width": 320, "t_star_per_frame": {"3": 4.0}}, "train": {"preset": "final"}})
     asked = read_requests(str(file), requests(take="hero"))
     assert (asked["freeze"].width, asked["freeze"].take, asked["train"].preset) == (320, "hero", "final")
-    for wrong, said in (({"bake": {}}, "'bake' is none of"), ({"freeze": {"wide": 3}}, "wide")):
+    wrongs = ({"bake": {}}, "'bake' is none of"), ({"freeze": {"wide": 3}}, "wide"), ({"train": {"preset": "x"}}, "'x'")
+    for wrong, said in wrongs:
         write_json(file, wrong)
         with pytest.raises(JobError, match=said):
             read_requests(str(file), requests())

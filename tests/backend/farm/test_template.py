@@ -10,6 +10,9 @@ from torch_backend import cli
 from torch_backend.contract import JobError, write_json
 from torch_backend.farm import export as exporting
 from torch_backend.farm.request import read_request
+from torch_backend.farm.shots import gather
+from torch_backend.farm.template import Needs, job_template
+from torch_backend.farm.work import steps_of
 
 
 @pytest.fixture
@@ -139,6 +142,85 @@ def test_many_shots_are_several_jobs(shots, tmp_path):
     assert cli.main(["farm", "export", *shots, "--output", str(tmp_path), "--shots-per-job", "1"]) == 0
     names = [json.loads((tmp_path / f"job-00{n}" / "template.json").read_text())["name"] for n in (1, 2)]
     assert names == ["Splannequin: hall", "Splannequin: kit __chen__"]
+
+
+ODD = [
+    "hall",
+    "hall",
+    "a}}b",
+    "{{Param.Home}}",
+    "../../evil",
+    "x" * 300,
+    "\udcff.mp4",
+    "t\tab\x7f\x85",
+    "h\u00e4ll \U0001f3ac",
+]
+"""Names that a shot.json may hold, whoever wrote it."""
+
+
+def test_whatever_shots_are_called_the_engine_takes_the_job(tmp_path, imported, capsys):
+    model = pytest.importorskip("openjd.model")
+    roots = []
+    for n, name in enumerate(ODD):
+        one = imported(tmp_path / "shots", f"shot{n}")
+        write_json(one.info_path, {"version": 1, "name": name})
+        roots.append(str(one.root))
+    words = ["--bake", "--t-star", "4,12"]
+    assert cli.main(["farm", "export", *roots, "--output", str(tmp_path / "job"), *words]) == 0, capsys.readouterr().err
+    template = json.loads((tmp_path / "job" / "template.json").read_text())
+    values = json.loads((tmp_path / "job" / "parameters.json").read_text())
+    read = model.decode_job_template(template=template)
+    given = model.preprocess_job_parameters(
+        job_template=read, job_parameter_values=values, job_template_dir=tmp_path / "job",
+        current_working_dir=tmp_path, allow_job_template_dir_walk_up=True,
+    )  # fmt: skip
+    job = model.create_job(job_template=read, job_parameter_values=given)
+    assert len({step.name for step in job.steps}) == len(job.steps) == len(ODD) * 7
+
+
+def test_what_a_task_is_told_is_what_was_asked_for_whatever_it_holds(shot, requests):
+    model = pytest.importorskip("openjd.model")
+    odd = "a}}}b{{{c}}{{d\x7f\udcff\n\\u007d"
+    asked = requests(t_star_per_frame={odd: 1.0})
+    (one,) = gather([str(shot("hall").root)], asked, [], {}, "")
+    steps = steps_of(one, 10, False)
+    template = job_template("odd", steps, {step.kind: Needs(512, False) for step in steps}, False)
+    model.decode_job_template(template=template)
+    data = named(template, "hall: freeze")["script"]["embeddedFiles"][0]["data"]
+    assert json.loads(data)["freeze"]["t_star_per_frame"] == {odd: 1.0}
+
+
+@pytest.mark.parametrize(
+    "name", ["a}}b", "a{{b", "{{Param.Home}}", "t\tab", "x\x85", "no utf\udcff", "deep" * 60 + "/" + "er" * 120]
+)
+@pytest.mark.parametrize("what", ["shot", "output", "mask"])
+def test_a_path_that_the_engine_refuses_is_one_sentence_at_export(imported, tmp_path, capsys, name, what):
+    """An output folder or a mask is a value beside the template, where braces mean nothing."""
+    model = pytest.importorskip("openjd.model")
+    name = name if len(name) < 100 else "/".join([name] * 3)
+    folder, words = tmp_path / name, []
+    try:
+        folder.mkdir(parents=True)
+    except OSError:
+        pytest.skip("no such name on this disk")
+    root = imported(folder if what == "shot" else tmp_path / "plain", "hall").root
+    if what == "mask":
+        (folder / "mask.png").touch()
+        words = ["--people-mask", str(folder / "mask.png")]
+    output = folder if what == "output" else tmp_path / "job"
+    code = cli.main(["farm", "export", str(root), "--output", str(output), "--bake", *words])
+    said = capsys.readouterr()
+    if what != "shot" and ("{{" in name or "}}" in name):
+        assert code == 0
+        values = json.loads((output / "parameters.json").read_text())
+        template = model.decode_job_template(template=json.loads((output / "template.json").read_text()))
+        model.preprocess_job_parameters(
+            job_template=template, job_parameter_values=values, job_template_dir=output, current_working_dir=output,
+            allow_job_template_dir_walk_up=True,
+        )  # fmt: skip
+    else:
+        assert code == 2 and "Traceback" not in said.err and not (output / "template.json").exists()
+        assert said.err.count("\n") <= 2, said.err
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,70 @@
+"""Which shot folder is a clip's."""
+
+import pytest
+
+from torch_backend.contract import (
+    JobError,
+    is_imported_from,
+    readable_stem,
+    shot_beside,
+    write_json,
+)
+from torch_backend.contract.clip_shot import refuse_anothers
+
+
+def imported(folder, source, beside=None):
+    write_json(folder / "shot.json", {"version": 1, "name": "a", "source": str(source)})
+    write_json(folder / "frames" / "frames.json", {} if beside is None else {"beside": beside})
+
+
+def test_clips_of_one_stem_have_shots_of_their_own_whatever_was_imported_before(tmp_path):
+    clips = [tmp_path / name for name in ("a.mov", "a.mp4", "a.mp4.avi", "a.avi")]
+    (tmp_path / "a.mp4.splannequin").mkdir()
+    found = {}
+    for clip in clips:
+        clip.touch()
+        found[clip] = shot_beside(clip)
+        imported(found[clip], clip, f"../{clip.name}")
+    assert len(set(found.values())) == len(clips) and found[clips[0]] == tmp_path / "a.splannequin"
+    assert {clip: shot_beside(clip) for clip in reversed(clips)} == {c: found[c] for c in clips}
+    imported(tmp_path / "a.mov.splannequin", tmp_path / "elsewhere.mov")
+    imported(tmp_path / "a.splannequin", clips[1], "../a.mp4")
+    assert shot_beside(clips[0]) not in [tmp_path / "a.splannequin", tmp_path / "a.mov.splannequin"]
+
+
+def test_a_shot_that_was_moved_with_its_clip_is_of_the_clip_and_one_beside_a_namesake_is_not(tmp_path):
+    shot, clip = tmp_path / "here" / "a.splannequin", tmp_path / "here" / "a.mp4"
+    imported(shot, tmp_path / "gone" / "a.mp4")
+    clip.touch()
+    assert is_imported_from(shot, clip)
+    (tmp_path / "gone").mkdir()
+    (tmp_path / "gone" / "a.mp4").touch()
+    assert is_imported_from(shot, clip) is False
+    imported(shot, tmp_path / "gone" / "a.mp4", "../a.mp4")
+    assert is_imported_from(shot, clip)
+    assert is_imported_from(tmp_path / "none.splannequin", clip) is None
+
+
+def test_a_shot_of_another_clip_is_refused_in_words(tmp_path):
+    imported(tmp_path / "shot.splannequin", tmp_path / "a.mp4")
+    (tmp_path / "a.mp4").touch()
+    refuse_anothers(tmp_path / "shot.splannequin", tmp_path / "a.mp4")
+    refuse_anothers(tmp_path / "none.splannequin", tmp_path / "a.mp4")
+    with pytest.raises(JobError, match="is the shot of another clip: .*a.mp4"):
+        refuse_anothers(tmp_path / "shot.splannequin", tmp_path / "b.mp4")
+
+
+@pytest.mark.parametrize(
+    ("name", "is_numbered", "stem"),
+    [
+        ("plate.v001.mp4", False, "plate.v001"),
+        ("kitchen.0001.png", True, "kitchen"),
+        ("kitchen_0001.png", True, "kitchen"),
+        ("kitchen-v2-0001.exr", True, "kitchen-v2"),
+        ("0001.png", True, "0001"),
+        (".hidden", False, ".hidden"),
+        ("take2.mov", False, "take2"),
+    ],
+)
+def test_what_a_clip_is_called(name, is_numbered, stem):
+    assert readable_stem(name, is_numbered) == stem
