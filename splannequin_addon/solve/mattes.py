@@ -187,6 +187,10 @@ def packed(pixels: np.ndarray) -> bytes:
 
 def _pixels(path: Path) -> np.ndarray:
     """A picture file as [H, W, 4] float32 as stored, bottom row first. JobError if it cannot be read."""
+    announced = contract.png_size(path)
+    if announced[0] * announced[1] > contract.MOST_PIXELS:  # Blender would ask for all of its memory
+        message = f"{path} is {announced[0]} x {announced[1]} pixels, or says so."
+        raise contract.JobError(message, "Remove it, or make it smaller.", contract.ExitCode.USAGE)
     image = bpy.data.images.load(str(path))
     try:
         image.alpha_mode = "CHANNEL_PACKED"  # nothing is multiplied

@@ -131,6 +131,16 @@ def test_refusals_are_sentences(matted, scene):
         bpy.ops.splannequin.show_motion()
 
 
+def test_paint_that_announces_too_many_pixels_is_not_loaded(matted, scene):
+    content = bytearray(png(np.zeros((4, 4), np.uint8)))
+    content[16:24] = struct.pack(">II", 16000, 16000)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    (matted / "motion_paint").mkdir()
+    (matted / "motion_paint" / "000006.png").write_bytes(content)
+    with pytest.raises(RuntimeError, match=r"000006\.png is 16000 x 16000 pixels"):
+        bpy.ops.splannequin.paint_motion()
+
+
 def test_buttons_are_off_without_a_solve(scene, tmp_path):
     assert not bpy.ops.splannequin.paint_motion.poll()
 

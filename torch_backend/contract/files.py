@@ -22,6 +22,10 @@ LONGEST_LINE = 1 << 20
 """Bytes of a line of events.jsonl or metrics.jsonl that are read."""
 
 
+MOST_PIXELS = 1 << 27
+"""Of a picture that people give: 16384 x 8192. A few kilobytes of PNG may announce a hundred times that."""
+
+
 def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, windows: bool = os.name == "nt") -> T:
     """What `act` gives, tried anew where Windows refuses: for a moment somebody else may hold the file open, a reader,
     a virus scanner, or whoever renames another one over it. Two seconds long, unless told otherwise.
@@ -64,6 +68,16 @@ def open_regular(path: str | Path) -> BinaryIO:
         source.close()
         raise
     return source
+
+
+def png_size(path: str | Path) -> tuple[int, int]:
+    """Width and height that the header of a PNG announces; (0, 0) if it is none. OSError or ValueError as
+    `open_regular`."""
+    with open_regular(path) as source:
+        head = source.read(24)
+    if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n":
+        return 0, 0
+    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
 
 
 def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:

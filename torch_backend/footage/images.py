@@ -21,7 +21,7 @@ from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
 from ..array_types import SparseMatrix, sparse_entries
-from ..contract import FRAMES_FOLDER, RAW_FOLDER, ExitCode, JobError, open_regular
+from ..contract import FRAMES_FOLDER, MOST_PIXELS, RAW_FOLDER, ExitCode, JobError, open_regular
 from ..shot import atomic_path
 
 PNG_COMPRESSION = 2
@@ -44,6 +44,22 @@ def error_of(source: Any = oiio) -> str:
         return source.geterror()
     except UnicodeDecodeError:  # it quotes the bytes of a damaged file
         return "it is damaged"
+
+
+def check_size(name: str, spec: oiio.ImageSpec) -> None:
+    """JobError (FOOTAGE) if a picture's header announces more pixels than are read: before any of them are."""
+    for width, height in ((spec.full_width, spec.full_height), (spec.width, spec.height)):
+        if width * height > MOST_PIXELS:
+            raise too_large(name, width, height)
+
+
+def too_large(name: str, width: int, height: int) -> JobError:
+    """The refusal of a picture of more than `MOST_PIXELS`."""
+    return JobError(
+        f"{name} is {width} x {height} pixels, or says so: at most {MOST_PIXELS >> 20} megapixels are read.",
+        "Make it smaller.",
+        ExitCode.FOOTAGE,
+    )
 
 
 def write_png(path: str | Path, pixels: NDArray[Any], key: str = "") -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import OpenImageIO as oiio
 
-from .images import error_of
+from .images import check_size, error_of
 from .oiio_types import channel_names
 from .sources import footage_error
 
@@ -89,6 +89,7 @@ def _layers(file: Path) -> tuple[list[Layer], list[str]]:
         # Only OpenEXR's parts are layers: those of a TIFF are pages, of a PSD the pieces of its first.
         while image.seek_subimage(part, 0) and (part == 0 or image.format_name() == "openexr"):
             spec = image.spec()
+            check_size(file.name, spec)
             if spec.deep:
                 raise footage_error(f"{file.name} holds deep data.", "Flatten it before import.")
             several = spec.get_int_attribute("oiio:subimages") > 1

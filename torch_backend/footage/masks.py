@@ -1,14 +1,15 @@
 """Masks that an artist gives: which pixels of which frame they cover, at the working frames' size.
 
 A mask is one picture for all frames, a numbered sequence, a video, or the footage's own alpha. White is covered, from
-half of it on; what a picture's own alpha takes away is not. Frames go by number; exactly as many pictures as frames are
-taken in order. What does not fit the frames is refused in a sentence.
+half of it on. An alpha that is opaque in some places only is the mask, unless the colour is black and white. Frames go
+by number (`pairing`). What does not fit the frames is refused in a sentence.
 """
 
 from __future__ import annotations
 
+import functools
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,13 +22,13 @@ from numpy.typing import NDArray
 from ..contract import MASK_ALPHA, MASK_KINDS, JobError, Reporter, is_pattern
 from ..shot import Shot, content_key
 from . import plate_encoding
-from .images import error_of
+from .images import check_size, error_of
 from .importing import FootageConfig, load_frames, source_places
 from .layers import find_layer
 from .opening import open_video, opens_as_video
-from .orientation import UPRIGHT, orientation_of_picture
+from .orientation import UPRIGHT, Orientation, orientation_of_picture
 from .pairing import counted_of, pair, pairing_words
-from .sequence import SequenceSource, find_sequence, sequence_of_file
+from .sequence import AS_STORED, SequenceSource, find_sequence, sequence_of_file, straight_colour
 from .sources import footage_error, frame_words
 from .video import VideoSource
 
@@ -36,6 +37,12 @@ _SHAPE = 0.01
 """How much the shape of a mask may differ from the footage's: sizes are rounded."""
 _ALL = 0.98
 """Share of the picture from which on a mask leaves nothing to solve by."""
+_BLACK, _MATTE = 0.1, 0.95
+"""Colour is a matte of its own if this share of it is black or white to within a tenth, and there is some of both."""
+_BRIGHTNESS, _ALPHA, _BOTH = "brightness", "alpha", "both"
+"""How the pictures of a mask are read."""
+_Picture = tuple[int | None, NDArray[np.float32], NDArray[np.float32] | None]
+"""Frame (None: all), colour [h, w, C], alpha [h, w], in 0..1."""
 WORDS = {"ignore": "what is ignored", "people": "what may move"}
 """Kind of mask -> what it says, in sentences."""
 
@@ -126,6 +133,12 @@ class _Reading:
     def _covered(self, grey: NDArray[np.float32]) -> NDArray[np.bool_]:
         """[H, W] bool at the working size, of a picture [h, w] in 0..1. JobError for one of another shape."""
         h, w = grey.shape
+        self._check_shape(w, h)
+        small = cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA if w > self.size[0] else cv2.INTER_LINEAR)
+        return np.asarray(small) >= _HALF
+
+    def _check_shape(self, w: int, h: int) -> None:
+        """JobError for a picture of another shape than the footage's."""
         ours = self.frames.get("source_size") or self.size
         aspect = float(self.frames.get("reading", {}).get("pixel_aspect", 1.0))
         shape = w / h
@@ -135,8 +148,6 @@ class _Reading:
                 f"{self.name} is {w}x{h}, the footage {ours[0]}x{ours[1]}: they have not the same shape.",
                 "Render the mask at the footage's size, or a fraction of it.",
             )
-        small = cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA if w > self.size[0] else cv2.INTER_LINEAR)
-        return np.asarray(small) >= _HALF
 
     # ------------------------------------------------------------------------------------------------- from files
 
@@ -146,19 +157,39 @@ class _Reading:
         if not path.exists() and not is_pattern(path.name):
             raise footage_error(f"{self.name} does not exist.", "Check the path.")
         if path.is_file() and opens_as_video(path):
-            yield from self._video(path)
-            return
-        files = self._files(path)
-        if len(files) == 1 and None in files:
-            grey, alpha = self._picture(files[None])
-            yield None, grey if grey.max() > 0.0 or alpha is None else alpha
-            return
-        matched = self._matched(sorted(n for n in files if n is not None))
-        # Some programs write a matte into the alpha of black pictures.
-        from_alpha = all(self._picture(files[theirs])[0].max() <= 0.0 for theirs in matched.values())
-        for frame, theirs in matched.items():
-            grey, alpha = self._picture(files[theirs])
-            yield frame, alpha if from_alpha and alpha is not None else grey
+            pictures = self._of_mask_video(path)
+        else:
+            files = self._files(path)
+            if None not in files:
+                matched = self._matched(sorted(n for n in files if n is not None))
+                files = dict[int | None, Path]({frame: files[theirs] for frame, theirs in matched.items()})
+            pictures = functools.partial(self._of_mask_files, files)
+        way = self._way(pictures(with_alpha=True))
+        for frame, colour, alpha in pictures():
+            grey = colour.mean(2)
+            if alpha is not None and way != _BRIGHTNESS:
+                grey = alpha if way == _ALPHA else grey * alpha
+            yield frame, grey
+
+    def _way(self, pictures: Iterator[_Picture]) -> str:
+        """How all pictures of the mask are read, by those that have an alpha: the artist is told."""
+        low, high, opaque = 1.0, 0.0, None
+        for _, colour, alpha in pictures:
+            if alpha is None:
+                continue
+            low, high = min(low, float(alpha.min())), max(high, float(alpha.max()))
+            if opaque is None and high >= _HALF:
+                opaque = colour[alpha >= _HALF]
+            if opaque is not None and low < _HALF:
+                break
+        if opaque is None or low >= _HALF:  # opaque everywhere, or nowhere
+            return _BRIGHTNESS
+        black, white = float((opaque.max(1) < _BLACK).mean()), float((opaque.min(1) > 1.0 - _BLACK).mean())
+        if black + white >= _MATTE and min(black, white) >= 1.0 - _MATTE:
+            self.report.warning(f"{self.name} is black and white with an alpha: white is masked where it is opaque.")
+            return _BOTH
+        self.report.warning(f"{self.name} has an alpha: what is opaque is masked, its colour is passed over.")
+        return _ALPHA
 
     def _files(self, path: Path) -> dict[int | None, Path]:
         """Number -> file; None for a picture that is none of a sequence."""
@@ -181,20 +212,40 @@ class _Reading:
             self.report.warning(*words)
         return paired.numbers
 
-    def _picture(self, file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """Brightness, less what its alpha takes away, and alpha, [h, w] each in 0..1."""
-        pixels, alpha = _read(file)
-        colours = [n for n in range(pixels.shape[2]) if n != alpha] or [0]
-        grey = pixels[..., colours[:3]].mean(2)
-        return grey, None if alpha is None else pixels[..., alpha]
+    def _of_mask_files(self, files: dict[int | None, Path], with_alpha: bool = False) -> Iterator[_Picture]:
+        """The pictures of a mask; `with_alpha`: those alone that have one."""
+        for frame, file in files.items():
+            buffer, orientation = _opened(file)
+            spec = buffer.spec()
+            self._check_shape(*orientation.size(spec.full_width, spec.full_height))
+            if with_alpha and spec.alpha_channel < 0:
+                continue
+            pixels, alpha = _pixels(file, buffer, orientation)
+            colours = [n for n in range(pixels.shape[2]) if n != alpha] or [0]
+            yield frame, pixels[..., colours[:3]], None if alpha is None else pixels[..., alpha]
 
-    def _video(self, path: Path) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    def _of_mask_video(self, path: Path) -> Callable[..., Iterator[_Picture]]:
+        """The same of a video."""
         video = open_video(path)
+        self._check_shape(video.info.width, video.info.height)
         count = sum(1 for _ in video.frames(None, None))
         wanted = {theirs: frame for frame, theirs in self._matched(list(range(1, count + 1))).items()}
-        for one in video.frames(None, max(wanted)):
-            if one.number in wanted:
-                yield wanted[one.number], np.asarray(plate_encoding.display(one.pixels).mean(2), np.float32)
+
+        def pictures(with_alpha: bool = False) -> Iterator[_Picture]:
+            if with_alpha and not video.has_alpha:
+                return
+            last = max(wanted)
+            alphas = iter(video.alphas(last)) if video.has_alpha else None
+            for one in video.frames(None, last):
+                alpha = None if alphas is None else next((found for n, found in alphas if n == one.number), None)
+                if one.number in wanted:
+                    colour = plate_encoding.display(one.pixels)
+                    if alpha is not None and alpha.shape != colour.shape[:2]:
+                        size = colour.shape[1], colour.shape[0]
+                        alpha = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR), np.float32)
+                    yield wanted[one.number], colour, alpha
+
+        return pictures
 
     # ------------------------------------------------------------------------------------------------- from alpha
 
@@ -254,15 +305,31 @@ class _Reading:
 
 
 def _read(file: Path, part: int = 0) -> tuple[NDArray[np.float32], int | None]:
-    """A whole picture, upright, [h, w, C] with colour multiplied by alpha, and which channel alpha is."""
-    buffer = oiio.ImageBuf(str(file), part, 0)
+    """A whole picture, upright, [h, w, C] with straight colour, and which channel alpha is."""
+    return _pixels(file, *_opened(file, part))
+
+
+def _opened(file: Path, part: int = 0) -> tuple[oiio.ImageBuf, Orientation]:
+    """A picture of which only the header is read yet. JobError if that cannot be, or says that it is too large."""
+    buffer = oiio.ImageBuf(str(file), part, 0, AS_STORED)
     spec = buffer.spec()
     if buffer.has_error:
         raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Write it again.")
+    check_size(file.name, spec)
+    return buffer, orientation_of_picture(spec) or UPRIGHT
+
+
+def _pixels(file: Path, buffer: oiio.ImageBuf, orientation: Orientation) -> tuple[NDArray[np.float32], int | None]:
+    """`_read` of what `_opened` gave."""
+    spec = buffer.spec()
     x, y = spec.full_x, spec.full_y
     roi = oiio.ROI(x, x + spec.full_width, y, y + spec.full_height, 0, 1, 0, spec.nchannels)
     pixels = buffer.get_pixels(oiio.FLOAT, roi)
     if pixels is None or buffer.has_error:
         raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Write it again.")
-    upright = (orientation_of_picture(spec) or UPRIGHT).upright(np.asarray(pixels, np.float32))
-    return upright, spec.alpha_channel if spec.alpha_channel >= 0 else None
+    upright = orientation.upright(np.asarray(pixels, np.float32))
+    alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
+    if alpha is not None and not spec.get_int_attribute("oiio:UnassociatedAlpha"):
+        colours = [n for n in range(upright.shape[2]) if n != alpha]
+        upright[..., colours] = straight_colour(upright[..., colours], upright[..., alpha], 1.0)
+    return upright, alpha

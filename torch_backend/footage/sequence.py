@@ -28,7 +28,7 @@ from ..contract import (
 )
 from . import plate_encoding
 from .color import LIGHTS, InputSpace, named_space, space_of_chromaticities
-from .images import error_of, resize
+from .images import check_size, error_of, resize
 from .layers import Layer, find_layer, shown
 from .lens_tags import focal_of_picture
 from .ocio import Colours
@@ -401,7 +401,7 @@ class SequenceSource:
             opaque = 1.0 if self.info.deep else 255
             findings.transparent |= bool((alpha[inner] < opaque).any())
             if not spec.get_int_attribute("oiio:UnassociatedAlpha"):
-                rgb = _straight(rgb, alpha, opaque)
+                rgb = straight_colour(rgb, alpha, opaque)
         return orientation.upright(rgb)
 
     def _same_layer(self, file: Path) -> Layer:
@@ -425,15 +425,16 @@ class _Findings:
     """Those that occur."""
 
 
-_AS_STORED = oiio.ImageSpec()
-_AS_STORED.attribute("oiio:UnassociatedAlpha", 1)
+AS_STORED = oiio.ImageSpec()
+AS_STORED.attribute("oiio:UnassociatedAlpha", 1)
 """Colour is not to be multiplied by alpha where the file has not done so."""
 
 
 def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
     """Header and pixels, and what is wrong with them, if anything is."""
-    buffer = oiio.ImageBuf(str(file), part, 0, _AS_STORED)
+    buffer = oiio.ImageBuf(str(file), part, 0, AS_STORED)
     spec = buffer.spec()
+    check_size(file.name, spec)
     return spec, buffer, (error_of(buffer) or "it is damaged") if buffer.has_error else ""
 
 
@@ -475,7 +476,7 @@ def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:
     return rows, slice(min(max(0, left), spec.full_width), max(0, min(spec.full_width, left + spec.width)))
 
 
-def _straight(rgb: NDArray[Any], alpha: NDArray[Any], opaque: float) -> NDArray[Any]:
+def straight_colour(rgb: NDArray[Any], alpha: NDArray[Any], opaque: float) -> NDArray[Any]:
     """Colour [H, W, 3] that was multiplied by alpha [H, W] without it; as it stands where alpha is 0 (pure light)."""
     covered = (alpha > 0) & (alpha < opaque)
     if not covered.any():

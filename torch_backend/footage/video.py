@@ -13,14 +13,14 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from ..contract import parse_timecode
+from ..contract import MOST_PIXELS, parse_timecode
 from . import plate_encoding
 from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
 from .decoding import Noticed, decoded, stored_frames, time_of
 from .frame_rgb import BT601, MATRICES, RGB, Coding, coding_of, depth_of, exact_rgb, rgb_codes
-from .images import resize, resize_float
+from .images import resize, resize_float, too_large
 from .lens_tags import focal_of_video
 from .ocio import Colours
 from .orientation import UPRIGHT, Orientation, display_matrix, orientation_of_matrix
@@ -73,6 +73,8 @@ class VideoSource:
         told = told or Told()
         with self._open() as container:
             stream = _best_stream(container, path)
+            if stream.codec_context.width * stream.codec_context.height > MOST_PIXELS:
+                raise too_large(path.name, stream.codec_context.width, stream.codec_context.height)
             frame = _first_frame(container, stream, path)
             matrix = display_matrix(frame)
             orientation = UPRIGHT if matrix is None else orientation_of_matrix(matrix)

@@ -24,7 +24,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ..contract import ST_MAP_WAYS, ExitCode, JobError, Reporter
-from ..footage.images import error_of
+from ..footage.images import check_size, error_of
 from ..footage.oiio_types import bits_of, channel_names
 from .map_lens import MapLens, Polynomial, fitted, widest
 
@@ -148,6 +148,7 @@ def _read(path: Path, layer: str, name: str) -> _Map:
                 f"{name} has {bits} bits a channel, which cannot tell places in a picture to less than a pixel.",
                 "Write it as an EXR of 32 bits.",
             )
+        check_size(name, spec)
         if max(spec.full_width, spec.full_height, spec.width, spec.height) > _LARGEST:
             raise _refused(f"{name} is {spec.full_width} x {spec.full_height}.", f"Choose up to {_LARGEST} a side.")
         pixels = opened.read_image(part, 0, 0, spec.nchannels, oiio.FLOAT)

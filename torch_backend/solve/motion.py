@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contract import (
+    MOST_PIXELS,
     MOTION_FILE,
     MOTION_UNFINISHED_FILE,
     PAINTED_FOLDER,
@@ -32,9 +33,10 @@ from ..contract import (
     JobError,
     Reporter,
     open_regular,
+    png_size,
     read_json,
 )
-from ..footage.images import is_whole_png
+from ..footage.images import is_whole_png, too_large
 from ..shot import Shot, content_key, make_folder, need_disk, write_json
 from .flow import FlowConfig, Map
 from .masks import IGNORE, PEOPLE, limited, load_mask, masks_key, write_grey
@@ -261,19 +263,25 @@ def _painted(path: Path, found: NDArray[np.uint8] | None, size: tuple[int, int])
         raise JobError(
             f"The painted motion matte {path} is damaged or no PNG.", "Paint it again, or remove it.", ExitCode.FOOTAGE
         )
-    pixels = pixels.astype(np.float32) * (255.0 / np.iinfo(pixels.dtype).max)
+    scale = 255.0 / np.iinfo(pixels.dtype).max
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-    grey = pixels[..., : 3 if pixels.shape[2] >= 3 else 1].mean(2)
+    # Made small as it is stored: as floats a large picture would take four times its memory.
+    colour = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST_EXACT)).reshape(*size[::-1], -1)
+    grey = colour[..., : 3 if pixels.shape[2] >= 3 else 1].astype(np.float32).mean(2) * scale
     labels = _LABELS[np.searchsorted([85.0, 170.0], grey, side="right")]
-    alpha = pixels[..., -1] if pixels.shape[2] in (2, 4) else np.full_like(grey, 255.0)
-    labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST_EXACT)
-    alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR)
+    alpha = np.full_like(grey, 255.0)
+    if pixels.shape[2] in (2, 4):
+        plane = pixels[..., -1].astype(np.float32) * scale
+        alpha = np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR))
     below = np.full_like(labels, UNKNOWN) if found is None else found
     return np.where(alpha > 127.5, labels, below)
 
 
 def _decoded(path: Path, how: int) -> NDArray[Any] | None:
-    """Pixels of a file; None if it holds no picture that can be read whole."""
+    """Pixels of a PNG; None if it holds no picture that can be read whole. JobError if it is too large."""
+    width, height = png_size(path)
+    if width * height > MOST_PIXELS:
+        raise too_large(path.name, width, height)
     with open_regular(path) as handle:
         data = np.frombuffer(handle.read(), np.uint8)
     if not len(data) or not is_whole_png(path):

@@ -1,5 +1,8 @@
 """Masks as artists hand them over: one picture, a sequence, a video, an alpha; and what does not fit is refused."""
 
+import struct
+import zlib
+
 import av
 import numpy as np
 import OpenImageIO as oiio
@@ -195,3 +198,79 @@ def test_a_damaged_mask_is_named(shot, recorder, tmp_path):
     (tmp_path / "m" / "m.0104.png").write_bytes(b"\x89PNG")
     with pytest.raises(JobError, match=r"m\.0104\.png cannot be read"):
         masks_of(shot, recorder, people=folder)
+
+
+def drawn(rgb, alpha):
+    """[48, 64, 3] colour, broadcast, and alpha, uint8."""
+    rgb, alpha = np.asarray(rgb, np.uint8), np.asarray(alpha, np.uint8)
+    return np.broadcast_to(rgb, (48, 64, 3)), np.broadcast_to(alpha, (48, 64))
+
+
+SKIN = np.random.default_rng(0).integers(20, 140, (48, 64, 3))
+HALF_BLACK = np.where(np.arange(64)[None, :, None] < 40, 0, 255)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "alpha", "expected"),
+    [
+        (SKIN, np.where(COVERED, 255, 0), COVERED),  # a cut-out of people
+        (SKIN // 8, np.where(COVERED, 255, 0), COVERED),  # in the dark
+        (np.where(COVERED[..., None], SKIN, 255), np.where(COVERED, 255, 0), COVERED),
+        (255, np.where(COVERED, 255, 0), COVERED),
+        (0, np.where(COVERED, 255, 0), COVERED),
+        (HALF_BLACK, np.where(COVERED, 255, 0), COVERED & (HALF_BLACK[..., 0] > 0)),  # a matte with an alpha
+        (np.where(COVERED[..., None], 255, 0), 255, COVERED),
+        (np.where(COVERED[..., None], 255, 0), 0, COVERED),  # an alpha that nobody filled
+        (np.where(COVERED[..., None], 255, 0), 90, COVERED),
+    ],
+)
+@pytest.mark.parametrize("as_sequence", [False, True])
+def test_an_alpha_that_varies_is_the_mask(shot, recorder, tmp_path, rgb, alpha, expected, as_sequence):
+    (tmp_path / "m").mkdir()
+    for number in FRAMES if as_sequence else [0]:
+        write_rgba(tmp_path / "m" / f"m.{number:04d}.png", *drawn(rgb, alpha))
+    source = tmp_path / "m" if as_sequence else tmp_path / "m" / "m.0000.png"
+    assert (masks_of(shot, recorder, people=source)["people"].of(105) == expected).all()
+
+
+def test_frames_without_the_person_do_not_change_how_the_others_are_read(shot, recorder, tmp_path):
+    (tmp_path / "m").mkdir()
+    for number in FRAMES:
+        alpha = np.where(COVERED, 255, 0) if number > 104 else 0
+        write_rgba(tmp_path / "m" / f"m.{number:04d}.png", *drawn(SKIN, alpha))
+    mask = masks_of(shot, recorder, people=tmp_path / "m")["people"]
+    assert not mask.of(103).any() and (mask.of(105) == COVERED).all()
+
+
+def test_cut_outs_in_exr_and_in_a_video_are_read_by_their_alpha(shot, recorder, tmp_path):
+    light = np.dstack([SKIN / 255.0, np.ones((48, 64))]) * COVERED[..., None]
+    assert oiio.ImageBuf(light.astype(np.float32)).write(str(tmp_path / "cut.exr"))
+    assert (masks_of(shot, recorder, people=tmp_path / "cut.exr")["people"].of(105) == COVERED).all()
+    write_alpha_video(tmp_path / "cut.mov", "png.mov", [SKIN.astype(np.uint8)] * 10)
+    mask = masks_of(shot, recorder, people=tmp_path / "cut.mov")["people"]
+    assert all((mask.of(frame) == np.roll(COVERED, frame - 101, axis=1)).all() for frame in FRAMES)
+
+
+def announced(width, height):
+    """A PNG of a few bytes that says how large it is."""
+
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    body = chunk(b"IDAT", zlib.compress(bytes(1 << 16)))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + body + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("size", [(16000, 16000), (64, 4_000_000), (100_000, 75_000)])
+def test_a_picture_that_announces_too_many_pixels_is_refused_before_they_are_read(shot, recorder, tmp_path, size):
+    (tmp_path / "m.png").write_bytes(announced(*size))
+    with pytest.raises(JobError) as error:
+        masks_of(shot, recorder, people=tmp_path / "m.png")
+    assert error.value.hint and error.value.exit_code == ExitCode.FOOTAGE
+    (tmp_path / "footage").mkdir()
+    for n in range(9):
+        (tmp_path / "footage" / f"f.{n}.png").write_bytes(announced(*size))
+    with pytest.raises(JobError) as error:
+        import_footage(Shot.create(tmp_path / "b.splannequin"), str(tmp_path / "footage"), FootageConfig(), recorder())
+    assert error.value.hint and error.value.exit_code == ExitCode.FOOTAGE

@@ -4,8 +4,10 @@ import json
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import cv2
@@ -503,6 +505,17 @@ def test_damaged_paint_is_named(own):
     (own.root / PAINTED).mkdir()
     (own.root / PAINTED / f"{NUMBERS[0]:06d}.png").write_bytes(b"\x89PNG\r\n\x1a\nnot more")
     with pytest.raises(JobError, match=r"painted motion matte .*001001\.png is damaged"):
+        load_motion(own, NUMBERS[0])
+
+
+def test_paint_that_announces_too_many_pixels_is_refused_before_they_are_read(own):
+    paint(own, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    file = own.painted_matte(NUMBERS[0])
+    content = bytearray(file.read_bytes())
+    content[16:24] = struct.pack(">II", 16000, 16000)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    file.write_bytes(content)
+    with pytest.raises(JobError, match=r"001001\.png is 16000 x 16000 pixels, or says so"):
         load_motion(own, NUMBERS[0])
 
 
