@@ -13,7 +13,7 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import named, settings_of
-from ..properties import BoolProperty, PointerProperty, StringProperty
+from ..properties import BoolProperty, FloatProperty, PointerProperty, StringProperty
 from ..scene import paths
 from ..scene.ownership import TAG
 
@@ -33,6 +33,11 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
         name="Plate", description="The camera that shows the clip until it is solved", type=bpy.types.Object
     )
     scaled = BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
+    guessed_scale = FloatProperty(
+        name="Guessed Scale",
+        description="Scene units per solve unit that the camera's height suggested; 0: none was guessed",
+        options={"HIDDEN"},
+    )
     collection = PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
     points_hidden_in = StringProperty(
         name="Points Hidden In",

@@ -348,9 +348,44 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
 
 
 def scaled(scene: bpy.types.Scene, shot: Path) -> bool:
-    """True if somebody gave a shot its scale: by Set Scale, or by hand on its root."""
+    """True if somebody gave a shot its scale: by Set Scale, or by hand on its root. A guess is none."""
     entry = scene_objects.of(scene, shot)
-    return (entry is not None and entry.scaled) or abs(scene_objects.depth_scale(scene, shot) - 1.0) > 1e-5
+    unscaled = guessed_scale(scene, shot) or 1.0
+    return (entry is not None and entry.scaled) or abs(scene_objects.depth_scale(scene, shot) / unscaled - 1.0) > 1e-4
+
+
+def guessed_scale(scene: bpy.types.Scene, shot: Path) -> float:
+    """Scene units per solve unit that `guess_scale` gave a shot; 0 if it gave none."""
+    entry = scene_objects.of(scene, shot)
+    return entry.guessed_scale if entry is not None else 0.0
+
+
+def guess_scale(scene: bpy.types.Scene, shot: Path, is_new: bool) -> list[str]:
+    """Scales a shot so that its camera is as high above the floor as people hold one; returns what changed, in words.
+
+    A scale that somebody gave stays, and so does a shot that stood in the scene without a guess. Without a floor a
+    guess of an earlier solve is taken back.
+
+    Args:
+        scene: the scene.
+        shot: shot folder; its root is there.
+        is_new: the root was made just now.
+    """
+    entry = present(scene_objects.of(scene, shot))
+    if is_new:
+        entry.scaled, entry.guessed_scale = False, 0.0
+    before = entry.guessed_scale
+    if scaled(scene, shot) or not (is_new or before):
+        return []
+    height = cameras.height_of_camera(shot)
+    metre = 1.0 / scene.unit_settings.scale_length if scene.unit_settings.system != "NONE" else 1.0
+    guess = 0.0 if height is None else cameras.HAND_HEIGHT * metre / height
+    change = (guess or 1.0) / scene_objects.depth_scale(scene, shot)
+    entry.guessed_scale = guess
+    notes = move(scene, shot, np.diag([change] * 3 + [1.0]))
+    if guess:
+        notes.append(f"The scale is a guess: the camera stands {cameras.HAND_HEIGHT:g} m above the floor.")
+    return notes
 
 
 def view_under(window: bpy.types.Window, x: int, y: int) -> tuple[Any, Any] | None:

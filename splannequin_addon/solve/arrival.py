@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ..footage import arrival, plate
 from ..scene import rollback
 from ..shot import inventory, selection
-from . import cameras
+from . import align_operators, cameras
 
 if TYPE_CHECKING:
     import bpy
@@ -18,8 +18,10 @@ def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
     """Brings the solve into the scene. FileNotFoundError if there is none."""
     state = inventory.read(shot)
     selection.see(scene, state)
+    is_new = cameras.find(scene, shot, "EMPTY") is None
     with rollback.scene_of(scene):
         camera = cameras.build(scene, shot)
+        notes = align_operators.guess_scale(scene, shot, is_new)
         changes = arrival.fit(scene, state, force_k=True)
     plate.remove(scene, shot)
-    return [f"{camera.name} is the scene's camera, with the plate behind it.", *changes]
+    return [f"{camera.name} is the scene's camera, with the plate behind it.", *notes, *changes]

@@ -25,6 +25,10 @@ from ..scene.ownership import TAG
 from ..shot import inventory, scene_objects
 from . import alignment, guesses
 
+HAND_HEIGHT = 1.5
+"""Height in metres at which a camera is mostly held by somebody who stands."""
+STEADY = 0.5
+"""Most that the height of such a camera varies, as a share of it: from the eyes to the waist."""
 _LENS = ("lens", "shift_x", "shift_y")
 """Properties of a camera that are keyed where the lens changes."""
 _NO_REACH = (1e6, 1e-6)
@@ -64,6 +68,23 @@ def scene_from_solve(
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = rotation, -centre
     return result
+
+
+def height_of_camera(shot: Path) -> float | None:
+    """Median height of a shot's camera over the floor that the solve found, solve units.
+
+    None without a floor, or if the camera rises and sinks too much to be held by somebody who stands.
+    """
+    floor = _floor(shot)
+    if floor is None:
+        return None
+    path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
+    heights = axes.poses(path)[:, :3, 3] @ np.array(floor[0], dtype=np.float64) - floor[1]
+    middle = float(alignment.middle(heights))
+    low, high = np.quantile(heights, (0.05, 0.95))
+    if not (math.isfinite(middle) and middle > 0.0 and float(high - low) < STEADY * middle):
+        return None
+    return middle
 
 
 def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:

@@ -41,7 +41,10 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
             return
         if not align_operators.scaled(scene_in(context), watch.shot):
             layout = layout_of(self)
-            wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")
+            if align_operators.guessed_scale(scene_in(context), watch.shot):
+                wrap(layout, context, "The scale is a guess from the camera's height.", "INFO")
+            else:
+                wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")
             layout.operator("splannequin.align_scale", icon=icons.of("splannequin.align_scale")).selected = False
         body = step_panel.sub_panel(layout_of(self), "camera_alignment", "Alignment")
         if body is not None:
