@@ -34,6 +34,7 @@ from ..contract import (
 )
 from ..contract.files import is_json_object
 from ..contract.option_table import options_of
+from ..footage.images import working_size
 from ..footage.numbering import renumbered, shift_of
 from ..footage.opening import open_source
 from ..footage.sequence import PICTURES
@@ -229,14 +230,14 @@ def _of_clip(path: str, requests: dict[str, Any], shots_folder: str) -> FarmShot
     last = info.last if taken.last is None else min(info.last, taken.last + shift)
     identity = os.path.abspath(info.file or clip)
     called = readable_stem(os.path.basename(identity), Path(identity).suffix.lower() in PICTURES)
-    high = taken.working_height or min(720, info.height)
+    working = working_size(info.width, info.height, taken.working_height)
     asked = {kind: dataclasses.asdict(params) for kind, params in requests.items()}
     asked["import"]["source"] = clip
     if asked["freeze"]["camera_path"]:
         raise JobError("A camera path is for a shot that is solved.", "Name the shot folder.", ExitCode.USAGE)
     return FarmShot(
         "", called, identity, "", _root_of(clip, called, identity, shots_folder), clip, first, last,
-        (round(info.width * high / info.height), high), (info.width, info.height), {}, asked, False, False,
+        working, (info.width, info.height), {}, asked, False, False,
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ the child process of `solve/worker.py` alone.
 from __future__ import annotations
 
 import errno
+import math
 import shutil
 import struct
 import zlib
@@ -182,13 +183,20 @@ def _weights(size: int, new_size: int, lobes: int) -> SparseMatrix:
     return sparse_entries(weights.astype(np.float32).ravel(), rows, columns, (new_size, size))
 
 
-def working_size(width: int, height: int, requested_height: int, limit: int = 720) -> tuple[int, int]:
+WORKING_LINES = 720
+"""Most lines of working frames of landscape footage, unless the import was told otherwise."""
+WORKING_AREA = 1280 * WORKING_LINES
+"""Most pixels of working frames of portrait and square footage: as many as landscape footage of 16:9 has."""
+
+
+def working_size(width: int, height: int, requested_height: int) -> tuple[int, int]:
     """Size of the working frames in pixels, `requested_height` high, never enlarged.
 
-    0 stands for the source's height, at most `limit`. A size that differs from the source's has even
-    sides, which video encoders like; an unscaled odd one is kept.
+    0 stands for the source's height, at most what `WORKING_LINES` and `WORKING_AREA` say. A size that differs from the
+    source's has even sides, which video encoders like; an unscaled odd one is kept.
     """
-    target = min(height, requested_height if requested_height > 0 else limit)
+    most = WORKING_LINES if width > height else max(WORKING_LINES, int(math.sqrt(WORKING_AREA * height / width)))
+    target = min(height, requested_height if requested_height > 0 else most)
     if target == height:
         return width, height
     target = max(2, target // 2 * 2)

@@ -35,6 +35,7 @@ from ..contract import (
 )
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
 from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
+from .bars import Bars, find_bars
 from .burnt_in import WIDTH, find_mark, looked_at
 from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
 from .earlier_work import EarlierWork, SamePictures, digest_of, footage_key
@@ -472,17 +473,38 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
     for n in looked_at(len(usable)):
         report.check_cancelled()
         pictures.append(_grey(fresh / usable[n]))
-    mark = find_mark(pictures)
-    if mark is None:
+    bars = find_bars(pictures)
+    inner = bars.inner(*pictures[0].shape) if pictures else ()
+    mark = find_mark([picture[inner] for picture in pictures])
+    if mark is None and not bars.sides:
         return {}
-    write_png(fresh / BURNT_IN_FILE, np.repeat(np.where(mark, np.uint8(255), np.uint8(0))[..., None], 3, axis=2))
-    share = float(mark.mean())
+    ignored = bars.mask(*pictures[0].shape)
+    found: dict[str, Any] = {}
+    if bars.sides:
+        found["bars"] = _tell_bars(bars, pictures[0].shape, record, report)
+    if mark is not None:
+        ignored[inner] |= mark
+        report.warning(
+            f"{100 * float(mark.mean()):.1f} % of the picture stands still while the world goes by: a logo, a caption? "
+            "It is ignored, and frozen frames show what is behind it.",
+            "If it is part of the scene, set Ignore to None before the solve (Masks, or --ignore-mask none).",
+        )
+    write_png(fresh / BURNT_IN_FILE, np.repeat(np.where(ignored, np.uint8(255), np.uint8(0))[..., None], 3, axis=2))
+    return {"burnt_in": {"file": BURNT_IN_FILE, "share": round(float(ignored.mean()), 5)}, **found}
+
+
+def _tell_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], report: Reporter) -> dict[str, float]:
+    """What frames.json says of bars found in pictures [h, w]: each as a share of the frame's height or width."""
+    h, w = shape
+    width, height = (int(side) for side in record["source_size"])
+    rows, columns = bars.inner(h, w)
+    size = f"{round((columns.stop - columns.start) * width / w)}x{round((rows.stop - rows.start) * height / h)}"
     report.warning(
-        f"{100 * share:.1f} % of the picture stands still while the world goes by: a logo, a caption? "
-        "It is ignored, and frozen frames show what is behind it.",
-        "If it is part of the scene, set Ignore to None before the solve (Masks, or --ignore-mask none).",
+        f"The picture fills only {size} of the frame's {width}x{height}: the bars {' and '.join(bars.sides)} are "
+        "ignored.",
+        "If they are part of the scene, set Ignore to None before the solve (Masks, or --ignore-mask none).",
     )
-    return {"burnt_in": {"file": BURNT_IN_FILE, "share": round(share, 5)}}
+    return {"top": bars.top / h, "bottom": bars.bottom / h, "left": bars.left / w, "right": bars.right / w}
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:

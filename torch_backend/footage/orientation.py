@@ -89,7 +89,7 @@ def orientation_of_matrix(matrix: NDArray[np.int32]) -> Orientation | None:
     if across == 0 or down == 0 or u or v:
         return None
     exact = a / across, b / across, c / down, d / down
-    rounded = tuple(round(value) for value in exact)
+    rounded = round(exact[0]), round(exact[1]), round(exact[2]), round(exact[3])
     if max(abs(x - y) for x, y in zip(exact, rounded, strict=True)) > _NEARLY or rounded not in _MATRICES:
         return None
     found = Orientation(_MATRICES[rounded])
