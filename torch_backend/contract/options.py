@@ -116,7 +116,7 @@ class ImportParams:
         words="the source's, at most 720 lines, of portrait footage at most 1280 x 720 pixels",
         limit=Limit("height of the working frames", 16, 16_384, {0: "the source's"}),
     )
-    """Height in pixels of the working frames; 0: the source's, at most 720 lines, or as many pixels if it is portrait."""
+    """Height in pixels of the working frames; 0: the source's, at most 720 lines, or as many pixels in portrait."""
     fps: float = option(
         0.0,
         flag="--fps",

@@ -102,7 +102,7 @@ def _flat_sides(stack: NDArray[np.float32]) -> tuple[int, int]:
 
 
 def _has_colour_of(found: NDArray[np.float32], other: NDArray[np.float32], lines: int) -> bool:
-    """True if the first rows of `other` [F, H, W] have the colour of the bar of `found`, but for those at its border."""
+    """True if the first rows of `other` [F, H, W] have the colour of the bar of `found`, up to near its border."""
     off = np.abs(other[:, : max(1, lines - _NEAR)] - np.median(found[:, :lines]))
     return bool((np.quantile((off <= _FLAT).mean(axis=2), 1.0 - _OFTEN, axis=0) >= _FLAT_SHARE).all())
 

@@ -13,12 +13,12 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from ..contract import MOST_PIXELS, parse_timecode
+from ..contract import MOST_PIXELS, open_regular, parse_timecode
 from . import plate_encoding
 from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
 from .color import PRIMARIES as PRIMARIES_READ
-from .decoding import Noticed, decoded, stored_frames, time_of
+from .decoding import Noticed, decoded, stored_frames, time_of, unmarked_fields
 from .frame_rgb import BT601, MATRICES, RGB, Coding, coding_of, depth_of, exact_rgb, rgb_codes
 from .images import resize, resize_float, too_large
 from .lens_tags import focal_of_video
@@ -54,6 +54,10 @@ NEAR_REC709 = {4: "BT.470 M", 5: "BT.601 625", 6: "BT.601 525", 7: "SMPTE 240M",
 """Primaries of standard definition: taken as Rec.709's, as editors and Blender do; the difference is small."""
 
 
+_MOST_INTERLACED = 1088
+"""Lines of the largest pictures that any standard interlaces."""
+_fields_of: dict[tuple[str, int, int], str] = {}
+"""Path, size and time of a file -> `decoding.unmarked_fields` of it."""
 _NO_ORIENTATION = (
     "The clip's header asks to show the picture at an angle or stretched, which is neither a quarter turn nor a "
     "mirroring: frames are read as they are stored.",
@@ -89,7 +93,8 @@ class VideoSource:
             rate = stream.average_rate or stream.guessed_rate
             rate_told, rate = bool(rate), rate or Fraction(24)
             count = stream.frames or _count_from_duration(container, stream, rate)
-            self._interlaced = bool(frame.interlaced_frame)
+            self._fields = "" if frame.interlaced_frame else self._unmarked_fields(frame.height)
+            self._interlaced = bool(frame.interlaced_frame or self._fields)
             self._promise = _promise(container, stream, rate)
             self._alpha_decoder = _alpha_decoder_of(stream)
             held = any(component.is_alpha for component in frame.format.components)
@@ -154,7 +159,7 @@ class VideoSource:
         with self._open() as container:
             stream = _best_stream(container, self.path)
             stream.thread_type = "AUTO"
-            for frame in decoded(container, stream, noticed):
+            for frame in decoded(container, stream, noticed, self._fields):
                 number += 1
                 if last is not None and number > last:
                     break
@@ -230,7 +235,7 @@ class VideoSource:
 
     def decode(self, container: Any, stream: Any) -> Iterator[Any]:
         """Frames from where a container of `open` stands, and errors in the place of what cannot be decoded."""
-        return decoded(container, stream)
+        return decoded(container, stream, fields=self._fields)
 
     @property
     def run_up(self) -> float:
@@ -275,6 +280,19 @@ class VideoSource:
             remedy = f" To use what is there, set the last frame to {seen.number}." if seen.number > 7 else ""
             raise footage_error(message, hint + remedy)
         self.warnings.append((message, hint))
+
+    def _unmarked_fields(self, height: int) -> str:
+        """See `decoding.unmarked_fields`; of this file, looked at once."""
+        if height > _MOST_INTERLACED:
+            return ""
+        stat = self.path.stat()
+        key = str(self.path), stat.st_size, stat.st_mtime_ns
+        if key not in _fields_of:
+            with self._open() as container:
+                stream = _best_stream(container, self.path)
+                stream.thread_type = "AUTO"
+                _fields_of[key] = unmarked_fields(container, stream)
+        return _fields_of[key]
 
     def _open(self) -> Any:
         try:
@@ -321,7 +339,8 @@ class VideoSource:
         elif not space.as_it_stands:
             self.warnings.append((f"The clip is {space.name}: converted to Rec.709.", ""))
         if self._interlaced:
-            self.warnings.append(_deinterlaced_words("The clip is interlaced: each frame"))
+            unsaid = ", though it does not say so" if self._fields else ""
+            self.warnings.append(_deinterlaced_words(f"The clip is interlaced{unsaid}: each frame"))
         if self.has_alpha:
             self.warnings.append(("The clip has alpha: its colour is taken, its alpha is not.", ""))
 
@@ -348,7 +367,37 @@ def _deinterlaced_words(which: str) -> tuple[str, str]:
     return message, "Film progressive where you can: half of its lines are interpolated."
 
 
+_ATOMS = {b"ftyp", b"mdat", b"free", b"skip", b"wide", b"uuid", b"pnot", b"moof", b"sidx", b"styp", b"meta"}
+"""What MP4 and QuickTime files consist of at their top, beside the index."""
+
+
+def _lacks_index(path: Path) -> bool:
+    """True if a file is an MP4 or QuickTime file without its index (the moov atom), which recorders write last."""
+    try:
+        size = path.stat().st_size
+        with open_regular(path) as file:
+            at = count = 0
+            while at + 8 <= size:
+                file.seek(at)
+                head = file.read(16)
+                length, kind = int.from_bytes(head[:4], "big"), head[4:8]
+                if length == 1:  # the size follows, in 64 bits
+                    length = int.from_bytes(head[8:16], "big")
+                if kind not in _ATOMS:
+                    break
+                count += 1
+                at = at + length if length >= 8 else size  # 0: until the file ends
+            return count > 0 and (at >= size - 8 or not any(head[:8]))
+    except OSError:
+        return False
+
+
 def _no_video(path: Path) -> Exception:
+    if _lacks_index(path):
+        return footage_error(
+            f"{path.name} was not finished: its index (the moov atom) is missing, so that no player can read it.",
+            "Copy it again. If the recording itself broke off, the camera or a repair program can rebuild the index.",
+        )
     return footage_error(
         f"{path.name} is not a video that can be read.",
         "Choose a video file (MP4, MOV, MKV) or a numbered image sequence.",
