@@ -376,10 +376,10 @@ def _lacks_index(path: Path) -> bool:
     try:
         size = path.stat().st_size
         with open_regular(path) as file:
-            at = count = 0
+            at, count, head = 0, 0, b""
             while at + 8 <= size:
                 file.seek(at)
-                head = file.read(16)
+                head = bytes(file.read(16))
                 length, kind = int.from_bytes(head[:4], "big"), head[4:8]
                 if length == 1:  # the size follows, in 64 bits
                     length = int.from_bytes(head[8:16], "big")
@@ -387,7 +387,8 @@ def _lacks_index(path: Path) -> bool:
                     break
                 count += 1
                 at = at + length if length >= 8 else size  # 0: until the file ends
-            return count > 0 and (at >= size - 8 or not any(head[:8]))
+            is_blank = head[:8] == bytes(8)  # room that was reserved and never filled
+            return count > 0 and (at >= size - 8 or is_blank)
     except OSError:
         return False
 
