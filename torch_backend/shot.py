@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import shutil
 import time
 from dataclasses import dataclass, field
@@ -14,8 +13,6 @@ from typing import Any
 from .contract import (
     SHOT_SUFFIX,
     UNPUBLISHED_FILE,
-    ExitCode,
-    JobError,
     ShotFolder,
     atomic_path,
     check_version,
@@ -24,7 +21,6 @@ from .contract import (
     disk_error,
     from_dict,
     is_disk_full,
-    is_link,
     locked,
     make_folder,
     need_disk,
@@ -108,26 +104,6 @@ class Shot(ShotFolder):
         shot.root.mkdir(parents=True, exist_ok=True)
         shot.save(ShotInfo(name=name or shot.root.name.removesuffix(SHOT_SUFFIX)))
         return shot
-
-    def own(self, folder: Path) -> Path:
-        """`folder` of this shot, for those who remove or overwrite files in it.
-
-        JobError if it is no folder, or if it or a folder on the way to it is a link: what lies behind is not ours.
-        """
-        path = self.root
-        for part in folder.relative_to(self.root).parts:
-            path = path / part
-            if is_link(path):
-                raise JobError(
-                    f"{path} is a link to {os.path.realpath(path)}: what lies there is not this shot's to replace.",
-                    "Remove the link, or put a folder of that name in its place, then start again.",
-                    ExitCode.USAGE,
-                )
-            if os.path.lexists(path) and not path.is_dir():
-                raise JobError(
-                    f"{path} is not a folder.", "Move it away: the shot keeps its files there.", ExitCode.USAGE
-                )
-        return folder
 
     def publish_frames(self) -> None:
         """Ends an import: moves work on the frames that it replaced to SHOT/replaced, and updates shot.json.

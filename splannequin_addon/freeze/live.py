@@ -165,7 +165,7 @@ class Session:
 
 
 def open_session(shot: Path, run: str, python: str, package_root: Path) -> Session:
-    """Starts a child for a run of a shot. JobError if its Python cannot be started.
+    """Starts a child for a run of a shot. JobError if its Python cannot be started, or its log would go through a link.
 
     Args:
         python: interpreter of the backend's environment.
@@ -173,8 +173,11 @@ def open_session(shot: Path, run: str, python: str, package_root: Path) -> Sessi
     """
     session = Session(shot, run)
     log = contract.ShotFolder(shot).live_log
+    contract.ShotFolder(shot).own(log.parent)
     try:
         log.parent.mkdir(parents=True, exist_ok=True)
+        if contract.is_link(log):  # else what it leads to would be emptied
+            contract.remove_link(log)
         with open(log, "wb") as errors:
             placed = contract.python_child(python, "torch_backend", "live", str(shot.absolute()), "--run", run)
             piped: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors}

@@ -57,7 +57,9 @@ def freeze_from(scene: bpy.types.Scene, path: contract.CameraPath, step: str = "
     A bake is about a part of the take: where the camera was not looked at now, it stays as it was.
     """
     folder = begin.needed(scene, step)
-    file = contract.ShotFolder(folder).camera_path(settings_of(scene).take_name)
+    shot = contract.ShotFolder(folder)
+    file = shot.camera_path(settings_of(scene).take_name)
+    shot.own(file.parent)
     if step == "bake" and file.is_file():
         path = _with_rest(path, contract.CameraPath.load(file))
     contract.write_json(file, path.to_json(), parents=False)

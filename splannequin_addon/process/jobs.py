@@ -220,7 +220,7 @@ def cancel(job: Job) -> None:
         return  # the shot was moved or deleted, which ends the job too
     except FileExistsError:
         since = flag.lstat().st_mtime
-        if time.time() - since > _KILL_SECONDS and is_alive(job, job.status):
+        if contract.disk_time(job.folder) - since > _KILL_SECONDS and is_alive(job, job.status):
             _kill(job)
 
 
@@ -274,8 +274,11 @@ def latest(shot: Path) -> dict[str, Job]:
     """The newest job of each kind in a shot, polled once: those that run are found again here."""
     found: dict[str, Job] = {}
     there = contract.ShotFolder(shot).jobs
-    folders = sorted(there.glob("*/"), key=lambda p: p.name, reverse=True) if shot.is_dir() else []
+    is_own = shot.is_dir() and not contract.is_link(there)  # behind a link lie another shot's: nothing is written there
+    folders = sorted(there.glob("*/"), key=lambda p: p.name, reverse=True) if is_own else []
     for folder in folders:
+        if contract.is_link(folder):
+            continue
         kind = next((k for k in contract.PARAMS if f"-{k}-" in folder.name), None)
         if kind is None or kind in found:
             continue

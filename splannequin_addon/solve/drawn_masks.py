@@ -49,7 +49,7 @@ def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple
         size = int(listing["width"]), int(listing["height"])
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE) from error
-    into = folder.drawn_masks(kind)
+    into = folder.own(folder.drawn_masks(kind))
     into.mkdir(parents=True, exist_ok=True)
     _tidy(into.parent)
     beside = _beside(into, os.getpid())

@@ -47,6 +47,7 @@ def params(scene: bpy.types.Scene, shot: Path | None) -> contract.SolveParams:
             raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
         backend.python()  # before anything is written: without a backend nothing would read it
         file = contract.ShotFolder(shot).tracking
+        contract.ShotFolder(shot).own(file.parent)
         contract.write_json(file, data, parents=False)
         asked.cameras = str(file)
     return asked

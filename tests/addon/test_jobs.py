@@ -347,6 +347,23 @@ def test_a_job_that_is_stopped_is_alive_and_can_be_ended_by_another_blender(addo
     assert found.state == "failed"
 
 
+@pytest.mark.skipif(os.name == "nt", reason="a link needs a privilege there")
+@pytest.mark.parametrize("what", ["the folder", "one job"])
+def test_jobs_behind_a_link_are_not_looked_at(addon, contract, empty_shot, tmp_path, what):
+    """One that seems dead is told so in its own folder, which would be another shot's."""
+    jobs = addon("process.jobs")
+    folder = jobs.new_job(empty_shot, "train", contract.TrainParams()).folder
+    os.utime(folder / "request.json", (1, 1))
+    place = folder.parent if what == "the folder" else folder
+    place.rename(tmp_path / "elsewhere")
+    place.symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    before = sorted(tmp_path.rglob("*.json"))
+    assert jobs.latest(empty_shot) == {} and sorted(tmp_path.rglob("*.json")) == before
+    if what == "the folder":
+        with pytest.raises(contract.JobError, match="is a link to"):
+            jobs.new_job(empty_shot, "train", contract.TrainParams())
+
+
 def test_cancel_follows_no_link(addon, contract, empty_shot, tmp_path):
     jobs = addon("process.jobs")
     job = jobs.new_job(empty_shot, "train", contract.TrainParams())

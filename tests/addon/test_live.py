@@ -1,5 +1,6 @@
 """What a 3D view asks the live session for, and a session that cannot begin. Drawing is seen in window/scrub.py."""
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -179,6 +180,17 @@ def test_a_closed_session_leaves_no_process(addon, contract, shot, root, tmp_pat
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
+@pytest.mark.skipif(os.name == "nt", reason="a link needs a privilege there")
+def test_a_log_that_is_a_link_empties_nothing(addon, contract, shot, root, tmp_path):
+    theirs, live = tmp_path / "theirs.txt", addon("freeze.live")
+    theirs.write_text("theirs")
+    log = contract.ShotFolder(shot).live_log
+    log.parent.mkdir(exist_ok=True)
+    log.symlink_to(theirs)
+    live.open_session(shot, "main", _stand_in(tmp_path, "listens", "exec cat > /dev/null"), root).close()
+    assert theirs.read_text() == "theirs" and not log.is_symlink()
+
+
 def test_a_session_that_hangs_is_ended(addon, shot, root, tmp_path, monkeypatch):
     live = addon("freeze.live")
     monkeypatch.setattr(live, "_PATIENCE_SECONDS", 0.2)

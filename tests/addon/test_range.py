@@ -81,6 +81,21 @@ def test_a_run_that_was_trained_on_makes_a_take_suspect(addon, shot):
     assert not addon("freeze.takes").may_be_stale(shot, "freeze")
 
 
+def test_a_take_tells_by_content_whether_its_run_was_trained_on(addon, contract, shot):
+    """Times say nothing: `cp -r` copies in any order."""
+    addon("process.steps")
+    stale = addon("freeze.takes").may_be_stale
+    checkpoint, take = shot / "runs" / "main" / "checkpoint.safetensors", shot / "takes" / "freeze" / "take.json"
+    checkpoint.write_bytes(b"as frozen")
+    frozen = contract.file_digest(checkpoint)
+    take.write_text(json.dumps({**json.loads(take.read_text()), "checkpoint": frozen}))
+    os.utime(take, (1000, 1000))
+    assert not stale(shot, "freeze")
+    checkpoint.write_bytes(b"trained on")
+    os.utime(checkpoint, (900, 900))
+    assert stale(shot, "freeze")
+
+
 def test_frames_of_the_range_that_the_take_lacks_are_told(addon, with_shot, shot):
     (shot / "takes" / "freeze" / "000006.exr").unlink()
     with_shot.frame_start, with_shot.frame_end = 5, 7

@@ -3,11 +3,14 @@
 import errno
 import json
 import os
+import time
 
 import pytest
 
-from torch_backend.contract import Cancelled, ExitCode, JobError, sweep_half_written
+from torch_backend.contract import Cancelled, ExitCode, JobError, SolveParams, sweep_half_written
 from torch_backend.contract.files import patiently
+from torch_backend.farm import records
+from torch_backend.job import new_job
 from torch_backend.shot import Shot, atomic_path, checked_name, content_key, need_disk, write_atomic, write_json
 
 
@@ -130,6 +133,35 @@ def test_two_hosts_with_one_process_number_do_not_meet(tmp_path):
         first.write_bytes(b"1")
         second.write_bytes(b"2")
     assert path.read_bytes() == b"1" and [p.name for p in tmp_path.iterdir()] == ["000001.exr"]
+
+
+@pytest.mark.parametrize("hours", [-3, 3])
+def test_files_are_swept_by_the_clock_of_their_disk(tmp_path, monkeypatch, hours):
+    """This computer's clock may be hours off that of the server whose disk it writes to."""
+    names = {age: f".{age}.{'a' * 12}.tmp.exr" for age in (0, 30, 90)}
+    for minutes, name in names.items():
+        (tmp_path / name).write_bytes(b"half")
+        written = (tmp_path / name).stat().st_mtime - 60 * minutes
+        os.utime(tmp_path / name, (written, written))
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + 3600 * hours)
+    sweep_half_written(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([names[0], names[30]])
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a link needs a privilege there")
+def test_nothing_is_written_through_links_of_a_shot_from_anywhere(tmp_path):
+    shot = Shot.create(tmp_path / "a.splannequin")
+    (tmp_path / "elsewhere").mkdir()
+    for folder in (shot.jobs, shot.farm):
+        folder.symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    with pytest.raises(JobError, match="jobs is a link to .*elsewhere"):
+        new_job(shot, "solve", SolveParams())
+    records.write(shot.root, "solve", "", 0, 0, 1.0, 0.0)
+    assert not list((tmp_path / "elsewhere").iterdir())
+    os.remove(shot.farm)
+    records.write(shot.root, "solve", "", 0, 0, 1.0, 0.0)
+    assert [p.name for p in shot.farm.iterdir()] == ["solve.json"]
 
 
 def test_what_killed_writers_leave_is_swept_and_nothing_else(tmp_path):

@@ -301,6 +301,7 @@ from .verbs import (
 from .writing import (
     atomic_path,
     content_key,
+    disk_time,
     is_half_written,
     locked,
     make_folder,
@@ -461,6 +462,7 @@ __all__ = [
     "default_of",
     "discard_unborn",
     "disk_error",
+    "disk_time",
     "end_with_starter",
     "ending",
     "file_as_blender_counts",

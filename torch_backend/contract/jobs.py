@@ -175,7 +175,8 @@ def new_job(shot: ShotFolder | Path, kind: str, params: Any) -> Path:
     """Makes a job folder with its request in a shot; returns it.
 
     Args:
-        shot: the shot folder. OSError, FileNotFoundError among them, if it cannot be written or is gone.
+        shot: the shot folder. OSError, FileNotFoundError among them, if it cannot be written or is gone; JobError if
+            its jobs would go through a link to elsewhere.
         kind: of `PARAMS`.
         params: the kind's dataclass; a dict of its fields as a request holds them.
     """
@@ -183,7 +184,7 @@ def new_job(shot: ShotFolder | Path, kind: str, params: Any) -> Path:
         raise ValueError(f"a {kind} job takes {PARAMS[kind].__name__}, not {type(params).__name__}")
     shot_folder = shot if isinstance(shot, ShotFolder) else ShotFolder(shot)
     folder = shot_folder.jobs / f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}-{uuid.uuid4().hex[:6]}"
-    shot_folder.jobs.mkdir(exist_ok=True)
+    shot_folder.own(shot_folder.jobs).mkdir(exist_ok=True)
     folder.mkdir()
     values = params if is_json_object(params) else dataclasses.asdict(params)
     request = JobRequest(kind=kind, shot=str(shot_folder.root), params=values)

@@ -18,10 +18,12 @@ replaced/NNN/                    what an import of other frames replaced, a whol
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from .files import checked_name, frame_file
+from .errors import ExitCode, JobError
+from .files import checked_name, frame_file, is_link
 
 SHOT_SUFFIX = ".splannequin"
 """Of a shot folder's own name."""
@@ -209,6 +211,26 @@ class ShotFolder:
     def take(self, name: str) -> Path:
         """Folder of a take; ValueError if the name could leave it."""
         return self.takes / checked_name(name, "take")
+
+    def own(self, folder: Path) -> Path:
+        """`folder` of this shot, for those who write or remove files in it: a shot may come from anywhere.
+
+        JobError if it is no folder, or if it or a folder on the way to it is a link: what lies behind is not ours.
+        """
+        path = self.root
+        for part in folder.relative_to(self.root).parts:
+            path = path / part
+            if is_link(path):
+                raise JobError(
+                    f"{path} is a link to {os.path.realpath(path)}: what lies there is not this shot's to change.",
+                    "Remove the link, or put a folder of that name in its place, then start again.",
+                    ExitCode.USAGE,
+                )
+            if os.path.lexists(path) and not path.is_dir():
+                raise JobError(
+                    f"{path} is not a folder.", "Move it away: the shot keeps its files there.", ExitCode.USAGE
+                )
+        return folder
 
 
 @dataclass(frozen=True)

@@ -87,11 +87,29 @@ def is_half_written(name: str) -> bool:
 
 
 def sweep_half_written(folder: Path) -> None:
-    """Removes what killed processes left half written in a folder: nobody has touched it for an hour."""
-    for file in folder.glob(".*.tmp*"):
-        with contextlib.suppress(OSError):  # another sweeper was first, or it is another's: it does no harm
-            if is_half_written(file.name) and time.time() - file.lstat().st_mtime > _ABANDONED:
-                file.unlink()
+    """Removes what killed processes left half written in a folder: nobody has touched it for an hour, by the clock of
+    the disk, which dates the files of all computers that write there."""
+    left = [file for file in folder.glob(".*.tmp*") if is_half_written(file.name)]
+    if not left:
+        return
+    with contextlib.suppress(OSError):  # nothing can be written there, nor removed
+        now = disk_time(folder)
+        for file in left:
+            with contextlib.suppress(OSError):  # another sweeper was first, or it is another's: it does no harm
+                if now - file.lstat().st_mtime > _ABANDONED:
+                    file.unlink()
+
+
+def disk_time(folder: Path) -> float:
+    """The time by which files in a folder are dated now, seconds since the epoch: a network disk has its server's
+    clock. OSError if nothing can be written there."""
+    probe = folder / f".clock.{uuid.uuid4().hex[:12]}.tmp"
+    try:
+        probe.write_bytes(b"1")
+        return probe.stat().st_mtime
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..contract import ShotFolder, computer_name, read_json, write_json
+from ..contract import JobError, ShotFolder, computer_name, read_json, write_json
 
 
 def write(shot: Path, step: str, t_star: str, first: int, frames: int, amount: float, began: float) -> None:
@@ -41,8 +41,9 @@ def write(shot: Path, step: str, t_star: str, first: int, frames: int, amount: f
         "cores": os.cpu_count(),
     }
     name = "-".join(filter(None, (step, t_star, str(first) if frames else "")))
-    with contextlib.suppress(OSError):
-        write_json(ShotFolder(shot).farm / f"{name}.json", data)
+    with contextlib.suppress(OSError, JobError):  # JobError: the folder is a link to elsewhere
+        folder = ShotFolder(shot)
+        write_json(folder.own(folder.farm) / f"{name}.json", data)
 
 
 def read(shot: Path) -> Iterator[dict[str, Any]]:

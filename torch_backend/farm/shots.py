@@ -287,6 +287,7 @@ def _keep_camera_path(folder: ShotFolder, freeze: dict[str, Any]) -> None:
     if freeze["camera_path"]:
         data = read_json(freeze["camera_path"])
         kept = folder.camera_path(checked_name(freeze["take"], "take"))
+        folder.own(kept.parent)
         if not kept.is_file() or read_json(kept) != data:
             write_json(kept, data)
         freeze["camera_path"] = kept.relative_to(folder.root).as_posix()

@@ -21,7 +21,9 @@ from ..contract import (
     Reporter,
     TrainParams,
     file_digest,
+    is_link,
     read_json,
+    remove_link,
     sweep_half_written,
 )
 from ..deformation import host
@@ -363,6 +365,8 @@ class Metrics:
     def __init__(self, folder: Path, report: Reporter, iteration: int) -> None:
         self.folder, self.report = folder, report
         self.path = folder / METRICS_FILE
+        if is_link(self.path):  # lines would be appended to what it leads to
+            remove_link(self.path)
         make_folder(folder / PREVIEWS_FOLDER)
         for picture in (folder / PREVIEWS_FOLDER).glob("*.png"):
             if picture.stem.isdigit() and int(picture.stem) > iteration:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import os
 import shutil
 from pathlib import Path
 
@@ -461,6 +462,32 @@ def test_a_run_of_other_pictures_is_refused_and_trained_anew(tmp_path, quiet):
     )
     imported("graded")
     assert not trained(), "a run of before does not say what it was trained on, and stays"
+
+
+def test_a_run_is_known_by_its_content_whatever_the_time_of_its_file(world, quiet, tmp_path):
+    """A disk may round times as it likes, and `cp -r` gives new ones."""
+    train_shot(world.shot, short(world, "timed"), quiet())
+    checkpoint = world.shot.run("timed") / CHECKPOINT_FILE
+    run = load_run(world.shot, "timed")
+    for time in (checkpoint.stat().st_mtime_ns // 100 * 100, 1):
+        os.utime(checkpoint, ns=(time, time))
+        assert not run.stale and load_run(world.shot, "timed").stamp == run.stamp
+    copy = shutil.copyfile(checkpoint, tmp_path / CHECKPOINT_FILE)
+    os.replace(copy, checkpoint)
+    assert not run.stale and load_run(world.shot, "timed").stamp == run.stamp
+    tensors, meta = load_checkpoint(checkpoint)
+    save_checkpoint(checkpoint, tensors, {**meta, "trained_seconds": meta["trained_seconds"] + 1.0})
+    assert run.stale
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a link needs a privilege there")
+def test_figures_are_not_appended_through_a_link(world, quiet, tmp_path):
+    theirs, folder = tmp_path / "notes.txt", world.shot.run("figures")
+    theirs.touch()
+    folder.mkdir(parents=True)
+    (folder / "metrics.jsonl").symlink_to(theirs)
+    train_shot(world.shot, short(world, "figures"), quiet())
+    assert not theirs.read_text() and not (folder / "metrics.jsonl").is_symlink()
 
 
 def test_damaged_checkpoint_is_an_error_in_words(world, quiet):
