@@ -150,8 +150,11 @@ def _image(footage: Footage, frames: tuple[int, int]) -> tuple[bpy.types.Image |
     size = sequences.shown_size(image, *frames, footage.shift)
     if size == footage.size:
         return image, ""
+    is_layered = image.type == "MULTILAYER"
     if image.users == 0:
         bpy.data.images.remove(image)
+    if not any(size) and not is_layered:
+        return None, f"Blender cannot read {footage.file.name}"
     shown = f"at {size[0]} x {size[1]}" if any(size) else "as several layers"
     return None, f"Blender reads {footage.file.name} {shown}"
 

@@ -226,6 +226,28 @@ def test_working_frames_stand_in_and_a_sentence_says_why(addon, scene, footage, 
     assert len(shown) == 1 and shown[0].filepath.endswith(".png")
 
 
+def test_footage_that_blender_does_not_read_is_called_that(addon, scene, footage, tmp_path):
+    (tmp_path / "f_0005.jxl").write_bytes(b"\xff\x0a of a format that is not known to it")
+    said = addon("bake.insertion").insert_freeze(scene, footage(file=str(tmp_path / "f_0005.jxl")), "detail")
+    assert any(line.endswith("not the footage: Blender cannot read f_0005.jxl.") for line in said)
+
+
+@pytest.mark.parametrize(
+    "name", ["frame-0001.png", "photo (1).png", "f_0001_left.png", "f_0001_v2.png", "a2_b[1]+.png"]
+)
+def test_blender_looks_for_the_files_that_the_import_says_it_does(contract, tmp_path, name):
+    shutil.copy(DATA / "detail" / "plate" / "000005.exr", tmp_path / name)
+    image = bpy.data.images.load(str(tmp_path / name))
+    image.source = "SEQUENCE"
+    background = bpy.data.cameras.new("camera").background_images.new()
+    background.image, user = image, background.image_user
+    user.frame_duration = 200000
+    for frame in (3, 12, 12345):
+        user.frame_current = frame
+        found = Path(image.filepath_from_user(image_user=user)).name
+        assert found == contract.file_as_blender_counts(name, frame)
+
+
 def test_footage_moved_together_with_the_shot_is_found(addon, scene, footage):
     shot = footage(file="/nowhere/000005.exr")
     assert "The plate is 000005.exr itself, 56 x 42." in addon("bake.insertion").insert_freeze(scene, shot, "detail")

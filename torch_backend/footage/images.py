@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import math
+import re
 import shutil
 import struct
 import zlib
@@ -42,9 +43,13 @@ _MADE_BY = {
 def error_of(source: Any = oiio) -> str:
     """The pending error of OpenImageIO or of one of its objects, which is thereby taken back."""
     try:
-        return source.geterror()
+        text = source.geterror()
     except UnicodeDecodeError:  # it quotes the bytes of a damaged file
         return "it is damaged"
+    claimed = re.search(r"claimed to be (\d+)x(\d+)", text)
+    if claimed:  # what follows is advice to programmers
+        return f"it claims to be {claimed[1]} x {claimed[2]} pixels"
+    return text.strip().partition("\n")[0].rstrip(".")
 
 
 def check_size(name: str, spec: oiio.ImageSpec) -> None:

@@ -65,6 +65,12 @@ PICTURES = _picture_endings()
 """Endings of files that OpenImageIO reads, lower case."""
 
 
+_IN_BLENDER = {
+    ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
+}  # fmt: skip
+"""Endings of files that Blender shows alike. It knows no JPEG XL, and loses a line of a colour of SGI files."""
+
+
 @dataclass(frozen=True)
 class PictureSequence:
     """The files of a numbered image sequence."""
@@ -321,16 +327,19 @@ class SequenceSource:
             self.warnings.append((f"The pictures are {self._space.name}: converted to Rec.709.", ""))
 
     def _first_readable(self, requested_layer: str) -> tuple[Path, oiio.ImageSpec, Layer, list[str]]:
+        why = ""
         for file in self._files.values():
             try:
                 layer, names = find_layer(file, requested_layer)
-            except OSError:
+            except OSError as error:
+                why = why or str(error).replace(str(file), file.name)
                 continue
             spec, _, failed = _open(file, layer.part)
             if not failed:
                 return file, spec, layer, names
+            why = why or f"{file.name}: {failed}"
         raise footage_error(
-            f"No picture of the sequence in {next(iter(self._files.values())).parent} can be read.",
+            f"No picture of the sequence in {next(iter(self._files.values())).parent} can be read: {why}.",
             "Open one in Blender to see whether it is whole.",
         )
 
@@ -453,6 +462,8 @@ def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction, orientation: Or
 
 def _named_unlike(name: str, files: dict[int, Path]) -> str:
     """The same by the files' names: Blender is given one of them and looks for the others under its name."""
+    if Path(name).suffix.lower() not in _IN_BLENDER:
+        return f"Blender does not show {Path(name).suffix} pictures as they are"
     if all(file.name == file_as_blender_counts(name, number) for number, file in files.items()):
         return ""
     return "Blender reads another number in its files' names"

@@ -41,6 +41,9 @@ from .sources import (
 NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
 """FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
 
+_ANIMATED_PICTURES = {"apng", "gif"}
+"""Formats of FFmpeg that other programs take for pictures."""
+
 # Code points of ITU-T H.273, as stored in the stream.
 UNSAID = (0, 2, 3)
 """Of primaries and transfer functions: reserved, or not known to the one who wrote the file."""
@@ -80,6 +83,7 @@ class VideoSource:
             if stream.codec_context.width * stream.codec_context.height > MOST_PIXELS:
                 raise too_large(path.name, stream.codec_context.width, stream.codec_context.height)
             frame = _first_frame(container, stream, path)
+            self._is_picture = container.format.name in _ANIMATED_PICTURES
             matrix = display_matrix(frame)
             orientation = UPRIGHT if matrix is None else orientation_of_matrix(matrix)
             self._orientation, self._rotation = orientation or UPRIGHT, frame.rotation
@@ -139,6 +143,8 @@ class VideoSource:
     def _unlike(self, frame: av.VideoFrame, orientation: Orientation | None) -> str:
         """Why other programs show the clip otherwise, see `SourceInfo.unlike`."""
         tagged = coding_of(frame)
+        if self._is_picture:
+            return "Blender shows an animated picture as a still one"
         if self._aspect != 1:
             return "its pixels are not square"
         if orientation is None or orientation.is_mirrored:  # Blender 5 takes a mirrored picture for a turned one

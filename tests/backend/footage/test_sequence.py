@@ -171,6 +171,7 @@ def test_whatever_openimageio_reads_is_a_sequence(tmp_path, pan, suffix):
         assert [f.number for f in frames] == [0, 1, 2]
         off = [np.abs(f.pixels.astype(int) - pixels).mean() for f, pixels in zip(frames, pictures)]
         assert max(off) < 3
+    assert bool(open_source(str(tmp_path)).info.unlike) == (suffix != "webp")
 
 
 def test_pictures_that_are_not_read_are_named_with_what_to_do(tmp_path, pan):
@@ -218,6 +219,7 @@ def test_animated_pictures_are_clips(tmp_path, pan, suffix):
         (tmp_path / "a1.apng").rename(tmp_path / "a1.png")
         write(tmp_path / "a2.png", flat(1, 2, 3, kind=np.uint8))
     source = open_source(str(tmp_path / f"a1.{suffix[-3:]}"))
+    assert source.info.unlike
     assert [f.number for f in source.frames(None, None)] == [1, 2, 3, 4, 5, 6]
 
 
