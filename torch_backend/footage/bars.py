@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,16 +57,27 @@ class Bars:
         named = {"above": self.top, "below": self.bottom, "left": self.left, "right": self.right}
         return [name for name, size in named.items() if size]
 
+    @property
+    def widened(self) -> Bars:
+        """The same with the lines of the picture that are mixed with them."""
+        return Bars(*(side + _MIXED if side else 0 for side in (self.top, self.bottom, self.left, self.right)))
+
     def inner(self, height: int, width: int) -> tuple[slice, slice]:
         """Rows and columns of the picture in a frame of that size."""
         return slice(self.top, height - self.bottom), slice(self.left, width - self.right)
 
     def mask(self, height: int, width: int) -> NDArray[np.bool_]:
-        """[height, width] bool: the bars, and lines of the picture beside them that are mixed with them."""
+        """[height, width] bool: the bars."""
         covered = np.ones((height, width), bool)
-        grown = (side + _MIXED if side else 0 for side in (self.top, self.bottom, self.left, self.right))
-        covered[Bars(*grown).inner(height, width)] = False
+        covered[self.inner(height, width)] = False
         return covered
+
+
+def recorded_bars(record: dict[str, Any], height: int, width: int) -> Bars:
+    """The bars of a frame of that size that an import noted in its frames.json: `bars`, shares of the frame's sides."""
+    shares: dict[str, float] = record.get("bars") or {}
+    lengths = {"top": height, "bottom": height, "left": width, "right": width}
+    return Bars(**{side: round(float(shares.get(side, 0.0)) * length) for side, length in lengths.items()})
 
 
 def find_bars(pictures: Sequence[NDArray[np.uint8]]) -> Bars:

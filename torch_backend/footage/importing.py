@@ -478,7 +478,7 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
     mark = find_mark([picture[inner] for picture in pictures])
     if mark is None and not bars.sides:
         return {}
-    ignored = bars.mask(*pictures[0].shape)
+    ignored = bars.widened.mask(*pictures[0].shape)
     found: dict[str, Any] = {}
     if bars.sides:
         found["bars"] = _tell_bars(bars, pictures[0].shape, record, report)
@@ -494,17 +494,19 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
 
 
 def _tell_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], report: Reporter) -> dict[str, float]:
-    """What frames.json says of bars found in pictures [h, w]: each as a share of the frame's height or width."""
+    """What frames.json says of bars found in pictures [h, w], and of the lines mixed with them: each as a share of the
+    frame's height or width. The artist is told."""
     h, w = shape
     width, height = (int(side) for side in record["source_size"])
     rows, columns = bars.inner(h, w)
     size = f"{round((columns.stop - columns.start) * width / w)}x{round((rows.stop - rows.start) * height / h)}"
     report.warning(
         f"The picture fills only {size} of the frame's {width}x{height}: the bars {' and '.join(bars.sides)} are "
-        "ignored.",
+        "ignored, and frozen frames through the clip's own camera keep them.",
         "If they are part of the scene, set Ignore to None before the solve (Masks, or --ignore-mask none).",
     )
-    return {"top": bars.top / h, "bottom": bars.bottom / h, "left": bars.left / w, "right": bars.right / w}
+    kept = bars.widened
+    return {"top": kept.top / h, "bottom": kept.bottom / h, "left": kept.left / w, "right": kept.right / w}
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:

@@ -22,6 +22,7 @@ from ..solve.stored import load_cameras, load_record
 from ..solve.undistort import BandUndistorter
 from ..torch_types import from_numpy
 from . import plate_encoding
+from .bars import recorded_bars
 from .display import display_of
 from .images import read_frame, read_png, resize_float, working_size
 from .importing import FootageConfig, import_keys, load_frames, source_places
@@ -120,6 +121,15 @@ class Plates:
         """The lens of all frames; None where frames have lenses of their own, or it is not told."""
         lenses = set(self._lenses.values()) if isinstance(self._lenses, dict) else set[PlateLens | MapLens]()
         return next(iter(lenses)) if len(lenses) == 1 else None
+
+    def bars(self, frame: int) -> NDArray[np.bool_] | None:
+        """[H, W]: what of a plate is a bar beside the picture, as the import found it; None if there is none."""
+        bars = recorded_bars(load_frames(self._shot), self.height, self.width)
+        if not bars.sides:
+            return None
+        white = np.where(bars.mask(self.height, self.width), np.uint8(255), np.uint8(0))
+        codes = self._undistorted(np.repeat(white[..., None], 3, axis=2), frame)[..., 0]
+        return codes > np.iinfo(codes.dtype).max // 2
 
     def close(self) -> None:
         """Frees what is held; plates are read anew if they are asked for again."""

@@ -20,17 +20,20 @@ Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023,
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..footage.display import PLAIN, Display
 from ..scene import Scene
 from ..shot import Shot
 from ..solve.motion import load_motion
+from ..torch_types import from_numpy
 from ..train import LoadedRun
 from .bands import bands, hand_back
 from .detail_config import DetailConfig
@@ -91,6 +94,10 @@ class DetailedFrame:
         return out
 
 
+BarsOf = Callable[[int], "NDArray[np.bool_] | None"]
+"""Frame number -> [H, W], what of its plate is a bar beside the picture and no part of the scene; None: nothing."""
+
+
 class Detailer:
     """Makes frozen frames of one run out of plates. What it computes of a plate serves all frames that use it."""
 
@@ -101,11 +108,12 @@ class Detailer:
         plates: PlateReader,
         config: DetailConfig | None = None,
         moving: MovingOf | None = None,
+        bars: BarsOf | None = None,
     ) -> None:
-        """`moving`: see `Sightings`."""
+        """`moving`: see `Sightings`. `bars`: see `BarsOf`; None: the footage has none."""
         self.run, self.scene, self.plates = run, scene, plates
         self.config = config or DetailConfig()
-        self._moving = moving
+        self._moving, self._bars = moving, bars
         self.seen = Sightings(run, scene, plates, moving, self.config.sightings)
         """The plates as the scene at hand has them: the run's, or that of a developed instant."""
         self._layers: OrderedDict[tuple[int, float], InstantLayer | None] = OrderedDict()
@@ -136,8 +144,24 @@ class Detailer:
         usable = [frame for frame in self.seen.frames if frame not in withheld]
         leading = leading_plate(self.seen, output, posed, usable)
         matte, st, own = leading_matte(self.seen, self.config, output, posed, leading, usable, (width, height))
+        bars = self._keep_bars(matte, leading) if own and leading == output.frame else None
         fillers = fillers_of(self.seen, self.config, posed, matte, leading, usable)
-        return self._mix_frame(posed, splat, leading, matte, st, own, fillers)
+        made = self._mix_frame(posed, splat, leading, matte, st, own, fillers)
+        if bars is not None:  # they are shown as they are, at every instant
+            made.support[bars], made.motion[bars] = 1.0, 0.0
+        return made
+
+    def _keep_bars(self, matte: Tensor, frame: int) -> Tensor | None:
+        """Has a frame's own plate give the bars beside its picture: `matte` [H, W] becomes 1 there."""
+        found = None if self._bars is None else self._bars(frame)
+        if found is None:
+            return None
+        (rows, columns), (height, width) = matte.shape, found.shape
+        top, left = (rows - height) // 2, (columns - width) // 2
+        bars = torch.zeros(rows, columns, dtype=torch.bool, device="cpu")
+        bars[top : top + height, left : left + width] = from_numpy(found)
+        matte[bars] = 1.0
+        return bars
 
     # ------------------------------------------------------------------------------------------------- the frame
 

@@ -178,7 +178,7 @@ def plate_detail(
         plates = Plates(shot, (max(16, round(plates.width * scale)), max(16, round(plates.height * scale))))
     if plates.note:
         report.warning(plates.note)
-    return Detailer(run, scene, plates)
+    return Detailer(run, scene, plates, bars=plates.bars)
 
 
 def detail_key(shot: Shot, detail: Detailer | None) -> str:

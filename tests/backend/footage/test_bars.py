@@ -116,4 +116,4 @@ def test_an_import_says_what_the_picture_fills_and_masks_the_rest(tmp_path, worl
     assert [m for m in report.warnings if "fills only 140x120 of the frame's 200x120" in m and "left and right" in m]
     covered = read_png(shot.burnt_in)[..., 0] > 0
     assert covered[:, :30].all() and covered[:, -30:].all() and not covered[:, 34:-34].any()
-    assert load_frames(shot)["bars"] == {"top": 0.0, "bottom": 0.0, "left": 0.15, "right": 0.15}
+    assert load_frames(shot)["bars"] == {"top": 0.0, "bottom": 0.0, "left": 0.16, "right": 0.16}
