@@ -150,6 +150,7 @@ def build(folder, report, still=False, logo=None, drawn=None):
     viewmats = path()
     shot, source = Shot.create(folder / "board.splannequin"), folder / "source"
     source.mkdir()
+    painted = {}
     for n in range(1, FRAMES + 1):
         picture, on = seen(viewmats[n - 1], 99.0 if still else board_at(n))
         if logo is not None:
@@ -157,10 +158,11 @@ def build(folder, report, still=False, logo=None, drawn=None):
         if drawn is not None:
             picture = drawn(picture, n)
         write_png(source / f"{n:06d}.png", np.rint(picture * 65535).astype(np.uint16))
-        matte = shot.root / PAINTED / f"{n:06d}.png"
-        matte.parent.mkdir(exist_ok=True)
-        write_matte(matte, np.where(on[::2, ::2], MOVING, STILL).astype(np.uint8))
+        painted[n] = np.where(on[::2, ::2], MOVING, STILL).astype(np.uint8)
     import_footage(shot, str(source), FootageConfig(working_height=H // 2), report)
+    (shot.root / PAINTED).mkdir()
+    for n, matte in painted.items():
+        write_matte(shot.root / PAINTED / f"{n:06d}.png", matte)
     solved(shot, viewmats)
     if logo is not None:
         ignore(shot, logo[::2, ::2])
