@@ -99,6 +99,14 @@ def test_the_solve_is_asked_for_with_what_was_tracked(addon, tracked, scene, sho
     assert (shot / "solve" / "cameras.json").is_file(), "the solve that was there stays"
 
 
+@pytest.mark.parametrize("template", ["frame-{:04d}.png", "2026-11-28-{:04d}.png", "f_{:04d}_left.png", "a ({}).png"])
+def test_numbers_are_read_as_the_import_reads_them(addon, tmp_path, pictures, template):
+    for n in range(101, 105):
+        pictures.write(tmp_path / template.format(n), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    clip = bpy.data.movieclips.load(str(tmp_path / template.format(101)))
+    assert addon("solve.exchange").first_number(clip) == 101
+
+
 def test_numbers_are_those_of_the_files(addon, clip):
     assert addon("solve.exchange").first_number(clip) == 101
     clip.frame_offset = 3

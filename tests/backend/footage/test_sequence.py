@@ -122,6 +122,20 @@ def test_frames_come_in_their_order_whatever_stands_around_the_number(tmp_path, 
     assert (source.info.reading["files"], source.warnings, source.info.unlike) == (pattern, [], "")
 
 
+@pytest.mark.parametrize(
+    ("template", "former"),
+    [
+        ("a.{:04d}.png", "a.3-6#.png"),
+        ("a{:03d}.png", "a3-6@@@.png"),
+        ("a{}.png", "a3-6@.png"),
+        ("a{:08d}.png", "a3-6##.png"),
+    ],
+)
+def test_an_import_of_before_is_known_by_the_name_that_its_sequence_had(tmp_path, template, former):
+    write_shades(tmp_path, [template.format(n) for n in range(3, 7)])
+    assert open_source(str(tmp_path)).info.former_key[0] == former
+
+
 def test_endings_of_one_format_are_one_sequence_that_blender_does_not_find(tmp_path):
     write_shades(tmp_path, [f"f_{n:04d}.{'tif' if n % 2 else 'TIFF'}" for n in range(10)])
     source = open_source(str(tmp_path))
