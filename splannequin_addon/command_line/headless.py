@@ -32,6 +32,7 @@ from ..process import backend, begin, jobs, steps
 from ..scene import scene_setup, sequences
 from ..shot import inventory
 from ..solve import arrival, cameras, exchange, stmaps
+from . import opening
 
 
 class Console:
@@ -264,6 +265,8 @@ def _bake_a_part(
         _render(scene, folder, fresh, console, is_part=True)
         return ExitCode.OK
     numbers = rendering.gathered(scene, folder, fresh)
+    if fresh:
+        opening.set_up(scene, shot, args.take)
     _save(scene, output / "shot.blend", folder)
     summary = {"version": 1, "shot": str(shot), "take": args.take, **_told(output, numbers)}
     jobs.write_json(output / contract.SUMMARY_FILE, summary)
@@ -357,6 +360,8 @@ def _bake(
     _set_up(scene, fresh, shot, take, console, span, warp)
     folder = output / rendering.COMPOSITED
     numbers = _render(scene, folder, fresh, console)
+    if fresh:
+        opening.set_up(scene, shot, take)
     _save(scene, output / "shot.blend", folder)
     return _told(output, numbers)
 

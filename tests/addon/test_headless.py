@@ -84,7 +84,7 @@ def test_camera_points_and_plate_are_in_the_baked_file(run, shot, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "shot.blend"))
     scene = bpy.context.scene
     assert scene.camera.animation_data and scene.camera.data.background_images[0].image
-    assert {o.type for o in scene.objects} == {"EMPTY", "CAMERA", "MESH"}
+    assert {o.type for o in scene.objects} == {"EMPTY", "CAMERA", "MESH", "LIGHT"}
     assert (scene.frame_start, scene.frame_end) == (5, 7)
     assert scene.render.filepath.startswith("//")
 
