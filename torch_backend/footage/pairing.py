@@ -50,7 +50,8 @@ def pair(pictures: Sequence[int], counted: Counted, needs_all: bool = False, may
     """The picture of each frame.
 
     A way to count is better if the pictures are exactly the frames; then if all pictures lie within the clip; then if
-    most frames have one. If two are alike, the shot's own numbers win, then the footage's.
+    most frames have one. If two are alike, the shot's own numbers win, then the footage's;
+    but pictures from 0 are counted from 0 where the footage begins at 1.
 
     Args:
         pictures: numbers of the pictures, ascending.
@@ -69,6 +70,8 @@ def pair(pictures: Sequence[int], counted: Counted, needs_all: bool = False, may
     may_count_anew = may_shift and (first in (0, 1) or (strange and as_many))
     if may_count_anew:
         steps += [clip[0] - first, frames[0] - first]
+    if may_shift and first == 0 and clip[0] - counted.shift == 1:  # programs count from 0 what people count from 1
+        steps.insert(0, clip[0])
     ways = [_Way(step, pictures, counted, needs_all) for step in dict.fromkeys(steps)]
     best = max(ways, key=lambda way: way.worth)
     if may_count_anew and len(pictures) == len(frames) and _is_even(pictures) and not best.worth.enough:

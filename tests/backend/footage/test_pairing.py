@@ -17,7 +17,10 @@ CASES = [
     (range(0, 100), range(1, 101), (1, 100), 0, 1),
     (range(0, 150), range(1, 101), (1, 150), 0, 1),  # of the whole clip, which was imported in part
     (range(0, 150), range(1, 101), (1, 200), 0, 1),
-    (range(0, 101), range(1, 101), (1, 100), 0, 0),  # one too many whichever way: its own numbers
+    (range(0, 101), range(1, 101), (1, 100), 0, 1),  # one too many whichever way
+    (range(0, 120), range(1, 101), (1, 100), 0, 1),
+    (range(0, 120), range(1001, 1101), (1001, 1100), 1000, 1001),
+    (range(0, 120), range(5, 101), (5, 100), 0, 0),  # with handles around the clip
     (range(0, 120), range(0, 100), (0, 119), 0, 0),
     (range(1, 101), range(0, 100), (0, 99), 0, -1),
     (range(1, 151), range(51, 101), (1, 150), 0, 0),
