@@ -21,7 +21,7 @@ from ...torch_backend import contract
 from .. import compat
 from ..scene import paths, scene_setup
 from ..scene.ownership import BAKES, DIGITS
-from . import picture_files, render_settings
+from . import render_settings
 
 COMPOSITED = "composited"
 """Folder of the pictures, in the output folder of a bake."""
@@ -198,7 +198,7 @@ class Run:
 
     def _publish(self, made: Path, place: Path, what: str) -> None:
         """Gives a whole file its name. JobError if it is not whole; OSError."""
-        if not picture_files.is_whole(made):
+        if not contract.is_whole_picture(made):
             raise self._or_full(f"Blender wrote {what} only in part to {place.parent}.", made)
         with open(made, "rb+") as file:
             os.fsync(file.fileno())
@@ -307,7 +307,7 @@ def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
     if png:
         compat.set_png(scene.render.image_settings)
     wanted = list(frames_of(scene))
-    lost = [n for n, path in _places(scene, wanted, folder).items() if not picture_files.is_whole(path)]
+    lost = [n for n, path in _places(scene, wanted, folder).items() if not contract.is_whole_picture(path)]
     if lost:
         raise contract.JobError(
             f"{folder} lacks {len(lost)} of {len(wanted)} frames, the first is {lost[0]}.",

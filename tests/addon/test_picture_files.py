@@ -56,7 +56,7 @@ def test_a_cut_off_movie_is_told_from_a_whole_one(addon, scene, tmp_path, contai
 
 
 def check(addon, path: Path, last: int) -> None:
-    is_whole, data = addon("bake.picture_files").is_whole, path.read_bytes()
+    is_whole, data = addon("bake.rendering").contract.is_whole_picture, path.read_bytes()
     assert is_whole(path)
     for length in (0, 10, 100, len(data) // 2, len(data) + last):
         path.write_bytes(data[:length])

@@ -13,6 +13,7 @@
     unborn          what a failed import leaves behind
     files, typed    reading what may come from anywhere, and plain JSON into dataclasses
     identity        what a file is known by: its content
+    picture_files   whether a picture or movie is whole
     writing         atomic files and folders
     camera_path     a pinhole camera over frames
     live_messages   what Blender and a live session say to each other
@@ -197,6 +198,9 @@ from .options import (
 from .path_rules import (
     RULES_VARIABLE,
     mapped,
+)
+from .picture_files import (
+    is_whole_picture,
 )
 from .processes import (
     GRACE_SECONDS,
@@ -482,6 +486,7 @@ __all__ = [
     "is_link",
     "is_pattern",
     "is_shot",
+    "is_whole_picture",
     "later",
     "layers_of",
     "limits_of",

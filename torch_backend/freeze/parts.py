@@ -64,7 +64,7 @@ def freeze_part(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     except JobError:
         frames = []
     done = _right_of(take, frames)
-    render_frames(take, frames, done, report)
+    render_frames(take, frames, done, report, lambda: _refuse_opened_anew(take))
     if take.spec.run.stale:
         raise JobError(
             "The run was trained while it was frozen.", "Open the take again, then freeze its parts.", ExitCode.FREEZE
@@ -125,6 +125,20 @@ def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
             ExitCode.FREEZE,
         )
     return take
+
+
+def _refuse_opened_anew(take: PlannedTake) -> None:
+    """JobError if the take was opened with something else since: this part's frames would replace newer ones."""
+    try:
+        state = read_json(take.folder.state)
+    except (OSError, ValueError):
+        state = {}
+    if state.get("frames") != _all_keys(take):
+        raise JobError(
+            f"The take {take.folder.root.name} was opened with something else while a part of it was frozen.",
+            "Freeze the parts of the job that opened it last.",
+            ExitCode.FREEZE,
+        )
 
 
 def _refuse_undeveloped(take: PlannedTake) -> None:

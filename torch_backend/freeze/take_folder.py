@@ -15,6 +15,7 @@ from ..contract import (
     JobError,
     TakeFolder,
     frame_number,
+    is_whole_picture,
     remove_file,
     replace_file,
     sweep_half_written,
@@ -76,9 +77,13 @@ def stored_keys(folder: TakeFolder, with_warps: bool) -> dict[int, str | None]:
 
 
 def stored_key(folder: TakeFolder, frame: int, with_warps: bool) -> str | None:
-    """The key that all files of a frame carry; None if one lacks, or is of another frame or take than the rest: a
-    process was killed between them. Empty if one carries none: an earlier version wrote it."""
+    """The key that all files of a frame carry. Empty if one carries none: an earlier version wrote it.
+
+    None if one lacks, is cut off, or is of another frame or take than the rest: a process was killed between them.
+    """
     files = [folder.frame(frame), folder.preview(frame), *([folder.warp(frame)] if with_warps else [])]
+    if not all(map(is_whole_picture, files)):  # a copy may have been cut off
+        return None
     keys = {read_key(file) for file in files}
     if None in keys:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Set
+from collections.abc import Callable, Set
 
 import numpy as np
 import torch
@@ -41,20 +41,25 @@ def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], rep
 
 
 def render_frames(
-    take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter
+    take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter,
+    before_each: Callable[[], None] | None = None,
 ) -> dict[int, Tensor]:  # fmt: skip
-    """Renders and writes those of `frames` that are not done, if the disk has room for them.
+    """Renders and writes those of `frames` that are not done, if the disk has room for them. What `before_each` raises
+    before a frame is written ends it.
 
     Returns frame number -> [h, w] share of plate, small, of those rendered. JobError if the disk is full.
     """
     make_ready(take, frames, done, report)
     try:
-        return _render_all(take, frames, done, report)
+        return _render_all(take, frames, done, report, before_each)
     except OSError as error:
         raise (disk_error(take.folder.root) if is_disk_full(error) else error) from error
 
 
-def _render_all(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> dict[int, Tensor]:
+def _render_all(
+    take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter,
+    before_each: Callable[[], None] | None,
+) -> dict[int, Tensor]:  # fmt: skip
     folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
     shares: dict[int, Tensor] = {}
     with WriteBeside() as out:
@@ -66,6 +71,8 @@ def _render_all(take: PlannedTake, frames: list[OutputFrame], done: Set[int], re
             image = _render(output, scene, spec, report)
             if isinstance(image, DetailedFrame):
                 shares[output.frame] = small_share(image.plate, image.support)
+            if before_each is not None:
+                before_each()
             write = functools.partial(_write, folder, output, image, scene, spec, keys[output.frame])
             out.write(write, sum(value.nbytes for value in vars(image).values() if isinstance(value, Tensor)))
             del image, write  # at 4K the next frame needs their gigabyte

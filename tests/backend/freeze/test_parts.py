@@ -158,3 +158,35 @@ def test_what_a_killed_part_of_another_instant_left_is_in_no_frame(own, quiet, w
     freeze_part(own, params, quiet())
     finish_take(own, params, quiet())
     assert files(own.take(take)) == before
+
+
+def test_a_part_stops_when_its_take_is_opened_with_something_else(own, quiet):
+    """A host that slept through the new job would write old frames over new ones."""
+    params = FreezeParams(take="straggler", **{**ASK, "last": 105, "develop": "off"})
+    open_take(own, params, quiet())
+    other = FreezeParams(take="straggler", **{**ASK, "last": 105, "t_star": 110, "develop": "off"})
+
+    class Meanwhile(type(quiet())):
+        def check_cancelled(self):
+            super().check_cancelled()
+            if (own.take("straggler") / "000103.exr").is_file() and not frames:
+                frames.append(True)
+                open_take(own, other, quiet())
+                freeze_part(own, other, quiet())
+
+    frames = []
+    with pytest.raises(JobError, match="opened with something else"):
+        freeze_part(own, params, Meanwhile())
+    facts = finish_take(own, other, quiet())
+    assert frames and facts["frames"] == 3
+
+
+@pytest.mark.parametrize("name", ["000103.exr", "warp/000103.exr", "preview/000103.png"])
+def test_a_frame_that_a_copy_cut_off_is_made_again(own, quiet, name):
+    params = FreezeParams(take="cut", **{**ASK, "last": 103})
+    freeze_shot(own, params, quiet())
+    file = own.take("cut") / name
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) * 3 // 4])
+    freeze_shot(own, params, quiet())
+    assert file.read_bytes() == data

@@ -1,4 +1,4 @@
-"""Tells whether a picture or movie that Blender wrote is whole. No bpy.
+"""Tells whether a picture or movie is whole, without decoding it.
 
 Blender reports success for a file that was cut off by a full disk, and reads most cut-off files without a word.
 
@@ -13,19 +13,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from ...torch_backend import contract
+from .files import LONGEST_LINE, open_regular
 
 _LINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
 """OpenEXR: compression -> scan lines in a chunk."""
 
 
-def is_whole(path: Path) -> bool:
+def is_whole_picture(path: Path) -> bool:
     """True if a file is a whole picture or movie; False too if it is not there.
 
     Of a format without a trailer, a stated size or a table, only an empty file is noticed.
     """
     try:
-        with contract.open_regular(path) as file:
+        with open_regular(path) as file:
             size = file.seek(0, 2)
             file.seek(0)
             check = _check_of(file.read(32), path.suffix.lower())
@@ -117,7 +117,7 @@ def _exr_header(file: BinaryIO) -> dict[str, bytes]:
     while name := _text(file):
         _text(file)  # its type
         length = struct.unpack("<i", file.read(4))[0]
-        if length < 0 or length > contract.LONGEST_LINE:
+        if length < 0 or length > LONGEST_LINE:
             raise ValueError("no attribute is so long")
         found[name] = file.read(length)
     return found
