@@ -48,7 +48,7 @@ class Setting:
     """When the row is in force:
 
     always   in every bake
-    strips   the scene has a sequencer
+    strips   the scene's sequencer holds something
     cg       the scene's own render is led into the freeze
     keep     the plate's colours are to be kept
     colours  they are to be kept, and the scene would change them
@@ -103,7 +103,7 @@ def needed(scene: bpy.types.Scene, is_exact: bool, has_cg: bool) -> list[Setting
     """
     keep = bool(settings_of(scene).keep_colours)
     force = {
-        "always": True, "strips": scene.sequence_editor is not None, "exact": is_exact, "cg": has_cg, "keep": keep,
+        "always": True, "strips": _has_strips(scene), "exact": is_exact, "cg": has_cg, "keep": keep,
         "colours": keep and not _is_linear(scene) and not _keeps_colours(scene),
     }  # fmt: skip
     return [row for row in SETTINGS if force[row.when] and _has(scene, row)]
@@ -196,6 +196,12 @@ def _has(scene: bpy.types.Scene, row: Setting) -> bool:
         return False
 
 
+def _has_strips(scene: bpy.types.Scene) -> bool:
+    """True if the scene's sequencer holds anything, wherever it lies: it replaces the picture out of its range, too."""
+    editor: Any = scene.sequence_editor
+    return editor is not None and bool(len(editor.strips if hasattr(editor, "strips") else editor.sequences))
+
+
 def _is_linear(scene: bpy.types.Scene) -> bool:
     """True if the files hold light, not what a display is to show."""
     return bool(scene.render.image_settings.has_linear_colorspace)
@@ -224,7 +230,7 @@ def _animated(scene: bpy.types.Scene) -> set[str]:
 # ------------------------------------------------------------------------------------------- saving, loading, undo
 
 going_on: dict[int, bool] = {}
-"""`session_uid` of each scene that is being baked -> whether its file was saved since the last frame."""
+"""`session_uid` of each scene that is being baked -> whether its file was saved since the last frame was written."""
 _paused: dict[int, Any] = {}
 """`session_uid` of a scene -> what the bake had noted, while its file is saved."""
 
@@ -269,6 +275,7 @@ def on_saved(*_: object) -> None:
         for owner, name, _, ours in json.loads(noted):
             setattr(_owner(scene, owner), name, ours)
         scene[_NOTED] = noted
+        going_on[scene.session_uid] = True  # a frame may have begun meanwhile
 
 
 _HANDLERS = (

@@ -90,6 +90,8 @@ class Run:
         self._is_movie = bool(scene.render.is_movie_format)
         self._places: dict[int, Path] = {}
         self._made: dict[int, Path] = {}
+        self._spoilt: list[int] = []
+        """Frames during which the file was saved: the scene had the artist's settings for a moment."""
         self._beside = Path()
         self._room = 8 * scene.render.resolution_x * scene.render.resolution_y
         self._frame = scene.frame_current
@@ -141,6 +143,12 @@ class Run:
                     self._check_cancelled()  # asked for while Blender was at work, in a handler of someone else's
                 except BaseException as error:
                     self.error = error
+            if self._spoilt and self.error is None:
+                self.error = contract.JobError(
+                    f"The file was saved while frame {self._spoilt[0]} was rendered: that frame is not new.",
+                    "Bake again.",
+                    contract.ExitCode.BAKE,
+                )
             is_whole = self.error is None and not is_cancelled
             if self._is_movie and self.done:
                 self._publish_movie(is_whole)
@@ -178,11 +186,9 @@ class Run:
         try:
             if self.error is None and number in self._made:
                 if render_settings.going_on.get(self.scene_uid):
-                    raise contract.JobError(
-                        f"The file was saved while frame {number} was rendered, which may have changed that frame.",
-                        "Bake again.",
-                        contract.ExitCode.BAKE,
-                    )
+                    render_settings.going_on[self.scene_uid] = False
+                    self._spoilt.append(number)
+                    return
                 if not self._is_movie:
                     self._publish(self._made[number], self._places[number], f"frame {number}")
                 self.done.append(number)

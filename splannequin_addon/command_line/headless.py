@@ -332,7 +332,14 @@ def _scene(blend: str) -> tuple[Any, bool]:
         path = Path(blend).absolute()
         if not path.is_file():
             raise FileNotFoundError(f"{path} does not exist: --blend names a .blend file")
-        bpy.ops.wm.open_mainfile(filepath=str(path))
+        try:
+            bpy.ops.wm.open_mainfile(filepath=str(path))
+        except RuntimeError as error:  # no .blend, a damaged one, or one of a newer Blender
+            raise contract.JobError(
+                f"Blender {bpy.app.version_string} cannot open {path}: {str(error).strip()}",
+                "Open it in the Blender that saved it.",
+                ExitCode.USAGE,
+            ) from error
     if bpy.data.filepath:
         return scene_in(bpy.context), False
     bpy.ops.wm.read_homefile(use_empty=True)

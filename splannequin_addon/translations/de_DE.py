@@ -294,7 +294,7 @@ MESSAGES: dict[str, str] = {
     "The scene renders at {} %: pictures have {} x {} pixels.": "Die Szene rendert mit {} %: Bilder haben {} x {} Pixel.",
     "The scene's output is black and white.": "Die Ausgabe der Szene ist schwarzweiß.",
     "Blender wrote {} only in part to {}.": "Blender hat {} nur zum Teil nach {} geschrieben.",
-    "The file was saved while frame {} was rendered, which may have changed that frame.": "Die Datei wurde gesichert, während Bild {} gerendert wurde; das kann dieses Bild verändert haben.",
+    "The file was saved while frame {} was rendered: that frame is not new.": "Die Datei wurde gesichert, während Bild {} gerendert wurde: dieses Bild ist nicht neu.",
     "No file was given": "Keine Datei angegeben",
     "Clip chosen: press Import Clip in the Splannequin tab": "Clip gewählt: im Reiter Splannequin „Clip importieren“ drücken",
     "Nothing is running": "Es läuft nichts",

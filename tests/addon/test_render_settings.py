@@ -212,21 +212,25 @@ def test_a_setting_that_moves_is_refused_before_anything_is_rendered(addon, cont
     assert state(baked) == before and not (tmp_path / "out").exists()
 
 
-def test_a_file_that_is_saved_while_it_is_baked_holds_the_artists_settings(addon, baked, tmp_path):
+def test_a_file_that_is_saved_while_it_is_baked_holds_the_artists_settings(addon, contract, baked, tmp_path):
     """By a handler, as the artist's Ctrl-S between two frames; and one that was saved with the bake's is put right."""
     scene, file, crashed = baked, tmp_path / "saved.blend", tmp_path / "crashed.blend"
     region(scene, True)
     scene.render.filepath = "//mine/f_##"
     settings = addon("bake.render_settings")
 
+    scene.frame_end = 7
+
     def save(done: int, _: int) -> None:
-        if done == 2:
+        if done == 1:
             bpy.data.libraries.write(str(crashed), {scene})  # as an autosave: no handler hears of it
             bpy.ops.wm.save_as_mainfile(filepath=str(file), copy=True)
             assert not scene.render.use_border and "splannequin_bake_settings" in scene, "the bake goes on"
 
-    addon("bake.rendering").render(scene, tmp_path / "out", on_frame=save)
+    with pytest.raises(contract.JobError, match="saved while frame 6"):  # in a window that one was at work
+        addon("bake.rendering").render(scene, tmp_path / "out", on_frame=save)
     assert scene.render.use_border
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["000005.png", "000007.png"], "it goes on"
     bpy.ops.wm.open_mainfile(filepath=str(file))
     held = bpy.context.scene.render
     assert held.use_border and held.use_crop_to_border and held.filepath.endswith("f_##")
