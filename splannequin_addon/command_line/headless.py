@@ -32,7 +32,7 @@ from ..process import backend, begin, jobs, steps
 from ..scene import scene_setup, sequences
 from ..shot import inventory
 from ..solve import arrival, cameras, exchange, stmaps
-from . import opening
+from . import first_view
 
 
 class Console:
@@ -266,7 +266,7 @@ def _bake_a_part(
         return ExitCode.OK
     numbers = rendering.gathered(scene, folder, fresh)
     if fresh:
-        opening.set_up(scene, shot, args.take)
+        first_view.set_up(scene, shot, args.take)
     _save(scene, output / "shot.blend", folder)
     summary = {"version": 1, "shot": str(shot), "take": args.take, **_told(output, numbers)}
     jobs.write_json(output / contract.SUMMARY_FILE, summary)
@@ -368,7 +368,7 @@ def _bake(
     folder = output / rendering.COMPOSITED
     numbers = _render(scene, folder, fresh, console)
     if fresh:
-        opening.set_up(scene, shot, take)
+        first_view.set_up(scene, shot, take)
     _save(scene, output / "shot.blend", folder)
     return _told(output, numbers)
 

@@ -103,6 +103,12 @@ def picture_of(shot: Path, frame: int) -> str:
         return ""
 
 
+def floor(shot: Path) -> tuple[list[float], float] | None:
+    """The floor that the solve found (torch_backend/solve/floor.py); None if it found none, or did not look."""
+    found = contract.read_json(ShotFolder(shot).solve_record).get("floor")
+    return (found["normal"], float(found["height"])) if found else None
+
+
 def burnt_in(shot: Path) -> Path | None:
     """Mask of what the import found to be burnt into the clip; None if it found nothing."""
     mask = ShotFolder(shot).burnt_in

@@ -15,16 +15,15 @@ import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader  # pyright: ignore[reportUnknownVariableType]
-from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..access import OperatorBase, Outcome, camera_of, mesh_of, present, scene_in
-from ..process import job_timer, steps
+from ..access import OperatorBase, Outcome, mesh_of, present, scene_in
+from ..process import job_timer
 from ..properties import BoolProperty, FloatProperty, FloatVectorProperty
 from ..scene import axes
 from ..shot import scene_objects, selection
 from ..translations import tr
-from . import alignment, cameras, points
+from . import alignment, cameras, points, scale
 
 REACH_PIXELS = 18.0
 """How far from the mouse a point may be seen, at a user interface scale of 1."""
@@ -54,32 +53,6 @@ _picking: Picking | None = None
 def picking() -> Picking | None:
     """What is being clicked at the moment."""
     return _picking
-
-
-def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
-    """Moves a shot's root by a change of the world as `alignment` makes them; returns what else was changed, in words.
-
-    Args:
-        scene: the scene.
-        shot: shot folder; its root is there.
-        change: [4, 4], multiplied onto the root from the left.
-    """
-    root, before = present(cameras.find(scene, shot, "EMPTY")), scene_objects.depth_scale(scene, shot)
-    scale = root.scale[:]
-    uniform = max(scale) - min(scale) <= 1e-5 * max(scale)
-    root.matrix_world = Matrix((change @ np.array(root.matrix_world, dtype=np.float64)).tolist())
-    if uniform:  # to the last bit, whatever the decomposition left
-        root.scale = [sum(root.scale[:]) / 3.0] * 3
-    bpy.context.view_layer.update()
-    grown = scene_objects.depth_scale(scene, shot) / before
-    if abs(grown - 1.0) < 1e-6:
-        return []
-    camera = cameras.find(scene, shot, "CAMERA")
-    if camera is not None:
-        lens = camera_of(camera)
-        lens.clip_end *= grown
-        lens.clip_start *= grown
-    return [note for step in steps.STEPS.values() for note in step.scaled(scene, shot)]
 
 
 def _shot_of(scene: bpy.types.Scene) -> Path:
@@ -134,7 +107,7 @@ class _Aligns(OperatorBase):
         scene, shot = scene_in(context), _shot_of(scene_in(context))
         context.view_layer.update()
         try:
-            notes = move(scene, shot, self.change(scene, shot, self._places(context, shot)))
+            notes = scale.move(scene, shot, self.change(scene, shot, self._places(context, shot)))
         except (contract.JobError, OSError, ValueError) as error:
             told = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
             self.report({"ERROR"}, told)
@@ -345,47 +318,6 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
         self.places = np.concatenate([one, other]).tolist()
         self.distance = float(np.linalg.norm(other - one))
         return context.window_manager.invoke_props_dialog(self)
-
-
-def scaled(scene: bpy.types.Scene, shot: Path) -> bool:
-    """True if somebody gave a shot its scale: by Set Scale, or by hand on its root. A guess is none."""
-    entry = scene_objects.of(scene, shot)
-    unscaled = guessed_scale(scene, shot) or 1.0
-    return (entry is not None and entry.scaled) or abs(scene_objects.depth_scale(scene, shot) / unscaled - 1.0) > 1e-4
-
-
-def guessed_scale(scene: bpy.types.Scene, shot: Path) -> float:
-    """Scene units per solve unit that `guess_scale` gave a shot; 0 if it gave none."""
-    entry = scene_objects.of(scene, shot)
-    return entry.guessed_scale if entry is not None else 0.0
-
-
-def guess_scale(scene: bpy.types.Scene, shot: Path, is_new: bool) -> list[str]:
-    """Scales a shot so that its camera is as high above the floor as people hold one; returns what changed, in words.
-
-    A scale that somebody gave stays, and so does a shot that stood in the scene without a guess. Without a floor a
-    guess of an earlier solve is taken back.
-
-    Args:
-        scene: the scene.
-        shot: shot folder; its root is there.
-        is_new: the root was made just now.
-    """
-    entry = present(scene_objects.of(scene, shot))
-    if is_new:
-        entry.scaled, entry.guessed_scale = False, 0.0
-    before = entry.guessed_scale
-    if scaled(scene, shot) or not (is_new or before):
-        return []
-    height = cameras.height_of_camera(shot)
-    metre = 1.0 / scene.unit_settings.scale_length if scene.unit_settings.system != "NONE" else 1.0
-    guess = 0.0 if height is None else cameras.HAND_HEIGHT * metre / height
-    change = (guess or 1.0) / scene_objects.depth_scale(scene, shot)
-    entry.guessed_scale = guess
-    notes = move(scene, shot, np.diag([change] * 3 + [1.0]))
-    if guess:
-        notes.append(f"The scale is a guess: the camera stands {cameras.HAND_HEIGHT:g} m above the floor.")
-    return notes
 
 
 def view_under(window: bpy.types.Window, x: int, y: int) -> tuple[Any, Any] | None:

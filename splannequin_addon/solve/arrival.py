@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ..footage import arrival, plate
 from ..scene import rollback
 from ..shot import inventory, selection
-from . import align_operators, cameras
+from . import cameras, scale
 
 if TYPE_CHECKING:
     import bpy
@@ -21,7 +21,7 @@ def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
     is_new = cameras.find(scene, shot, "EMPTY") is None
     with rollback.scene_of(scene):
         camera = cameras.build(scene, shot)
-        notes = align_operators.guess_scale(scene, shot, is_new)
+        notes = scale.guess_scale(scene, shot, is_new)
         changes = arrival.fit(scene, state, force_k=True)
     plate.remove(scene, shot)
     return [f"{camera.name} is the scene's camera, with the plate behind it.", *notes, *changes]

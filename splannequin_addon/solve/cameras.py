@@ -25,10 +25,6 @@ from ..scene.ownership import TAG
 from ..shot import inventory, scene_objects
 from . import alignment, guesses
 
-HAND_HEIGHT = 1.5
-"""Height in metres at which a camera is mostly held by somebody who stands."""
-STEADY = 0.5
-"""Most that the height of such a camera varies, as a share of it: from the eyes to the waist."""
 _LENS = ("lens", "shift_x", "shift_y")
 """Properties of a camera that are keyed where the lens changes."""
 _NO_REACH = (1e6, 1e-6)
@@ -70,23 +66,6 @@ def scene_from_solve(
     return result
 
 
-def height_of_camera(shot: Path) -> float | None:
-    """Median height of a shot's camera over the floor that the solve found, solve units.
-
-    None without a floor, or if the camera rises and sinks too much to be held by somebody who stands.
-    """
-    floor = _floor(shot)
-    if floor is None:
-        return None
-    path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
-    heights = axes.poses(path)[:, :3, 3] @ np.array(floor[0], dtype=np.float64) - floor[1]
-    middle = float(alignment.middle(heights))
-    low, high = np.quantile(heights, (0.05, 0.95))
-    if not (math.isfinite(middle) and middle > 0.0 and float(high - low) < STEADY * middle):
-        return None
-    return middle
-
-
 def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     """Brings the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
 
@@ -106,7 +85,7 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     """
     path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
     xyz, rgb = _points(shot)
-    floor, unsolved = _floor(shot), guesses.ranges(path, guesses.solved(shot, path))
+    floor, unsolved = inventory.floor(shot), guesses.ranges(path, guesses.solved(shot, path))
     name = scene_objects.name_of(shot)
     with rollback.scene_of(scene):
         # All that can fail comes before what is there is changed.
@@ -313,12 +292,6 @@ def _show_plate(data: bpy.types.Camera, plate: tuple[bpy.types.Image, int, int] 
         data.background_images.remove(background)
     if old is not None and old.users == 0:
         bpy.data.images.remove(old)
-
-
-def _floor(shot: Path) -> tuple[Sequence[float], float] | None:
-    """The floor that the solve found (torch_backend/solve/floor.py); None if it found none, or did not look."""
-    found = contract.read_json(contract.ShotFolder(shot).solve_record).get("floor")
-    return (found["normal"], float(found["height"])) if found else None
 
 
 def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from ..process import steps
 from ..shot import inventory, selection
 from ..ui import icons, step_panel
 from ..ui.sentences import wrap
-from . import align_operators, cameras, matte_operators
+from . import align_operators, cameras, matte_operators, scale
 
 
 def can_load_camera(running: str | None) -> bool:
@@ -39,9 +39,9 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
             matte_operators.draw(body)
         if watch is None or cameras.find(scene_in(context), watch.shot, "EMPTY") is None:
             return
-        if not align_operators.scaled(scene_in(context), watch.shot):
+        if not scale.scaled(scene_in(context), watch.shot):
             layout = layout_of(self)
-            if align_operators.guessed_scale(scene_in(context), watch.shot):
+            if scale.guessed_scale(scene_in(context), watch.shot):
                 wrap(layout, context, "The scale is a guess from the camera's height.", "INFO")
             else:
                 wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")

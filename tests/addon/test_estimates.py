@@ -16,7 +16,7 @@ def test_a_tooltip_tells_what_the_preset_is(addon, contract):
 def test_the_scale_is_asked_for_until_it_was_set(addon, scene, shot, by_hand):
     scene.splannequin.shot_path = str(shot)
     bpy.ops.splannequin.load_camera()
-    scaled = addon("solve.align_operators").scaled
+    scaled = addon("solve.scale").scaled
     assert not scaled(scene, shot)
     bpy.ops.splannequin.align_origin(places=(0.5, 0, 0))
     assert not scaled(scene, shot)

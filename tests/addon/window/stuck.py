@@ -161,7 +161,7 @@ def _solved(work: Path, told: dict[str, Any]) -> Iterator[float]:
     yield 1.0
     yield from press._click("splannequin.load_camera")
     yield 1.0
-    scaled = press.addon_module("solve.align_operators").scaled
+    scaled = press.addon_module("solve.scale").scaled
     told["scale_asked_for"] = not scaled(scene, shot)
     yield from press._shoot(work, "11-presets-and-scale", settle=0)
     for name, x in (("one", 0.0), ("other", 1.0)):

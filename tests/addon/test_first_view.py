@@ -66,3 +66,9 @@ def test_an_artists_own_file_is_left_as_it_is(bake, tmp_path):
     assert not [item for item in scene.objects if item.type == "LIGHT"]
     (plate,) = shown(scene.camera)
     assert plate.image.filepath.endswith(".png")
+
+
+def test_a_scene_without_the_solved_camera_is_left_as_it_is(addon, scene, shot):
+    before, names = views(), {item.name for item in scene.objects}
+    addon("command_line.first_view").set_up(scene, shot, "freeze")
+    assert views() == before and {item.name for item in scene.objects} == names
