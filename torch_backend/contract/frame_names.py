@@ -13,7 +13,7 @@ from typing import TypeVar
 
 _RUN = re.compile(r"[0-9]+")
 _ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]*$")
-_MARK = re.compile(r"#+|@+|%0?[0-9]*d")
+_MARK = re.compile(r"#+|@+|%0?[0-9]*d(?![A-Za-z])")
 """What stands for the number in a pattern: `####`, `@@@@`, `%04d`, `%d`."""
 _WILDCARD = {"*": ".*", "?": "."}
 _ALIKE = {".jpeg": ".jpg", ".tiff": ".tif"}

@@ -147,7 +147,7 @@ def _sequences_in(folder: Path, names: list[str]) -> list[NumberedFiles]:
 
 def _is_readable(numbered: NumberedFiles) -> bool:
     """True if OpenImageIO reads such files."""
-    return Path(numbered.pattern).suffix.lower() in PICTURES
+    return Path(next(iter(numbered.files.values()))).suffix.lower() in PICTURES
 
 
 def _only(folder: Path, found: list[NumberedFiles], who: str, missing: JobError | None) -> PictureSequence:

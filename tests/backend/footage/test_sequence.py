@@ -83,7 +83,10 @@ def test_folder_file_and_patterns_mean_the_same_sequence(exrs, name):
     assert (source.info.first, source.info.last, source.info.width, source.info.height) == (1001, 1010, 64, 48)
 
 
-@pytest.mark.parametrize(("name", "numbers"), [("*.exr", (1001, 1010)), ("shot.100?.exr", (1001, 1009))])
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [("*.exr", (1001, 1010)), ("shot.100?.exr", (1001, 1009)), ("shot.####", (1001, 1010)), ("s*.####", (1001, 1010))],
+)
 def test_a_wildcard_chooses_among_the_files(exrs, name, numbers):
     write(exrs / "other.png", np.zeros((8, 8, 3), np.uint8))
     info = open_source(str(exrs / name)).info
