@@ -114,7 +114,7 @@ def _bury(root: Path, dead: Writer) -> None:
         return  # another one was faster
     try:
         with contextlib.suppress(OSError, ValueError):
-            if contract.from_dict(Writer, json.loads(beside.read_bytes())) != dead:
+            if contract.from_dict(Writer, contract.read_json(beside, _LENGTH)) != dead:
                 os.link(beside, path)
     finally:
         beside.unlink(missing_ok=True)

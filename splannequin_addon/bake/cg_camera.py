@@ -6,8 +6,6 @@ solved camera, or the artist's own that the take was frozen from. Otherwise it s
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -178,10 +176,10 @@ def _pixels_apart(
 def _typical_depth(shot: Path, path: contract.CameraPath) -> float:
     """Median depth of the solve's points from the first pose, solve units; 1 if they cannot be read."""
     try:
-        with np.load(contract.ShotFolder(shot).points) as data:
+        with contract.open_arrays(contract.ShotFolder(shot).points) as source, np.load(source) as data:
             xyz = np.asarray(data["xyz"], dtype=np.float64)
         view = np.array(path.frames[0].viewmat, dtype=np.float64).reshape(4, 4)
         depth = float(np.median(xyz @ view[2, :3] + view[2, 3]))
         return depth if np.isfinite(depth) and depth > 1e-6 else 1.0
-    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile, zlib.error):
+    except (OSError, ValueError, IndexError):
         return 1.0

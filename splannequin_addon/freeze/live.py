@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import subprocess
 import threading
 from dataclasses import dataclass, field
@@ -195,7 +196,10 @@ def open_session(shot: Path, run: str, python: str, package_root: Path) -> Sessi
 def last_line(log: Path) -> str:
     """Last line of a session's log that says something, at most 200 characters."""
     try:
-        lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    except OSError:
+        with contract.open_regular(log) as source:
+            source.seek(max(0, os.fstat(source.fileno()).st_size - contract.LONGEST_LINE))
+            text = source.read(contract.LONGEST_LINE).decode("utf-8", "replace")
+        lines = [line for line in text.splitlines() if line.strip()]
+    except (OSError, ValueError):
         return ""
     return lines[-1].strip()[:200] if lines else ""

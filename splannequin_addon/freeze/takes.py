@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import time
 from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
@@ -170,7 +171,7 @@ def may_be_stale(shot: Path, take: str) -> bool:
 def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
     """Frames that a take can have: those of its camera's path, or the clip's."""
     path = seen_camera.path_of(shot, facts)
-    if path and Path(path).is_file():
+    if os.path.isfile(path):
         return {f.frame for f in contract.CameraPath.load(path).frames}
     first, last = (facts["first"], facts["last"]) if path else inventory.read(shot).frame_range
     return set(range(first, last + 1))

@@ -8,6 +8,7 @@ from typing import Any
 
 import bpy
 
+from ...torch_backend import contract
 from .. import compat
 from ..access import size_of
 from . import paths
@@ -72,7 +73,7 @@ def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = Fals
             _ahead.discard(wanted)
             return image
     compat.colour_space(encoding)  # before anything is made: a configuration may have none
-    image = bpy.data.images.load(wanted)
+    image = bpy.data.images.load(contract.regular_file(wanted, None))
     image.name = name
     if image.source != "MOVIE":
         image.source = "SEQUENCE"
@@ -98,7 +99,7 @@ def load_numbers(path: Path, name: str) -> bpy.types.Image:
                 known.reload()
             _ahead.discard(wanted)
             return known
-    image = bpy.data.images.load(wanted)
+    image = bpy.data.images.load(contract.regular_file(wanted))
     image.name = name
     image[TAG] = True
     compat.set_data(image)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -85,4 +86,4 @@ def path_of(shot: Path, facts: dict[str, Any]) -> str:
     """File of the camera path that a take was seen from: as it was named, or in the shot, if that was moved since."""
     named = str(facts.get("camera_path", ""))
     moved = contract.ShotFolder(shot).camera_path(str(facts.get("take", "")))
-    return str(moved) if named and not Path(named).is_file() and moved.is_file() else named
+    return str(moved) if named and not os.path.isfile(named) and os.path.isfile(moved) else named

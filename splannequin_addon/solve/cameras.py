@@ -7,8 +7,6 @@ depth is brought to scene units through it.
 from __future__ import annotations
 
 import math
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -303,10 +301,15 @@ def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:
     if not file.is_file():
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            return stored["xyz"].astype(np.float32), stored["rgb"].astype(np.uint8)
-    except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError) as error:
+        with contract.open_arrays(file) as source, np.load(source, allow_pickle=False) as stored:
+            xyz, rgb = stored["xyz"].astype(np.float32), stored["rgb"].astype(np.uint8)
+    except contract.UnreadableFile:
+        raise
+    except ValueError as error:
         raise ValueError(f"{file} is damaged: solve again.") from error
+    if xyz.shape != rgb.shape or xyz.shape[1:] != (3,) or not np.isfinite(xyz).all():
+        raise ValueError(f"{file} is damaged: solve again.")
+    return xyz, rgb
 
 
 def _point_mesh(name: str, xyz: np.ndarray, rgb: np.ndarray) -> bpy.types.Mesh:

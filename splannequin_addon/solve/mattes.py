@@ -191,7 +191,7 @@ def _pixels(path: Path) -> np.ndarray:
     if announced[0] * announced[1] > contract.MOST_PIXELS:  # Blender would ask for all of its memory
         message = f"{path} is {announced[0]} x {announced[1]} pixels, or says so."
         raise contract.JobError(message, "Remove it, or make it smaller.", contract.ExitCode.USAGE)
-    image = bpy.data.images.load(str(path))
+    image = bpy.data.images.load(contract.regular_file(path))
     try:
         image.alpha_mode = "CHANNEL_PACKED"  # nothing is multiplied
         width, height = size_of(image)

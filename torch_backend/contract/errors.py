@@ -33,6 +33,13 @@ class JobError(Exception):
         self.exit_code = int(exit_code)
 
 
+class UnreadableFile(JobError, ValueError):
+    """A path that holds no file to read: a pipe, a device, a folder, or a file too large to be what it should."""
+
+    def __init__(self, path: str | Path, why: str) -> None:
+        super().__init__(f"{path} {why}: replace or remove it", "", ExitCode.USAGE)
+
+
 class Cancelled(Exception):
     """Raised by `Reporter.check_cancelled` when someone asked the job to stop."""
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import stat
 import sys
 import time
+import zipfile
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, BinaryIO, TypeGuard, TypeVar
+
+from .errors import UnreadableFile
 
 T = TypeVar("T")
 
@@ -18,6 +22,12 @@ LONGEST_JSON = 1 << 28
 """Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
 SHORT_JSON = 1 << 20
 """Bytes of a file that Blender reads between two turns of its timer: a status, a run's figures."""
+LONGEST_PICTURE = 1 << 33
+"""Bytes of a picture that are read: 16K, twenty channels of 32 bits, uncompressed take 10 GB; EXRs are compressed."""
+LONGEST_ARRAYS = 1 << 32
+"""Bytes of arrays (.npz) that are read, unpacked: 100 million points take 2 GB."""
+LONGEST_CHECKPOINT = 1 << 34
+"""Bytes of a checkpoint that are read; a million Gaussians with what their optimiser keeps take 1 GB."""
 LONGEST_LINE = 1 << 20
 """Bytes of a line of events.jsonl or metrics.jsonl that are read."""
 
@@ -42,11 +52,12 @@ def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, window
             time.sleep(pause)
 
 
-def open_regular(path: str | Path) -> BinaryIO:
+def open_regular(path: str | Path, longest: int | None = None) -> BinaryIO:
     """Opens a regular file (or a link to one) for reading, without ever waiting for it.
 
     A shot folder may come from anywhere: a pipe would hold up Blender's main thread, a device would fill its memory.
-    FileNotFoundError or another OSError of the system's; ValueError names a path that holds something else.
+    FileNotFoundError or another OSError of the system's; UnreadableFile, a ValueError, names a path that holds
+    something else, or a file of more than `longest` bytes, as a sparse one may have without taking any disk.
     """
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
@@ -60,10 +71,13 @@ def open_regular(path: str | Path) -> BinaryIO:
     except (IsADirectoryError, PermissionError) as error:
         if isinstance(error, PermissionError) and not os.path.isdir(path):  # what Windows says of a folder
             raise
-        raise ValueError(f"{path} is not a file: remove it") from None
+        raise UnreadableFile(path, "is not a file") from None
     try:
-        if not stat.S_ISREG(os.fstat(source.fileno()).st_mode):
-            raise ValueError(f"{path} is not a file: remove it")
+        found = os.fstat(source.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise UnreadableFile(path, "is not a file")
+        if longest is not None and found.st_size > longest:
+            raise UnreadableFile(path, f"has {found.st_size / 1e9:.1f} GB, more than a file of its kind can have")
     except BaseException:
         source.close()
         raise
@@ -80,14 +94,43 @@ def png_size(path: str | Path) -> tuple[int, int]:
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
 
 
+def regular_file(path: str | Path, longest: int | None = LONGEST_PICTURE) -> str:
+    """The path, for a library that opens files by itself: one that `open_regular` opens, of at most `longest` bytes.
+
+    Errors as `open_regular`.
+    """
+    open_regular(path, longest).close()
+    return os.fspath(path)
+
+
+@contextlib.contextmanager
+def open_arrays(path: str | Path) -> Generator[BinaryIO, None, None]:
+    """Opens an .npz for NumPy, if what is packed in it is not endless. ValueError for whatever is wrong in it while it
+    is read; OSError or ValueError as `open_regular`."""
+    with open_regular(path, LONGEST_ARRAYS) as source:
+        try:
+            with zipfile.ZipFile(source) as archive:
+                packed = archive.infolist()
+            if sum(part.file_size for part in packed) > LONGEST_ARRAYS:
+                raise UnreadableFile(path, "holds more than a file of its kind can")
+            source.seek(0)
+            yield source
+        except UnreadableFile:
+            raise
+        # zipfile, zlib and NumPy raise a dozen kinds, in words for programmers.
+        except Exception as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+
+
 def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
     """A JSON object from a file of at most `longest` bytes.
 
     FileNotFoundError, or ValueError naming the file and what is wrong in it.
     """
     with open_regular(path) as source:
-        text = source.read(longest + 1)
-    if len(text) > longest:
+        is_long = os.fstat(source.fileno()).st_size > longest
+        text = b"" if is_long else source.read(longest + 1)  # it may have grown since
+    if is_long or len(text) > longest:
         raise ValueError(f"{path} is longer than {longest >> 20} MB: nothing of ours is")
     try:
         data = json.loads(text, parse_constant=_no_number)

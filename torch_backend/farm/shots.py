@@ -15,6 +15,7 @@ from typing import Any
 
 from ..contract import (
     PARAMS,
+    SHORT_JSON,
     SHOT_SUFFIX,
     ExitCode,
     ImportParams,
@@ -26,6 +27,7 @@ from ..contract import (
     from_dict,
     is_imported_from,
     is_shot,
+    open_regular,
     path_digest,
     read_json,
     readable_stem,
@@ -334,7 +336,8 @@ def read_instants(path: str) -> dict[str, list[int]]:
     """A file with a line per shot, its name and then its instants; # begins a comment. JobError names a wrong line."""
     found: dict[str, list[int]] = {}
     try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()  # editors on Windows begin with a mark
+        with open_regular(path, SHORT_JSON) as source:
+            lines = source.read().decode("utf-8-sig").splitlines()  # editors on Windows begin with a mark
     except (OSError, ValueError) as error:
         raise JobError(f"{path} cannot be read: {error}.", "", ExitCode.USAGE) from error
     for number, line in enumerate(lines, 1):

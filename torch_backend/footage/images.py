@@ -23,7 +23,7 @@ from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
 from ..array_types import SparseMatrix, sparse_entries
-from ..contract import FRAMES_FOLDER, MOST_PIXELS, RAW_FOLDER, ExitCode, JobError, open_regular
+from ..contract import FRAMES_FOLDER, MOST_PIXELS, RAW_FOLDER, ExitCode, JobError, open_regular, regular_file
 from ..shot import atomic_path
 
 PNG_COMPRESSION = 2
@@ -99,7 +99,7 @@ def read_png(path: str | Path) -> NDArray[Any]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"picture {path} does not exist")
-    buffer = oiio.ImageBuf(str(path))
+    buffer = oiio.ImageBuf(regular_file(path))
     kind = oiio.UINT16 if str(buffer.spec().format) == "uint16" else oiio.UINT8
     pixels = None if buffer.has_error else buffer.get_pixels(kind)
     if pixels is None or buffer.has_error:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import OpenImageIO as oiio
 
+from ..contract import regular_file
 from .images import check_size, error_of
 from .oiio_types import channel_names
 from .sources import footage_error
@@ -79,7 +80,7 @@ def _rank(layer: Layer) -> tuple[int, int]:
 
 def _layers(file: Path) -> tuple[list[Layer], list[str]]:
     """Layers with colour, and the names of all, in the order of the file."""
-    image = oiio.ImageInput.open(str(file))
+    image = oiio.ImageInput.open(regular_file(file))
     if image is None:
         raise OSError(f"{file}: {error_of()}")
     found: list[Layer] = []

@@ -19,7 +19,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from ..contract import MASK_ALPHA, MASK_KINDS, JobError, Reporter, is_pattern
+from ..contract import MASK_ALPHA, MASK_KINDS, JobError, Reporter, is_pattern, regular_file
 from ..shot import Shot, content_key
 from . import plate_encoding
 from .images import check_size, error_of
@@ -311,7 +311,7 @@ def _read(file: Path, part: int = 0) -> tuple[NDArray[np.float32], int | None]:
 
 def _opened(file: Path, part: int = 0) -> tuple[oiio.ImageBuf, Orientation]:
     """A picture of which only the header is read yet. JobError if that cannot be, or says that it is too large."""
-    buffer = oiio.ImageBuf(str(file), part, 0, AS_STORED)
+    buffer = oiio.ImageBuf(regular_file(file), part, 0, AS_STORED)
     spec = buffer.spec()
     if buffer.has_error:
         raise footage_error(f"The mask {file} cannot be read: {error_of(buffer)}.", "Write it again.")

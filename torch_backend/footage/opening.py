@@ -10,7 +10,7 @@ import av
 import OpenImageIO as oiio
 from av.error import FFmpegError
 
-from ..contract import JobError, is_pattern
+from ..contract import JobError, is_pattern, regular_file
 from .images import error_of
 from .ocio import Colours
 from .sequence import PICTURES, SequenceSource, find_sequence, numbered_neighbours, unreadable_pictures
@@ -59,13 +59,13 @@ def opens_as_video(path: Path) -> bool:
     """True if a file is opened as a video: all but still pictures that OpenImageIO reads."""
     if path.suffix.lower() not in PICTURES:
         return True
-    picture = oiio.ImageInput.open(str(path))
+    picture = oiio.ImageInput.open(regular_file(path))
     if picture is None:  # damaged: its sequence says so
         error_of()
         return False
     try:
         if picture.format_name() == "png":  # OpenImageIO reads the first picture of an animated PNG alone
-            with av.open(str(path)) as container:
+            with av.open(regular_file(path)) as container:
                 return container.format.name == "apng"
         return bool(picture.spec().get_int_attribute("oiio:Movie"))
     except FFmpegError:

@@ -25,6 +25,7 @@ from ..contract import (
     matching_files,
     numbered_files,
     parse_timecode,
+    regular_file,
 )
 from . import plate_encoding
 from .color import LIGHTS, InputSpace, named_space, space_of_chromaticities
@@ -441,7 +442,7 @@ AS_STORED.attribute("oiio:UnassociatedAlpha", 1)
 
 def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
     """Header and pixels, and what is wrong with them, if anything is."""
-    buffer = oiio.ImageBuf(str(file), part, 0, AS_STORED)
+    buffer = oiio.ImageBuf(regular_file(file), part, 0, AS_STORED)
     spec = buffer.spec()
     check_size(file.name, spec)
     return spec, buffer, (error_of(buffer) or "it is damaged") if buffer.has_error else ""

@@ -13,7 +13,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from ..contract import MOST_PIXELS, open_regular, parse_timecode
+from ..contract import MOST_PIXELS, open_regular, parse_timecode, regular_file
 from . import plate_encoding
 from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
@@ -303,7 +303,9 @@ class VideoSource:
     def _open(self) -> Any:
         try:
             # Only plain files: a playlist in disguise must not make the decoder fetch anything.
-            return av.open(str(self.path), options={"protocol_whitelist": "file"}, metadata_errors="ignore")
+            return av.open(
+                regular_file(self.path, None), options={"protocol_whitelist": "file"}, metadata_errors="ignore"
+            )
         except FFmpegError as error:
             raise _no_video(self.path) from error
 

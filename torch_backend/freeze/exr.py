@@ -25,7 +25,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
-from ..contract import FRAME_LAYERS, channels_of, layers_of, parse_timecode
+from ..contract import FRAME_LAYERS, channels_of, layers_of, parse_timecode, regular_file
 from ..contract.timecode import smpte_bits
 from ..footage.color import LIGHTS, PRIMARIES, InputSpace, in_light, light_matrix, light_of_chromaticities
 from ..shot import atomic_path
@@ -256,7 +256,7 @@ def read_layers(
     """
     if not path.is_file():
         raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
-    image = oiio.ImageInput.open(str(path))
+    image = oiio.ImageInput.open(regular_file(path))
     if image is None:
         raise ValueError(f"{path}: cannot be read as EXR: {oiio.geterror()}")
     try:
@@ -306,7 +306,10 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
 
 def read_key(path: str | Path) -> str | None:
     """`FrameMetadata.key` of a frame, from its header alone; None if the file cannot be read as one."""
-    image = oiio.ImageInput.open(str(path))
+    try:
+        image = oiio.ImageInput.open(regular_file(path))
+    except (OSError, ValueError):
+        return None
     if image is None:
         oiio.geterror()  # else it is told to whoever asks next
         return None

@@ -14,6 +14,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..contract import LONGEST_CHECKPOINT, open_regular
 from ..shot import atomic_path
 
 SH_BASES = (1, 4, 9, 16)
@@ -104,7 +105,7 @@ def read_ply(path: str | Path) -> PlyGaussians:
     FileNotFoundError without a file; ValueError if it is not such a PLY, is cut short, or holds NaN or infinity.
     """
     path = Path(path)
-    with open(path, "rb") as handle:
+    with open_regular(path, LONGEST_CHECKPOINT) as handle:
         count, layout = _read_header(handle, path)
         need, available = count * layout.itemsize, os.fstat(handle.fileno()).st_size - handle.tell()
         if available < need:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..contract import LONGEST_ARRAYS, UnreadableFile, open_regular
 from ..shot import atomic_path
 from .poses import quat_to_rotation, rotation_to_quat
 
@@ -128,6 +129,8 @@ def read_model(folder: Path) -> ColmapModel:
         if len(files) > 2:
             at = files[2]
             points = _points_bin(at) if binary else _points_txt(at)
+    except UnreadableFile:
+        raise
     except (struct.error, IndexError, OverflowError, UnicodeDecodeError) as error:
         raise ValueError(f"{at} is no file of a COLMAP model, or it is cut off: {error}") from error
     except ValueError as error:
@@ -164,7 +167,8 @@ class _Bytes:
     """A file read from front to back; struct.error where it ends too early."""
 
     def __init__(self, path: Path) -> None:
-        self.data = path.read_bytes()
+        with open_regular(path, LONGEST_ARRAYS) as source:
+            self.data = source.read()
         self.at = 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
@@ -241,7 +245,9 @@ def _points(rows: list[list[float]], tracks: list[NDArray[np.int64]]) -> ColmapP
 
 def _lines(path: Path) -> list[str]:
     """The lines that say something. Empty ones stay: an image without keypoints has one."""
-    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.lstrip().startswith("#")]
+    with open_regular(path, LONGEST_ARRAYS) as source:
+        text = source.read().decode("utf-8")
+    return [line for line in text.splitlines() if not line.lstrip().startswith("#")]
 
 
 def _cameras_txt(path: Path) -> Iterator[ColmapCamera]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import CameraPath, ExitCode, JobError, numbered_files, read_json
+from ..contract import LONGEST_ARRAYS, CameraPath, ExitCode, JobError, numbered_files, open_regular, read_json
 from ..footage.pairing import Counted, Pairing, pair, pairing_words
 from ..footage.sources import frame_words
 from .colmap_files import ColmapModel, model_files, read_model
@@ -127,7 +127,7 @@ def fingerprint(path: str | Path) -> str:
     digest = hashlib.sha256()
     for file in find(path)[1]:
         digest.update(file.name.encode())
-        with open(file, "rb") as source:
+        with open_regular(file, LONGEST_ARRAYS) as source:
             while block := source.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()

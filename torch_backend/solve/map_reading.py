@@ -23,7 +23,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from ..contract import ST_MAP_WAYS, ExitCode, JobError, Reporter
+from ..contract import LONGEST_PICTURE, ST_MAP_WAYS, ExitCode, JobError, Reporter, open_regular, regular_file
 from ..footage.images import check_size, error_of
 from ..footage.oiio_types import bits_of, channel_names
 from .map_lens import MapLens, Polynomial, fitted, widest
@@ -71,7 +71,7 @@ def fingerprint(path: str) -> str:
     """Hash of a map's file. JobError (USAGE) if it cannot be read."""
     digest = hashlib.sha256()
     try:
-        with open(path, "rb") as source:
+        with open_regular(path, LONGEST_PICTURE) as source:
             while block := source.read(1 << 20):
                 digest.update(block)
     except OSError as error:
@@ -133,7 +133,7 @@ def read_lens(path: str, way: str, layer: str, frames: dict[str, Any], report: R
 
 def _read(path: Path, layer: str, name: str) -> _Map:
     """The two channels, and where they say something. JobError (USAGE) as `read_lens`."""
-    opened = oiio.ImageInput.open(str(path)) if path.is_file() else None
+    opened = oiio.ImageInput.open(regular_file(path)) if path.is_file() else None
     if opened is None:
         why = error_of() if path.is_file() else "it is not there"
         raise _refused(f"{name} cannot be read: {why.rstrip('.')}.", "Name an EXR file.")

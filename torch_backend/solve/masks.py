@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import MASK_KINDS, PICTURE, ExitCode, JobError, frame_file, open_regular, read_json
+from ..contract import LONGEST_PICTURE, MASK_KINDS, PICTURE, ExitCode, JobError, frame_file, open_regular, read_json
 from ..contract.files import is_json_object
 from ..footage.masks import Mask
 from ..shot import Shot, make_folder, write_atomic
@@ -121,7 +121,7 @@ def load_mask(shot: Shot, kind: str, frame: int) -> NDArray[np.bool_] | None:
         return None
     path = shot.mask(kind, frame)
     try:
-        with open_regular(path) as handle:
+        with open_regular(path, LONGEST_PICTURE) as handle:
             pixels = cv2.imdecode(np.frombuffer(handle.read(), np.uint8), cv2.IMREAD_GRAYSCALE)
     except (OSError, cv2.error) as error:
         raise _damaged(path) from error

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contract import (
+    LONGEST_PICTURE,
     MOST_PIXELS,
     MOTION_FILE,
     MOTION_UNFINISHED_FILE,
@@ -212,7 +213,12 @@ def motion_key(shot: Shot, with_found: bool = True) -> str:
     """
     found = _record(shot.motion / _RECORD).get("key") if with_found and is_found(shot) else None
     painted = sorted(p for p in shot.painted.glob("*.png") if p.is_file())
-    return content_key(found, [[p.name, hashlib.sha256(p.read_bytes()).hexdigest()] for p in painted])
+    return content_key(found, [[p.name, _content(p)] for p in painted])
+
+
+def _content(path: Path) -> str:
+    with open_regular(path, LONGEST_PICTURE) as source:
+        return hashlib.sha256(source.read()).hexdigest()
 
 
 def load_motion(shot: Shot, frame: int, likely: bool = False) -> NDArray[np.uint8] | None:

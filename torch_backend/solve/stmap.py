@@ -16,7 +16,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from ..contract import STMAP_FILES, ExitCode, FreezeParams, JobError
+from ..contract import STMAP_FILES, ExitCode, FreezeParams, JobError, regular_file
 from ..footage.oiio_types import open_output
 from ..shot import Shot, atomic_path, disk_error, is_disk_full, need_disk
 from .lens import Lens, load_lens
@@ -170,7 +170,7 @@ def write_plate_map(path: Path, lens: PlateLens | MapLens, width: int, height: i
 
     `key` tells whether a file that is there is this map. JobError (DISK), OSError.
     """
-    known = oiio.ImageInput.open(str(path)) if path.is_file() else None
+    known = oiio.ImageInput.open(regular_file(path)) if path.is_file() else None
     if known is not None:
         try:
             if known.spec().getattribute("splannequin:key") == key:

@@ -16,7 +16,7 @@ from ..contract import (
     ExitCode,
     JobError,
     check_version,
-    open_regular,
+    open_arrays,
     read_json,
 )
 from ..shot import Shot
@@ -52,7 +52,7 @@ def load_points(shot: Shot) -> dict[str, NDArray[Any]]:
     """
     path = _there(shot, POINTS_FILE)
     try:
-        with open_regular(path) as handle, np.load(handle, allow_pickle=False) as data:
+        with open_arrays(path) as handle, np.load(handle, allow_pickle=False) as data:
             points = {name: data[name] for name in _POINTS}
     except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds, in words for programmers
         raise damaged(path, "it cannot be read") from error

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import SURFACE, atomic_path, frame_number, open_regular
+from ..contract import SURFACE, atomic_path, frame_number, open_arrays
 from .fleeting import Sight
 from .flow import Map, Mask
 from .still import Evidence
@@ -109,7 +109,7 @@ def read_surface(folder: Path) -> SurfacePoints:
 def _arrays(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
     """(xyz, rgb) of a file; None if they cannot be read, or are not what was written."""
     try:
-        with open_regular(path) as handle, np.load(handle, allow_pickle=False) as data:
+        with open_arrays(path) as handle, np.load(handle, allow_pickle=False) as data:
             xyz, rgb = data["xyz"], data["rgb"]
     except Exception:  # zipfile, zlib and numpy raise a dozen kinds
         return None

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..contract import (
     CONFIG_FILE,
+    LONGEST_JSON,
     METRICS_FILE,
     PREVIEWS_FOLDER,
     ExitCode,
@@ -22,6 +23,7 @@ from ..contract import (
     TrainParams,
     file_digest,
     is_link,
+    open_regular,
     read_json,
     remove_link,
     sweep_half_written,
@@ -371,7 +373,7 @@ class Metrics:
         for picture in (folder / PREVIEWS_FOLDER).glob("*.png"):
             if picture.stem.isdigit() and int(picture.stem) > iteration:
                 picture.unlink()
-        lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
+        lines = _lines(self.path) if self.path.is_file() else []
         kept = [line for line in lines if _iteration_of(line) <= iteration]
         self._measured = max(map(_iteration_of, kept), default=-1.0)
         if kept != lines:
@@ -400,6 +402,11 @@ class Metrics:
             lines.write(json.dumps(row) + "\n")
         self._measured = trainer.iteration
         self.report.metric("training", row)
+
+
+def _lines(path: Path) -> list[str]:
+    with open_regular(path, LONGEST_JSON) as source:
+        return source.read().decode("utf-8", "replace").splitlines()
 
 
 def _iteration_of(line: str) -> float:

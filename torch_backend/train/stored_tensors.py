@@ -11,6 +11,8 @@ import safetensors
 import safetensors.torch
 from torch import Tensor
 
+from ..contract import LONGEST_CHECKPOINT, regular_file
+
 
 class StoredTensors(Protocol):
     """An open file of tensors, mapped and not read yet."""
@@ -29,8 +31,8 @@ class StoredTensors(Protocol):
 
 
 def open_stored(path: Path) -> AbstractContextManager[StoredTensors]:
-    """Opens a file; SafetensorError or OSError if it is none."""
-    opened: Any = cast(Any, safetensors).safe_open(str(path), framework="pt", device="cpu")
+    """Opens a file; SafetensorError, OSError or UnreadableFile if it is none."""
+    opened: Any = cast(Any, safetensors).safe_open(regular_file(path, LONGEST_CHECKPOINT), framework="pt", device="cpu")
     return opened
 
 

@@ -91,7 +91,7 @@ def test_an_interrupt_while_a_file_is_opened_closes_it_once(tmp_path):
 def test_what_is_no_file_is_refused_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path):
-        with pytest.raises(ValueError, match="is not a file: remove it"):
+        with pytest.raises(ValueError, match="is not a file: replace or remove it"):
             contract.open_regular(path)
 
 
