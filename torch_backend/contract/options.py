@@ -131,12 +131,13 @@ class ImportParams:
         "",
         flag="--layer",
         metavar="NAME",
-        help="layer or part of an EXR sequence, by its name or the end of it",
+        help="layer or part of an EXR sequence, by its name or the end of it; a video's stream by its number",
         words="the picture itself",
         label="Layer",
         tip="Layer or part of an EXR sequence to freeze, by its name or the end of it; empty: the picture itself",
     )
-    """Layer or part of a sequence's pictures to take, by its name or the end of it; empty: the picture itself."""
+    """Layer or part of a sequence's pictures to take, by its name or the end of it, or a video's stream by its number;
+    empty: the picture itself, the largest stream."""
     colour_space: str = option(
         "",
         flag="--colour-space",

@@ -34,7 +34,15 @@ from ..contract import (
     read_json,
 )
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
-from .analysis import FrameMeasures, automatic_step, choose_solved, find_cuts, flag_duplicate, measure
+from .analysis import (
+    FrameMeasures,
+    automatic_step,
+    choose_solved,
+    find_cuts,
+    flag_duplicate,
+    looks_like_log,
+    measure,
+)
 from .bars import Bars, find_bars
 from .burnt_in import WIDTH, find_mark, looked_at
 from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
@@ -128,7 +136,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
                 if not config.replace:
                     raise earlier.refusal()
                 order = earlier.order(record)
-            for message, hint in opened.warnings + _remarks(extracted):
+            for message, hint in opened.warnings + _remarks(extracted) + _log_remark(opened.info, config, extracted):
                 report.warning(message, hint)
             record |= _marked(shot, record, fresh, report)
             write_json(fresh / FRAMES_FILE, record)
@@ -379,6 +387,21 @@ def _cut_error(first: int, last: int, cuts: list[tuple[int, int]]) -> Exception:
         f"The clip has a hard cut at frame {where}: a freeze needs one continuous take.",
         f"Pass the range of one take: {', '.join(shots[:6])} (for example --first {longest[0]} --last {longest[1]}).",
     )
+
+
+def _log_remark(info: SourceInfo, config: FootageConfig, extracted: _Extracted) -> list[tuple[str, str]]:
+    """A warning about a clip that looks like a camera's log and was taken for a display."""
+    tones = looks_like_log(extracted.measures)
+    if tones is None or info.colour == "linear" or config.colour_space:
+        return []
+    taken = info.reading.get("colour", "video")
+    return [
+        (
+            f"The picture is as flat as log: its darkest tones are at {100 * tones[0]:.0f} %, its brightest at "
+            f"{100 * tones[1]:.0f} %. It was taken as {taken}.",
+            "If it is log, name its colour space (--colour-space, such as 'ARRI LogC3 (EI800)').",
+        )
+    ]
 
 
 def _remarks(extracted: _Extracted) -> list[tuple[str, str]]:

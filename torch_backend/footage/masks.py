@@ -289,7 +289,7 @@ class _Reading:
             path = Path(place)
             try:
                 if path.is_file() and opens_as_video(path):
-                    return VideoSource(path)
+                    return VideoSource(path, layer=settings.layer)
                 sequence = find_sequence(path)
                 SequenceSource(sequence, settings.fps, settings.layer)
             except (JobError, OSError):

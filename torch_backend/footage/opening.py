@@ -48,7 +48,8 @@ def open_source(
         raise footage_error(
             f"The footage {source} does not exist.", "Check the path; a clip on a server must be mounted."
         )
-    video = open_video(path, colours, told)
+    video = open_video(path, colours, told, layer)
+    layer = "" if video.has_streams else layer
     for value, what, own in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
         if value:
             video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {own}.", ""))
@@ -74,10 +75,10 @@ def opens_as_video(path: Path) -> bool:
         picture.close()
 
 
-def open_video(path: Path, colours: Colours | None = None, told: Told | None = None) -> VideoSource:
+def open_video(path: Path, colours: Colours | None = None, told: Told | None = None, layer: str = "") -> VideoSource:
     """A video. JobError says of a picture, animated or not, that it is one."""
     try:
-        video = VideoSource(path, colours, told)
+        video = VideoSource(path, colours, told, layer)
     except JobError as error:
         if path.suffix.lower() in PICTURES:
             raise footage_error(

@@ -74,12 +74,14 @@ class VideoSource:
     A file that ends before what it announces, and a picture that changes its size midway, are told by name.
     """
 
-    def __init__(self, path: Path, colours: Colours | None = None, told: Told | None = None) -> None:
-        self.path = path
+    def __init__(self, path: Path, colours: Colours | None = None, told: Told | None = None, layer: str = "") -> None:
+        """`layer`: number of the video stream to read, from 1; empty: the largest. Passed over where there is one."""
+        self.path, self.layer = path, layer
         self.warnings: list[tuple[str, str]] = []
         told = told or Told()
         with self._open() as container:
-            stream = _best_stream(container, path)
+            stream = _stream_of(container, path, layer)
+            self._tell_streams(container, stream)
             if stream.codec_context.width * stream.codec_context.height > MOST_PIXELS:
                 raise too_large(path.name, stream.codec_context.width, stream.codec_context.height)
             frame = _first_frame(container, stream, path)
@@ -149,6 +151,8 @@ class VideoSource:
             return "its pixels are not square"
         if orientation is None or orientation.is_mirrored:  # Blender 5 takes a mirrored picture for a turned one
             return f"its header says that it is {orientation.words if orientation else 'turned or stretched'}"
+        if not self._is_first_stream:
+            return "it has several video streams, of which other programs show another"
         if self._interlaced:
             return "it is interlaced, and frames are made of its fields here"
         if (tagged.matrix, tagged.is_full) != (self._coding.matrix, self._coding.is_full):
@@ -163,7 +167,7 @@ class VideoSource:
         number, got, seen, noticed = 0, 0, _Seen(), Noticed()
         lost: list[int] = []
         with self._open() as container:
-            stream = _best_stream(container, self.path)
+            stream = _stream_of(container, self.path, self.layer)
             stream.thread_type = "AUTO"
             for frame in decoded(container, stream, noticed, self._fields):
                 number += 1
@@ -204,7 +208,7 @@ class VideoSource:
         if not self.has_alpha:
             raise footage_error(f"{self.path.name} has no alpha.", "Give the mask as pictures of their own.")
         with self._open() as container:
-            stream = _best_stream(container, self.path)
+            stream = _stream_of(container, self.path, self.layer)
             stream.thread_type = "AUTO"
             decoder = None
             if self._alpha_decoder:
@@ -251,7 +255,7 @@ class VideoSource:
     def open(self, threads: int) -> tuple[Any, Any]:
         """The container and its stream, to be decoded by at most so many threads. JobError if it cannot be opened."""
         container = self._open()
-        stream = _best_stream(container, self.path)
+        stream = _stream_of(container, self.path, self.layer)
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
         return container, stream
@@ -287,6 +291,22 @@ class VideoSource:
             raise footage_error(message, hint + remedy)
         self.warnings.append((message, hint))
 
+    def _tell_streams(self, container: Any, stream: Any) -> None:
+        """Says which of several video streams is read."""
+        streams = _streams_of(container, self.path)
+        self.has_streams = len(streams) > 1
+        """True if there is another that `layer` could name."""
+        # Blender shows the first.
+        self._is_first_stream = stream.index == container.streams.video[0].index
+        if self.has_streams and not self.layer:
+            number = 1 + [one.index for one in streams].index(stream.index)
+            self.warnings.append(
+                (
+                    f"The clip has {len(streams)} video streams: number {number} is taken, {_size_words(stream)}.",
+                    f"Name another by its number (--layer): {_listed(streams)}.",
+                )
+            )
+
     def _unmarked_fields(self, height: int) -> str:
         """See `decoding.unmarked_fields`; of this file, looked at once."""
         if height > _MOST_INTERLACED:
@@ -295,7 +315,7 @@ class VideoSource:
         key = str(self.path), stat.st_size, stat.st_mtime_ns
         if key not in _fields_of:
             with self._open() as container:
-                stream = _best_stream(container, self.path)
+                stream = _stream_of(container, self.path, self.layer)
                 stream.thread_type = "AUTO"
                 _fields_of[key] = unmarked_fields(container, stream)
         return _fields_of[key]
@@ -413,7 +433,27 @@ def _no_video(path: Path) -> Exception:
     )
 
 
-def _best_stream(container: Any, path: Path) -> Any:
+def _stream_of(container: Any, path: Path, layer: str) -> Any:
+    """The video stream to read: of the number `layer`, else the largest. JobError if there is none."""
+    streams = _streams_of(container, path)
+    if not layer or len(streams) == 1:
+        return max(streams, key=lambda s: (s.codec_context.width or 0) * (s.codec_context.height or 0))
+    numbered = {str(number): stream for number, stream in enumerate(streams, start=1)}
+    if layer not in numbered:
+        raise footage_error(f"{path.name} has no video stream {layer!r}.", f"It has: {_listed(streams)}.")
+    return numbered[layer]
+
+
+def _size_words(stream: Any) -> str:
+    return f"{stream.codec_context.width}x{stream.codec_context.height}"
+
+
+def _listed(streams: list[Any]) -> str:
+    return ", ".join(f"{number} ({_size_words(one)})" for number, one in enumerate(streams, start=1))
+
+
+def _streams_of(container: Any, path: Path) -> list[Any]:
+    """Video streams that can be decoded, in the file's order. JobError if there is none."""
     names = set(container.format.name.split(","))
     streams = [s for s in container.streams.video if not (s.disposition & s.disposition.attached_pic)]
     if names & NOT_VIDEO or not streams:
@@ -424,7 +464,7 @@ def _best_stream(container: Any, path: Path) -> Any:
             f"{path.name} is encoded in a way that cannot be decoded here, or its header is damaged.",
             "Export it as H.264 or ProRes, or as an image sequence.",
         )
-    return max(streams, key=lambda s: (s.codec_context.width or 0) * (s.codec_context.height or 0))
+    return streams
 
 
 def _alpha_decoder_of(stream: Any) -> str:

@@ -434,3 +434,16 @@ def test_an_import_killed_between_its_frames_and_shot_json_is_ended_by_the_next_
     shot.cameras.write_text("{}")
     import_footage(shot, clip, FootageConfig(first=5), recorder())
     assert shot.cameras.exists(), "once is enough"
+
+
+@pytest.mark.parametrize(
+    ("black", "white", "is_flat"), [(0.093, 0.6, True), (0.125, 0.85, True), (0.0, 0.6, False), (0.1, 1.0, False)]
+)
+def test_a_clip_as_flat_as_log_is_told_so(shot, tmp_path, pan, write_video, recorder, black, white, is_flat):
+    grey = [np.repeat(f.mean(2, keepdims=True), 3, axis=2) for f in pan(10)]
+    grey = [(f - f.min()) / np.ptp(f) for f in grey]
+    frames = [np.rint(255 * (black + f * (white - black))).astype(np.uint8) for f in grey]
+    write_video(tmp_path / "a.mp4", frames)
+    report = recorder()
+    import_footage(shot, str(tmp_path / "a.mp4"), FootageConfig(), report)
+    assert any("as flat as log" in message for message in report.warnings) == is_flat

@@ -371,6 +371,41 @@ def test_a_recording_that_was_not_finished_is_told_so(tmp_path, pan, write_video
     assert caught.value.exit_code == ExitCode.FOOTAGE
 
 
+@pytest.fixture
+def two_streams(tmp_path, pan):
+    """A QuickTime file of two videos of one size, and the first frame of each."""
+    videos = [pan(8, seed=1), pan(8, seed=2)]
+    with av.open(str(tmp_path / "a.mov"), "w") as container:
+        streams = [container.add_stream("libx264", rate=24) for _ in videos]
+        for stream in streams:
+            stream.width, stream.height, stream.pix_fmt, stream.options = 64, 48, "yuv444p", {"crf": "0"}
+        for frames in zip(*videos, strict=True):
+            for stream, pixels in zip(streams, frames, strict=True):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, "rgb24")))
+        for stream in streams:
+            container.mux(stream.encode())
+    return tmp_path / "a.mov", [video[0] for video in videos]
+
+
+def test_which_of_two_streams_is_read_is_said_and_the_other_can_be_named(two_streams):
+    path, firsts = two_streams
+    source, got = decoded(path)
+    assert source.warnings == [
+        (
+            "The clip has 2 video streams: number 1 is taken, 64x48.",
+            "Name another by its number (--layer): 1 (64x48), 2 (64x48).",
+        )
+    ]
+    assert close(got[0].pixels, firsts[0], 2) and not source.info.unlike
+    other = open_source(str(path), layer="2")
+    assert close(next(other.frames(None, None)).pixels, firsts[1], 2) and not other.warnings
+    reader = other.plates(Known({n: (n - 1) / 24 for n in range(1, 9)}, 0.0, lambda *_: True))
+    assert close(reader.plate(1), firsts[1], 2) and "several video streams" in other.info.unlike
+    reader.close()
+    with pytest.raises(JobError, match="a.mov has no video stream '3'"):
+        open_source(str(path), layer="3")
+
+
 def test_frames_in_words():
     assert frame_words([7]) == "frame 7"
     assert frame_words([3, 4, 5, 9, 11, 12]) == "frames 3-5, 9, 11-12"

@@ -505,14 +505,12 @@ def test_a_frame_made_some_rows_at_a_time_is_the_same(world, monkeypatch, case):
 def test_bars_beside_the_picture_are_the_frames_own_plate_s(world):
     """No part of the scene, so no splat and no other plate has anything to say there."""
     output, bars = world.output(4, 7), np.zeros((H, W), bool)
-    bars[:, : W // 6] = bars[:, -W // 6 :] = True
+    bars[:, : W // 2] = True  # also over the board, whose pixels there are no frame's but t*'s
     config = DetailConfig(depth_error=0.01)
     detailer = Detailer(world.run, world.scene, world.plates(), config, bars=lambda frame: bars if frame == 4 else None)
     made, plain = world.make(output, detailer, (3, 2)), world.make(output, None, (3, 2))
     inner = (slice(2, -2), slice(3, -3))
     own = world.plates().linear(4)
-    assert torch.equal(made.linear[inner][bars], own[bars])
+    assert torch.equal(made.linear[inner][bars], own[bars]) and not torch.equal(plain.linear[inner][bars], own[bars])
     for name, value in (("matte", 1.0), ("support", 1.0), ("motion", 0.0), ("plate", 1.0), ("source", 4.0)):
         assert (getattr(made, name)[inner][bars] == value).all(), name
-    kept = torch.from_numpy(~bars)
-    assert torch.equal(made.linear[inner][kept], plain.linear[inner][kept])
