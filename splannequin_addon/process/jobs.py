@@ -167,7 +167,7 @@ def is_alive(job: Job, status: contract.Status | None) -> bool:
     if job.process is not None:
         return job.process.poll() is None
     if status is None or not status.pid:
-        return time.time() - _made(job.folder) < _START_SECONDS
+        return _age(job.folder) < _START_SECONDS
     if status.host and status.host != contract.computer_name():
         return _holds(job) or not _silent(job, status)
     if status.host or (status.process_started and sys.platform == "linux"):
@@ -440,6 +440,15 @@ def _keep(job: Job, status: contract.Status) -> contract.Status:
     if status.host in ("", contract.computer_name()):
         write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
     return status
+
+
+def _age(folder: Path) -> float:
+    """Seconds since a job was made, by the clock of its disk: another computer may have made it."""
+    try:
+        now = contract.disk_time(folder)
+    except OSError:
+        now = time.time()
+    return now - _made(folder)
 
 
 def _made(folder: Path) -> float:
