@@ -35,6 +35,8 @@ from .video import VideoSource
 _HALF = 0.5
 _SHAPE = 0.01
 """How much the shape of a mask may differ from the footage's: sizes are rounded."""
+_MOST_PIXELS = 1 << 25
+"""Of a mask that is larger than the footage: as floats it takes 0.5 GB."""
 _ALL = 0.98
 """Share of the picture from which on a mask leaves nothing to solve by."""
 _BLACK, _MATTE = 0.1, 0.95
@@ -138,8 +140,13 @@ class _Reading:
         return np.asarray(small) >= _HALF
 
     def _check_shape(self, w: int, h: int) -> None:
-        """JobError for a picture of another shape than the footage's."""
+        """JobError for a picture of another shape than the footage's, or of many more pixels."""
         ours = self.frames.get("source_size") or self.size
+        if w * h > max(ours[0] * ours[1], _MOST_PIXELS):
+            raise footage_error(
+                f"{self.name} is {w}x{h}, the footage {ours[0]}x{ours[1]}: it has far more pixels than are of use.",
+                "Render the mask at the footage's size, or a fraction of it.",
+            )
         aspect = float(self.frames.get("reading", {}).get("pixel_aspect", 1.0))
         shape = w / h
         # A mask of anamorphic footage may have the footage's own pixels, or square ones.

@@ -262,6 +262,12 @@ def announced(width, height):
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + body + chunk(b"IEND", b"")
 
 
+def test_a_mask_of_far_more_pixels_than_the_footage_is_refused_before_they_are_read(shot, recorder, tmp_path):
+    (tmp_path / "m.png").write_bytes(announced(8000, 6000))
+    with pytest.raises(JobError, match="8000x6000, the footage 64x48: it has far more pixels"):
+        masks_of(shot, recorder, people=tmp_path / "m.png")
+
+
 @pytest.mark.parametrize("size", [(16000, 12000), (100_000, 75_000)])
 def test_a_picture_that_announces_too_many_pixels_is_refused_before_they_are_read(shot, recorder, tmp_path, size):
     (tmp_path / "m.png").write_bytes(announced(*size))
