@@ -174,7 +174,7 @@ ANSWERS = (
         "frame n shows plate n",
         "splannequin_addon",
         "show_sequence",
-        "user.frame_offset = first - 1",
+        "user.frame_offset = first - shift - 1",
         "user.frame_offset = 0",
         f"{TEST}cameras.py::test_plate_fits_the_sensor_and_follows_the_frame_numbers",
     ),
