@@ -180,10 +180,11 @@ class Detailer:
         if layer is None:
             return frozen, image
         frozen = join(frozen, layer)
-        K, exposed_at = with_overscan(output.K, image, width, height), self.scene.time_of_frame(output.exposed_like)
+        K, beyond = with_overscan(output.K, image, width, height)
+        exposed_at = self.scene.time_of_frame(output.exposed_like)
         rows, columns = image.alpha.shape
         exposure = self.run.model.exposure
-        return frozen, render_frozen(frozen, output.viewmat, K, columns, rows, exposure, exposed_at)
+        return frozen, render_frozen(frozen, output.viewmat, K, columns, rows, exposure, exposed_at, beyond)
 
     def _layer(self, t_star: float, frozen: FrozenGaussians) -> InstantLayer | None:
         key = len(frozen.support), t_star

@@ -25,7 +25,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
-from ..contract import FRAME_LAYERS, channels_of, layers_of, parse_timecode, regular_file
+from ..contract import FRAME_LAYERS, UserError, channels_of, layers_of, parse_timecode, regular_file
 from ..contract.timecode import smpte_bits
 from ..footage.color import LIGHTS, PRIMARIES, InputSpace, in_light, light_matrix, light_of_chromaticities
 from ..shot import atomic_path
@@ -258,17 +258,17 @@ def read_layers(
         raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
     image = oiio.ImageInput.open(regular_file(path))
     if image is None:
-        raise ValueError(f"{path}: cannot be read as EXR: {oiio.geterror()}")
+        raise UserError(f"{path}: cannot be read as EXR: {oiio.geterror()}")
     try:
         spec = image.spec()
         names = channel_names(spec)
         missing = [name for name in channels if name not in names]
         if missing:
-            raise ValueError(f"{path}: {what}, it has no channel {', '.join(missing)}")
+            raise UserError(f"{path}: {what}, it has no channel {', '.join(missing)}")
         facts = metadata(spec, path)
         pixels = image.read_image(oiio.FLOAT)
         if pixels is None:
-            raise ValueError(f"{path}: damaged, {image.geterror()}")
+            raise UserError(f"{path}: damaged, {image.geterror()}")
     finally:
         image.close()
     return spec, names, facts, np.asarray(pixels, dtype=np.float32)
@@ -451,9 +451,9 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> FrameMetadata:
     values = {name: spec.getattribute(f"splannequin:{name}") for name in names}
     missing = [name for name, value in values.items() if value is None]
     if missing:
-        raise ValueError(f"{path}: not a frozen frame, it has no attribute splannequin:{missing[0]}")
+        raise UserError(f"{path}: not a frozen frame, it has no attribute splannequin:{missing[0]}")
     if values["version"] > EXR_VERSION:
-        raise ValueError(f"{path}: written by a newer version ({values['version']}, this one reads {EXR_VERSION})")
+        raise UserError(f"{path}: written by a newer version ({values['version']}, this one reads {EXR_VERSION})")
     return FrameMetadata(
         frame=int(values["frame"]),
         t_star_frame=float(values["tStarFrame"]),

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..torch_types import norm
 from .bands import look_up_near
+from .decisions import first_best
 from .detail_config import DetailConfig
 from .instant_pixels import InstantPixels, instant_pixels
 from .posed import PosedFrame, displacements, parallax
@@ -160,7 +161,7 @@ def fill(
         weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, still))
         places.append(sighting.pixels * larger)
     believed = torch.stack(weights)
-    filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[believed.argmax(dim=0)]
+    filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[first_best(believed)]
     total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
     filling.share = total / (total + config.doubt)
     for n, residual in enumerate(fillers.residuals):
@@ -245,7 +246,8 @@ def _chosen(
             for frame, gain in gains.items()
             if frame not in chosen
         }
-        frame = max(worth, key=lambda candidate: worth[candidate])
+        candidates = sorted(worth, key=lambda candidate: abs(candidate - leading))
+        frame = candidates[int(first_best(torch.tensor([worth[each] for each in candidates], device="cpu")))]
         if worth[frame] < 1e-3 * float(need.sum()):
             break
         chosen.append(frame)

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..contract import UserError
+from ..raster import RasterSettings
 from ..scene import Scene
 from ..supervision import nearest_bin, support_confidence
 from ..torch_types import norm
@@ -116,7 +118,7 @@ def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "ne
             state that no frame has constrained; plain: at t* itself (the published method). ValueError otherwise.
     """
     if query not in ("nearest", "plain"):
-        raise ValueError(f"query is {query!r}: it should be nearest or plain")
+        raise UserError(f"query is {query!r}: it should be nearest or plain")
     gaussians, rows = model.gaussians, model.open_rows()
     times = torch.full((len(rows),), float(time), device=model.device)
     if query == "nearest" and len(rows):
@@ -138,11 +140,13 @@ def render_frozen(
     height: int,
     exposure: Exposure | None = None,
     exposed_at: float = 0.0,
+    overscan: tuple[float, float] = (0.0, 0.0),
 ) -> FrozenImage:
     """One view of a frozen scene, brought to the CPU: viewmat [4, 4] in scene units, K [3, 3] in pixels.
 
     Time stands still for the world, not for the camera: `exposure` at the normalised time `exposed_at` is applied, so
-    that a frozen frame matches the plate it is mixed with. None: colours as the Gaussians have them.
+    that a frozen frame matches the plate it is mixed with. None: colours as the Gaussians have them. `overscan`: pixels
+    around the camera's own frame, which then looks as it does without them.
     """
     mattes = torch.stack([frozen.support, frozen.motion], dim=1)
     out = render(
@@ -155,6 +159,7 @@ def render_frozen(
         colors=mattes,
         with_depth=True,
         with_contributions=False,
+        settings=RasterSettings(overscan=overscan),
     )
     if out.depth_median is None:
         raise RuntimeError("the rasteriser returned no depth")

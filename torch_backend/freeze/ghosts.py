@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from .decisions import above, all_of, any_of, by_levels, none_of
 from .detail_config import DetailConfig
 from .held import BothPlates, Light, left_by_shifts, light_on
 from .instant_view import InstantView, bridged, continued, exposed, together
@@ -30,7 +31,7 @@ class Ghosts:
     """Where plate t* stands in place of ghosts; [h, w] at the size of decisions."""
 
     where: Tensor
-    """bool."""
+    """In 0..1."""
     places: Tensor
     """[h, w, 2] where plate t* shows what is behind them, in its pixels."""
     light: Light
@@ -53,12 +54,12 @@ def ghosts(
         leading: the frame's leading plate.
         view: plate t* as the frame sees it.
         shown: [h, w, 3] what the splats do, display-referred.
-        let_go: bool [h, w], where the leading plate is not believed.
+        let_go: [h, w] in 0..1, where the leading plate is not believed.
         counts: [h, w] in 0..1, how well plate t* shows what stands still there; 0 elsewhere.
     """
     unit = sightings.unit
     gap, rim = config.gap * unit, max(1, round(config.rim * unit))
-    clear = narrowed(closed(counts > 0.5, round(gap)), rim)
+    clear = narrowed(closed(above(counts, 0.5), round(gap)), rim)
     if not bool(clear.any()):
         return None
     told = view.told(view.sighting.pixels)
@@ -69,15 +70,16 @@ def ghosts(
     instant = light.on(told) * counted
     off, most = (sightings.difference(instant, other * counted) for other in (shown, both.own))
     some, more = config.ghost_of
-    spots = opened((off > config.ghost) & (off < some * most), round(config.thin * unit))
-    found = sightings.whole(spots, torch.where(off < more * most, off, 0.0), config.ghost_too) | (posed.held > 0.5)
-    if not bool((found & clear).any()):
+    spots = opened(all_of(above(off, config.ghost), none_of(above(off, some * most))), round(config.thin * unit))
+    beside = all_of(above(off, config.ghost_too), none_of(above(off, more * most)))
+    found = any_of(sightings.whole(spots, beside), above(posed.held, 0.5))
+    if not bool(all_of(found, clear).any()):
         return None
-    places, steady = bridged(view.sighting.pixels, counts > 0.5, gap, config.unsteady * unit)
-    found = closed(found, round(gap)) & clear
-    plain = found & steady & ~_behind_rims(sightings, config, posed, places)
+    places, steady = bridged(view.sighting.pixels, above(counts, 0.5), gap, config.unsteady * unit)
+    found = all_of(closed(found, round(gap)), clear)
+    plain = all_of(found, steady, none_of(_behind_rims(sightings, config, posed, places)))
     # Depth is a ghost's there, too: what that and its rims cut out goes on as beside them.
-    found &= closed(plain, round(gap))
+    found = all_of(found, closed(plain, round(gap)))
     places = together(continued(places, plain, round(gap) + rim), unit)
     known = torch.maximum(sighting.moving, posed.held)
     where = _passed(config, both, light, known, opened(found, round(config.sliver * unit)), unit)
@@ -96,22 +98,30 @@ def _both(
 
 
 def _passed(config: DetailConfig, both: BothPlates, light: Light, known: Tensor, where: Tensor, unit: float) -> Tensor:
-    """[h, w] bool: the regions of `where` in which the leading plate shows something that was elsewhere at t*.
+    """[h, w] in 0..1: the regions of `where` in which the leading plate shows something that was elsewhere at t*.
 
     That is `known`, [h, w] in 0..1, by mattes or by what is held, or plate t* shows its like nowhere near.
     """
     grain = config.held.grain * unit
     lit = light.on(both.instant) * (both.seen > 0.0)[..., None]
     own, instant = blurred(both.own, grain), blurred(lit, grain)
-    soft, out = BothPlates(own, instant, both.seen), torch.zeros_like(where)
-    for region in components(where):
-        if float(known[region].mean()) > 0.5 or left_by_shifts(soft, region, unit, config.held) > config.held.left:
-            out |= region
-    return out
+    soft = BothPlates(own, instant, both.seen)
+
+    def passed(mask: Tensor) -> Tensor:
+        """[h, w] in 0..1: how far each region of a bool mask shows such a thing."""
+        out = torch.zeros_like(where)
+        for region in components(mask):
+            told = above(known[region].mean(), 0.5)
+            if bool(told < 1.0):
+                told = any_of(told, above(left_by_shifts(soft, region, unit, config.held), config.held.left))
+            out[region] = told
+        return out
+
+    return by_levels(where, passed)
 
 
 def _behind_rims(sightings: Sightings, config: DetailConfig, posed: PosedFrame, places: Tensor) -> Tensor:
-    """[h, w] bool: plate t* shows something much nearer beside it: a depth that is a pixel off would fetch that."""
+    """[h, w] in 0..1: plate t* shows something much nearer beside it: a depth that is a pixel off would fetch that."""
     depth = sightings.view(posed.t).surface[..., 0].clamp_max(1e6)
     nearest = narrowed(depth, max(1, round(config.rim * sightings.unit)))
-    return look_up((depth - nearest > config.jump * nearest).float(), places) > 0.5
+    return above(look_up(above(depth - nearest, config.jump * nearest), places), 0.5)

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .regions import components, enclosed, grown, larger, opened
+from .decisions import above, all_of, any_of, by_levels, none_of
+from .regions import components, enclosed, grown, holes, larger, opened, standing_on
 from .reproject import blurred, narrowed, resized, widened
 
-_CLIPPED = 0.98
-"""Display-referred, from which on a plate may hide anything brighter."""
+_CLIPPED = 0.98, 0.01
+"""Display-referred, from which on a plate may hide anything brighter; and how soft that is."""
 _COARSE = 8
 """Light is looked at in so many times fewer pixels a side."""
 _FLAT = 0.003
@@ -111,45 +112,54 @@ class Light:
 def held(
     both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, denied: Tensor, unit: float, config: HeldConfig
 ) -> Tensor:
-    """[h, w] bool: what hangs together with `wrong`, and where the own plate shows another thing than plate t*.
+    """[h, w] in 0..1: what hangs together with `wrong`, and where the own plate shows another thing than plate t*.
 
     Args:
         render: [h, w, 3] the frozen render, display-referred.
         off: [h, w] low-passed difference of it and the own plate.
-        wrong: [h, w] bool, where the own plate is let go of.
-        denied: [h, w] bool, where it is because both others show another thing: a hand whose arm may be left.
+        wrong: [h, w] in 0..1, where the own plate is let go of.
+        denied: [h, w] in 0..1, where it is because both others show another thing: a hand whose arm may be left.
         unit: pixels of decisions to one in which the configuration counts.
     """
     both = in_the_same_light(both, wrong, config.light * unit)
     soft = BothPlates(blurred(both.own, config.grain * unit), blurred(both.instant, config.grain * unit), both.seen)
     apart = blurred(both.own - both.instant, config.low * unit).abs().amax(dim=-1)
-    elsewhere = _elsewhere(soft, apart, unit, config) & (off > config.smeared)
+    elsewhere = all_of(_elsewhere(soft, apart, unit, config), above(off, config.smeared))
     gap, reach = round(config.gap * unit), round(config.reach * unit)
-    hanging = grown(wrong, elsewhere, reach) & ~wrong
-    found = grown(widened(wrong, gap), widened(elsewhere, gap), reach) & elsewhere & ~wrong
+    beside = none_of(wrong)
+    hanging = all_of(grown(wrong, elsewhere, reach), beside)
+    found = all_of(grown(widened(wrong, gap), widened(elsewhere, gap), reach), elsewhere, beside)
     if not bool(found.any()):
         return found
     around = blurred(both.seen, config.low * unit)  # beside what plate t* does not see both are 0, and agree in nothing
-    agree = (both.seen > 0.5) & (apart < config.apart * around)
+    agree = all_of(above(both.seen, 0.5), none_of(above(apart, config.apart * around)))
     rim, least, least_beside = max(1, round(config.rim * unit)), config.least * unit**2, config.least_beside * unit**2
-    borne_out, out = _borne_out(both, render, hanging, unit, config), torch.zeros_like(found)
-    regions = components(enclosed(found & ~borne_out, agree | wrong, rim, config.share, least_beside))
-    for region in sorted(regions, key=lambda each: int(each.sum()), reverse=True):
-        enough = int(region.sum()) >= least or bool((widened(region, 2 * gap) & (out | denied)).any())
-        if enough and left_by_shifts(soft, region, unit, config) > config.left:
-            out |= region
-    return out | borne_out
+    borne_out = _borne_out(both, render, hanging, unit, config)
+
+    def things(mask: Tensor) -> Tensor:
+        """[h, w] in 0..1: how far each region of a bool mask is a thing that plate t* does not show."""
+        out = torch.zeros_like(found)
+        for region in sorted(components(mask), key=lambda each: int(each.sum()), reverse=True):
+            near = all_of(widened(region, 2 * gap), any_of(out, denied)).amax()
+            enough = torch.maximum(above(float(region.sum()), least), near)
+            if bool(enough > 0.0):
+                left = above(left_by_shifts(soft, region, unit, config), config.left)
+                out[region] = torch.minimum(enough, left)
+        return out
+
+    candidates = enclosed(all_of(found, none_of(borne_out)), any_of(agree, wrong), rim, config.share, least_beside)
+    return any_of(by_levels(candidates, things), borne_out)
 
 
 def in_the_same_light(both: BothPlates, wrong: Tensor, sigma: float) -> BothPlates:
     """Plate t* with what it differs by smoothly: exposure, vignetting, a sheen. `sigma`: pixels.
 
-    What is let go of (`wrong`, bool [h, w]) or clipped says nothing of it; and what is clipped in one plate may be as
+    What is let go of (`wrong`, [h, w] in 0..1) or clipped says nothing of it; what is clipped in one plate may be as
     bright as the other says.
     """
     made = both.instant + light_between(both, wrong, sigma) * both.seen[..., None]
-    made = torch.where(both.instant > _CLIPPED, torch.maximum(made, both.own), made)
-    made = torch.where(both.own > _CLIPPED, torch.minimum(made, both.own), made)
+    made = torch.lerp(made, torch.maximum(made, both.own), above(both.instant, *_CLIPPED))
+    made = torch.lerp(made, torch.minimum(made, both.own), above(both.own, *_CLIPPED))
     return BothPlates(both.own, made, both.seen)
 
 
@@ -175,9 +185,9 @@ def light_on(both: BothPlates, wrong: Tensor, sigma: float) -> Light:
 
 
 def _told_of_light(both: BothPlates, wrong: Tensor) -> Tensor:
-    """[h, w, 1] 1 where both plates tell what light there is."""
-    clipped = torch.maximum(both.own, both.instant).amax(dim=-1) > _CLIPPED
-    return ((both.seen > 0.5) & ~wrong & ~clipped).float()[..., None]
+    """[h, w, 1] in 0..1: where both plates tell what light there is."""
+    clipped = above(torch.maximum(both.own, both.instant).amax(dim=-1), *_CLIPPED)
+    return all_of(above(both.seen, 0.5), none_of(wrong, clipped))[..., None]
 
 
 def _smooth(told: Tensor, sigma: float) -> Tensor:
@@ -187,50 +197,61 @@ def _smooth(told: Tensor, sigma: float) -> Tensor:
 
 
 def with_holes(wrong: Tensor, found: Tensor, off: Tensor, unit: float, config: HeldConfig) -> tuple[Tensor, Tensor]:
-    """(what is let go of, what of it was `found`), bool [h, w] both, with its holes that belong to it.
+    """(what is let go of, what of it was `found`), [h, w] in 0..1 both, with its holes that belong to it.
 
     Those are the ones that what was found surrounds, and small ones in which render and own plate differ, by `off`
     [h, w].
     """
-    surrounded = torch.zeros_like(found)
-    if bool(found.any()):
-        surrounded = enclosed(~wrong, found, max(1, round(config.rim * unit)), config.hole)
-    holes, islands = torch.zeros_like(found), torch.zeros_like(found)
-    for region in components(~wrong):
-        if bool(torch.cat([region[0], region[-1], region[:, 0], region[:, -1]]).any()):  # all around is no hole
-            continue
-        if bool((surrounded & region).any()):
-            holes |= region
-        elif float(region.sum()) <= config.island * unit**2 and float(off[region].mean()) > config.unlike:
-            islands |= region
-    return wrong | holes | islands, found | holes
+    rest = none_of(wrong)
+    if not bool(rest.any()):
+        return wrong.float(), found.float()
+    rim, ground = max(1, round(config.rim * unit)), bool(found.any())
+
+    def of_it(mask: Tensor) -> Tensor:
+        """[2, h, w] in 0..1: how far what was found surrounds each hole of a bool mask, and how far each other one is
+        small, and nothing to look through."""
+        inner, out = holes(mask), torch.zeros(2, *mask.shape, device="cpu")
+        if ground:
+            out[0] = all_of(standing_on(mask, found, rim, config.hole), inner)
+        for region in components(inner):
+            small = none_of(above(float(region.sum()), config.island * unit**2))
+            rims = all_of(small, above(off[region].mean(), config.unlike))
+            out[1][region] = all_of(rims, none_of(out[0][region].amax()))
+        return out
+
+    surrounded, islands = by_levels(rest, of_it)
+    return wrong + surrounded + islands, any_of(found, surrounded)
 
 
 def _borne_out(both: BothPlates, render: Tensor, found: Tensor, unit: float, config: HeldConfig) -> Tensor:
-    """[h, w] bool: regions of `found` in which the frozen render shows what plate t* does, and the own plate does not.
+    """[h, w] in 0..1: regions of `found` in which the frozen render shows what plate t* does, and the own plate does
+    not.
 
     A fist before a face of its colour is a shift of that face, too; the splats, which other plates have made, know.
     """
-    out, regions = torch.zeros_like(found), components(larger(found, config.least_borne_out * unit**2))
-    if not regions:
-        return out
     shown = render * both.seen[..., None]
     from_own, from_instant = (
         blurred(shown - plate, config.low * unit).abs().amax(dim=-1) for plate in (both.own, both.instant)
     )
-    for region in regions:
-        own, instant = float(from_own[region].mean()), float(from_instant[region].mean())
-        if own > config.surely and instant < config.borne_out * own:
-            out |= region
-    return out
+
+    def known(mask: Tensor) -> Tensor:
+        """[h, w] in 0..1: how far the render says so of each region of a bool mask."""
+        out = torch.zeros_like(from_own)
+        for region in components(mask):
+            own, instant = from_own[region].mean(), from_instant[region].mean()
+            out[region] = all_of(above(own, config.surely), none_of(above(instant, config.borne_out * own)))
+        return out
+
+    return by_levels(larger(found, config.least_borne_out * unit**2), known)
 
 
 def _elsewhere(soft: BothPlates, apart: Tensor, unit: float, config: HeldConfig) -> Tensor:
-    """[h, w] bool: the plates show different things, and not one edge at places that are `misplaced` pixels apart."""
+    """[h, w] in 0..1: the plates show different things, and not one edge at places that are `misplaced` pixels
+    apart."""
     reach = max(1, round(config.misplaced * unit))
     beyond = torch.maximum(_beyond(soft.own, soft.instant, reach), _beyond(soft.instant, soft.own, reach))
-    spots = opened(beyond > config.apart, max(1, round(config.thin * unit)))
-    return spots | (widened(spots, round(config.near * unit)) & (apart > config.apart))
+    spots = opened(above(beyond, config.apart), max(1, round(config.thin * unit)))
+    return any_of(spots, all_of(widened(spots, round(config.near * unit)), above(apart, config.apart)))
 
 
 def left_by_shifts(soft: BothPlates, region: Tensor, unit: float, config: HeldConfig) -> float:
@@ -240,22 +261,28 @@ def left_by_shifts(soft: BothPlates, region: Tensor, unit: float, config: HeldCo
     """
     (h, w), step = region.shape, max(1, round(config.step * unit))
     reach = step * max(1, round(config.shift * unit / step))
-    y, x = (at[:: step * step] for at in region.nonzero().unbind(1))
+    grid = torch.zeros_like(region)
+    grid[::step, ::step] = True  # the same places, whichever pixels come or go
+    y, x = (region & grid if bool((region & grid).any()) else region).nonzero().unbind(1)
     own = soft.own[y, x]
 
-    def apart(dy: int, dx: int) -> float:
-        """Mean difference where plate t* sees it; infinite if that is less than half of it."""
-        down, right = y + dy, x + dx
-        at = down.clamp(0, h - 1), right.clamp(0, w - 1)
-        sees = (soft.seen[at] > 0.5) & (down == at[0]) & (right == at[1])
-        off = (own - soft.instant[at]).abs().amax(-1)[sees]
-        return float(off.mean()) if 2 * len(off) > len(y) else torch.inf
+    shifts = torch.arange(-reach, reach + 1, step, device="cpu")
+    sees, instant = above(soft.seen, 0.5).flatten(), soft.instant.flatten(0, 1)
 
-    unmoved = apart(0, 0)
+    def apart(dy: int, shifts: Tensor) -> Tensor:
+        """[S] mean difference where plate t* sees it, for shifts down and to the right; infinite if that is less than
+        half of it."""
+        down, right = y + dy, x + shifts[:, None]
+        at = down.clamp(0, h - 1) * w + right.clamp(0, w - 1)
+        counts = sees[at] * ((down >= 0) & (down < h) & (right >= 0) & (right < w))
+        told = counts.sum(1)
+        off = ((own - instant[at]).abs().amax(-1) * counts).sum(1) / told.clamp_min(1e-6)
+        return torch.where(2.0 * told > len(y), off, torch.inf)
+
+    unmoved = float(apart(0, shifts.new_zeros(1)))
     if unmoved == torch.inf:  # not seen: nothing tells it from a wrong depth
         return 0.0
-    shifts = range(-reach, reach + 1, step)
-    return min(apart(dy, dx) for dy in shifts for dx in shifts) / max(unmoved, 1e-6)
+    return min(float(apart(int(dy), shifts).min()) for dy in shifts) / max(unmoved, 1e-6)
 
 
 def _beyond(a: Tensor, b: Tensor, reach: int) -> Tensor:

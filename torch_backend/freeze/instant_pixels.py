@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..torch_types import norm
 from .bands import look_up_near
+from .decisions import above, all_of, any_of, none_of
 from .detail_config import DetailConfig
 from .ghosts import ghosts
 from .held import Light
@@ -86,25 +87,25 @@ def instant_pixels(
     """Plate t* for what it shows from near enough of what moves, and behind what is let go of; None if that is nothing,
     or it is not to be used."""
     h, w = posed.depth.shape
-    let_go = torch.maximum(posed.motion, posed.doubt) > 0.5
+    let_go = above(torch.maximum(posed.motion, posed.doubt), 0.5)
     if posed.t not in usable or not bool(let_go.any()):
         return None
     view = instant_view(sightings, config, posed)
     shown, moves = (resized(of, w, h) for of in (posed.image.color, posed.image.motion))
     # Mattes are wide and depth is worst behind their rims: what the model does not move is none of what moves.
-    movers = let_go & (moves > config.moves)
+    movers = all_of(let_go, above(moves, config.moves))
     taken, places = _of_movers(sightings, config, posed, view, shown, moves, view.shows(movers))
-    behind = ghosts(sightings, config, posed, leading, view, shown, let_go, view.shows(let_go & ~movers))
+    behind = ghosts(sightings, config, posed, leading, view, shown, let_go, view.shows(all_of(let_go, none_of(movers))))
     light, haunted = None, torch.zeros_like(view.depth)
     if behind is not None:
-        near = (widened(behind.where, _feather(config, sightings)) > 0.5) & ~taken
-        places = torch.where(near[..., None], behind.places, places)
-        lit, light = near[..., None], behind.light
-        light = Light(torch.where(lit, light.gain, 1.0), torch.where(lit, light.offset, 0.0))
-        taken, haunted = taken | behind.where, near.float()
+        haunted = all_of(widened(behind.where, _feather(config, sightings)), none_of(taken))
+        lit, light = haunted[..., None], behind.light
+        places = torch.where(lit > 0.5, behind.places, places)
+        light = Light(torch.lerp(torch.ones_like(light.gain), light.gain, lit), light.offset * lit)
+        taken = any_of(taken, behind.where)
     if not bool(taken.any()):
         return None
-    where = blurred(taken.float(), config.feather * sightings.unit) * view.near
+    where = blurred(taken, config.feather * sightings.unit) * view.near
     plate, together = sightings.displayed(posed.t), config.unsteady * sightings.unit
     return InstantPixels(where, haunted, places, plate, view.gain, view.offset, light, together)
 
@@ -123,38 +124,40 @@ def _of_movers(
     moves: Tensor,
     counts: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """([h, w] bool: what moves and is taken from plate t*, [h, w, 2] where that shows it)."""
-    seen = narrowed(closed(counts > 0.5, round(config.gap * sightings.unit)), round(config.rim * sightings.unit))
+    """([h, w] in 0..1: what moves and is taken from plate t*, [h, w, 2] where that shows it)."""
+    shows = above(counts, 0.5)
+    seen = narrowed(closed(shows, round(config.gap * sightings.unit)), round(config.rim * sightings.unit))
     if not bool(seen.any()):
         return seen, view.sighting.pixels
     gap, unsteady = config.gap * sightings.unit, config.unsteady * sightings.unit
-    places, steady = bridged(view.sighting.pixels, counts > 0.5, gap, unsteady)
+    places, steady = bridged(view.sighting.pixels, shows, gap, unsteady)
     surface = _Surface(view.depth, places, moves, view.told(places), shown, counts)
-    taken = _torn(sightings, config, surface) | _plain(sightings, config, posed, surface)
-    taken = taken & seen & steady
+    taken = any_of(_torn(sightings, config, surface), _plain(sightings, config, posed, surface))
+    taken = all_of(taken, seen, steady)
     return taken, continued(places, taken, _feather(config, sightings))
 
 
 def _torn(sightings: Sightings, config: DetailConfig, surface: _Surface) -> Tensor:
-    """[h, w] bool: the splats have fallen apart, whole regions of them."""
+    """[h, w] in 0..1: the splats have fallen apart, whole regions of them."""
     counts = surface.counts[..., None]
     off = sightings.difference(surface.told * counts, surface.shown * counts)
-    return sightings.whole(opened(off > config.torn, round(config.thin * sightings.unit)), off, config.torn_too)
+    spots = opened(above(off, config.torn), round(config.thin * sightings.unit))
+    return sightings.whole(spots, above(off, config.torn_too))
 
 
 def _plain(sightings: Sightings, config: DetailConfig, posed: PosedFrame, surface: _Surface) -> Tensor:
-    """[h, w] bool: what moves is in plain view of plate t*, or looks there as the splats do."""
+    """[h, w] in 0..1: what moves is in plain view of plate t*, or looks there as the splats do."""
     rim, jump = max(1, round(config.rim * sightings.unit)), config.outline
     theirs = smooth_depth(config, sightings.view(posed.t).surface[..., 0], sightings.unit)
-    theirs = widened(_edges(theirs, jump), rim).float()
-    outline = widened(_edges(surface.depth, jump), rim) | (look_up(theirs, surface.places) > 0.5)
+    theirs = above(look_up(widened(_edges(theirs, jump), rim), surface.places), 0.5)
+    outline = any_of(widened(_edges(surface.depth, jump), rim), theirs)
     off = blurred(surface.told - surface.shown, config.fine * sightings.unit).abs().amax(-1)
-    plain = ((surface.counts > 0.5) & ~outline) | (off < config.same)
-    return opened(plain & (surface.moves > config.moves_surely), 1)
+    plain = any_of(all_of(above(surface.counts, 0.5), none_of(outline)), none_of(above(off, config.same)))
+    return opened(all_of(plain, above(surface.moves, config.moves_surely)), 1)
 
 
 def _edges(depth: Tensor, jump: float) -> Tensor:
-    """[h, w] bool: pixels among whose neighbours depth jumps by a share `jump` of itself."""
+    """[h, w] in 0..1: pixels among whose neighbours depth jumps by a share `jump` of itself."""
     depth = depth.clamp_max(1e6)
     least = narrowed(depth, 1)
-    return widened(depth, 1) - least > jump * least
+    return above(widened(depth, 1) - least, jump * least)

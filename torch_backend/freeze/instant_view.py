@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..scene import resize_intrinsics
 from ..torch_types import from_numpy, norm
+from .decisions import above, all_of, any_of, none_of
 from .detail_config import DetailConfig
 from .posed import PosedFrame
 from .reproject import blurred, inside, look_up, pixel_centres, project, unproject
@@ -46,7 +47,7 @@ class InstantView:
         return look_up(self.picture, places) * self.gain + self.offset
 
     def shows(self, where: Tensor) -> Tensor:
-        """[h, w] in 0..1: how well it shows what is `where`, bool [h, w], from near enough; 0 elsewhere."""
+        """[h, w] in 0..1: how well it shows what is `where`, [h, w] in 0..1, from near enough; 0 elsewhere."""
         return self.sighting.visible * where * (self.near > 0.0)
 
 
@@ -65,7 +66,7 @@ def instant_view(sightings: Sightings, config: DetailConfig, posed: PosedFrame) 
 
 
 def bridged(places: Tensor, seen: Tensor, sigma: float, unsteady: float) -> tuple[Tensor, Tensor]:
-    """[h, w, 2] where plate t* shows each pixel, and bool [h, w] where that can be told.
+    """[h, w, 2] where plate t* shows each pixel, and in 0..1 [h, w] where that can be told.
 
     In gaps of what it is `seen` to show depth is rough, and would fetch a pixel from anywhere: there it is as around
     them, if all around is displaced alike, to `unsteady` pixels. Where it is not, two surfaces meet.
@@ -76,18 +77,19 @@ def bridged(places: Tensor, seen: Tensor, sigma: float, unsteady: float) -> tupl
     around = blurred(torch.cat([moved, moved.square().sum(-1, keepdim=True), counts], dim=-1), max(1.0, sigma))
     told = around[..., :3] / around[..., 3:].clamp_min(1e-6)
     mean, square = told[..., :2], told[..., 2]
-    steady = (square - mean.square().sum(-1) < unsteady**2) & (around[..., 3] > _FEW)
-    return torch.where(counts > 0.0, places, here + mean), seen | steady
+    steady = all_of(none_of(above(square - mean.square().sum(-1), unsteady**2)), above(around[..., 3], _FEW))
+    return torch.lerp(here + mean, here + (places - here).clamp(-w, w), counts), any_of(seen, steady)
 
 
 def continued(places: Tensor, taken: Tensor, reach: int) -> Tensor:
-    """[h, w, 2] where plate t* shows each pixel, carried on by `reach` pixels beyond what is `taken`, bool [h, w].
+    """[h, w, 2] where plate t* shows each pixel, carried on by `reach` pixels beyond what is `taken`, [h, w] in 0..1.
 
     A border is soft, and what it fades out into may lie behind: pixels of plate t* from there would be specks. It goes
     on as the nearest pixel that is taken; between two of them in the mean it would be at neither.
     """
     import cv2
 
+    taken = taken > 0.5  # what is less goes on as beside it: no soft pixel is one that others are like
     if not bool(taken.any()):
         return places
     h, w = taken.shape

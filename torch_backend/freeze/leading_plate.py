@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..torch_types import norm
 from .bands import bands
+from .decisions import above, all_of, any_of, first_least, none_of
 from .detail_config import DetailConfig
 from .frozen import SUPPORT_SECONDS, OutputFrame
 from .held import BothPlates, held, with_holes
@@ -21,15 +22,19 @@ from .warp import snap
 
 
 def leading_plate(sightings: Sightings, output: OutputFrame, posed: PosedFrame, usable: list[int]) -> int:
-    """The frame's own plate, else the nearest in pose of those usable: in travel over depth, and in direction."""
+    """The frame's own plate, else the nearest in pose of those usable: in travel over depth, and in direction.
+
+    Of poses that are alike, as a tripod's are, the nearest in number.
+    """
     if posed.own and output.frame in usable:
         return output.frame
+    usable = sorted(usable, key=lambda frame: abs(frame - output.frame))
     at = torch.tensor([sightings.index[frame] for frame in usable], device="cpu")
     solid = posed.depth[posed.depth < 1e9]
     depth = float(solid.median()) if len(solid) else 1.0
     travel = norm(sightings.centres[at] - posed.centre, 1) / max(depth, 1e-6)
     turned = 1.0 - sightings.scene.viewmats[at][:, 2, :3] @ posed.viewmat[2, :3]
-    return usable[int((travel + turned).argmin())]
+    return usable[first_least([float(each) for each in travel + turned], 1e-5)]
 
 
 def leading_matte(
@@ -70,15 +75,15 @@ def leading_matte(
             posed.moved = torch.maximum(posed.motion, 1.0 - free)
             within = within * resized(free, columns, rows)
         return within, st, own
-    wrong = torch.maximum(posed.motion, lead.moving) > 0.5
+    wrong = above(torch.maximum(posed.motion, lead.moving), 0.5)
     found = None if truth is None else _otherwise(sightings, config, posed, leading, lead, truth)
     if own:
         wrong, found = _let_go(sightings, config, posed, leading, usable, wrong, truth, found)
     elif found is not None:
-        wrong = wrong | found
+        wrong = any_of(wrong, found)
     if found is not None:
-        posed.held = widened(found.float(), round(config.margin * sightings.unit))
-    posed.doubt = widened(wrong.float(), round(config.margin * sightings.unit))
+        posed.held = widened(found, round(config.margin * sightings.unit))
+    posed.doubt = widened(wrong, round(config.margin * sightings.unit))
     let_go = blurred(posed.doubt, config.feather * sightings.unit)
     matte = 1.0 - let_go
     if own:
@@ -99,7 +104,9 @@ def _unseen(sightings: Sightings, config: DetailConfig, posed: PosedFrame, movin
     seconds = {frame: float(sightings.scene.seconds[sightings.index[frame]]) for frame in usable}
     if not seconds:
         return moving
-    at, points = moving > 0.5, posed.points[moving > 0.5]
+    moving = moving * above(moving, 0.5)
+    at = moving > 0.0
+    points = posed.points[at]
     known = torch.zeros(len(points), device="cpu")
     t_star = float(sightings.scene.seconds[sightings.index[posed.t]])
     for offset in config.known_at if len(points) else ():
@@ -131,11 +138,11 @@ def _let_go(
     truth: Sighting | None,
     otherwise: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """([h, w] bool: where the frame's own plate shows another instant than t*, [h, w] bool: what of it `held` found, or
-    was `otherwise`).
+    """([h, w] in 0..1: where the frame's own plate shows another instant than t*, [h, w] in 0..1: what of it `held`
+    found, or was `otherwise`).
 
     Args:
-        moving: [h, w] bool, by the mattes.
+        moving: [h, w] in 0..1, by the mattes.
         truth: how plate t* sees what is seen; None if it may not be used.
         otherwise: as `_otherwise`.
     """
@@ -143,47 +150,48 @@ def _let_go(
     render = resized(posed.image.color, w, h)
     off, gained = _off(sightings, posed, frame, render)
     travel = _travel(sightings, posed, frame)
-    wrong = moving | _swayed(sightings, config, travel, gained) | _beside(sightings, config, posed, frame, usable, off)
+    swayed, beside = _swayed(sightings, config, travel, gained), _beside(sightings, config, posed, frame, usable, off)
+    wrong = any_of(moving, swayed, beside)
     both = None if truth is None else _both_plates(sightings, posed, frame, truth)
     apart = off if both is None else sightings.difference(both.own, both.instant)
     contrary, denied = torch.minimum(off, apart), torch.zeros_like(wrong)
     if truth is not None:
-        wrong = wrong | _of_its_time(sightings, config, truth, off, gained, apart)
         denied = _denied(sightings, config, truth, contrary)
-        wrong = wrong | denied
+        wrong = any_of(wrong, _of_its_time(sightings, config, truth, off, gained, apart), denied)
     # What the model lacks at the plate's own time, too, is its fault and no motion.
-    wrong = sightings.whole(wrong, torch.where(gained > config.own_time * off, off, 0.0))
-    wrong = grown(wrong, travel > config.carried, round(config.body * sightings.unit))
+    differs = sightings.contradicted(off)
+    wrong = sightings.whole(wrong, all_of(differs, above(gained, config.own_time * off)))
+    wrong = grown(wrong, above(travel, config.carried), round(config.body * sightings.unit))
     if truth is not None:
-        wrong = sightings.whole(wrong, contrary, config.denied_too)
+        wrong = sightings.whole(wrong, above(contrary, config.denied_too))
         # Of what plate t* does not see the frozen render alone knows: an elbow that was further back.
-        beyond = sightings.whole(wrong, torch.where(truth.visible < 0.5, off, 0.0)) & ~wrong
-        wrong = wrong | larger(beyond, config.beyond * sightings.unit**2)
+        beyond = all_of(sightings.whole(wrong, all_of(differs, none_of(above(truth.visible, 0.5)))), none_of(wrong))
+        wrong = any_of(wrong, larger(beyond, config.beyond * sightings.unit**2))
     found = torch.zeros_like(wrong) if otherwise is None else otherwise
     if both is not None:
-        found = found | held(both, render, off, wrong, denied, sightings.unit, config.held)
-    wrong = closed(wrong | found, round(config.gap * sightings.unit))
+        found = any_of(found, held(both, render, off, wrong, denied, sightings.unit, config.held))
+    wrong = closed(any_of(wrong, found), round(config.gap * sightings.unit))
     return with_holes(wrong, found, off, sightings.unit, config.held)
 
 
 def _otherwise(
     sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, lead: Sighting, truth: Sighting
 ) -> Tensor | None:
-    """[h, w] bool: where plate `frame`, which sees what is seen as `lead` says, shows what was otherwise then, by
+    """[h, w] in 0..1: where plate `frame`, which sees what is seen as `lead` says, shows what was otherwise then, by
     `turned.py`, and what hangs together with it in which it differs from plate t* (`truth`); None if nothing was."""
     turned = posed.frozen.turned
     if turned is None or not bool((then := turned.otherwise(frame)).any()):
         return None
     h, w = then.shape
     scale = torch.tensor([w / sightings.size[0], h / sightings.size[1]], device="cpu")
-    known = (look_up(then.float(), truth.pixels * scale, "nearest") > 0.5) & (truth.visible > 0.5)
+    known = all_of(above(look_up(then.float(), truth.pixels * scale), 0.5), above(truth.visible, 0.5))
     seen = (lead.visible * truth.visible)[..., None]
     own, instant = (
         look_up(sightings.view(plate).picture.float(), sighting.pixels) * seen
         for plate, sighting in ((frame, lead), (posed.t, truth))
     )
-    apart = sightings.difference(own, instant)
-    found = sightings.whole(known & (apart > config.denied_too), apart, config.denied_too)
+    differs = above(sightings.difference(own, instant), config.denied_too)
+    found = sightings.whole(all_of(known, differs), differs)
     return found if bool(found.any()) else None
 
 
@@ -202,7 +210,7 @@ def _off(sightings: Sightings, posed: PosedFrame, frame: int, render: Tensor) ->
 def _beside(
     sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, usable: list[int], off: Tensor
 ) -> Tensor:
-    """[h, w] bool: what the plate before or after sees and calls moving, or both call moving that is before it.
+    """[h, w] in 0..1: what the plate before or after sees and calls moving, or both call moving that is before it.
 
     What only one of three finds would come and go. Where its own plate shows what the frozen render does (`off`)
     nothing would, and the plate stays.
@@ -216,19 +224,19 @@ def _beside(
         found, both = torch.maximum(found, sighting.visible * sighting.moving), both * sighting.moving
     if len(around) == 2:
         found = torch.maximum(found, both)
-    near = widened((off > config.alike).float(), round(config.margin * sightings.unit))
-    return (resized(found, w, h) > 0.5) & (near > 0.5)
+    near = widened(above(off, config.alike), round(config.margin * sightings.unit))
+    return all_of(above(resized(found, w, h), 0.5), near)
 
 
 def _denied(sightings: Sightings, config: DetailConfig, truth: Sighting, off: Tensor) -> Tensor:
-    """[h, w] bool: plate t* (`truth`) bears the frozen render out, its own plate differs from both, by `off`.
+    """[h, w] in 0..1: plate t* (`truth`) bears the frozen render out, its own plate differs from both, by `off`.
 
     A hand that is held still where it was not at t* is still to the flow, and may be unknown to the model at any time.
     What both plates show and the model lacks is no motion; a wrong depth explains edges only.
     """
-    denied = (off > config.denied) & (truth.visible * truth.explained > 0.5)
+    denied = all_of(above(off, config.denied), above(truth.visible * truth.explained, 0.5))
     spots = opened(denied, round(config.thin * sightings.unit))
-    return sightings.whole(spots, off, config.denied_too)
+    return sightings.whole(spots, above(off, config.denied_too))
 
 
 def _both_plates(sightings: Sightings, posed: PosedFrame, frame: int, truth: Sighting) -> BothPlates:
@@ -244,13 +252,13 @@ def _both_plates(sightings: Sightings, posed: PosedFrame, frame: int, truth: Sig
 
 
 def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: Tensor) -> Tensor:
-    """[h, w] bool: the model moves what is seen from t* to its own plate (`travel`), and the plate bears it out.
+    """[h, w] in 0..1: the model moves what is seen from t* to its own plate (`travel`), and the plate bears it out.
 
     That is, the render of t* differs from the plate by more than the render of the plate's own time does (`gained`,
     as `_off`). A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
     that are.
     """
-    out = (gained > config.borne_out) & (travel > config.travel)
+    out = all_of(above(gained, config.borne_out), above(travel, config.travel))
     # Outlines are errors of depth; what moves is a region.
     return opened(out, round(config.thin * sightings.unit))
 
@@ -258,13 +266,13 @@ def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: 
 def _of_its_time(
     sightings: Sightings, config: DetailConfig, truth: Sighting, off: Tensor, gained: Tensor, apart: Tensor
 ) -> Tensor:
-    """[h, w] bool: its own plate shows what the model has at its own time, and plate t* (`truth`) something else.
+    """[h, w] in 0..1: its own plate shows what the model has at its own time, and plate t* (`truth`) something else.
 
     So an arm is found that no matte sees and that stands before a wall: there the frozen render shows what never moves.
     Of what plate t* does not see the model alone would say it, and on truth lost more by that than it gained.
     """
     least, share = config.of_its_time
-    shown = (gained > least) & (torch.minimum(gained, apart) > share * off) & (truth.visible > 0.5)
+    shown = all_of(above(gained, least), above(torch.minimum(gained, apart), share * off), above(truth.visible, 0.5))
     return opened(shown, round(config.thin * sightings.unit))
 
 

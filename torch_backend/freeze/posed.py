@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..raster import RasterSettings
 from ..scene import resize_intrinsics
 from ..torch_types import norm_of_all
 from ..train.model import render
+from .decisions import above
 from .detail_config import DetailConfig
 from .frozen import FrozenGaussians, FrozenImage, OutputFrame
-from .reproject import look_up, pixel_centres, resized, unproject
+from .reproject import pixel_centres, resized, unproject
 from .sightings import Sightings
 
 
@@ -42,6 +44,8 @@ class PosedFrame:
     """[h, w] in 0..1: what moves in the clip, at t*."""
     per_pixel: float
     """Pixels of decisions per pixel of the picture."""
+    beyond: tuple[int, int]
+    """Pixels of the picture that are overscan, on either side, and above and below."""
     doubt: Tensor
     """[h, w] in 0..1: where plates of other times are believed only if they agree with the model."""
     moved: Tensor
@@ -51,6 +55,11 @@ class PosedFrame:
     held: Tensor
     """[h, w] in 0..1: what is held in the frame's own plate where it was not at t*, by these two plates alone: no other
     fills it that contradicts plate t*, whatever its matte says."""
+
+    def settings(self, width: int, height: int) -> RasterSettings:
+        """How its camera renders the picture, overscan included, at another size."""
+        rows, columns = self.image.alpha.shape
+        return RasterSettings(overscan=(self.beyond[0] * width / columns, self.beyond[1] * height / rows))
 
     @property
     def centre(self) -> Tensor:
@@ -75,11 +84,13 @@ def posed_frame(
         width, height: pixels of the frame without overscan.
     """
     rows, columns = image.alpha.shape
-    K = with_overscan(output.K, image, width, height)
+    K, beyond = with_overscan(output.K, image, width, height)
     per_pixel = min(1.0, sightings.config.width / width)
     w, h = max(8, round(columns * per_pixel)), max(8, round(rows * per_pixel))
     small = pixel_centres(w, h)
-    depth = look_up(image.depth, small * torch.tensor([columns / w, rows / h], device="cpu"), "nearest")
+    # The pixel at each centre, in whole numbers: a centre that lies between two pixels is always the second's.
+    across, down = ((2 * torch.arange(n, device="cpu") + 1) * of // (2 * n) for n, of in ((w, columns), (h, rows)))
+    depth = image.depth[down[:, None], across]
     points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
     t = min(sightings.frames, key=lambda frame: abs(frame - output.t_star))
     motion = resized(image.motion, w, h)
@@ -87,7 +98,7 @@ def posed_frame(
     nothing = torch.zeros_like(motion)
     return PosedFrame(
         output.viewmat, K, image, sightings.scene.time_of_frame(output.exposed_like), own, t, frozen, points, depth,
-        motion, w / columns, nothing, motion, nothing, nothing,
+        motion, w / columns, beyond, nothing, motion, nothing, nothing,
     )  # fmt: skip
 
 
@@ -132,8 +143,9 @@ def displacements(
     rows_full, columns = posed.image.alpha.shape
     K = resize_intrinsics(posed.K[None], columns, rows_full, w, h)[0]
     out = render(
-        state, 0, posed.viewmat.to(extra.device), K.to(extra.device), w, h, colors=extra, with_contributions=False
-    )
+        state, 0, posed.viewmat.to(extra.device), K.to(extra.device), w, h, colors=extra, with_contributions=False,
+        settings=posed.settings(w, h),
+    )  # fmt: skip
     shown = (out.colors[0, ..., 3:] / out.alphas[0].clamp_min(1e-3)[..., None]).cpu()
     return [shown[..., 3 * n : 3 * n + 3] for n in range(len(chosen))], shown[..., -1]
 
@@ -150,15 +162,20 @@ def added_share(sightings: Sightings, posed: PosedFrame) -> Tensor | None:
         posed.viewmat.to(added.device),
         resize_intrinsics(posed.K[None], columns, rows, w, h)[0].to(added.device),
     )
-    out = render(frozen.state, 0, viewmat, K, w, h, colors=added.float()[:, None], with_contributions=False)
+    out = render(
+        frozen.state, 0, viewmat, K, w, h, colors=added.float()[:, None], with_contributions=False,
+        settings=posed.settings(w, h),
+    )  # fmt: skip
     share = (out.colors[0, ..., 3] / out.alphas[0].clamp_min(1e-3)).cpu()
-    return torch.where(share > 0.5, 1.0, share)  # a trace of the wall behind it would bring that wall's plates in
+    # A trace of the wall behind it would bring that wall's plates in.
+    return torch.lerp(share, torch.ones_like(share), above(share, 0.5))
 
 
-def with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> Tensor:
-    """[3, 3] the camera of a frame of `width` x `height` in pixels of its render, which may show more around it."""
+def with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> tuple[Tensor, tuple[int, int]]:
+    """([3, 3] the camera of a frame of `width` x `height` in pixels of its render, how many of those are beside it, and
+    above or below it)."""
     rows, columns = image.alpha.shape
+    beyond = (columns - width) // 2, (rows - height) // 2
     wide = K.clone()
-    wide[0, 2] += (columns - width) // 2
-    wide[1, 2] += (rows - height) // 2
-    return wide
+    wide[:2, 2] += torch.tensor(beyond, dtype=K.dtype, device="cpu")
+    return wide, beyond

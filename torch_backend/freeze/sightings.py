@@ -20,6 +20,7 @@ from ..shot import Shot
 from ..solve.motion import MOVING, UNKNOWN, load_motion
 from ..torch_types import from_numpy
 from ..train import LoadedRun
+from .decisions import above
 from .frozen import FrozenGaussians, FrozenImage, render_frozen
 from .ignored import ignore_mattes
 from .regions import grown
@@ -207,10 +208,8 @@ class Sightings:
         view = self.view(frame)
         return sighted(points, view.viewmat, view.K, view.surface, view.ignored, self.config.depth_tolerance)
 
-    def whole(self, moving: Tensor, off: Tensor, least: float = 0.0) -> Tensor:
-        """[h, w] bool: `moving`, bool, and the regions that touch it in which plate and model differ, by `off` [h, w].
-
-        `least` is the difference that counts; 0: `contradicted`.
+    def whole(self, moving: Tensor, differs: Tensor) -> Tensor:
+        """[h, w] in 0..1: `moving`, and the regions that touch it in which plate and model differ (`differs`).
 
         Flow ends some pixels before what moves does, or says nothing within it. What was missed would stand where it
         is as specks and outlines.
@@ -218,7 +217,11 @@ class Sightings:
         if not bool(moving.any()):
             return moving
         reach, thin = (round(length * self.unit) for length in (self.config.reach, self.config.thin))
-        return grown(moving, off > (least or self.config.contradicted), reach, thin)
+        return grown(moving, differs, reach, thin)
+
+    def contradicted(self, off: Tensor) -> Tensor:
+        """[h, w] in 0..1: where plate and model differ enough, by `off` [h, w], to be of what moves beside it."""
+        return above(off, self.config.contradicted)
 
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height

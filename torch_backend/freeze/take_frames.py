@@ -86,7 +86,7 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
     exposed_at = scene.time_of_frame(output.exposed_like)
     K = output.K.clone()
     K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
-    image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at)
+    image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
     return image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
 
 

@@ -30,6 +30,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from ..contract import UserError
 from ..footage.color import LIGHTS, in_light, light_matrix
 from ..torch_types import from_numpy
 from .exr import check_finite, linear_spec, read_layers, read_light, set_margin, write_exr
@@ -207,9 +208,9 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> WarpMetadata:
     values = {name: spec.getattribute(f"splannequin:{name}") for name in names}
     missing = [name for name, value in values.items() if value is None]
     if missing:
-        raise ValueError(f"{path}: no warp, it has no attribute splannequin:{missing[0]}")
+        raise UserError(f"{path}: no warp, it has no attribute splannequin:{missing[0]}")
     if values["version"] > WARP_VERSION:
-        raise ValueError(f"{path}: written by a newer version ({values['version']}, this one reads {WARP_VERSION})")
+        raise UserError(f"{path}: written by a newer version ({values['version']}, this one reads {WARP_VERSION})")
     return WarpMetadata(
         frame=int(values["frame"]),
         leading=int(values["leading"]),

@@ -106,7 +106,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.view[:] = floats(scene.viewmats[camera, :3].reshape(-1))
     K = scene.Ks[camera]
     block.fx, block.fy, block.cx, block.cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    limits = camera_limits(K, scene.width, scene.height, FRUSTUM_MARGIN)
+    limits = camera_limits(scene, camera, FRUSTUM_MARGIN)
     block.x_low, block.x_high, block.y_low, block.y_high = limits
     block.near = scene.settings.near
     slots = block.chunks * source.CHUNK

@@ -218,6 +218,7 @@ def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
         scene.width,
         scene.height,
     )
+    args.overscan_x, args.overscan_y = scene.settings.overscan
     args.tiles_x, args.tiles_y = -(-scene.width // TILE), -(-scene.height // TILE)
     args.n_colors = 0 if scene.colors is None else scene.colors.shape[1]
     args.n_sh, args.bands = (0, 0) if scene.sh is None else (3, (scene.sh_degree + 1) ** 2)

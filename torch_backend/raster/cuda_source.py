@@ -95,7 +95,7 @@ SIZES = (
 FIELDS = {
     **{name: "uint64" for names in POINTERS.values() for name in names},
     **dict.fromkeys(SIZES, "int32"),
-    "near": "float32",
+    **dict.fromkeys(("near", "overscan_x", "overscan_y"), "float32"),
 }
 """Fields of the parameter structure and their Warp types; pointers travel as integers."""
 _POINTER = {name: kind for kind, names in POINTERS.items() for name in names}

@@ -154,7 +154,7 @@ def _footprint(scene: Scene, camera: int, index: Tensor) -> _Footprint:
     x, y, z = (scene.means[index] @ R.T + t).unbind(-1)
     mean2d = torch.stack((fx * x / z + cx, fy * y / z + cy), -1)
 
-    x_low, x_high, y_low, y_high = camera_limits(scene.Ks[camera], scene.width, scene.height, k.FRUSTUM_MARGIN)
+    x_low, x_high, y_low, y_high = camera_limits(scene, camera, k.FRUSTUM_MARGIN)
     u, v, zero = (x / z).clamp(x_low, x_high), (y / z).clamp(y_low, y_high), torch.zeros_like(z)
     J = torch.stack((fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z), -1).reshape(-1, 2, 3)
     scales = scene.log_scales[index].clamp_min(k.LOG_SCALE_MIN).exp()

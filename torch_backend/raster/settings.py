@@ -18,6 +18,9 @@ class RasterSettings:
     """Scale opacities by sqrt(det / det_blurred), so that the low-pass does not thicken thin Gaussians."""
     absgrad: bool = True
     """Also gather the sum over pixels of |d loss / d mean2d| in the backward pass (RasterOutput.means2d_absgrad)."""
+    overscan: tuple[float, float] = (0.0, 0.0)
+    """Pixels left and right, and above and below, that the picture has around the camera's own frame. The Jacobian is
+    clamped by that frame's frustum, so overscan does not change the pixels within it."""
     threads: int = field(default_factory=default_threads)
     """Worker threads of the CPU body. The result is bitwise the same for any number."""
 
@@ -89,8 +92,13 @@ class Scene:
         return (0 if self.sh is None else 3) + (0 if self.colors is None else self.colors.shape[1])
 
 
-def camera_limits(K: Tensor, width: int, height: int, margin: float) -> tuple[float, float, float, float]:
-    """Bounds of x/z and y/z for the Jacobian: (x_low, x_high, y_low, y_high) of the widened frustum of K [3, 3]."""
+def camera_limits(scene: Scene, camera: int, margin: float) -> tuple[float, float, float, float]:
+    """Bounds of x/z and y/z for the Jacobian: (x_low, x_high, y_low, y_high) of a camera's widened frustum.
+
+    `margin` is a share of half the frame without overscan. Overscan beyond it widens the frustum to the picture's edge.
+    """
+    K, (across, down), width, height = scene.Ks[camera], scene.settings.overscan, scene.width, scene.height
     fx, fy, cx, cy = (float(v) for v in torch.stack((K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
-    mx, my = margin * 0.5 * width / fx, margin * 0.5 * height / fy
+    mx = max(0.0, margin * 0.5 * (width - 2 * across) - across) / fx
+    my = max(0.0, margin * 0.5 * (height - 2 * down) - down) / fy
     return -cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my

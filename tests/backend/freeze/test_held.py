@@ -35,7 +35,17 @@ def found(both, wrong, off=0.03, config=CONFIG, render=None, denied=None):
     """With splats that hold a smear, half of either plate, unless a `render` is given."""
     render = torch.lerp(both.own, both.instant, 0.5) if render is None else render
     denied = torch.zeros_like(wrong) if denied is None else denied
-    return held(both, render, torch.full((H, W), off), wrong, denied, 1.0, config)
+    return surely(held(both, render, torch.full((H, W), off), wrong, denied, 1.0, config))
+
+
+def surely(mask):
+    """bool [H, W] of a mask in which nothing is half decided."""
+    assert ((mask == 0.0) | (mask == 1.0)).float().mean() > 0.99
+    return mask > 0.5
+
+
+def filled(wrong, of_it, off, unit=1.0):
+    return tuple(surely(mask) for mask in with_holes(wrong, of_it, off, unit, CONFIG))
 
 
 def with_hand(picture, hand, by=0.1):
@@ -145,10 +155,10 @@ def test_the_middle_of_a_hand_that_has_the_walls_colour_goes_with_its_rim():
     wrong[10:50, 10:50] = True
     wrong &= ~window
     agree = torch.zeros(H, W)
-    let_go, of_it = with_holes(wrong | rim, rim, agree, 1.0, CONFIG)
+    let_go, of_it = filled(wrong | rim, rim, agree)
     assert torch.equal(of_it, hand) and torch.equal(let_go, wrong | hand)
     nothing = torch.zeros_like(rim)
-    let_go, of_it = with_holes(wrong, nothing, agree, 1.0, CONFIG)
+    let_go, of_it = filled(wrong, nothing, agree)
     assert torch.equal(let_go, wrong) and not of_it.any()
 
 
@@ -159,9 +169,9 @@ def test_what_is_left_between_an_arm_and_a_head_goes_if_it_is_their_rims():
     first, second = torch.zeros_like(wrong), torch.zeros_like(wrong)
     first[20:50, 20:50] = second[60:90, 20:50] = True
     off[20:50, 20:26], off[120:, :] = 0.3, 0.3
-    let_go, of_it = with_holes(wrong & ~first & ~second, torch.zeros_like(wrong), off, 1.0, CONFIG)
+    let_go, of_it = filled(wrong & ~first & ~second, torch.zeros_like(wrong), off)
     assert torch.equal(let_go, wrong & ~second) and not of_it.any()
-    wide = with_holes(wrong & ~first & ~second, torch.zeros_like(wrong), off, 0.5, CONFIG)[0]
+    wide = filled(wrong & ~first & ~second, torch.zeros_like(wrong), off, 0.5)[0]
     assert torch.equal(wide, wrong & ~first & ~second), "at half the size a window of 900 pixels is one to look through"
 
 

@@ -215,13 +215,13 @@ def blobs():
 def test_a_region_grows_along_what_hangs_together_and_no_farther_than_its_reach():
     mask, seeds = blobs(), np.zeros((120, 160), bool)
     seeds[26:34, 26:34] = True
-    found = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 200).numpy()
+    found = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 200).numpy() > 0.5
     first = ndimage.label(mask)[0] == ndimage.label(mask)[0][30, 30]
     assert (found & ~first).sum() == 0 and (first & ~found).mean() < 0.002
-    near = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 40).numpy()
+    near = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 40).numpy() > 0.5
     rows = np.nonzero(near[:, 40])[0]
     assert abs(rows.max() - (33 + 40)) <= 2 and not near[:, 84:].any()
-    thick = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 200, 4).numpy()
+    thick = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 200, 4).numpy() > 0.5
     assert thick[20:60, 20:60].mean() > 0.99 and not thick[64:].any(), "along the line, which is thin, it goes nowhere"
 
 

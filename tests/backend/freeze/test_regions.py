@@ -53,8 +53,8 @@ def test_what_is_enclosed_stands_on_its_ground_all_around_and_is_no_speck():
     mask[20:40, 10:30] = mask[20:40, 60:80] = mask[50:53, 100:103] = True
     ground = torch.ones_like(mask)
     ground[:, 70:90] = False  # half of what surrounds the second one
-    assert (enclosed(mask, ground, 3, 0.9, 20.0) == (mask & (torch.arange(120) < 40))).all()
-    assert (enclosed(mask, ground, 3, 0.4, 20.0) == (mask & (torch.arange(120) < 90))).all()
+    assert torch.equal(enclosed(mask, ground, 3, 0.9, 20.0) == 1.0, mask & (torch.arange(120) < 40))
+    assert torch.equal(enclosed(mask, ground, 3, 0.4, 20.0) == 1.0, mask & (torch.arange(120) < 90))
     assert (enclosed(mask, ground, 3, 0.4) == mask).all()
     assert not enclosed(torch.zeros_like(mask), ground, 3, 0.0).any()
 
@@ -63,6 +63,6 @@ def test_regions_of_too_few_pixels_are_dropped_whole():
     mask = torch.zeros(20, 30, dtype=torch.bool)
     mask[2:6, 2:7] = mask[10:13, 10:16] = True
     mask[6, 7] = True  # hangs on the first by its corner
-    kept = larger(mask, 19.0)
-    assert torch.equal(kept, mask & (torch.arange(20)[:, None] < 8))
-    assert torch.equal(larger(mask, 18.0), mask) and not larger(mask, 22.0).any()
+    assert torch.equal(larger(mask, 10.0), mask.float()) and not larger(mask, 30.0).any()
+    mask[14:19, 2:12] = True
+    assert torch.equal(larger(mask, 30.0), (mask & (torch.arange(20)[:, None] >= 14)).float())

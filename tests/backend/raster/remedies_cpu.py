@@ -260,7 +260,7 @@ REMEDIES = [
     Remedy(
         "the clamp is about the principal point, wherever it is",
         "_set_up",
-        "limits = camera_limits(K, scene.width, scene.height, FRUSTUM_MARGIN)",
+        "limits = camera_limits(scene, camera, FRUSTUM_MARGIN)",
         "u, v = 0.65 * scene.width / block.fx, 0.65 * scene.height / block.fy; limits = -u, u, -v, v",
         POINTS,
         "cpu",
