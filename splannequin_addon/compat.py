@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from mathutils import Color
 
-from ..torch_backend.contract import PROBE
+from ..torch_backend.contract import PROBE, UserError
 
 if TYPE_CHECKING:
     from bpy.stub_internal.rna_enums import PropertyFlagItems
@@ -408,7 +408,7 @@ def colour_space(encoding: str | tuple[float, ...]) -> str:
         if not name:
             names = {"linear": "scene-linear Rec.709", "srgb": "sRGB"}
             told = names[encoding] if isinstance(encoding, str) else "these pictures"
-            raise ValueError(
+            raise UserError(
                 f"The colour configuration that Blender was started with (OCIO) has no colour space for {told}. "
                 "Start Blender without it, or add one to it."
             )

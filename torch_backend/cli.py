@@ -133,7 +133,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
             print_reading(results[kind], console)
         info = shot.info()
         if args.t_star is not None and not info.first <= args.t_star <= info.last:  # said before hours of training
-            raise ValueError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
+            raise contract.UserError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
     summary = contract.summarise(str(shot.root), shot.info().source, results, stages, time.perf_counter() - started)
     write_json(output / contract.SUMMARY_FILE, summary)
     print_summary(summary, console)
@@ -392,14 +392,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except contract.JobError as error:
         print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
         return error.exit_code
-    except OSError as error:
-        refusal = path_error(error)
-        text = f"{refusal.message} {refusal.hint}" if refusal else str(error)
-        print(f"Error: {text}", file=sys.stderr)
-        return refusal.exit_code if refusal else ExitCode.USAGE
-    except ValueError as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return ExitCode.USAGE
+    except Exception as error:
+        refusal = path_error(error) if isinstance(error, OSError) else None
+        refusal = refusal or contract.broke(f"`{args.command}`", error)
+        print(f"Error: {refusal.message} {refusal.hint}".rstrip(), file=sys.stderr)
+        return refusal.exit_code
 
 
 def _dispatch(args: argparse.Namespace, console: Console) -> int:

@@ -8,6 +8,7 @@ So both move to a folder that everybody may write and whose name is ASCII. Stand
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -17,9 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .contract import ExitCode, JobError
-from .shot import locked, replace_file
+from .shot import is_disk_full, locked, replace_file
 
 _FOLDER = "Splannequin"
+_KERNEL_BYTES = 1 << 20
+"""Room that one compiled kernel may need."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,55 @@ def compiler_folders(
         _copied(package / "native", root / f"warp-{version}") if moved[1] else None,
         precompiled,
     )
+
+
+def need_room(kernels: Path) -> None:
+    """JobError if there is no room for another compiled kernel; OSError if the folder cannot be written."""
+    kernels.mkdir(parents=True, exist_ok=True)
+    if _room(kernels) < _KERNEL_BYTES:
+        raise _no_room(kernels)
+
+
+def kernel_refusal(kernels: Path, error: Exception) -> JobError | None:
+    """The sentence for a kernel that could not be compiled for the disk's sake; None if the disk was not the reason.
+
+    Not every compiler says why it could not write: a disk with no room left is looked at.
+    """
+    if isinstance(error, JobError):
+        return None
+    full = isinstance(error, OSError) and is_disk_full(error)
+    with contextlib.suppress(OSError):  # a folder that cannot be asked
+        full = full or _room(kernels) < _KERNEL_BYTES
+    if full:
+        return _no_room(kernels)
+    if isinstance(error, OSError) and (error.filename or error.filename2):
+        return JobError(
+            f"Kernels cannot be compiled in {kernels}: {error.strerror or error}.",
+            "Make the folder writable, or name another one in the environment variable WARP_CACHE_PATH.",
+            ExitCode.ENVIRONMENT,
+        )
+    return None
+
+
+def _no_room(kernels: Path) -> JobError:
+    return JobError(
+        f"No space left in {kernels}, where kernels are compiled.",
+        "Free some space there, or name a folder on another disk in the environment variable WARP_CACHE_PATH.",
+        ExitCode.DISK,
+    )
+
+
+def _room(folder: Path) -> int:
+    """Bytes that this user may still write."""
+    with tempfile.TemporaryFile(dir=folder) as probe:  # a quota is no matter of the disk's
+        try:
+            probe.write(bytes(_KERNEL_BYTES))
+            probe.flush()
+        except OSError as error:
+            if is_disk_full(error):
+                return 0
+            raise
+    return shutil.disk_usage(folder).free
 
 
 def _writable(environ: Mapping[str, str]) -> Path | None:

@@ -121,19 +121,14 @@ def run_task(args: argparse.Namespace) -> int:
         except JobError as error:
             reporter.fail(f"{error.message} {error.hint}".rstrip())
             return error.exit_code
-        except (ValueError, KeyError) as error:
-            traceback.print_exc()
-            reporter.fail(str(error))
-            return ExitCode.USAGE
-        except OSError as error:
-            traceback.print_exc()
-            known = disk_error(args.shot) if is_disk_full(error) else path_error(error)
-            reporter.fail(str(error) if known is None else f"{known.message} {known.hint}".rstrip())
-            return ExitCode.DISK if known is None else known.exit_code
         except Exception as error:
             traceback.print_exc()
-            reporter.fail(f"It broke: {type(error).__name__}: {error}. This is a bug; the log has its details.")
-            return ExitCode.INTERNAL
+            known = None
+            if isinstance(error, OSError):
+                known = disk_error(args.shot) if is_disk_full(error) else path_error(error)
+            known = known or contract.unexpected("The task", error, "the log")
+            reporter.fail(f"{known.message} {known.hint}".rstrip())
+            return known.exit_code
 
 
 def _amount(args: argparse.Namespace, request: dict[str, Any]) -> float:

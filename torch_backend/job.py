@@ -21,7 +21,7 @@ from types import FrameType
 from typing import Any
 
 from . import contract
-from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status, Writer
+from .contract import Cancelled, Event, ExitCode, JobError, JobRequest, Reporter, Status, Writer, unexpected
 from .contract import new_job as new_job
 from .shot import Shot, disk_error, is_disk_full, path_error, working_on, write_json
 from .writer import only_writer, patient_writer
@@ -90,7 +90,7 @@ class JobReporter:
 
     def check_cancelled(self) -> None:
         if self._missed >= _MISSED_BEATS:
-            raise FileNotFoundError(f"{self.folder} is gone")
+            raise contract.MissingError(f"{self.folder} is gone")
         if self._taken_by is not None:  # nothing more is written: it is another's now
             message = f"The shot was taken over by {self._taken_by.host}: this computer had fallen silent."
             raise JobError(message, "It goes on there.", ExitCode.USAGE)
@@ -239,13 +239,11 @@ def _run(
     except JobError as error:
         state, code, message, hint = "failed", error.exit_code, error.message, error.hint
         _log(reporter.folder, "\n".join([message, hint, *getattr(error, "__notes__", ())]) + "\n")
-    except ValueError as error:
-        state, code, message = "failed", int(ExitCode.USAGE), str(error)
-        _log(reporter.folder, traceback.format_exc())
-    except Exception as error:
+    except Exception as error:  # nobody foresaw it: whatever it is, it is no mistake of the user's
         _log(reporter.folder, traceback.format_exc())
         known, text = _about_a_path(error, request.shot) or _about_a_module(error), str(error).lower()
-        state, code = "failed", known.exit_code if known else int(ExitCode.INTERNAL)
+        known = known or unexpected(f"The {request.kind} step", error, reporter.folder / contract.LOG_FILE)
+        state, code = "failed", known.exit_code
         if type(error).__name__ == "OutOfMemoryError":  # torch's own, of a card
             message = "The graphics card is out of memory."
             hint = (
@@ -255,8 +253,7 @@ def _run(
         elif isinstance(error, MemoryError) or "out of memory" in text or "defaultcpuallocator" in text:
             message, hint = "Out of memory.", "Choose a smaller width or fewer Gaussians, or close other programs."
         else:
-            message = known.message if known else f"The {request.kind} step broke: {type(error).__name__}: {error}"
-            hint = known.hint if known else f"This is a bug; its details are in {reporter.folder / contract.LOG_FILE}."
+            message, hint = known.message, known.hint
     reporter.finish(state, code, message, hint, result)
     if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
         print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log goes with the shot's folder, the status does not
@@ -292,8 +289,6 @@ def _about_a_path(error: Exception, shot: str) -> JobError | None:
     """The sentence for a full disk, or for a file that the system refuses; None for any other error."""
     if not isinstance(error, OSError):
         return None
-    if isinstance(error, FileNotFoundError) and not error.filename:
-        return JobError(str(error), "", ExitCode.USAGE)  # said in words by whoever looked for it
     return disk_error(shot) if is_disk_full(error) else path_error(error)
 
 

@@ -28,7 +28,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .contract import NO_DEPTH, JobError, LiveView, from_dict, own_input, read_message, write_message
+from . import contract
+from .contract import NO_DEPTH, JobError, LiveView, from_dict, own_input, path_error, read_message, write_message
 from .footage.plates import Plates
 from .freeze.detail import DetailConfig, DetailedFrame, Detailer
 from .freeze.developed_instants import developed_path, load_developed
@@ -303,8 +304,10 @@ def serve(session: LiveSession, requests: BinaryIO, answers: BinaryIO) -> None:
             except Superseded:
                 waiting.put_back(request)
                 continue
-            except (JobError, RuntimeError, ValueError) as error:
-                header, body = {"kind": "error", "seq": request.seq, "message": str(error), "hint": ""}, b""
+            except Exception as error:
+                known = error if isinstance(error, JobError) else contract.broke("The live view", error)
+                words = {"message": known.message, "hint": known.hint}
+                header, body = {"kind": "error", "seq": request.seq, **words}, b""
             write_message(answers, header, body)
     except BrokenPipeError:
         pass  # Blender is gone
@@ -318,9 +321,10 @@ def run_live(shot: str | Path, run: str, device: str = "auto") -> int:
     requests = os.fdopen(own_input(), "rb")
     try:
         session = LiveSession(Shot.open(shot), run, device)
-    except (JobError, ValueError, OSError) as error:
-        message, hint = getattr(error, "message", str(error)), getattr(error, "hint", "")
-        write_message(answers, {"kind": "error", "message": message, "hint": hint})
-        return int(getattr(error, "exit_code", 1))
+    except Exception as error:
+        known = path_error(error) if isinstance(error, OSError) and not isinstance(error, JobError) else None
+        known = known or (error if isinstance(error, JobError) else contract.broke("The live session", error))
+        write_message(answers, {"kind": "error", "message": known.message, "hint": known.hint})
+        return known.exit_code
     serve(session, requests, answers)
     return 0

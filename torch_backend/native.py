@@ -27,7 +27,7 @@ import torch
 import warp as wp
 from warp._src import build as warp_build
 
-from .compiler_folders import compiler_folders
+from .compiler_folders import compiler_folders, kernel_refusal, need_room
 from .kernel_text import kernel_text
 
 Launch = Callable[[int, int, int], None]
@@ -41,6 +41,10 @@ _recorded = threading.local()
 PRELUDE = kernel_text(Path(__file__).with_name("kernels") / "prelude.cpp")
 POINTER, INTEGER = (ctypes.c_uint64, "float*"), (ctypes.c_int64, "long long")
 """Kinds of a block's fields: (ctypes, C)."""
+
+
+PROCESSOR_VARIABLE = "SPLANNEQUIN_MARCH"
+"""Environment variable: compile kernels for this processor (Clang's -march, such as x86-64-v3) instead of this one."""
 
 
 def default_threads() -> int:
@@ -103,11 +107,31 @@ def initialised_warp() -> Any:
     if folders.kernels is not None:
         wp.config.kernel_cache_dir = str(folders.kernels)
     wp.config.use_precompiled_headers = wp.config.use_precompiled_headers and folders.precompiled
+    processor = os.environ.get(PROCESSOR_VARIABLE)
+    if processor:  # its kernels lie beside the others: Warp's cache tells them apart by the flags
+        wp.config.cpu_compiler_flags = f"-march={processor}"
     with _without_notice():
         wp.init()
     if folders.headers is not None:
         cast(Any, warp_build).warp_home = str(folders.headers)  # Warp 1.19 has no setting for it
     return wp
+
+
+@contextlib.contextmanager
+def compiling(folder: Path | None = None) -> Generator[None]:
+    """JobError, in a sentence, if a kernel cannot be compiled meanwhile because there is no room for it.
+
+    `folder`: where it lies once it is compiled. LLVM ends the process if it cannot write, so room is looked for first.
+    """
+    try:
+        if folder is not None and not any(folder.glob("*.o")):
+            need_room(folder.parent)
+        yield
+    except Exception as error:
+        refusal = kernel_refusal(Path(str(wp.config.kernel_cache_dir)), error)
+        if refusal is None:
+            raise
+        raise refusal from error
 
 
 def func_native(text: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -129,7 +153,10 @@ def build(name: str, text: str) -> Launch:
 
     module = f"{__name__}.{name}"
     kernel = wp.Kernel(entry, key=name, module=wp.get_module(module), options={"enable_backward": False})
-    wp.load_module(module, device="cpu")
+    identifier = cast(Any, wp.get_module(module)).get_module_identifier(1)  # of blocks of one thread, as on a processor
+    folder = Path(str(wp.config.kernel_cache_dir)) / identifier
+    with compiling(folder):
+        wp.load_module(module, device="cpu")
 
     def launch(block: int, stage: int, worker: int) -> None:
         _relaunch(kernel, 1, [block, stage, worker], _CPU, None, None)
@@ -328,10 +355,11 @@ def _relaunch(kernel: Any, dim: int, inputs: list[Any], device: torch.device, bl
     command = known.get(key)
     if command is None:
         blank = [arg.type() for arg in kernel.adj.args]
-        command = known[key] = initialised_warp().launch(
-            kernel, dim=dim, inputs=blank, block_dim=block, record_cmd=True, record_tape=False, stream=stream,
-            device=None if stream else "cpu",
-        )  # fmt: skip
+        with compiling():
+            command = known[key] = initialised_warp().launch(
+                kernel, dim=dim, inputs=blank, block_dim=block, record_cmd=True, record_tape=False, stream=stream,
+                device=None if stream else "cpu",
+            )  # fmt: skip
     if command.bounds.size != dim:
         command.set_dim(dim)
     for index, value in enumerate(inputs):

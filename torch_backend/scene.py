@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .contract import ExitCode, JobError, Reporter, frame_file
+from .contract import ExitCode, JobError, Reporter, UserError, frame_file
 from .footage.display import PLAIN, Display, display_of
 from .footage.images import read_frame
 from .footage.importing import load_frames
@@ -178,7 +178,7 @@ def split_frames(solved: list[int], holdout: int, phase: int = 0) -> tuple[list[
     if holdout <= 0:
         return list(solved), []
     if holdout < 2:
-        raise ValueError(f"holdout is {holdout}: it should be 0 or at least 2")
+        raise UserError(f"holdout is {holdout}: it should be 0 or at least 2")
     test = [i for n, i in enumerate(solved) if n % holdout == phase % holdout and 0 < n < len(solved) - 1]
     held = set(test)
     return [i for i in solved if i not in held], test

@@ -13,6 +13,7 @@ from typing import Any
 from .contract import (
     SHOT_SUFFIX,
     UNPUBLISHED_FILE,
+    MissingError,
     ShotFolder,
     atomic_path,
     check_version,
@@ -89,7 +90,7 @@ class Shot(ShotFolder):
         """An existing shot. FileNotFoundError if there is none, ValueError if it is from a newer version."""
         shot = cls(root)
         if not shot.info_path.is_file():
-            raise FileNotFoundError(f"{shot.root} is not a shot folder: it has no shot.json")
+            raise MissingError(f"{shot.root} is not a shot folder: it has no shot.json", "Check the name.")
         shot.info()
         settle_solve(shot)
         return shot

@@ -144,7 +144,7 @@ def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bp
     finally:
         bpy.data.node_groups.remove(group)
     if missing:
-        raise ValueError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+        raise contract.UserError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
     return image
 
 

@@ -111,12 +111,11 @@ def main(argv: Sequence[str]) -> int:
     except contract.JobError as error:
         print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
         return error.exit_code
-    except (ValueError, FileNotFoundError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return ExitCode.USAGE
-    except OSError as error:
-        print(f"Error: {error.strerror or error}: {error.filename or ''}", file=sys.stderr)
-        return ExitCode.DISK
+    except Exception as error:
+        known = contract.path_error(error) if isinstance(error, OSError) else None
+        known = known or contract.broke(f"`{argv[0] if argv else 'splannequin'}`", error)
+        print(f"Error: {known.message} {known.hint}".rstrip(), file=sys.stderr)
+        return known.exit_code
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
@@ -331,7 +330,7 @@ def _scene(blend: str) -> tuple[Any, bool]:
     if blend:
         path = Path(blend).absolute()
         if not path.is_file():
-            raise FileNotFoundError(f"{path} does not exist: --blend names a .blend file")
+            raise contract.MissingError(f"{path} does not exist: --blend names a .blend file")
         try:
             bpy.ops.wm.open_mainfile(filepath=str(path))
         except RuntimeError as error:  # no .blend, a damaged one, or one of a newer Blender

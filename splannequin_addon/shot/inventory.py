@@ -236,7 +236,7 @@ class _Take:
     def __post_init__(self) -> None:
         numbers = [*self.margin, *self.t_star_per_frame.values()]
         if len(self.margin) != 2 or any(type(v) not in (int, float) or not abs(v) < _LARGEST for v in numbers):
-            raise ValueError("margin should be two numbers, and t_star_per_frame a number per frame")
+            raise contract.UserError("margin should be two numbers, and t_star_per_frame a number per frame")
 
 
 def _typed(kind: type, path: Path) -> dict[str, Any]:
@@ -253,7 +253,7 @@ def _read_typed(path: Path, kind: type, longest: int = contract.SHORT_JSON) -> d
     try:
         return _believed(kind, data)
     except ValueError as error:
-        raise ValueError(f"{path} is damaged: {str(error).lstrip('_')}.") from error
+        raise contract.UserError(f"{path} is damaged: {str(error).lstrip('_')}.") from error
 
 
 def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
@@ -262,7 +262,7 @@ def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
     values = vars(made)
     for name, value in values.items():
         if isinstance(value, (int, float)) and not abs(value) < _LARGEST:
-            raise ValueError(f"{kind.__name__}.{name} cannot be that large")
+            raise contract.UserError(f"{kind.__name__}.{name} cannot be that large")
         if isinstance(value, str) and name not in ("source", "camera_path"):
             values[name] = contract.printable(value)
     if isinstance(values.get("result"), dict):

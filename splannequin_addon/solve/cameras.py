@@ -306,9 +306,9 @@ def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:
     except contract.UnreadableFile:
         raise
     except ValueError as error:
-        raise ValueError(f"{file} is damaged: solve again.") from error
+        raise contract.UserError(f"{file} is damaged: solve again.") from error
     if xyz.shape != rgb.shape or xyz.shape[1:] != (3,) or not np.isfinite(xyz).all():
-        raise ValueError(f"{file} is damaged: solve again.")
+        raise contract.UserError(f"{file} is damaged: solve again.")
     return xyz, rgb
 
 

@@ -1,8 +1,11 @@
 """A disk that is full: a sentence and exit code 8, and what was finished is kept. On a small disk of the test's own."""
 
 import json
+import os
 import shutil
 import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from torch_backend.footage.images import write_png
 from torch_backend.freeze.video import write_video
 from torch_backend.shot import Shot, is_disk_full
 from torch_backend.train.checkpoint import read_meta
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -89,3 +94,35 @@ def test_pictures_and_videos_are_whole_or_not_there(disk):
             write()
         assert is_disk_full(refused.value)
         assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("left", [0, 8192])
+def test_a_full_kernel_cache_is_named_and_not_the_take(disk, tmp_path, left):
+    """A real child, whose cache of kernels is a disk without room: compiling ends in words that say which folder.
+
+    With room for its text, and none for what is made of that, LLVM would end the process.
+    """
+    folder = disk(4)
+    (folder / "room").write_bytes(bytes(left))
+    fill(folder)
+    (folder / "room").unlink()
+    code = (
+        "from torch_backend import job, contract\n"
+        "from torch_backend.shot import Shot\n"
+        "def station(shot, params, report):\n"
+        "    from torch_backend.freeze import sighted\n"
+        "    sighted.warm_up()\n"
+        "job.RUNNERS['import'] = station\n"
+        f"shot = Shot.create({str(tmp_path / 's.splannequin')!r})\n"
+        "asked = job.new_job(shot, 'import', contract.ImportParams(source='x'))\n"
+        "code, _ = job.run_job(asked)\n"
+        "print((asked / contract.STATUS_FILE).read_text())\n"
+        "raise SystemExit(code)\n"
+    )
+    environ = {**os.environ, "WARP_CACHE_PATH": str(folder / "kernels")}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], env=environ, capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    status = json.loads(ran.stdout)
+    assert ran.returncode == ExitCode.DISK, status
+    assert str(folder / "kernels") in status["message"] and "WARP_CACHE_PATH" in status["hint"]

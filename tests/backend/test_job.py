@@ -73,7 +73,11 @@ def test_what_a_station_foretells_is_what_is_left(shot, monkeypatch):
     ("error", "code", "word"),
     [
         (JobError("No people.", "Film some.", ExitCode.FOOTAGE), ExitCode.FOOTAGE, "No people."),
-        (ValueError("width is -1"), ExitCode.USAGE, "width is -1"),
+        (contract.UserError("The width is -1."), ExitCode.USAGE, "The width is -1."),
+        (contract.MissingError("There is no clip."), ExitCode.USAGE, "There is no clip."),
+        (ValueError("operands could not be broadcast\n  together"), ExitCode.INTERNAL, "import step broke: ValueError"),
+        (FileNotFoundError("libx.so"), ExitCode.INTERNAL, "import step broke: FileNotFoundError"),
+        (KeyError("frames"), ExitCode.INTERNAL, "import step broke"),
         (OSError(28, "No space left on device"), ExitCode.DISK, "No space left"),
         (ZeroDivisionError("oops"), ExitCode.INTERNAL, "import step broke"),
         (RuntimeError("CUDA out of memory"), ExitCode.INTERNAL, "Out of memory"),
@@ -90,7 +94,20 @@ def test_errors_become_a_sentence(shot, monkeypatch, error, code, word):
     assert status.state == "failed"
     assert word in status.message
     assert [e["type"] for e in events_of(folder)] == ["error", "done"]
-    assert "Traceback" not in status.message + status.hint
+    assert "Traceback" not in status.message + status.hint and "\n" not in status.message
+    if got == ExitCode.INTERNAL:
+        log = (folder / contract.LOG_FILE).read_text()
+        assert "Traceback" in log and type(error).__name__ in log
+        assert "broke" not in word or str(folder / contract.LOG_FILE) in status.hint
+
+
+def test_what_a_user_can_put_right_is_a_value_error_to_whoever_tries(shot):
+    """Readers of settings try values; a job, and a command, say them to the user."""
+    with pytest.raises(ValueError, match="no field"):
+        contract.from_dict(contract.ImportParams, {"sauce": "x"})
+    with pytest.raises(FileNotFoundError, match=r"no shot\.json") as missing:
+        Shot.open(shot.root.parent / "elsewhere")
+    assert isinstance(missing.value, JobError) and missing.value.exit_code == ExitCode.USAGE
 
 
 def test_a_name_that_is_no_text_is_told_as_well_as_may_be(shot, monkeypatch):

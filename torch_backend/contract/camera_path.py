@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .errors import UserError
 from .files import read_json
 from .typed import CONTRACT_VERSION, check_version, from_dict
 
@@ -28,9 +29,9 @@ class CameraFrame:
 
     def __post_init__(self) -> None:
         if len(self.viewmat) != 16 or len(self.K) != 4:
-            raise ValueError(f"camera frame {self.frame}: viewmat needs 16 numbers and K needs 4")
+            raise UserError(f"camera frame {self.frame}: viewmat needs 16 numbers and K needs 4")
         if not all(math.isfinite(v) for v in (*self.viewmat, *self.K)):
-            raise ValueError(f"camera frame {self.frame}: viewmat or K is not finite")
+            raise UserError(f"camera frame {self.frame}: viewmat or K is not finite")
 
 
 @dataclass
@@ -56,13 +57,13 @@ class CameraPath:
         check_version(data, "camera path")
         missing = {"width", "height", "frames"} - set(data)
         if missing:
-            raise ValueError(f"camera path has no {min(missing)}")
+            raise UserError(f"camera path has no {min(missing)}")
         frames = [from_dict(CameraFrame, f) for f in data["frames"]]
         numbers = [f.frame for f in frames]
         if numbers != sorted(set(numbers)):
-            raise ValueError("camera path should list its frames once each, in ascending order")
+            raise UserError("camera path should list its frames once each, in ascending order")
         if not (int(data["width"]) > 0 and int(data["height"]) > 0):
-            raise ValueError(f"camera path is {data['width']} x {data['height']} pixels: both should be above 0")
+            raise UserError(f"camera path is {data['width']} x {data['height']} pixels: both should be above 0")
         return CameraPath(int(data["width"]), int(data["height"]), frames)
 
     @staticmethod
@@ -72,4 +73,4 @@ class CameraPath:
         try:
             return CameraPath.from_json(data)
         except (ValueError, TypeError, AttributeError, OverflowError) as error:
-            raise ValueError(f"{path} holds no camera path: {error}") from error
+            raise UserError(f"{path} holds no camera path: {error}") from error

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import enum
 import errno
+import os
+import tempfile
+import traceback
 from pathlib import Path
 
 
@@ -33,11 +36,40 @@ class JobError(Exception):
         self.exit_code = int(exit_code)
 
 
-class UnreadableFile(JobError, ValueError):
+class UserError(JobError, ValueError):
+    """A value, a name or a file that a user can put right. Whoever merely tries a value may catch the ValueError."""
+
+    def __init__(self, message: str, hint: str = "", exit_code: int = ExitCode.USAGE) -> None:
+        super().__init__(message, hint, exit_code)
+
+
+class UnreadableFile(UserError):
     """A path that holds no file to read: a pipe, a device, a folder, or a file too large to be what it should."""
 
     def __init__(self, path: str | Path, why: str) -> None:
-        super().__init__(f"{path} {why}: replace or remove it", "", ExitCode.USAGE)
+        super().__init__(f"{path} {why}: replace or remove it")
+
+
+class MissingError(UserError, FileNotFoundError):
+    """A file or folder that a user named and that is not there."""
+
+
+def unexpected(what: str, error: BaseException, log: str | Path) -> JobError:
+    """The one sentence for an error that is nobody's but ours. `what` broke; its details are in `log`."""
+    text = " ".join(str(error).split())[:300]
+    message = f"{what} broke: {type(error).__name__}{': ' if text else ''}{text}"
+    return JobError(message, f"This is a bug; its details are in {log}.", ExitCode.INTERNAL)
+
+
+def broke(what: str, error: BaseException) -> JobError:
+    """`unexpected` of an error at hand, outside of a job: its details go into a file of the temporary folder."""
+    log = Path(tempfile.gettempdir()) / f"splannequin-{os.getpid()}.log"
+    try:
+        log.write_text("".join(traceback.format_exception(error)), encoding="utf-8", errors="backslashreplace")
+    except OSError:
+        traceback.print_exception(error)  # nothing can be written: the details are to be somewhere
+        return unexpected(what, error, "what stands above")
+    return unexpected(what, error, log)
 
 
 class Cancelled(Exception):

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, BinaryIO, TypeGuard, TypeVar
 
-from .errors import UnreadableFile
+from .errors import UnreadableFile, UserError
 
 T = TypeVar("T")
 
@@ -119,7 +119,7 @@ def open_arrays(path: str | Path) -> Generator[BinaryIO, None, None]:
             raise
         # zipfile, zlib and NumPy raise a dozen kinds, in words for programmers.
         except Exception as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
+            raise UserError(f"{path} is damaged: {error}") from error
 
 
 def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
@@ -131,13 +131,13 @@ def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
         is_long = os.fstat(source.fileno()).st_size > longest
         text = b"" if is_long else source.read(longest + 1)  # it may have grown since
     if is_long or len(text) > longest:
-        raise ValueError(f"{path} is longer than {longest >> 20} MB: nothing of ours is")
+        raise UserError(f"{path} is longer than {longest >> 20} MB: nothing of ours is")
     try:
         data = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:  # ValueError: no JSON, no UTF-8, or a number of too many digits
-        raise ValueError(f"{path} is not valid JSON: {error}") from error
+        raise UserError(f"{path} is not valid JSON: {error}") from error
     if not is_json_object(data):
-        raise ValueError(f"{path} should hold a JSON object, found {type(data).__name__}")
+        raise UserError(f"{path} should hold a JSON object, found {type(data).__name__}")
     return data
 
 
@@ -147,7 +147,7 @@ def is_json_object(value: object) -> TypeGuard[dict[str, Any]]:
 
 
 def _no_number(name: str) -> float:
-    raise ValueError(f"{name} is no number of JSON")
+    raise UserError(f"{name} is no number of JSON")
 
 
 def read_lines(
@@ -177,9 +177,9 @@ def printable(text: str, longest: int = 2000) -> str:
 def checked_name(name: str, what: str) -> str:
     """`name` if it is safe as a folder name on every system; ValueError otherwise."""
     if not _NAME.fullmatch(name) or name.endswith((".", " ")):
-        raise ValueError(f"{what} name {name!r} should be 1 to 64 letters, digits, spaces, '.', '_' or '-'")
+        raise UserError(f"{what} name {name!r} should be 1 to 64 letters, digits, spaces, '.', '_' or '-'")
     if name.partition(".")[0].rstrip().upper() in _DEVICES:
-        raise ValueError(f"{what} name {name!r} is the name of a device on Windows: choose another one")
+        raise UserError(f"{what} name {name!r} is the name of a device on Windows: choose another one")
     return name
 
 

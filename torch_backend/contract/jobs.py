@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from .errors import ExitCode, JobError
+from .errors import ExitCode, JobError, UserError
 from .files import is_json_object
 from .options import PARAMS, check_params
 from .processes import process
@@ -81,7 +81,7 @@ class JobRequest:
     def typed_params(self) -> Any:
         """The parameters as their dataclass. ValueError names an unknown kind or field, or a value that cannot be."""
         if self.kind not in PARAMS:
-            raise ValueError(f"unknown job kind {self.kind!r}: expected one of {', '.join(PARAMS)}")
+            raise UserError(f"unknown job kind {self.kind!r}: expected one of {', '.join(PARAMS)}")
         params = from_dict(PARAMS[self.kind], self.params)
         check_params(params)
         return params

@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from .errors import UserError
+
 
 @dataclass(frozen=True)
 class Limit:
@@ -124,7 +126,7 @@ def overscan(text: str) -> float:
     except ValueError:
         value = math.nan
     if text != "lens" and not 0.0 <= value <= 100.0:
-        raise ValueError(f"overscan is 0 to 100 percent, or lens, got {text!r}")
+        raise UserError(f"overscan is 0 to 100 percent, or lens, got {text!r}")
     return value
 
 

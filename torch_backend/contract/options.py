@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from .errors import UserError
 from .files import frame_number, is_json_object
 from .hosts import host_names
 from .option_table import MASK_FOUND, SWITCH, Limit, Option, ignored_path, limits_of, mask_path, option, overscan
@@ -600,10 +601,10 @@ def check_params(params: object) -> None:
                 continue
             also = "".join(f", or {value} for {meaning}" for value, meaning in limit.also.items())
             message = f"The {limit.what} is {value}: it should be {_plain(limit.low)} to {_plain(limit.high)}{also}."
-            raise ValueError(message)
+            raise UserError(message)
     odd = [key for key in getattr(params, "t_star_per_frame", {}) if frame_number(key) is None]
     if odd:
-        raise ValueError(f"t* is given for frame {odd[0]!r}: it should be the number of a frame.")
+        raise UserError(f"t* is given for frame {odd[0]!r}: it should be the number of a frame.")
 
 
 def _plain(number: float) -> str:

@@ -12,6 +12,7 @@ import posixpath
 from pathlib import Path
 from typing import Any, cast
 
+from .errors import UserError
 from .files import LONGEST_JSON, is_json_object, read_json
 
 RULES_VARIABLE = "SPLANNEQUIN_PATH_RULES"
@@ -63,5 +64,5 @@ def _told() -> list[dict[str, Any]]:
     told = cast("list[Any]", rules) if isinstance(rules, list) else [None]
     found = [rule for rule in told if is_json_object(rule) and wanted <= set(rule)]
     if len(found) != len(told):
-        raise ValueError(f"{file} holds no path mapping rules as Open Job Description writes them")
+        raise UserError(f"{file} holds no path mapping rules as Open Job Description writes them")
     return found

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from .errors import UserError
+
 _TEXT = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.,])(\d\d)")
 
 
@@ -24,7 +26,7 @@ def later(timecode: str, frames: int, fps: float) -> str:
     found = _TEXT.fullmatch(timecode)
     rate = round(fps)
     if found is None or rate < 1:
-        raise ValueError(f"this is no timecode of {fps:g} frames per second: {timecode!r}")
+        raise UserError(f"this is no timecode of {fps:g} frames per second: {timecode!r}")
     hours, minutes, seconds, number = (int(found[i]) for i in (1, 2, 3, 5))
     drop = rate // 15 if found[4] != ":" and rate % 30 == 0 else 0
     total = 60 * hours + minutes
@@ -43,7 +45,7 @@ def smpte_bits(timecode: str) -> tuple[int, int]:
     """The two words that OpenEXR and DPX store of it: binary coded decimals, bit 6 of the first for drop frame."""
     found = _TEXT.fullmatch(timecode)
     if found is None or int(found[5]) > 39:  # two bits for the tens of frames
-        raise ValueError(f"this is no timecode that a picture can hold: {timecode!r}")
+        raise UserError(f"this is no timecode that a picture can hold: {timecode!r}")
     fields = [int(found[i]) for i in (5, 3, 2, 1)]
     word = sum((value // 10 << 4 | value % 10) << 8 * i for i, value in enumerate(fields))
     return word | (0 if found[4] == ":" else 1 << 6), 0

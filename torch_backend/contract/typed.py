@@ -8,6 +8,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
+from .errors import UserError
 from .files import printable
 
 CONTRACT_VERSION = 1
@@ -17,7 +18,7 @@ def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VER
     """ValueError, in words, if `data` was written by a newer Splannequin."""
     version = data.get("version", 1)
     if not isinstance(version, int) or version > newest:
-        raise ValueError(
+        raise UserError(
             f"{what} has version {_short(version)}, this Splannequin reads up to {newest}: "
             "update the add-on and its backend"
         )
@@ -28,15 +29,15 @@ def from_dict(cls: type, data: Mapping[str, Any]) -> Any:
     hints = _hints(cls)
     unknown = set(data) - set(hints)
     if unknown:
-        raise ValueError(f"{cls.__name__} has no field {sorted(unknown)[0]!r}: it has {', '.join(hints)}")
+        raise UserError(f"{cls.__name__} has no field {sorted(unknown)[0]!r}: it has {', '.join(hints)}")
     missing = _needed(cls) - set(data)
     if missing:
-        raise ValueError(f"{cls.__name__} has no {min(missing)}")
+        raise UserError(f"{cls.__name__} has no {min(missing)}")
     values = {name: _checked(cls.__name__, name, hints[name], value) for name, value in data.items()}
     try:
         return cls(**values)
     except (TypeError, OverflowError) as error:
-        raise ValueError(f"{cls.__name__}: {error}") from error
+        raise UserError(f"{cls.__name__}: {error}") from error
 
 
 @functools.cache
@@ -67,7 +68,7 @@ def _checked(owner: str, name: str, hint: Any, value: Any) -> Any:
                 return value
         elif base is not float and isinstance(base, type) and isinstance(value, base):
             return value
-    raise ValueError(f"{owner}.{name} cannot be {_short(value)}")
+    raise UserError(f"{owner}.{name} cannot be {_short(value)}")
 
 
 _LARGEST_FLOAT, _LARGEST_INT = 1e300, 1 << 53

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..contract import UserError
 from .color import srgb_to_linear
 from .display import PLAIN, Display
 
@@ -193,7 +194,7 @@ def choose_solved(measures: Sequence[FrameMeasures], step: int) -> set[int]:
     to the sharpest of those neighbours.
     """
     if step < 1:
-        raise ValueError(f"step should be at least 1, got {step}")
+        raise UserError(f"step should be at least 1, got {step}")
     usable = [m for m in measures if not m.flags]
     if not usable:
         return set()

@@ -23,7 +23,17 @@ from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
 from ..array_types import SparseMatrix, sparse_entries
-from ..contract import FRAMES_FOLDER, MOST_PIXELS, RAW_FOLDER, ExitCode, JobError, open_regular, regular_file
+from ..contract import (
+    FRAMES_FOLDER,
+    MOST_PIXELS,
+    RAW_FOLDER,
+    ExitCode,
+    JobError,
+    MissingError,
+    UserError,
+    open_regular,
+    regular_file,
+)
 from ..shot import atomic_path
 
 PNG_COMPRESSION = 2
@@ -98,12 +108,12 @@ def read_png(path: str | Path) -> NDArray[Any]:
     """A PNG as [H, W, 3] uint8 or uint16, as stored. FileNotFoundError, or ValueError naming the file."""
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"picture {path} does not exist")
+        raise MissingError(f"picture {path} does not exist")
     buffer = oiio.ImageBuf(regular_file(path))
     kind = oiio.UINT16 if str(buffer.spec().format) == "uint16" else oiio.UINT8
     pixels = None if buffer.has_error else buffer.get_pixels(kind)
     if pixels is None or buffer.has_error:
-        raise ValueError(f"picture {path} cannot be read: {error_of(buffer)}")
+        raise UserError(f"picture {path} cannot be read: {error_of(buffer)}")
     pixels = np.asarray(pixels)
     return pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
 

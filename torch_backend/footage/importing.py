@@ -27,6 +27,7 @@ from ..contract import (
     JobError,
     Reporter,
     ShotFolder,
+    UserError,
     frame_file,
     is_half_written,
     later,
@@ -252,9 +253,9 @@ def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
 
 def _check(config: FootageConfig) -> None:
     if config.step < 0 or config.working_height < 0:
-        raise ValueError(f"step and working_height cannot be negative: {config.step}, {config.working_height}")
+        raise UserError(f"step and working_height cannot be negative: {config.step}, {config.working_height}")
     if config.fps and not SLOWEST_FPS <= config.fps <= FASTEST_FPS:  # NaN is neither
-        raise ValueError(f"fps is {config.fps}: it should be {SLOWEST_FPS} to {FASTEST_FPS:g}, or 0: the footage's own")
+        raise UserError(f"fps is {config.fps}: it should be {SLOWEST_FPS} to {FASTEST_FPS:g}, or 0: the footage's own")
     if config.first is not None and config.last is not None and config.last - config.first + 1 < LEAST_FRAMES:
         raise footage_error(
             f"Frames {config.first} to {config.last} are too few: a freeze needs at least {LEAST_FRAMES}.",

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..contract import ExitCode, JobError
+from ..contract import ExitCode, JobError, UserError
 from ..shot import Shot, content_key
 from ..solve.map_lens import MapLens
 from ..solve.plate_lens import PlateLens, load_plate_lenses
@@ -139,7 +139,7 @@ class Plates:
 
     def _codes(self, frame: int) -> NDArray[Any]:
         if frame not in self._files:
-            raise ValueError(f"the shot has no frame {frame}: it has {self.frames[0]} to {self.frames[-1]}")
+            raise UserError(f"the shot has no frame {frame}: it has {self.frames[0]} to {self.frames[-1]}")
         if frame in self._held:
             self._held.move_to_end(frame)
             return self._held[frame]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import LONGEST_ARRAYS, UnreadableFile, open_regular
+from ..contract import LONGEST_ARRAYS, MissingError, UnreadableFile, open_regular
 from ..shot import atomic_path
 from .poses import quat_to_rotation, rotation_to_quat
 
@@ -118,7 +118,7 @@ def read_model(folder: Path) -> ColmapModel:
     """
     files = model_files(folder)
     if not files:
-        raise FileNotFoundError(f"{folder} holds no COLMAP model: cameras and images, as .bin or .txt")
+        raise MissingError(f"{folder} holds no COLMAP model: cameras and images, as .bin or .txt")
     binary = files[0].suffix == ".bin"
     points = ColmapPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), [])
     at = files[0]

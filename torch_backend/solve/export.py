@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import PICTURE, CameraPath, ExitCode, JobError, frame_file
+from ..contract import PICTURE, CameraPath, ExitCode, JobError, UserError, frame_file
 from ..shot import Shot, write_atomic, write_json
 from .colmap_files import PARTS, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints, write_model
 from .stored import load_cameras, load_points
@@ -39,7 +39,7 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False) -> l
         JobError: the shot is not solved, or the folder holds a model that would be read instead of this one.
     """
     if kind not in FORMATS:
-        raise ValueError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
+        raise UserError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
     path, points = load_cameras(shot), load_points(shot)
     if kind == "nerfstudio":
         return _write_transforms(shot, path, points, folder)

@@ -33,6 +33,7 @@ from ..contract import (
     ExitCode,
     JobError,
     Reporter,
+    UserError,
     frame_file,
     open_regular,
 )
@@ -282,13 +283,13 @@ def _check(config: SolveConfig, cameras: str) -> None:
             ExitCode.USAGE,
         )
     if config.st_map_way not in ST_MAP_WAYS:
-        raise ValueError(f"st_map_way should be one of {', '.join(ST_MAP_WAYS)}, got {config.st_map_way!r}")
+        raise UserError(f"st_map_way should be one of {', '.join(ST_MAP_WAYS)}, got {config.st_map_way!r}")
     if config.camera_model not in CAMERA_MODELS:
-        raise ValueError(f"camera_model should be one of {', '.join(CAMERA_MODELS)}, got {config.camera_model!r}")
+        raise UserError(f"camera_model should be one of {', '.join(CAMERA_MODELS)}, got {config.camera_model!r}")
     if config.focal_mm < 0 or config.sensor_mm <= 0:
-        raise ValueError(f"focal_mm and sensor_mm should be lengths, got {config.focal_mm} and {config.sensor_mm}")
+        raise UserError(f"focal_mm and sensor_mm should be lengths, got {config.focal_mm} and {config.sensor_mm}")
     if not 1 <= config.overlap <= 31 or config.features < 128 or config.neighbours < 1:
-        raise ValueError(
+        raise UserError(
             "overlap should be 1 to 31, features at least 128 and neighbours at least 1, got "
             f"{config.overlap}, {config.features} and {config.neighbours}"
         )

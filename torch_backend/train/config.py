@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
-from ..contract import CARD_GAUSSIANS, CARD_WIDTH, DETECTORS, METHODS, SUPERVISIONS, TrainParams
+from ..contract import CARD_GAUSSIANS, CARD_WIDTH, DETECTORS, METHODS, SUPERVISIONS, TrainParams, UserError
 from ..deformation import GateConfig, HexPlaneConfig, HostConfig, host, host_config, hosts
 from ..gaussians import DensifyConfig, InitConfig
 from ..supervision import SupervisionConfig
@@ -161,7 +161,7 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
         ("detector", params.detector, DETECTORS),
     ):
         if value not in allowed:
-            raise ValueError(f"{name} is {value!r}: it should be one of {', '.join(allowed)}")
+            raise UserError(f"{name} is {value!r}: it should be one of {', '.join(allowed)}")
     config = PRESETS[params.preset]()
     if on_card:
         _for_card(config)
@@ -182,7 +182,7 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
     if params.holdout >= 0:
         config.holdout = params.holdout
     if config.iterations < 10:
-        raise ValueError(f"iterations is {config.iterations}: a run needs at least 10")
+        raise UserError(f"iterations is {config.iterations}: a run needs at least 10")
     return config
 
 
@@ -262,4 +262,4 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
             values[name] = cls(**inner)
         return TrainConfig(**values)
     except (TypeError, KeyError) as error:
-        raise ValueError(f"the run's config.json does not fit this version: {error}") from error
+        raise UserError(f"the run's config.json does not fit this version: {error}") from error

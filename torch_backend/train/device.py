@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..cards import why_unused
-from ..contract import DEVICES, ExitCode, JobError, Reporter
+from ..contract import DEVICES, ExitCode, JobError, Reporter, UserError
 from ..deformation import planes_cuda
 from ..native import initialised_warp
 from . import recorder
@@ -52,7 +52,7 @@ def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]
     Both of one look at the card: one that does not answer is waited for once.
     """
     if requested not in DEVICES:
-        raise ValueError(f"device is {requested!r}: it should be one of {', '.join(DEVICES)}")
+        raise UserError(f"device is {requested!r}: it should be one of {', '.join(DEVICES)}")
     if requested == "cpu":
         return torch.device("cpu"), None
     refusal = cuda_refusal()

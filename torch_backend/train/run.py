@@ -21,6 +21,7 @@ from ..contract import (
     JobError,
     Reporter,
     TrainParams,
+    UserError,
     file_digest,
     is_link,
     open_regular,
@@ -157,7 +158,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     JobError in words if there is nothing to extend.
     """
     if params.extend < 0:
-        raise ValueError(f"extend is {params.extend}: it is a number of steps to add")
+        raise UserError(f"extend is {params.extend}: it is a number of steps to add")
     folder, again = shot.own(shot.run(params.run)), "Train it without --extend first."
     shot.own(folder / PREVIEWS_FOLDER)
     finish_replacing(folder)

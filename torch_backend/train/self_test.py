@@ -3,7 +3,8 @@ processor's bodies.
 
 It runs in a process of its own (`python -m torch_backend doctor --gpu`), because what a kernel breaks on a card stays
 broken for the process that launched it, and because a driver may hang. What it found is kept beside Warp's compiled
-kernels, for one driver, card and version of ours, Warp's and torch's: so it runs once, and again after an update.
+kernels, for one driver, card and version of ours, Warp's and torch's: so it runs once, and again after an update. Only
+two tests in a row that fail alike speak against a card for good: one may have been killed, or met a full disk.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -25,7 +27,7 @@ from torch import Tensor
 
 from .. import __version__
 from ..cards import nvidia_cards
-from ..contract import ExitCode, check_version, content_key, from_dict, python_child, read_json
+from ..contract import ExitCode, JobError, check_version, content_key, from_dict, python_child, read_json
 from ..deformation import planes, planes_cuda
 from ..native import initialised_warp
 from ..raster import RasterOutput, RasterSettings, rasterize, ssim, ssim_cuda
@@ -35,7 +37,7 @@ from .adam import FusedAdam
 from .losses import photometric
 from .recorder import CudaGraphs
 
-SELF_TEST_VERSION = 3
+SELF_TEST_VERSION = 4
 _SECONDS = 240.0
 """A card that has not answered by then hangs; cold, the kernels take tens of seconds to compile."""
 _GAUSSIANS, _WIDTH, _HEIGHT = 300, 64, 48
@@ -44,6 +46,8 @@ _FLIPPED = 0.01
 _PIXEL = 3e-4
 _GRADIENT = 2e-2
 """Relative L2 that a gradient may be off by: what flips at the cut is in it (1e-4 to 4e-3 on fibers)."""
+_CTRL_C_EXIT = 0xC000013A
+"""Exit code of a process on Windows that Ctrl-C ended, or a closed console."""
 _NO_NUMBER = 1e9
 _EXACT = 1e-4
 """Relative L2 of what has no cut."""
@@ -76,11 +80,16 @@ class SelfTest:
     recording: str = ""
     """The same of steps that are recorded as CUDA graphs; launched one by one they serve as well."""
     lasting: bool = True
-    """Will it be so the next time, too? Not if the card was full, or did not answer."""
+    """Will it be so the next time, too? Not if the card or the disk was full, or the test was ended before it told."""
     seconds: float = 0.0
     """How long it took, compiling included."""
     checks: list[Check] = field(default_factory=list[Check])
     """What was compared."""
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Names of the parts that failed."""
+        return tuple(name for name in ("problem", "planes", "recording") if getattr(self, name))
 
 
 def self_test_key() -> str:
@@ -109,6 +118,9 @@ def _problem(found: SelfTest, compare: Callable[[], list[Check]]) -> str:
     except torch.OutOfMemoryError:
         found.lasting = False
         return "its memory is taken by other programs"
+    except (OSError, MemoryError, JobError) as error:  # of this machine's disk or memory, not of the card
+        found.lasting = False
+        return f"it could not be tested ({str(error) or type(error).__name__})"
     except Exception as error:  # whatever a driver, a compiler or a kernel comes up with is what this test is for
         words = (str(error).strip().splitlines() or [type(error).__name__])[0]
         return f"a kernel does not build or run on it ({words})"
@@ -120,7 +132,7 @@ def _problem(found: SelfTest, compare: Callable[[], list[Check]]) -> str:
 
 
 def card_verdict(folder: Path | None = None, test: Callable[[str], SelfTest] | None = None) -> SelfTest:
-    """What a self-test found of this machine's card. Tests it if it was not yet.
+    """What a self-test found of this machine's card. Tests it if it was not yet; twice if it fails.
 
     Args:
         folder: where the verdict is kept (default: beside Warp's kernels).
@@ -129,16 +141,20 @@ def card_verdict(folder: Path | None = None, test: Callable[[str], SelfTest] | N
     place, key = (folder or kernel_folder()) / "splannequin-card.json", self_test_key()
     found = _kept(place)
     if found is None or found.key != key:
-        found = (test or tested_apart)(key)
-        keep(found, place.parent)
+        test = test or tested_apart
+        first = found = test(key)
+        if first.lasting and first.failed:
+            found = test(key)
+        keep(found, place.parent, confirmed=found.failed == first.failed)
     return found
 
 
-def keep(found: SelfTest, folder: Path) -> None:
-    """Notes a verdict; one that may be another the next time is forgotten, and the one before with it."""
+def keep(found: SelfTest, folder: Path, confirmed: bool = False) -> None:
+    """Notes a verdict; one that may be another the next time is forgotten, and the one before with it. So is a failure
+    that no other test has confirmed."""
     place = folder / "splannequin-card.json"
     try:
-        if found.lasting:
+        if found.lasting and (confirmed or not found.failed):
             write_json(place, dataclasses.asdict(found))
         else:
             place.unlink(missing_ok=True)
@@ -182,7 +198,15 @@ def tested_apart(key: str) -> SelfTest:
         if ran.returncode == ExitCode.ENVIRONMENT:
             return SelfTest(key=key, problem="it could not be tested", lasting=False)
         last = (ran.stderr.strip().splitlines() or ["without a word"])[-1]
-        return SelfTest(key=key, problem=f"the process that tested it ended with code {ran.returncode} ({last})")
+        problem = f"the process that tested it ended with code {ran.returncode} ({last})"
+        return SelfTest(key=key, problem=problem, lasting=_crashed(ran.returncode))
+
+
+def _crashed(code: int) -> bool:
+    """True of the exit code of a process that the system ended for what it did. Others were killed, or gave up."""
+    if os.name == "nt":
+        return code & 0xC0000000 == 0xC0000000 and code & 0xFFFFFFFF != _CTRL_C_EXIT
+    return -code in {getattr(signal, name) for name in ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGILL", "SIGFPE")}
 
 
 # ------------------------------------------------------------------------------------------------------- the checks

@@ -5,6 +5,7 @@ On a pretended card, and with kernels that do not launch: tests/backend/card/tes
 
 import dataclasses
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -112,14 +113,14 @@ def test_a_card_is_tested_once_and_again_after_an_update(tmp_path: Path, cards):
 
     cards("NVIDIA GeForce RTX 4070, 580.65.06, 8.9")
     assert [card_verdict(tmp_path, test).problem for _ in range(3)] == ["it is broken"] * 3
-    assert len(asked) == 1
+    assert len(asked) == 2, "what fails is tested again, and not a third time"
     kept = json.loads((tmp_path / "splannequin-card.json").read_text())
     assert kept["checks"] == [{"what": "a frame", "error": 0.5, "bound": 0.01}]
     cards("NVIDIA GeForce RTX 4070, 590.10.01, 8.9")
     card_verdict(tmp_path, test)
-    assert len(asked) == 2 and asked[0] != asked[1]
+    assert len(asked) == 4 and asked[1] != asked[2]
     (tmp_path / "splannequin-card.json").write_text("[]")  # damaged: as if it were not there
-    assert card_verdict(tmp_path, test).problem == "it is broken" and len(asked) == 3
+    assert card_verdict(tmp_path, test).problem == "it is broken" and len(asked) == 6
 
 
 def test_what_may_be_otherwise_the_next_time_is_not_kept(tmp_path: Path):
@@ -129,6 +130,39 @@ def test_what_may_be_otherwise_the_next_time_is_not_kept(tmp_path: Path):
     assert card_verdict(tmp_path, full).problem and not list(tmp_path.iterdir())
     assert card_verdict(tmp_path, lambda key: SelfTest(key=key)).problem == ""
     assert card_verdict(tmp_path, full).problem == "", "it was sound, and is not asked again"
+
+
+def test_a_failure_that_is_not_confirmed_speaks_against_no_card(tmp_path: Path):
+    """The first of two tests met something that is gone: the card is used, now and later."""
+    answers = ["a kernel does not build or run on it (unspecified launch failure)", ""]
+    found = card_verdict(tmp_path, lambda key: SelfTest(key=key, problem=answers.pop(0)))
+    assert found.problem == "" and not answers
+    assert card_verdict(tmp_path, lambda key: SelfTest(key=key, problem="not asked again")).problem == ""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize(("name", "kept"), [("SIGKILL", False), ("SIGTERM", False), ("SIGSEGV", True), ("", False)])
+def test_a_test_that_was_killed_is_tried_again_by_the_next_job(tmp_path: Path, monkeypatch, name, kept):
+    """A real child that ends so, or gives up with exit code 1: only one that crashes twice speaks against the card."""
+    ends = f"os.kill(os.getpid(), signal.{name})" if name else "sys.exit('there is no disk')"
+    child = tmp_path / "child.py"
+    child.write_text(f"import os, signal, sys\nopen({str(tmp_path / 'asked')!r}, 'a').write('x')\n{ends}\n")
+    monkeypatch.setattr(self_test, "python_child", lambda *_: {"args": [sys.executable, str(child)], "cwd": tmp_path})
+    found = card_verdict(tmp_path)
+    assert found.problem.startswith("the process that tested it ended with code")
+    assert (tmp_path / "splannequin-card.json").is_file() == kept
+    asked = len((tmp_path / "asked").read_text())
+    assert asked == (2 if kept else 1)
+    assert card_verdict(tmp_path, lambda key: SelfTest(key=key)).problem == (found.problem if kept else "")
+
+
+def test_a_disk_that_is_full_while_kernels_compile_speaks_against_no_card(monkeypatch):
+    def full(device):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(self_test, "_frame", full)
+    found = run_self_test(torch.device("cpu"))
+    assert found.problem.startswith("it could not be tested (") and not found.lasting
 
 
 def test_a_card_that_does_not_answer_is_waited_for_once(monkeypatch, quiet):
@@ -170,5 +204,5 @@ def test_a_test_in_another_process_comes_back(tmp_path: Path):
     found = self_test.tested_apart("of this key")
     assert found.key == "of this key" and not found.lasting
     assert found.problem == device.cuda_refusal()
-    self_test.keep(dataclasses.replace(found, lasting=True), tmp_path)
+    self_test.keep(dataclasses.replace(found, lasting=True), tmp_path, confirmed=True)
     assert self_test._kept(tmp_path / "splannequin-card.json") == dataclasses.replace(found, lasting=True)
