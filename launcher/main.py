@@ -25,7 +25,7 @@ from .environments import backend_environment
 from .errors import LauncherError
 from .places import DEMO_CLIP, HERE
 from .summary import failed_job, read_summary
-from .testing import run_tests
+from .testing import run_sensitive_tests, run_tests
 
 
 def parser() -> argparse.ArgumentParser:
@@ -50,6 +50,11 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("clip", metavar="INPUT", help=INPUT[1])
         if name in ("test", "setup"):
             command.add_argument("--bpy", choices=sorted(BPY_WHEELS), help="the bpy wheel (default: one that fits)")
+        if name == "test":
+            command.add_argument(
+                "--instructions", action="store_true",
+                help="only tests that depend on floats, computed as on an older processor (without AVX-512)",
+            )  # fmt: skip
         if name == "doctor":
             command.add_argument(
                 "--gpu", action="store_true", help="test the graphics card, and write what was found to DIR/gpu.json"
@@ -166,5 +171,5 @@ def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
     if args.command == "bench":
         return bench(rest, output)
     if args.command == "test":
-        return run_tests(rest, args.bpy, output)
+        return run_sensitive_tests(rest, output) if args.instructions else run_tests(rest, args.bpy, output)
     return doctor(output, args.gpu)

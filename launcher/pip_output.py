@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import platform
 import re
+import sysconfig
 import urllib.parse
 from pathlib import Path
 
@@ -32,7 +34,33 @@ BROKEN_CONNECTION = re.compile(
 """What pip says of an index that it cannot ask. What it says last is that no version was found."""
 
 
-def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = None) -> None:
+SYSTEMS = (
+    "it takes a 64-bit Python on Windows or Linux with a processor of Intel's or AMD's kind (x86-64), or on a Mac with "
+    "Apple silicon"
+)
+"""Where all packages have wheels."""
+_OTHERS = (
+    (r"win32", "a 32-bit Python on Windows"),
+    (r"win-arm", "Windows on ARM"),
+    (r"macosx-.*-x86_64", "a Mac with an Intel processor"),
+    (r"linux-(aarch64|arm)", "Linux on ARM"),
+)
+"""Other systems, by the beginning of what `sysconfig.get_platform` says."""
+
+
+def lacking_system(system: str | None = None) -> str:
+    """A system for which some package has no wheel, in words; empty for the others.
+
+    Args:
+        system: as `sysconfig.get_platform` says it of a Python; None: of this one.
+    """
+    system = (system or sysconfig.get_platform()).replace("universal2", platform.machine())
+    if re.fullmatch(r"win-amd64|linux-x86_64|macosx-.*-arm64", system):
+        return ""
+    return next((words for pattern, words in _OTHERS if re.match(pattern, system)), system)
+
+
+def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = None, system: str | None = None) -> None:
     """Raises the sentence for a failed step of a set-up, from what it printed.
 
     Args:
@@ -41,6 +69,7 @@ def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = N
         step: what failed.
         output: what it printed.
         wheels: the folder that packages come from, in place of an index.
+        system: as in `lacking_system`.
     """
     lines = [line.strip() for line in output.splitlines() if line.strip()] or ["no output"]
     telling = [line for line in lines if re.search(r"error|not found|cannot|No space", line, re.I)]
@@ -59,6 +88,10 @@ def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = N
         last, advice = _unreachable(output)
     elif re.search(r"ensurepip|python3-venv", output):
         advice = "install the venv module of this Python (Debian and Ubuntu: apt install python3-venv)"
+    elif re.search(r"No matching distribution|from versions:", output) and lacking_system(system):
+        lacking = re.search(r"No matching distribution found for ([\w.-]+)", output)
+        last = f"there is no {lacking.group(1) if lacking else 'package'} for {lacking_system(system)}"
+        advice = SYSTEMS
     elif re.search(r"No matching distribution|from versions:", output):
         advice = "use Python 3.11 or 3.13 on 64-bit Windows, macOS or Linux, or check the package index pip is set to"
     elif re.search(r"lib\S+\.so\S*: cannot open shared object", output):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -29,6 +30,23 @@ NEWS_SECONDS = 60.0
 BACKEND_APART = ("tests/backend/solve", "tests/backend/raster", "tests/backend/footage", "tests/backend/card")
 """Half of the backend's tests by what they take: a leg of their own, beside which the others run. None of them needs
 the run that the others train once."""
+OTHER_INSTRUCTIONS = {
+    "ATEN_CPU_CAPABILITY": "default",
+    "SPLANNEQUIN_MARCH": "x86-64-v3",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+    "OPENCV_CPU_DISABLE": "AVX2,AVX512-SKX",
+}
+"""Environment variables with which torch, our kernels, numpy and OpenCV compute as on an older processor: floats come
+out some 1e-7 otherwise. For processors of x86; on others torch's alone means something."""
+SENSITIVE = (
+    "tests/backend/freeze/test_decisions.py", "tests/backend/freeze/test_overscan.py",
+    "tests/backend/freeze/test_regions.py", "tests/backend/freeze/test_held.py",
+    "tests/backend/freeze/test_ghosts.py", "tests/backend/freeze/test_instant_pixels.py",
+    "tests/backend/freeze/test_detail.py", "tests/backend/freeze/test_honest.py",
+    "tests/backend/freeze/test_turned.py", "tests/backend/freeze/test_sighted.py",
+    "tests/backend/freeze/test_unseen.py", "tests/backend/raster",
+)  # fmt: skip
+"""Tests of what decides by floats, and of the kernels: those that `test --instructions` runs."""
 ADDON_TESTS = ("tests/addon", "tests/addon_free")
 """Those that run in Blender. The second need none: the backend's leg runs them too."""
 
@@ -36,8 +54,12 @@ ADDON_TESTS = ("tests/addon", "tests/addon_free")
 class Leg:
     """One part of the tests: its command, and what became of it."""
 
-    def __init__(self, name: str, command: list[str], report: Path | None = None) -> None:
+    def __init__(
+        self, name: str, command: list[str], report: Path | None = None, environ: dict[str, str] | None = None
+    ) -> None:
         self.name = name
+        self.environ = environ or {}
+        """Environment variables of its own."""
         self.command = command if report is None else [*command, f"--junitxml={report}"]
         self.report = report
         """Where pytest writes its counts; None for a checker."""
@@ -52,7 +74,7 @@ class Leg:
         """Its process; what that prints goes to `log`, or where ours does."""
         if self.report:
             self.report.unlink(missing_ok=True)
-        environ = child_environ(SPLANNEQUIN_BACKEND_PYTHON=backend_python, **environ)
+        environ = child_environ(SPLANNEQUIN_BACKEND_PYTHON=backend_python, **environ, **self.environ)
         if log is None:
             return start_child(self.command, environ, cwd=ROOT)
         with open(log, "wb") as stream:
@@ -160,6 +182,22 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
             raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
         command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
         legs.append(Leg(f"add-on in {blender.label}", command, output / "junit-addon.xml"))
+    output.mkdir(parents=True, exist_ok=True)
+    run_legs(legs, backend.python, output, min(AT_ONCE, cores()))
+    return _close_tests(legs, output)
+
+
+def run_sensitive_tests(pytest_args: Sequence[str], output: Path) -> int:
+    """The tests of `SENSITIVE` with another instruction set than this processor's; closes as `run_tests`."""
+    backend = backend_environment(testing=True)
+    set_up(backend, sys.executable)
+    x86 = platform.machine().lower() in ("x86_64", "amd64")
+    environ = {name: value for name, value in OTHER_INSTRUCTIONS.items() if x86 or name == "ATEN_CPU_CAPABILITY"}
+    legs: list[Leg] = []
+    for name in ("raster", "freeze"):
+        paths = [path for path in SENSITIVE if path.startswith(f"tests/backend/{name}")]
+        command = [backend.python, "-P", "-m", "pytest", *paths, *pytest_args]
+        legs.append(Leg(f"{name}, other instructions", command, output / f"junit-{name}.xml", environ))
     output.mkdir(parents=True, exist_ok=True)
     run_legs(legs, backend.python, output, min(AT_ONCE, cores()))
     return _close_tests(legs, output)

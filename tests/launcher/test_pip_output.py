@@ -48,5 +48,28 @@ def test_pip_in_one_line_per_package(line: str, shown: str | None):
 )
 def test_what_pip_prints_in_a_sentence(environment: Environment, printed: str, says: str):
     with pytest.raises(LauncherError) as refused:
-        pip_output.refuse(environment.name, environment.log, "installing packages", printed)
+        pip_output.refuse(environment.name, environment.log, "installing packages", printed, system="linux-x86_64")
     assert says in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("system", "words"),
+    [
+        ("win-arm64", "Windows on ARM"), ("win32", "32-bit Python"), ("macosx-14.0-x86_64", "a Mac with an Intel"),
+        ("linux-aarch64", "Linux on ARM"), ("linux-riscv64", "linux-riscv64"),
+    ],
+)  # fmt: skip
+def test_a_system_without_wheels_is_told_as_that_and_not_as_the_wrong_python(environment: Environment, system, words):
+    printed = (
+        "ERROR: Could not find a version that satisfies the requirement torch==2.13.0 (from versions: 2.2.0, 2.2.1)\n"
+        "ERROR: No matching distribution found for torch==2.13.0"
+    )
+    with pytest.raises(LauncherError) as refused:
+        pip_output.refuse(environment.name, environment.log, "installing packages", printed, system=system)
+    said = str(refused.value)
+    assert "there is no torch" in said and words in said and "use Python 3.11" not in said
+
+
+@pytest.mark.parametrize("system", ["win-amd64", "linux-x86_64", "macosx-11.0-arm64"])
+def test_systems_with_wheels_lack_none(system: str):
+    assert pip_output.lacking_system(system) == ""
