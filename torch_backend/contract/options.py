@@ -151,6 +151,16 @@ class ImportParams:
         "configuration: ACEScg, ARRI LogC3 (EI800), ADX10, ...); empty: what the files say",
     )
     """Colour space of the footage as the OCIO configuration names it; empty: what the files say."""
+    lut: str = option(
+        "",
+        flag="--lut",
+        metavar="FILE.cube",
+        is_path=True,
+        help="look of the camera, a 1D or 3D `.cube` table that makes sRGB or Rec.709 video of the footage, for logs "
+        "that no OCIO configuration has; in place of `--colour-space`",
+        words="none",
+    )
+    """File of a look (.cube) through which the footage becomes display-referred; empty: none."""
     pixel_aspect: float = option(
         0.0,
         flag="--pixel-aspect",

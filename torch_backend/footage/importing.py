@@ -393,14 +393,14 @@ def _cut_error(first: int, last: int, cuts: list[tuple[int, int]]) -> Exception:
 def _log_remark(info: SourceInfo, config: FootageConfig, extracted: _Extracted) -> list[tuple[str, str]]:
     """A warning about a clip that looks like a camera's log and was taken for a display."""
     tones = looks_like_log(extracted.measures)
-    if tones is None or info.colour == "linear" or config.colour_space:
+    if tones is None or info.colour == "linear" or config.colour_space or config.lut:
         return []
     taken = info.reading.get("colour", "video")
     return [
         (
             f"The picture is as flat as log: its darkest tones are at {100 * tones[0]:.0f} %, its brightest at "
             f"{100 * tones[1]:.0f} %. It was taken as {taken}.",
-            "If it is log, name its colour space (--colour-space, such as 'ARRI LogC3 (EI800)').",
+            "If it is log, name its colour space (--colour-space, such as 'ARRI LogC3 (EI800)'), or a look (--lut).",
         )
     ]
 

@@ -113,7 +113,7 @@ def _is_clip(path: Path) -> bool:
 def _pictures(path: Path, fps: float, layer: str, colours: Colours, told: Told | None) -> SequenceSource:
     """A sequence. What can only be said of a video is told to be passed over."""
     told = told or Told()
-    pictures = SequenceSource(find_sequence(path), fps, layer, colours, told.pixel_aspect)
+    pictures = SequenceSource(find_sequence(path), fps, layer, colours, told.pixel_aspect, told.look)
     for value, what in ((told.matrix, "matrix"), (told.levels, "levels")):
         if value:
             pictures.warnings.append((f"The {what} {value!r} is passed over: pictures hold RGB as it is.", ""))

@@ -32,6 +32,7 @@ from .color import LIGHTS, InputSpace, named_space, space_of_chromaticities
 from .images import check_size, error_of, resize
 from .layers import Layer, find_layer, shown
 from .lens_tags import focal_of_picture
+from .look import look_space
 from .ocio import Colours
 from .oiio_types import attribute, bits_of, channel_names
 from .orientation import UPRIGHT, Orientation, orientation_of_picture
@@ -194,6 +195,7 @@ class SequenceSource:
         layer: str = "",
         colours: Colours | None = None,
         told_aspect: Fraction | None = None,
+        look: str = "",
     ) -> None:
         self.warnings: list[tuple[str, str]] = []
         self._files = sequence.files
@@ -209,7 +211,7 @@ class SequenceSource:
             )
         first, spec, self._layer, names = self._first_readable(layer)
         self._channels = channel_names(spec)
-        self._space = _input_space(first, spec, colours or Colours(), self.warnings)
+        self._space = look_space(look) if look else _input_space(first, spec, colours or Colours(), self.warnings)
         aspect = told_aspect or _pixel_aspect(spec)
         self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
         orientation = orientation_of_picture(spec)

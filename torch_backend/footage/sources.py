@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from ..contract import ExitCode, ImportParams, JobError, files_digest
+from ..contract import ExitCode, ImportParams, JobError, files_digest, mapped
 
 LEAST_FRAMES = 8
 """Frames that a freeze needs."""
@@ -81,12 +81,20 @@ class Told:
     """One of `frame_rgb.RANGE_OVERRIDES`; empty: what the file says, or players assume."""
     pixel_aspect: Fraction | None = None
     """Width of a pixel over its height; None: what the files say, else square."""
+    look: str = ""
+    """File of a look through which the footage is seen, see `look`; empty: none."""
 
 
 def told_in(config: ImportParams) -> Told:
     """What of it an import was asked for."""
     matrix, levels = ("" if value == "auto" else value for value in (config.matrix, config.levels))
-    return Told(matrix, levels, Fraction(config.pixel_aspect).limit_denominator(10_000) or None)
+    if config.lut and config.colour_space:
+        raise footage_error(
+            f"A colour space ({config.colour_space}) and a look ({config.lut}) are both given.",
+            "Give one of them: a look already makes a picture for a display.",
+        )
+    look = mapped(config.lut) if config.lut else ""
+    return Told(matrix, levels, Fraction(config.pixel_aspect).limit_denominator(10_000) or None, look)
 
 
 class Source(Protocol):

@@ -22,6 +22,7 @@ from .decoding import Noticed, decoded, stored_frames, time_of, unmarked_fields
 from .frame_rgb import BT601, MATRICES, RGB, Coding, coding_of, depth_of, exact_rgb, rgb_codes
 from .images import resize, resize_float, too_large
 from .lens_tags import focal_of_video
+from .look import LookSpace, look_space
 from .ocio import Colours
 from .orientation import UPRIGHT, Orientation, display_matrix, orientation_of_matrix
 from .seeking import VideoReader
@@ -92,7 +93,8 @@ class VideoSource:
             # FFmpeg makes the stream's pixel aspect of the matrix: of one that is not applied it means nothing.
             aspect = told.pixel_aspect or _pixel_aspect(stream if orientation else stream.codec_context)
             self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
-            self._space = _chosen_space(path, colours or Colours()) or _input_space(frame, self.warnings)
+            look = look_space(told.look) if told.look else None
+            self._space = look or _chosen_space(path, colours or Colours()) or _input_space(frame, self.warnings)
             self._coding = coding_of(frame, told.matrix, told.levels)
             self._deep = depth_of(frame) > 8 or self._space.is_light
             self._size = width, height = self._shown_size(frame)
@@ -364,7 +366,7 @@ class VideoSource:
                     "Deliver it graded for SDR, or as scene-linear EXR, if it should look otherwise.",
                 )
             )
-        elif not space.as_it_stands:
+        elif not space.as_it_stands and not isinstance(space, LookSpace):
             self.warnings.append((f"The clip is {space.name}: converted to Rec.709.", ""))
         if self._interlaced:
             unsaid = ", though it does not say so" if self._fields else ""
