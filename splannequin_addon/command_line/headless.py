@@ -332,13 +332,21 @@ def _scene(blend: str) -> tuple[Any, bool]:
         if not path.is_file():
             raise contract.MissingError(f"{path} does not exist: --blend names a .blend file")
         try:
-            bpy.ops.wm.open_mainfile(filepath=str(path))
+            # Whoever made the file may be a stranger: its scripts, and drivers that call Python, do not run.
+            bpy.ops.wm.open_mainfile(filepath=str(path), use_scripts=False)
         except RuntimeError as error:  # no .blend, a damaged one, or one of a newer Blender
             raise contract.JobError(
                 f"Blender {bpy.app.version_string} cannot open {path}: {str(error).strip()}",
                 "Open it in the Blender that saved it.",
                 ExitCode.USAGE,
             ) from error
+        bpy.context.view_layer.update()  # drivers are told of when they are evaluated
+        if bpy.app.autoexec_fail:
+            print(
+                f"Note: {path.name} has Python in it, which was not run ({bpy.app.autoexec_fail_message}). "
+                "If its picture depends on that, bake what the Python does into keys, and save the file.",
+                file=sys.stderr,
+            )
     if bpy.data.filepath:
         return scene_in(bpy.context), False
     bpy.ops.wm.read_homefile(use_empty=True)

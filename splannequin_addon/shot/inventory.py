@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import errno
 import json
+import math
 import os
 import time
 from collections.abc import Iterable
@@ -104,9 +105,21 @@ def picture_of(shot: Path, frame: int) -> str:
 
 
 def floor(shot: Path) -> tuple[list[float], float] | None:
-    """The floor that the solve found (torch_backend/solve/floor.py); None if it found none, or did not look."""
-    found = contract.read_json(ShotFolder(shot).solve_record).get("floor")
-    return (found["normal"], float(found["height"])) if found else None
+    """The floor that the solve found (torch_backend/solve/floor.py); None if it found none, or did not look.
+
+    OSError without a solve; ValueError if its file is damaged.
+    """
+    file = ShotFolder(shot).solve_record
+    found = contract.read_json(file).get("floor")
+    if not found:
+        return None
+    try:
+        normal, height = [float(value) for value in found["normal"]], float(found["height"])
+    except (KeyError, TypeError, ValueError, OverflowError):
+        normal, height = [], 0.0
+    if len(normal) != 3 or not all(map(math.isfinite, (*normal, height))):
+        raise ValueError(f"{file} is damaged: solve again.")
+    return normal, height
 
 
 def burnt_in(shot: Path) -> Path | None:

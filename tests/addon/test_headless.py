@@ -79,6 +79,34 @@ def test_bake_into_an_artists_file_keeps_its_settings(run, shot, tmp_path, addon
     assert {"CompositorNodeRGB", "CompositorNodeGroup"} <= names
 
 
+@pytest.mark.parametrize("kind", ["script", "driver"])
+def test_python_in_the_artists_file_does_not_run(run, shot, tmp_path, kind):
+    """Whatever the preferences say: a file on a command line may be a stranger's."""
+    ran = tmp_path / "ran"
+    call = f"open({ran.as_posix()!r}, 'w').close()"
+    if kind == "script":
+        text = bpy.data.texts.new("on_load.py")
+        text.write(call)
+        text.use_module = True
+    else:
+        thing = bpy.data.objects.new("driven", None)
+        bpy.context.scene.collection.objects.link(thing)
+        driver = thing.driver_add("location", 0).driver
+        driver.type = "SCRIPTED"
+        bpy.context.preferences.filepaths.use_scripts_auto_execute = False
+        driver.expression = f"{call} or 1.0"
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 6, 6
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "artist.blend"))
+    ran.unlink(missing_ok=True)
+    bpy.context.preferences.filepaths.use_scripts_auto_execute = True
+    try:
+        code, _, said = run("bake", "--shot", shot, "--output", tmp_path / "out", "--blend", tmp_path / "artist.blend")
+    finally:
+        bpy.context.preferences.filepaths.use_scripts_auto_execute = False
+    assert code == 0 and not ran.exists()
+    assert "artist.blend has Python in it" in said
+
+
 def test_camera_points_and_plate_are_in_the_baked_file(run, shot, tmp_path):
     assert run("bake", "--shot", shot, "--output", tmp_path / "out")[0] == 0
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "shot.blend"))

@@ -1,6 +1,11 @@
 """Everything the add-on registers is there once, and gone after it is unregistered."""
 
+import os
+import subprocess
+import sys
+
 import bpy
+import pytest
 
 
 def ours() -> set[str]:
@@ -30,6 +35,105 @@ def test_unregister_leaves_nothing_and_register_twice_registers_once(package):
         package.register()
     package.register()
     assert ours() == before and handlers() == hooks
+
+
+def everything() -> tuple:
+    """What Blender knows of the add-on: classes, handlers, menu entries, the property of scenes, timer."""
+    menus = (bpy.types.TOPBAR_MT_render, bpy.types.CLIP_MT_clip)
+    drawn = [getattr(getattr(menu.draw, "__func__", menu.draw), "_draw_funcs", []) for menu in menus]
+    entries = sum(_ours(draw) for functions in drawn for draw in functions)
+    return ours(), handlers(), entries, hasattr(bpy.types.Scene, "splannequin")
+
+
+@pytest.mark.parametrize("where", ["a part", "half a part", "a class", "the last part"])
+def test_what_fails_while_it_is_enabled_leaves_nothing_behind(package, addon, monkeypatch, where):
+    registration, preferences = addon("registration"), addon("ui.preferences")
+    before = everything()
+    package.unregister()
+    assert everything()[:2] == (set(), 0)
+
+    def breaks() -> None:
+        raise AttributeError("it is broken")
+
+    failing = {
+        "a part": (addon("translations"), "register", breaks),
+        "half a part": (preferences, "_CLASSES", (*preferences._CLASSES[:2], object)),
+        "a class": (registration, "_CLASSES", (*registration._CLASSES[:7], object, *registration._CLASSES[7:])),
+        "the last part": (addon("command_line.command"), "register", breaks),
+    }[where]
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(*failing)
+            with pytest.raises(RuntimeError, match="cannot be enabled, and nothing of it is"):
+                package.register()
+            assert everything()[:2] == (set(), 0) and not hasattr(bpy.types.Scene, "splannequin")
+    finally:
+        package.register()
+    assert everything() == before, "and it can be enabled again"
+
+
+def test_a_part_that_cannot_be_taken_back_keeps_nothing_else(package, addon, monkeypatch):
+    before = everything()
+
+    def breaks() -> None:
+        raise AttributeError("it is broken")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(addon("shot.places"), "unregister", breaks)
+        package.unregister()
+    assert everything()[:2] == (set(), 0)
+    package.register()
+    assert everything() == before
+
+
+COPIES = """
+import os
+import sys
+from pathlib import Path
+import bpy
+import addon_utils
+root, name = Path(os.environ["COPY_OF"]), os.environ["COPY_FIRST"]
+places = {"splannequin_copy": bpy.utils.user_resource("SCRIPTS", path="addons", create=True),
+          "bl_ext.user_default.splannequin": bpy.utils.user_resource("EXTENSIONS", path="user_default", create=True)}
+for package, place in places.items():
+    (Path(place) / package.rpartition(".")[2]).symlink_to(root, target_is_directory=True)
+sys.path.append(places["splannequin_copy"])  # as Blender does at its start, if the folder is there then
+addon_utils.modules_refresh()
+first, second = name, next(other for other in places if other != name)
+def known():
+    groups = bpy.types.PropertyGroup.__subclasses__()
+    return next((c for c in groups if c.__name__ == "SPLANNEQUIN_PG_scene" and c.is_registered), None)
+assert addon_utils.enable(first) is not None
+mine = known()
+errors = []
+assert addon_utils.enable(second, handle_error=errors.append) is None
+assert known() is mine and hasattr(bpy.types.Scene, "splannequin"), "the first goes on working"
+assert f"enabled already, as {first}" in str(errors[0]), errors
+addon_utils.disable(second)
+assert known() is mine and hasattr(bpy.types.Scene, "splannequin")
+bpy.ops.splannequin.set_up.poll()
+addon_utils.disable(first)
+assert known() is None
+assert addon_utils.enable(second) is not None and known().__module__.startswith(second + ".")
+addon_utils.disable(second)
+assert known() is None and not hasattr(bpy.types.Scene, "splannequin")
+addon_utils.enable(first)
+bpy.ops.script.reload()
+hooks = [h for hooks in (bpy.app.handlers.load_post, bpy.app.handlers.save_pre) for h in hooks]
+hooks = [h for h in hooks if "splannequin" in h.__module__]
+assert len(hooks) == len({(h.__module__, h.__name__) for h in hooks}), hooks
+addon_utils.disable(first)
+print("held")
+"""
+
+
+@pytest.mark.parametrize("first", ["splannequin_copy", "bl_ext.user_default.splannequin"])
+def test_of_two_installed_copies_the_second_is_refused(root, tmp_path, first):
+    blender = [bpy.app.binary_path, "--background", "--factory-startup", "--python-expr"]
+    environ = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path), "COPY_OF": str(root), "COPY_FIRST": first}
+    command = [*(blender if bpy.app.binary_path else (sys.executable, "-c")), COPIES]
+    done = subprocess.run(command, env=environ, capture_output=True, text=True)
+    assert "held\n" in done.stdout, done.stdout[-2000:] + done.stderr[-2000:]
 
 
 def test_the_panels_stand_in_order_in_one_tab(addon):
