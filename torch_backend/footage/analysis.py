@@ -1,8 +1,7 @@
-"""What a frame is worth before any solve: sharpness, exposure, blank and duplicate frames, cuts, and which are kept."""
+"""What a frame is worth before any solve: sharpness, exposure, blank and duplicate frames, and which are kept."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..contract import UserError
 from .color import srgb_to_linear
+from .continuity import Features, quick_features, small_grey
 from .display import PLAIN, Display
 
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -20,11 +20,6 @@ LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 THUMB_WIDTH, THUMB_HEIGHT = 64, 36
 BLANK_DEVIATION = 1.5 / 255.0
 DUPLICATE_DIFFERENCE = 0.5 / 255.0
-CUT_SCORE = 0.11
-"""Above the worst of three continuous handheld clips (0.087, at a gap of half a second), below the least of 18 splices
-of those clips (0.125)."""
-CUT_OUTLIER = 5.0
-"""A cut also stands out from its neighbours by this factor: a whip pan does not."""
 BLUR_RATIO = 0.7
 _LOG_BLACK, _LOG_WHITE = 0.06, 0.9
 """Luma that no frame of a log clip goes below and beyond: Canon Log has black at 0.073."""
@@ -50,6 +45,8 @@ class FrameMeasures:
     """[36, 64, 3] encoded colour in [0, 1]."""
     luma: NDArray[np.float32] = field(repr=False, default_factory=lambda: np.zeros((0, 0), np.float32))
     """Every other pixel of luma in [0, 1]."""
+    features: Features | None = field(repr=False, default=None)
+    """What its picture is compared by to find cuts."""
     brightest: float = 1.0
     """The largest number in it, 0 to 1."""
     tones: tuple[float, float] = (0.0, 1.0)
@@ -77,6 +74,7 @@ def measure(frame: int, pixels: NDArray[Any], display: Display = PLAIN) -> Frame
         tones=tones_of(luma[::2, ::2]),
         flags=flags,
         thumb=thumb,
+        features=quick_features(small_grey(pixels)),
         luma=np.ascontiguousarray(luma[::2, ::2]),
     )
 
@@ -125,59 +123,6 @@ def flag_duplicate(current: FrameMeasures, last_distinct: FrameMeasures | None) 
     if repeated:
         current.flags.append("duplicate")
     return repeated
-
-
-def shifted_correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """Best normalised cross-correlation of two [h, w] pictures over all shifts that overlap by at least half.
-
-    Masked normalised cross-correlation through the Fourier transform, after D. Padfield, "Masked Object Registration
-    in the Fourier Domain", IEEE TIP 2012.
-    """
-    h, w = a.shape
-    shape = (2 * h - 1, 2 * w - 1)
-    flipped = b[::-1, ::-1]
-
-    def transform(x: NDArray[Any]) -> NDArray[Any]:
-        return np.fft.rfft2(x, shape)
-
-    def inverse(x: NDArray[Any]) -> NDArray[Any]:
-        return np.fft.irfft2(x, shape)
-
-    ones = transform(np.ones((h, w)))
-    fa, fb = transform(a), transform(flipped)
-    count = np.maximum(inverse(ones * ones), 1.0)
-    sum_a, sum_b = inverse(fa * ones), inverse(ones * fb)
-    square_a, square_b = inverse(transform(a * a) * ones), inverse(ones * transform(flipped * flipped))
-    covariance = inverse(fa * fb) - sum_a * sum_b / count
-    spread = np.maximum(square_a - sum_a**2 / count, 1e-6) * np.maximum(square_b - sum_b**2 / count, 1e-6)
-    return float((covariance / np.sqrt(spread))[count >= 0.5 * h * w].max())
-
-
-def cut_score(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """How unlike two [h, w, 3] thumbnails are, camera motion allowed for: 0 the same scene, about 0.25 a cut."""
-    correlation = shifted_correlation(a.mean(axis=2), b.mean(axis=2))
-    return (1.0 - correlation) * float(np.abs(_histogram(a) - _histogram(b)).sum()) / 2.0
-
-
-def _histogram(thumb: NDArray[np.float32]) -> NDArray[np.float64]:
-    bins = np.clip((thumb * 6).astype(int), 0, 5)
-    index = (bins[..., 0] * 6 + bins[..., 1]) * 6 + bins[..., 2]
-    return np.bincount(index.ravel(), minlength=216) / index.size
-
-
-def find_cuts(measures: Sequence[FrameMeasures]) -> list[tuple[int, int]]:
-    """Hard cuts as (last frame before, first frame after). Blank frames are stepped over; a flash is not a cut."""
-    seen = [m for m in measures if not {"blank", "corrupt"} & set(m.flags)]
-    scores = np.array([cut_score(a.thumb, b.thumb) for a, b in itertools.pairwise(seen)])
-    cuts: list[tuple[int, int]] = []
-    for i in np.flatnonzero(scores > CUT_SCORE):
-        near = np.concatenate([scores[max(0, i - 8) : i], scores[i + 1 : i + 9]])
-        if near.size and scores[i] < CUT_OUTLIER * float(np.median(near)):
-            continue
-        before, after = seen[max(0, i - 1)], seen[min(len(seen) - 1, i + 2)]
-        if all(cut_score(x.thumb, y.thumb) > CUT_SCORE for x, y in ((before, seen[i + 1]), (seen[i], after))):
-            cuts.append((seen[i].frame, seen[i + 1].frame))
-    return cuts
 
 
 def automatic_step(count: int, fps: float) -> int:

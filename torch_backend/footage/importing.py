@@ -35,17 +35,11 @@ from ..contract import (
     read_json,
 )
 from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, restore_folder, write_json
-from .analysis import (
-    FrameMeasures,
-    automatic_step,
-    choose_solved,
-    find_cuts,
-    flag_duplicate,
-    looks_like_log,
-    measure,
-)
+from .analysis import FrameMeasures, automatic_step, choose_solved, flag_duplicate, looks_like_log, measure
 from .bars import Bars, find_bars
 from .burnt_in import WIDTH, find_mark, looked_at
+from .continuity import small_grey
+from .cuts import Frames, Transition, find_transitions
 from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
 from .earlier_work import EarlierWork, SamePictures, digest_of, footage_key
 from .images import is_whole_png, read_frame, resize, working_size, write_png
@@ -129,7 +123,8 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     try:
         with replacing_folder(shot.frames, keep=earlier is not None) as fresh:
             extracted = _extract(shot, opened, numbered, fresh / RAW_FOLDER, report)
-            _refuse_unusable(extracted.measures, shift)
+            _refuse_unusable(extracted.measures)
+            _refuse_cuts(extracted.measures, fresh / RAW_FOLDER, shift)
             record = _record(opened, config, extracted, key, shift)
             record["beside"] = _beside(shot, source)
             if earlier is not None:
@@ -352,8 +347,8 @@ def _expected(opened: Source, config: FootageConfig) -> int:
     return min(info.last, info.last if config.last is None else config.last) - first + 1
 
 
-def _refuse_unusable(measures: list[FrameMeasures], shift: int) -> None:
-    """JobError for a clip that no solve could use: too short, a still, or cut. `shift`: see `numbering`."""
+def _refuse_unusable(measures: list[FrameMeasures]) -> None:
+    """JobError for a clip that no solve could use: too short, or a still."""
     if len(measures) < LEAST_FRAMES:
         raise footage_error(
             f"The clip has only {len(measures)} frames: a freeze needs at least {LEAST_FRAMES}.",
@@ -371,23 +366,42 @@ def _refuse_unusable(measures: list[FrameMeasures], shift: int) -> None:
             f"Only {usable} of {len(measures)} frames are usable, the others are blank, damaged or repeated.",
             f"A freeze needs at least {LEAST_FRAMES}: choose another range.",
         )
-    cuts = find_cuts(measures)
-    if cuts:
-        ends = measures[0].frame - shift, measures[-1].frame - shift
-        raise _cut_error(*ends, [(before - shift, after - shift) for before, after in cuts])
 
 
-def _cut_error(first: int, last: int, cuts: list[tuple[int, int]]) -> Exception:
-    """The error in the footage's own numbers, which the range that it proposes has to be in."""
-    starts = [first, *(after for _, after in cuts)]
-    ends = [*(before for before, _ in cuts), last]
-    shots = [f"{a} to {b}" for a, b in zip(starts, ends, strict=True)]
-    where = " and ".join(f"{after}" for _, after in cuts[:3]) + (" and later" if len(cuts) > 3 else "")
-    longest = max(zip(starts, ends, strict=True), key=lambda pair: pair[1] - pair[0])
+def _refuse_cuts(measures: list[FrameMeasures], folder: Path, shift: int) -> None:
+    """JobError for a clip of several takes; `folder` holds its working frames. `shift`: see `numbering`."""
+
+    def picture(index: int) -> NDArray[np.uint8]:
+        return small_grey(read_frame(folder / frame_file(measures[index].frame, PICTURE)))
+
+    features = [m.features for m in measures]
+    frames = Frames([f for f in features if f is not None], [m.exposure for m in measures], picture)
+    found = find_transitions(frames, [n for n, m in enumerate(measures) if not m.flags])
+    if found:
+        raise _cut_error([m.frame - shift for m in measures], found)
+
+
+def _cut_error(numbers: list[int], found: list[Transition]) -> Exception:
+    """The error, in the footage's own `numbers`, which the range that it proposes has to be in."""
+    starts = [numbers[0], *(numbers[one.after] for one in found)]
+    ends = [*(numbers[one.before] for one in found), numbers[-1]]
+    longest = max(zip(starts, ends, strict=True), key=lambda take: take[1] - take[0])
+    takes = [f"{a} to {b}" for a, b in zip(starts, ends, strict=True) if b - a + 1 >= LEAST_FRAMES]
+    where = [_transition_words(one.kind, numbers[one.before], numbers[one.after]) for one in found[:3]]
+    where += ["more"] if len(found) > 3 else []
     return footage_error(
-        f"The clip has a hard cut at frame {where}: a freeze needs one continuous take.",
-        f"Pass the range of one take: {', '.join(shots[:6])} (for example --first {longest[0]} --last {longest[1]}).",
+        f"The clip has {', '.join(where)}: a freeze needs one continuous take.",
+        f"Pass the range of one take: {', '.join(takes[:6])} (for example --first {longest[0]} --last {longest[1]})."
+        if takes
+        else f"No take of it has {LEAST_FRAMES} frames: choose another clip.",
     )
+
+
+def _transition_words(kind: str, before: int, after: int) -> str:
+    """A transition as part of a sentence, by the last frame before it and the first one after it."""
+    if kind == "hard cut":
+        return f"a hard cut at frame {after}"
+    return f"a {kind} between frames {before} and {after}"
 
 
 def _log_remark(info: SourceInfo, config: FootageConfig, extracted: _Extracted) -> list[tuple[str, str]]:

@@ -46,6 +46,7 @@ from ..footage.sources import frame_words
 from ..replacing import Staged, replacing_solve, settle_solve
 from ..shot import Shot, atomic_path, content_key, make_folder, need_disk, replace_file, write_json
 from . import foreign, map_reading
+from .flat import flat_words
 from .floor import floor_of
 from .given import doubts, prepare, refuse_misfit, take_over
 from .ladder import climb
@@ -399,8 +400,10 @@ def _finish(
         save_arrays(beside, points)
     replace_file(scratch / "model", staged.solve / COLMAP_FOLDER)
     write_json(staged.solve / CAMERAS_FILE, path.to_json())
-    result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0])
+    flat = flat_words(points["xyz"])
+    result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0], flat is not None)
     warnings = _warnings(frames, path, result, "given" in answer)
+    warnings = ([flat] if flat is not None else []) + warnings
     warnings += doubts(answer) if "given" in answer else lens_remarks(answer)
     for message, hint in warnings:
         report.warning(message, hint)
@@ -531,7 +534,9 @@ def _undistort(
             raise
 
 
-def _result(answer: dict[str, Any], path: CameraPath, solved: int, points: int, focal: float) -> SolveResult:
+def _result(
+    answer: dict[str, Any], path: CameraPath, solved: int, points: int, focal: float, flat: bool
+) -> SolveResult:
     sources = [f.source for f in path.frames]
     error = round(float(answer["reprojection_error_px"]), 4)
     registered = int(answer["registered"])
@@ -544,7 +549,7 @@ def _result(answer: dict[str, Any], path: CameraPath, solved: int, points: int, 
         reprojection_error_px=error,
         points=points,
         focal_px=round(focal, 3),
-        quality=quality_words(registered, solved, error, "given" in answer),
+        quality=quality_words(registered, solved, error, "given" in answer, flat),
     )
 
 

@@ -94,10 +94,13 @@ def fault_of(answer: dict[str, Any], frames: dict[str, Any]) -> Fault | None:
     return None
 
 
-def quality_words(registered: int, solved: int, error_px: float, given: bool = False) -> str:
-    """One sentence: Good, Fair or Poor, and the figures; cameras that were `given` are said to be."""
+def quality_words(registered: int, solved: int, error_px: float, given: bool = False, flat: bool = False) -> str:
+    """One sentence: Good, Fair or Poor, and the figures; cameras that were `given` are said to be. A `flat` scene is
+    poor, however well its points fit."""
     share = registered / max(1, solved)
-    if share >= GOOD_SHARE and error_px <= GOOD_ERROR_PX:
+    if flat:
+        word = "Poor"
+    elif share >= GOOD_SHARE and error_px <= GOOD_ERROR_PX:
         word = "Good"
     else:
         word = "Fair" if share >= FAIR_SHARE and error_px <= FAIR_ERROR_PX else "Poor"

@@ -10,11 +10,8 @@ from torch_backend.footage.analysis import (
     FrameMeasures,
     automatic_step,
     choose_solved,
-    cut_score,
-    find_cuts,
     flag_duplicate,
     measure,
-    shifted_correlation,
     thumbnail,
 )
 
@@ -68,37 +65,6 @@ def test_a_repeated_frame_is_flagged_and_a_slow_pan_is_not(pan):
     again = measure(2, np.clip(frames[0].astype(int) + np.eye(48, 64, dtype=int)[..., None], 0, 255).astype(np.uint8))
     assert flag_duplicate(again, one) and again.flags == ["duplicate"]
     assert not flag_duplicate(two, one) and not two.flags
-
-
-def test_shifted_correlation_finds_the_shift():
-    wide = gaussian_filter(np.random.default_rng(0).random((36, 90)), 1.5)
-    assert shifted_correlation(wide[:, :64], wide[:, 20:84]) == pytest.approx(1.0, abs=0.03)
-    assert shifted_correlation(wide[:, :64], 3.0 * wide[:, :64] + 1.0) == pytest.approx(1.0, abs=1e-3)
-    other = gaussian_filter(np.random.default_rng(1).random((36, 64)), 1.5)
-    assert shifted_correlation(wide[:, :64], other) < 0.7
-
-
-def test_a_cut_is_found_and_named_by_the_frames_beside_it(pan):
-    frames = pan(12, seed=1) + pan(9, seed=2)
-    assert find_cuts([measure(i, f) for i, f in enumerate(frames, 101)]) == [(112, 113)]
-
-
-def test_a_cut_through_black_is_found(pan):
-    frames = [*pan(12, seed=1), *[flat(0)] * 3, *pan(9, seed=2)]
-    assert find_cuts([measure(i, f) for i, f in enumerate(frames, 1)]) == [(12, 16)]
-
-
-def test_pans_flashes_and_fades_are_no_cuts(pan):
-    frames = pan(30, seed=3, speed=6)
-    frames[14] = np.clip(frames[14].astype(int) * 3 + 80, 0, 255).astype(np.uint8)  # a flash
-    frames[20:23] = [flat(0)] * 3
-    assert find_cuts([measure(i, f) for i, f in enumerate(frames, 1)]) == []
-
-
-def test_cut_score_is_symmetric_and_zero_for_the_same(pan):
-    a, b = (thumbnail(f) / 255 for f in (pan(1, seed=1)[0], pan(1, seed=2)[0]))
-    assert cut_score(a, a) == pytest.approx(0.0, abs=1e-3)
-    assert cut_score(a, b) == pytest.approx(cut_score(b, a), abs=1e-4)
 
 
 @pytest.mark.parametrize(

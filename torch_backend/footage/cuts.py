@@ -1,0 +1,249 @@
+"""Where a clip goes from one take to another: hard cuts, dissolves, wipes, fades through black or white.
+
+In one take, neighbouring frames show one scene: a cut is two sharp frames that have next to nothing in common, while
+each has much in common with its other neighbour. And in one take that is transitive: if frame m lies near where frames
+m - L and m + L look, those two overlap. In a dissolve or wipe m shows both takes, and they have nothing in common.
+
+All that is compared with what the neighbours have in common, so noise, blur and darkness do not count. A flash, a
+passer-by or a whip pan is no cut: frames before and after fit, or the frames between are smeared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .continuity import Features, Link, link, sure_features
+
+SUSPICIOUS = 0.35
+"""Share of what the neighbours have in common, by the quick features, below which the sure ones are asked."""
+APART = 0.13
+"""The same by the sure features, at or below which two frames show different scenes. Measured: 0.20 to 1.5 in three
+handheld clips at their fastest, darkened, noisy, flickering and blurred; cuts 0.01 to 0.083, to mirrored pictures and
+to other views of one room too."""
+_LEAST_LEVEL = 20
+"""Sure features that neighbours have in common, from which on something can be said."""
+_LINKED = 0.15
+"""Quick features that a frame has in common with a neighbour, unless it is noise, a flash or smeared."""
+_SHARP = 0.4
+"""Sharpness of a frame as a share of its take's, below which it is smeared."""
+_AROUND = 8
+"""Frames of a take by which its sharpness and exposure are told."""
+_ALIKE = 0.06
+"""Share of quick features that unrelated pictures may have in common, with a margin: measured up to 0.04."""
+_NEAR = 0.2
+"""Way of the picture, as a share of its width, up to which frames on both sides of a third have to overlap."""
+_WIPED = 0.1
+"""What the frames on both sides of a wipe have in common, as a share of what the frame between has with the poorer one.
+Measured: 0.04 and 0.05; 0.15 where somebody walks through the picture, 0.29 and more in handheld clips with noise."""
+_MIXED = 0.4
+"""The same of a dissolve, in which matches are uncertain. It has to be a sum of the two pictures, too."""
+_LEAST_COMMON = 10
+"""Sure features that place the two pictures of a dissolve on the frame between."""
+_EXPLAINED = 0.85
+"""Least share of a dissolved frame's variance that the sum of the two pictures explains."""
+_GAINED = 2.2
+"""Times by which the sum leaves less unexplained than either picture alone. Measured: 2.2 to 8 in dissolves over 4 to
+30 frames; often more in one take, see `_UNLIKE`."""
+_UNLIKE = 0.65
+"""Correlation of the two pictures, laid over each other, above which they show the same. Measured: 0.41 to 0.55 in
+dissolves, 0.74 and more in one take, where the mean of two neighbours also explains the frame between."""
+_LEAST_PART = 0.25
+"""Least weight of either picture in the sum, which is near 1 in total."""
+_FADED_STOPS = 2.0
+"""Stops by which a picture between two takes is darker or brighter than both if they are faded."""
+_FADING = 0.1
+"""Stops by which a picture changes from one frame of a fade to the next."""
+
+
+@dataclass(frozen=True)
+class Transition:
+    """The end of a take and the beginning of the next."""
+
+    kind: str
+    """hard cut, dissolve, fade, or `wipe or dissolve`."""
+    before: int
+    """Index of a frame up to which there is the one take alone."""
+    after: int
+    """Index of a frame from which on there is the other alone."""
+
+
+class Frames:
+    """Frames of a clip, compared with each other; nothing is compared twice."""
+
+    def __init__(
+        self, quick: Sequence[Features], exposure: Sequence[float], picture: Callable[[int], NDArray[np.uint8]]
+    ) -> None:
+        """Args:
+        quick: of each frame.
+        exposure: of each frame, stops.
+        picture: grey picture of a frame by its index, as `continuity.small_grey`.
+        """
+        self.quick, self.exposure, self.picture = quick, exposure, picture
+        self._links: dict[tuple[int, int], Link] = {}
+        self._sure: dict[int, Features] = {}
+        self._sure_links: dict[tuple[int, int], Link] = {}
+
+    def share(self, a: int, b: int) -> float:
+        """Share of quick features that two frames have in common."""
+        return self.linked(a, b).share
+
+    def linked(self, a: int, b: int) -> Link:
+        """What two frames have in common by their quick features."""
+        if (a, b) not in self._links:
+            self._links[a, b] = link(self.quick[a], self.quick[b])
+        return self._links[a, b]
+
+    def sure(self, a: int, b: int) -> Link:
+        """The same by their sure features."""
+        for index in (a, b):
+            if index not in self._sure:
+                self._sure[index] = sure_features(self.picture(index))
+        if (a, b) not in self._sure_links:
+            self._sure_links[a, b] = link(self._sure[a], self._sure[b])
+        return self._sure_links[a, b]
+
+    def forget(self, before: int) -> None:
+        """Frees what was kept of frames before an index."""
+        self._sure = {index: kept for index, kept in self._sure.items() if index >= before}
+
+
+def find_transitions(frames: Frames, usable: Sequence[int]) -> list[Transition]:
+    """All transitions, in order; `usable` are indices of frames that are neither blank, repeated nor damaged."""
+    shown = [i for i in usable if frames.quick[i].enough]
+    ends = (shown[:1], shown[-1:])
+
+    def held(n: int) -> bool:
+        # Noise in black, flashes and smears have nothing in common with a neighbour.
+        near = [pair for pair in (shown[max(0, n - 1) : n + 1], shown[n : n + 2]) if len(pair) == 2]
+        return max((frames.share(*pair) for pair in near), default=0.0) >= _LINKED
+
+    # At the clip's ends a single frame may be what is left of another take.
+    shown = [i for n, i in enumerate(shown) if [i] in ends or held(n)]
+    found = _breaks(frames, shown)
+    return sorted([*found, *_mixtures(frames, shown, found)], key=lambda one: one.before)
+
+
+def _breaks(frames: Frames, shown: list[int]) -> list[Transition]:
+    """Hard cuts and fades: neighbours among the frames that show something, and have nothing in common."""
+    found: list[Transition] = []
+    for n in range(len(shown) - 1):
+        before, after = shown[max(0, n - 2) : n + 1], shown[n + 1 : n + 4]
+        inner = [pair for pair in ((before[-2:]), (after[:2])) if len(pair) == 2]
+        level = min((frames.share(*pair) for pair in inner), default=0.0)
+        if frames.share(before[-1], after[0]) >= SUSPICIOUS * level or level < _LINKED:
+            continue
+        sure_level = min(frames.sure(*pair).count for pair in inner)
+        if sure_level < _LEAST_LEVEL or any(
+            frames.sure(a, b).count > APART * sure_level for a in before for b in after
+        ):
+            continue
+        if any(frames.sure(*pair).shift > _NEAR for pair in inner):
+            continue  # so fast that the next frame may show another place: a whip pan
+        if not (_is_sharp(frames, shown, n, -1) and _is_sharp(frames, shown, n + 1, 1)):
+            continue
+        frames.forget(before[0])
+        faded = _faded(frames, before[-1], after[0])
+        if faded is not None:
+            found.append(faded)
+        elif after[0] == before[-1] + 1 or _is_plain_gap(frames, before[-1], after[0]):
+            found.append(Transition("hard cut", before[-1], after[0]))
+    return found
+
+
+def _is_sharp(frames: Frames, shown: list[int], n: int, way: int) -> bool:
+    """Whether a frame is as sharp as its take, which lies before it (`way` -1) or after it (1)."""
+    take = shown[max(0, n - _AROUND) : n + 1] if way < 0 else shown[n : n + _AROUND + 1]
+    usual = float(np.median([frames.quick[i].sharpness for i in take]))
+    return frames.quick[shown[n]].sharpness >= _SHARP * usual
+
+
+def _is_plain_gap(frames: Frames, before: int, after: int) -> bool:
+    """Whether the frames between two takes show nothing: smeared ones of a whip pan do."""
+    return not any(frames.quick[i].enough for i in range(before + 1, after))
+
+
+def _faded(frames: Frames, before: int, after: int) -> Transition | None:
+    """The fade in which two takes end and begin, out to where their exposure is what it was; None if there is none."""
+    light = frames.exposure
+    between = light[before : after + 1]
+    first, last = before, after
+    for sign, end in ((-1.0, min(between)), (1.0, max(between))):
+        while first > 0 and sign * (light[first] - light[first - 1]) > _FADING:
+            first -= 1
+        while last < len(light) - 1 and sign * (light[last] - light[last + 1]) > _FADING:
+            last += 1
+        if all(sign * (end - light[i]) > _FADED_STOPS for i in (first, last)):
+            return Transition("fade", first, last)
+    return None
+
+
+def _mixtures(frames: Frames, shown: list[int], known: list[Transition]) -> list[Transition]:
+    """Dissolves and wipes: a frame that has something in common with two others, which have nothing in common."""
+    found: list[Transition] = []
+    reach = 2
+    while 2 * reach < len(shown):
+        for n in range(reach, len(shown) - reach, max(1, reach // 2)):
+            a, m, b = shown[n - reach], shown[n], shown[n + reach]
+            if not any(one.before < b and a < one.after for one in [*known, *found]):
+                kind = _mixed(frames, a, m, b)
+                if kind == "dissolve":  # the frames on both sides may be mixed a little, too
+                    a, b = shown[max(0, n - 2 * reach)], shown[min(len(shown) - 1, n + 2 * reach)]
+                if kind:
+                    found.append(Transition(kind, a, b))
+        reach *= 2
+    return found
+
+
+def _mixed(frames: Frames, a: int, m: int, b: int) -> str:
+    """dissolve, or wipe or dissolve, if frame `m` shows takes of which `a` shows one and `b` the other; else empty."""
+    quick = frames.share(a, m), frames.share(m, b)
+    if frames.share(a, b) > _ALIKE or max(quick) < _ALIKE:
+        return ""
+    left, right = frames.sure(a, m), frames.sure(b, m)
+    level, across = min(left.count, right.count), frames.sure(a, b).count
+    if level < _LEAST_COMMON or max(left.shift, right.shift) > _NEAR:
+        return ""
+    if level >= 2 * _LEAST_LEVEL and across <= _WIPED * level:
+        return "dissolve" if _is_sum(frames, left, m, right, a, b) else "wipe or dissolve"
+    return "dissolve" if across <= _MIXED * level and _is_sum(frames, left, m, right, a, b) else ""
+
+
+def _is_sum(frames: Frames, left: Link, m: int, right: Link, a: int, b: int) -> bool:
+    """Whether frame `m` is a weighted sum of frames `a` and `b`, laid over it by what they have in common with it."""
+    target = _soft(frames.picture(m))
+    size = (target.shape[1], target.shape[0])
+    laid = [
+        np.asarray(cv2.warpPerspective(_soft(frames.picture(i)), side.homography, size, borderValue=-1.0), np.float32)
+        for i, side in ((a, left), (b, right))
+    ]
+    covered = (laid[0] >= 0.0) & (laid[1] >= 0.0)
+    if covered.mean() < 0.5 or target[covered].var() == 0.0:
+        return False
+    first, second, values = laid[0][covered], laid[1][covered], target[covered]
+    if not np.corrcoef(first, second)[0, 1] <= _UNLIKE:
+        return False
+
+    def fitted(*columns: NDArray[np.float32]) -> tuple[float, NDArray[np.float64]]:
+        basis = np.stack([*columns, np.ones_like(values)], axis=1)
+        weights = np.asarray(np.linalg.lstsq(basis, values, rcond=None)[0], np.float64)
+        return float(np.square(values - basis @ weights).mean() / values.var()), weights
+
+    unexplained, weights = fitted(first, second)
+    alone = min(fitted(first)[0], fitted(second)[0])
+    parts = float(weights[0]), float(weights[1])
+    return (
+        unexplained <= 1.0 - _EXPLAINED
+        and alone >= _GAINED * unexplained
+        and min(parts) >= _LEAST_PART
+        and 0.75 <= sum(parts) <= 1.25
+    )
+
+
+def _soft(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """A grey picture in which a pixel's misplacement does not count."""
+    return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 3.0), np.float32)
