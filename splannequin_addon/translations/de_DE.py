@@ -560,6 +560,8 @@ MESSAGES: dict[str, str] = {
     "Splannequin's backend is not set up: no Python environment for it was found.": "Splannequins Backend ist nicht eingerichtet: es wurde keine Python-Umgebung dafür gefunden.",
     "Press Set Up Backend in the add-on's preferences, or choose the Python of one that is there (or name it in {}).": "In den Einstellungen des Add-ons „Backend einrichten“ drücken oder das Python eines vorhandenen wählen (oder es in {} nennen).",
     "The backend's set-up has not finished: the environment in {} is half-made.": "Das Einrichten des Backends ist nicht beendet: die Umgebung in {} ist halb fertig.",
+    "Splannequin is enabled already, as {}: disable that copy first.": "Splannequin ist schon eingeschaltet, als {}: zuerst dieses ausschalten.",
+    "Splannequin cannot be enabled, and nothing of it is: {}": "Splannequin kann nicht eingeschaltet werden, und nichts davon ist es: {}",
     "The backend in {} was changed since it was set up: {}.": "Das Backend in {} wurde seit dem Einrichten geändert: {}.",
     "The backend's environment is incomplete: {}.": "Die Umgebung des Backends ist unvollständig: {}.",
     "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.": "In den Einstellungen des Add-ons „Reparieren“ drücken oder `python3 splannequin.py setup` noch einmal ausführen.",
