@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ..footage import arrival, plate
 from ..scene import rollback
 from ..shot import inventory, selection
-from . import cameras, scale
+from . import cameras, motion_overlay, scale
 
 if TYPE_CHECKING:
     import bpy
@@ -20,6 +20,7 @@ def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
     selection.see(scene, state)
     is_new = cameras.find(scene, shot, "EMPTY") is None
     with rollback.scene_of(scene):
+        motion_overlay.hide(scene, shot)  # it is of the mattes of before
         camera = cameras.build(scene, shot)
         notes = scale.guess_scale(scene, shot, is_new)
         changes = arrival.fit(scene, state, force_k=True)

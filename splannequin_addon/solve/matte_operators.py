@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from ..scene import sequences
 from ..shot import inventory, selection
 from ..translations import tr
 from ..ui import icons
-from . import mattes
+from . import mattes, motion_overlay
 
 
 def _in_editor(context: bpy.types.Context, image: bpy.types.Image, mode: str) -> Any | None:
@@ -80,6 +81,37 @@ class SPLANNEQUIN_OT_show_motion(_Matte, bpy.types.Operator):
         return f"The motion matte has frames {first} to {last}."
 
 
+class SPLANNEQUIN_OT_motion_over_plate(_Matte, bpy.types.Operator):
+    """Tint what the solve found to move over the plate, seen through the solved camera; pressed again: no more"""
+
+    bl_idname = "splannequin.motion_over_plate"
+    bl_label = "Motion over Plate"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: bpy.types.Context, shot: Path) -> str:
+        """Shows or hides it; in a window, frames that have still to be tinted are, one a turn of the timer."""
+        scene = scene_in(context)
+        if motion_overlay.hide(scene, shot):
+            return "The plate is shown as it is."
+        turns = mattes.tint_in_turns(shot)
+        first = next(turns, None)
+        if first is None or bpy.app.background:
+            for _ in turns:
+                pass
+            return " ".join(mattes.show_over_plate(scene, shot))
+        job_timer.work(shot, "solve", _tint(shot, turns, scene.session_uid))
+        return "The mattes are tinted."
+
+
+def _tint(shot: Path, turns: Iterator[tuple[int, int]], scene_uid: int) -> Iterator[job_timer.Progress]:
+    """Tints the frames that are left, a frame a turn, then shows them."""
+    for done, total in turns:
+        yield job_timer.Progress(f"Tinting the motion, frame {done} of {total}", done, total)
+    job_timer.change(
+        job_timer.watch_of(shot), "solve", lambda scene: mattes.show_over_plate(scene, shot), only=scene_uid
+    )
+
+
 class SPLANNEQUIN_OT_paint_motion(_Matte, bpy.types.Operator):
     """Paint over the motion matte of the current frame in an Image Editor: black where it stands still, white where it
     moves"""
@@ -142,8 +174,10 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
         return f"Frame {frame} of the motion matte is as the solve found it."
 
 
-def draw(layout: bpy.types.UILayout) -> None:
+def draw(layout: bpy.types.UILayout, is_over_plate: bool) -> None:
     """The buttons."""
+    name = "splannequin.motion_over_plate"
+    layout.operator(name, icon=icons.of(name), depress=is_over_plate)
     row = layout.row(align=True)
     for name in ("splannequin.show_motion", "splannequin.paint_motion"):
         row.operator(name, icon=icons.of(name))
@@ -154,6 +188,7 @@ def draw(layout: bpy.types.UILayout) -> None:
 
 CLASSES = (
     SPLANNEQUIN_OT_show_motion,
+    SPLANNEQUIN_OT_motion_over_plate,
     SPLANNEQUIN_OT_paint_motion,
     SPLANNEQUIN_OT_save_motion,
     SPLANNEQUIN_OT_clear_motion,

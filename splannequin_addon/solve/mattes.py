@@ -11,6 +11,7 @@ import contextlib
 import os
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,24 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
-from ..access import pixels_of, size_of
-from ..scene import paths, sequences
-from ..scene.ownership import MATTE_SHOT
+from ..access import camera_of, pixels_of, size_of
+from ..scene import numbered, paths, sequences
+from ..scene.ownership import MATTE_SHOT, TAG
 from ..shot import inventory, scene_objects
+from . import motion_overlay
 
 _FRAME = "splannequin_matte"
 """Property of the images that are painted on: frame number. `MATTE_SHOT` is another."""
 _PICTURE = "splannequin_picture"
 """Another: digest of the picture that the frame had. Another clip may have been imported into the shot since."""
+MOVING_TINT = (255, 64, 0)
+"""Tint, sRGB, of what moves and, fainter, of what is likely to."""
+UNKNOWN_TINT = (64, 128, 255)
+"""Tint of what is not known."""
+_OPAQUE = 150
+"""Of what surely moves, of 255: the plate is seen through it."""
+_FAINT = 70
+"""Of what is likely to move, and of what is not known."""
 
 
 def found_file(shot: Path, frame: int) -> Path:
@@ -63,7 +73,7 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
     image = find_image(shot, frame)
     if image is not None:
         return image
-    pixels = _matte(shot, frame)
+    pixels = matte_pixels(shot, frame)
     height, width = pixels.shape[:2]
     image = next((i for i in bpy.data.images if _is_of(i, shot, frame)), None)
     if image is None:
@@ -74,7 +84,7 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
     return image
 
 
-def _matte(shot: Path, frame: int) -> np.ndarray:
+def matte_pixels(shot: Path, frame: int) -> np.ndarray:
     """The matte of a frame as it stands in the shot, [H, W, 4] float32, bottom row first; JobError as `paint_image`."""
     path = next((p for p in (painted_file(shot, frame), found_file(shot, frame)) if p.is_file()), None)
     if path is None:
@@ -146,7 +156,7 @@ def save_paint(image: bpy.types.Image) -> Path:
     pixels_of(image).foreach_get(pixels)
     data = packed(pixels.reshape(height, width, image.channels)[::-1])
     try:
-        _write(path, data)
+        write(path, data)
     except OSError as error:
         raise inventory.unwritable(
             path, error, "Make room, or see to it that the shot's folder can be written."
@@ -170,17 +180,22 @@ def clear_paint(shot: Path, frame: int) -> bool:
 
 def packed(pixels: np.ndarray) -> bytes:
     """A PNG of [H, W, C] float32 in 0 to 1, top row first: grey, 8 bits, with alpha if any of it is transparent."""
-    height, width, channels = pixels.shape
+    channels = pixels.shape[2]
     planes = [pixels[..., : 3 if channels >= 3 else 1].mean(2)]
     if channels in (2, 4) and (pixels[..., -1] < 1.0).any():
         planes.append(pixels[..., -1])
-    rows = np.rint(np.clip(np.stack(planes, -1), 0.0, 1.0) * 255.0).astype(np.uint8).reshape(height, -1)
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)
+    return png(np.rint(np.clip(np.stack(planes, -1), 0.0, 1.0) * 255.0).astype(np.uint8))
+
+
+def png(pixels: np.ndarray) -> bytes:
+    """A PNG of [H, W, C] uint8, top row first: grey, grey and alpha, colour, or colour and alpha."""
+    height, width, channels = pixels.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    head = struct.pack(">IIBBBBB", width, height, 8, 4 if len(planes) == 2 else 0, 0, 0, 0)
+    head = struct.pack(">IIBBBBB", width, height, 8, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
     body = zlib.compress(rows.tobytes(), 2)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
 
@@ -204,11 +219,87 @@ def _pixels(path: Path) -> np.ndarray:
         bpy.data.images.remove(image)
 
 
-def _write(path: Path, data: bytes) -> None:
+def write(path: Path, data: bytes) -> None:
     """Writes beside `path`, fsyncs, renames over it. OSError, also if its folder is a link to elsewhere."""
     if contract.is_link(path.parent):
         raise NotADirectoryError(20, "its folder is a link", str(path))
     contract.write_atomic(path, data, parents=False)
+
+
+# What follows shows mattes over the plate. A matte is grey and has no alpha, so it is written once more as tint and
+# alpha, and again when it has changed.
+
+
+def overlay_folder(shot: Path) -> Path:
+    """Where the tinted frames of a shot lie."""
+    return contract.ShotFolder(shot).motion / "overlay"
+
+
+def tint_in_turns(shot: Path) -> Iterator[tuple[int, int]]:
+    """Writes the tinted frames that are not there or older than their mattes; yields how many are done, of how many.
+
+    JobError if the shot has no mattes, or a file cannot be read or written.
+    """
+    numbers = numbered.frame_numbers(contract.ShotFolder(shot).motion, contract.PICTURE)
+    if not numbers:
+        raise no_matte(shot)
+    folder = overlay_folder(shot)
+    stale = [n for n in numbers if not _is_newer(folder / contract.frame_file(n, contract.PICTURE), shot, n)]
+    for done, number in enumerate(stale):
+        yield done, len(stale)
+        try:
+            if contract.is_link(folder.parent):
+                raise NotADirectoryError(20, "its folder is a link", str(folder))
+            folder.mkdir(exist_ok=True)
+            data = png(tinted(matte_pixels(shot, number)[::-1, :, 0]))
+            write(folder / contract.frame_file(number, contract.PICTURE), data)
+        except OSError as error:
+            raise inventory.unwritable(
+                folder, error, "Make room, or see to it that the shot's folder can be written."
+            ) from error
+
+
+def tinted(matte: np.ndarray) -> np.ndarray:
+    """[H, W, 4] uint8 tint and alpha of a matte [H, W] in 0 to 1: still below a tenth, unknown around a half."""
+    moves, unknown = matte > 0.75, (matte > 0.35) & (matte <= 0.75)
+    likely = (matte > 0.1) & ~(moves | unknown)
+    picture = np.zeros((*matte.shape, 4), np.uint8)
+    picture[..., :3] = np.where(unknown[..., None], np.array(UNKNOWN_TINT, np.uint8), np.array(MOVING_TINT, np.uint8))
+    picture[..., 3] = np.where(moves, _OPAQUE, np.where(unknown | likely, _FAINT, 0))
+    return picture
+
+
+def show_over_plate(scene: bpy.types.Scene, shot: Path) -> list[str]:
+    """Puts the tinted frames before the plate, in the view through the shot's camera; returns what was done, in words.
+
+    JobError without frames or camera.
+    """
+    camera = scene_objects.part(scene, shot, "camera")
+    folder = overlay_folder(shot)
+    numbers = numbered.frame_numbers(folder, contract.PICTURE)
+    if camera is None:
+        raise contract.JobError("The solve is not in this scene.", "Load the camera first.", contract.ExitCode.USAGE)
+    if not numbers:
+        raise no_matte(shot)
+    data = camera_of(camera)
+    path = folder / contract.frame_file(numbers[0], contract.PICTURE)
+    image = sequences.load_sequence(path, f"Motion over {scene_objects.name_of(shot)}", "srgb")
+    image[TAG] = motion_overlay.OVERLAY
+    background = motion_overlay.find(scene, shot) or data.background_images.new()
+    background.image = image
+    sequences.show_sequence(background.image_user, image, numbers[0], numbers[-1])
+    background.frame_method, background.display_depth, background.alpha = "FIT", "FRONT", 1.0
+    data.show_background_images = True
+    return ["What moves is tinted over the plate: orange moves, faint orange may, blue is not known."]
+
+
+def _is_newer(file: Path, shot: Path, number: int) -> bool:
+    """True if a tinted frame was written after its mattes, found and painted."""
+    sources = [found_file(shot, number), painted_file(shot, number)]
+    try:
+        return file.stat().st_mtime_ns > max(p.stat().st_mtime_ns for p in sources if p.is_file())
+    except (OSError, ValueError):
+        return False
 
 
 @persistent
@@ -227,7 +318,7 @@ def _after_load(*_: object) -> None:
         known = _of(image)
         if known is not None and image.source == "GENERATED":
             with contextlib.suppress(contract.JobError, RuntimeError):  # Paint Motion will say why
-                _fill(image, _matte(Path(known[0]), known[1]))
+                _fill(image, matte_pixels(Path(known[0]), known[1]))
 
 
 def register() -> None:

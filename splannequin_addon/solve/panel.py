@@ -10,7 +10,7 @@ from ..process import steps
 from ..shot import inventory, selection
 from ..ui import icons, step_panel
 from ..ui.sentences import wrap
-from . import align_operators, cameras, matte_operators, scale
+from . import align_operators, cameras, matte_operators, motion_overlay, scale
 
 
 def can_load_camera(running: str | None) -> bool:
@@ -36,7 +36,8 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
             self._masks(context, body)
         body = step_panel.sub_panel(layout_of(self), "camera_motion", "Motion Matte")
         if body is not None:
-            matte_operators.draw(body)
+            shown = watch is not None and motion_overlay.find(scene_in(context), watch.shot) is not None
+            matte_operators.draw(body, shown)
         if watch is None or cameras.find(scene_in(context), watch.shot, "EMPTY") is None:
             return
         if not scale.scaled(scene_in(context), watch.shot):

@@ -1,0 +1,91 @@
+"""What moves, tinted over the plate behind the solved camera: drawn from the mattes, undone, and gone with the shot."""
+
+import os
+
+import bpy
+import numpy as np
+import pytest
+
+from tests.addon.test_mattes import HEIGHT, labels, matted, png  # noqa: F401 - a fixture
+
+
+@pytest.fixture
+def loaded(addon, scene, matted):  # noqa: F811
+    addon("solve.arrival").load_camera(scene, matted)
+    addon("process.job_timer").refresh(addon("process.job_timer").watch_of(matted))
+    return matted
+
+
+def toggle():
+    assert bpy.ops.splannequin.motion_over_plate() == {"FINISHED"}
+
+
+def frames(addon, shot):
+    """Frame -> [H, W, 4] of the tinted frames on the disk, as Blender reads them, top row first."""
+    found = {}
+    for path in sorted(addon("solve.mattes").overlay_folder(shot).iterdir()):
+        image = bpy.data.images.load(str(path))
+        image.alpha_mode = "CHANNEL_PACKED"
+        pixels = np.array(image.pixels[:]).reshape(HEIGHT, -1, 4)[::-1]
+        found[int(path.stem)] = np.rint(pixels * 255).astype(int)
+        bpy.data.images.remove(image)
+    return found
+
+
+def test_it_is_tinted_where_something_moves_and_clear_where_the_plate_stands_still(addon, scene, loaded):
+    toggle()
+    camera = addon("solve.cameras").find(scene, loaded, "CAMERA").data
+    plate, overlay = camera.background_images
+    assert overlay.display_depth == "FRONT" and plate.display_depth == "BACK" and plate.show_background_image
+    assert (overlay.image_user.frame_start, overlay.image_user.frame_offset) == (5, 4)
+    written = frames(addon, loaded)
+    assert sorted(written) == [5, 6, 7]
+    for number, picture in written.items():
+        alpha = picture[..., 3]
+        moves, unknown = labels(number) == 255, labels(number) == 128
+        assert (alpha[labels(number) == 0] == 0).all() and (alpha[moves] > alpha[unknown].max()).all()
+        assert (picture[moves][:, 0] > picture[moves][:, 2]).all(), "orange"
+        assert (picture[unknown][:, 2] > picture[unknown][:, 0]).all(), "blue"
+    toggle()
+    assert addon("solve.motion_overlay").find(scene, loaded) is None
+    assert list(camera.background_images) == [plate] and not [i for i in bpy.data.images if "Motion over" in i.name]
+
+
+def test_what_was_painted_since_is_tinted_anew(addon, loaded):
+    toggle()
+    toggle()
+    folder = addon("solve.mattes").overlay_folder(loaded)
+    before = {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
+    painted = loaded / "motion_paint" / "000006.png"
+    painted.parent.mkdir()
+    painted.write_bytes(png(np.full((HEIGHT, 16), 255, np.uint8)))
+    later = max(before.values()) + 10**9
+    os.utime(painted, ns=(later, later))
+    toggle()
+    changed = {p.name for p in folder.iterdir() if p.stat().st_mtime_ns != before[p.name]}
+    assert changed == {"000006.png"} and (frames(addon, loaded)[6][..., 3] > 100).all()
+
+
+def test_undo_takes_it_away_and_another_solve_and_removing_the_shot_do(addon, scene, loaded):
+    overlay = addon("solve.motion_overlay")
+    toggle()
+    addon("solve.arrival").load_camera(scene, loaded)
+    assert overlay.find(scene, loaded) is None, "the mattes are those of another solve"
+    toggle()
+    addon("process.steps").STEPS["solve"].remove(scene, loaded, [])
+    assert not [i for i in bpy.data.images if "Motion over" in i.name]
+
+
+def test_without_mattes_or_camera_it_says_so(addon, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    with pytest.raises(RuntimeError, match="no motion matte"):
+        bpy.ops.splannequin.motion_over_plate()
+
+
+def test_nothing_is_written_through_a_link(addon, scene, loaded, tmp_path):
+    motion, elsewhere = loaded / "solve" / "motion", tmp_path / "elsewhere"
+    motion.rename(elsewhere)
+    motion.symlink_to(elsewhere, target_is_directory=True)
+    with pytest.raises(RuntimeError, match="Cannot write"):
+        bpy.ops.splannequin.motion_over_plate()
+    assert not (elsewhere / "overlay").exists()
