@@ -285,6 +285,8 @@ def show_over_plate(scene: bpy.types.Scene, shot: Path) -> list[str]:
     path = folder / contract.frame_file(numbers[0], contract.PICTURE)
     image = sequences.load_sequence(path, f"Motion over {scene_objects.name_of(shot)}", "srgb")
     image[TAG] = motion_overlay.OVERLAY
+    if motion_overlay.find(scene, shot) is None:
+        motion_overlay.bare_plate(data, image)
     background = motion_overlay.find(scene, shot) or data.background_images.new()
     background.image = image
     sequences.show_sequence(background.image_user, image, numbers[0], numbers[-1])

@@ -51,6 +51,17 @@ def test_it_is_tinted_where_something_moves_and_clear_where_the_plate_stands_sti
     assert list(camera.background_images) == [plate] and not [i for i in bpy.data.images if "Motion over" in i.name]
 
 
+def test_the_plate_is_seen_below_it_and_the_freeze_again_afterwards(addon, scene, loaded):
+    """In a shot.blend the freeze stands before the plate."""
+    addon("command_line.first_view").set_up(scene, loaded, "freeze")
+    camera = addon("solve.cameras").find(scene, loaded, "CAMERA").data
+    toggle()
+    plate, freeze, overlay = camera.background_images
+    assert [b.show_background_image for b in (plate, freeze, overlay)] == [True, False, True]
+    toggle()
+    assert [b.show_background_image for b in camera.background_images] == [False, True]
+
+
 def test_what_was_painted_since_is_tinted_anew(addon, loaded):
     toggle()
     toggle()
