@@ -3,7 +3,8 @@
 Warp hands its compilers paths as UTF-8, and Clang and NVRTC open them as Windows' own code page: from a profile such as
 `C:\\Users\\Jörg` neither the headers in `warp/native` nor the folder of compiled kernels can be read, and nothing
 compiles, for the processor no more than for a card. Short (8.3) names do not help: Warp makes the long ones of them.
-So both move to a folder that everybody may write and whose name is ASCII. Standard library only.
+So both move to a folder whose name is ASCII, where every user may make one. What lies there is loaded as a library, so
+the folder is one that this user made, and that no other may write. Standard library only.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ import contextlib
 import hashlib
 import os
 import shutil
+import stat
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from .contract import ExitCode, JobError
+from .contract import ExitCode, JobError, is_link
 from .shot import is_disk_full, locked, replace_file
 
 _FOLDER = "Splannequin"
@@ -125,14 +128,93 @@ def _writable(environ: Mapping[str, str]) -> Path | None:
     """A folder of this user's with an ASCII name that can be written; None if there is none."""
     user = hashlib.sha256(environ.get("USERPROFILE", environ.get("USERNAME", "")).encode()).hexdigest()[:8]
     for base in _bases(environ):
-        folder = base / _FOLDER / user
+        # Not in a folder that users share: whoever owns that could put another one in this one's place.
+        folder = base / f"{_FOLDER}-{user}"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            base.mkdir(parents=True, exist_ok=True)
+            if not os.path.lexists(folder):
+                make_private(folder)
+            if not is_private(folder):
+                continue
             tempfile.TemporaryFile(dir=folder).close()
             return folder
         except OSError:
             continue
     return None
+
+
+if sys.platform == "win32":
+    import ctypes
+    from ctypes import byref, wintypes
+
+    _advapi = ctypes.WinDLL("advapi32", use_last_error=True)
+    _kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+    _kernel.GetCurrentProcess.restype = wintypes.HANDLE
+    _advapi.EqualSid.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
+    _advapi.IsWellKnownSid.argtypes = [ctypes.c_void_p, ctypes.c_int]
+    _advapi.OpenProcessToken.argtypes = [wintypes.HANDLE, wintypes.DWORD, ctypes.c_void_p]
+    _advapi.GetTokenInformation.argtypes = [
+        wintypes.HANDLE, ctypes.c_int, ctypes.c_void_p, wintypes.DWORD, ctypes.c_void_p,
+    ]  # fmt: skip
+    _kernel.LocalFree.argtypes = [ctypes.c_void_p]
+    _kernel.CloseHandle.argtypes = [wintypes.HANDLE]
+
+    class _Attributes(ctypes.Structure):
+        _fields_ = (
+            ("length", wintypes.DWORD),
+            ("descriptor", ctypes.c_void_p),
+            ("inherited", wintypes.BOOL),
+        )
+
+    def make_private(folder: Path) -> None:
+        """Makes a folder that only its owner, administrators and the system may open. OSError if it cannot be made.
+
+        `mkdir` gives it what %PROGRAMDATA% hands down: every user may put files there.
+        """
+        descriptor = ctypes.c_void_p()
+        rules = "D:P(A;OICI;FA;;;SY)(A;OICI;FA;;;BA)(A;OICI;FA;;;OW)"
+        if not _advapi.ConvertStringSecurityDescriptorToSecurityDescriptorW(rules, 1, byref(descriptor), None):
+            raise ctypes.WinError(ctypes.get_last_error())
+        try:
+            attributes = _Attributes(ctypes.sizeof(_Attributes), descriptor, False)
+            if not _kernel.CreateDirectoryW(str(folder), byref(attributes)):
+                raise ctypes.WinError(ctypes.get_last_error())
+        finally:
+            _kernel.LocalFree(descriptor)
+
+    def is_private(folder: Path) -> bool:
+        """True if a folder, and no link to one, is this user's, or an administrator's."""
+        if is_link(folder) or not folder.is_dir():
+            return False
+        owner, descriptor, token, size = ctypes.c_void_p(), ctypes.c_void_p(), wintypes.HANDLE(), wintypes.DWORD()
+        if _advapi.GetNamedSecurityInfoW(str(folder), 1, 1, byref(owner), None, None, None, byref(descriptor)):
+            return False
+        try:
+            if _advapi.IsWellKnownSid(owner, 26):  # administrators: who has their rights may do anything
+                return True
+            if not _advapi.OpenProcessToken(_kernel.GetCurrentProcess(), 0x0008, byref(token)):
+                return False
+            _advapi.GetTokenInformation(token, 1, None, 0, byref(size))
+            user = ctypes.create_string_buffer(size.value)
+            if not _advapi.GetTokenInformation(token, 1, user, size, byref(size)):
+                return False
+            # TOKEN_USER begins with a pointer to the user's SID.
+            return bool(_advapi.EqualSid(owner, ctypes.cast(user, ctypes.POINTER(ctypes.c_void_p))[0]))
+        finally:
+            _kernel.LocalFree(descriptor)
+            if token:
+                _kernel.CloseHandle(token)
+
+else:
+
+    def make_private(folder: Path) -> None:
+        """Makes a folder that only its owner may open. OSError if it cannot be made."""
+        os.mkdir(folder, 0o700)
+
+    def is_private(folder: Path) -> bool:
+        """True if a folder, and no link to one, is this user's, and no other may write there."""
+        found = os.lstat(folder)
+        return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
 
 
 def _bases(environ: Mapping[str, str]) -> Iterator[Path]:

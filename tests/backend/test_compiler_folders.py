@@ -63,6 +63,35 @@ def test_a_copy_that_was_interrupted_is_made_anew(warp_of, tmp_path: Path):
     assert [path.name for path in (again / "native").iterdir()] == ["builtin.h"]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="owner and modes as POSIX has them")
+@pytest.mark.parametrize("whose", ["another user's", "open to all", "a link", "a file"])
+def test_a_folder_that_another_user_may_have_filled_is_not_taken(warp_of, tmp_path: Path, whose: str):
+    """What is compiled is loaded: who can write there runs code as this user."""
+    odd = warp_of("Jörg")
+    places = {**environ(tmp_path), "PUBLIC": str(tmp_path / "public")}
+    first = compiler_folders(odd, "1.0", places, odd, windows=True).kernels
+    assert first is not None and first.parent.stat().st_mode & 0o777 == 0o700
+    shutil.rmtree(first.parent)
+    if whose == "a link":
+        (tmp_path / "trap").mkdir()
+        first.parent.symlink_to(tmp_path / "trap")
+    elif whose == "a file":
+        first.parent.touch()
+    else:
+        first.parent.mkdir()
+        if whose == "open to all":
+            first.parent.chmod(0o777)
+        elif os.geteuid():
+            pytest.skip("only root gives folders away")
+        else:
+            os.chown(first.parent, 12345, 12345)
+    taken = compiler_folders(odd, "1.0", places, odd, windows=True).kernels
+    assert taken is not None and tmp_path / "public" in taken.parents
+    del places["PUBLIC"]
+    with pytest.raises(JobError, match="the compiler cannot open"):
+        compiler_folders(odd, "1.0", places, odd, windows=True)
+
+
 def test_nowhere_to_go_is_one_sentence(warp_of, tmp_path: Path):
     odd = warp_of("Jörg")
     for places in ({}, {"PROGRAMDATA": str(tmp_path / "Jörg")}, {"PUBLIC": "not absolute"}):
