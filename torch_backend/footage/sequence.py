@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -300,11 +300,6 @@ class SequenceSource:
         if unreadable:
             words = frame_words(unreadable).capitalize()
             self.warnings.append((f"{words} cannot be read: left out of the shot.", "Render or copy it again."))
-        if len(findings.orientations) > 1:
-            self.info.reading["orientations"] = sorted(one.code for one in findings.orientations)
-            words = ", ".join(sorted(one.words or "as they are stored" for one in findings.orientations))
-            message = f"The pictures' headers differ in orientation: each is shown by its own ({words})."
-            self.warnings.append((message, ""))
         if findings.transparent:
             self.warnings.append(
                 ("The pictures are transparent in places: their colour is taken, their alpha is not.", "")
@@ -388,13 +383,18 @@ class SequenceSource:
             raise OSError(f"{file}: {failed}")
         size = spec.full_width, spec.full_height
         orientation = orientation_of_picture(spec) or UPRIGHT
-        findings.orientations.add(orientation)
-        if orientation.size(*square_size(*size, self._aspect)) != (self.info.width, self.info.height):
-            began = f"{self._stored[0]}x{self._stored[1]}"
-            turned = [f", {one.words}" if one.words else "" for one in (orientation, self._orientation)]
+        if orientation != self._orientation:
+            # Each turned by its own would be as wrong as all by the first: cameras change the note during a take while
+            # the picture goes on, and programs turn the pixels of some.
+            words = [one.words or "stored upright" for one in (orientation, self._orientation)]
             raise footage_error(
-                f"{file.name} is {size[0]}x{size[1]}{turned[0]}, the sequence began with {began}{turned[1]}.",
-                "All pictures of a sequence need one size, once each is turned as its header says.",
+                f"{file.name} is {words[0]} by its header, the sequence began with pictures that are {words[1]}.",
+                "All pictures of a sequence need one orientation: write them upright, or take a range that has one.",
+            )
+        if size != self._stored:
+            raise footage_error(
+                f"{file.name} is {size[0]}x{size[1]}, the sequence began with {self._stored[0]}x{self._stored[1]}.",
+                "All pictures of a sequence need one size.",
             )
         channels = [*layer.channels] if layer.alpha is None else [*layer.channels, layer.alpha]
         first, beyond = min(channels), max(channels) + 1
@@ -433,8 +433,6 @@ class _Findings:
 
     transparent: bool = False
     cropped: bool = False
-    orientations: set[Orientation] = field(default_factory=set[Orientation])
-    """Those that occur."""
 
 
 AS_STORED = oiio.ImageSpec()

@@ -32,8 +32,7 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     info, lens = plates.original(), plates.lens()
     if info is None:
         return {}
-    unlike = info.unlike or _unsteady(shot, info.fps) or _differently_turned(shot)
-    unlike = unlike or ("its lens changes between frames" if lens is None else "")
+    unlike = info.unlike or _unsteady(shot, info.fps) or ("its lens changes between frames" if lens is None else "")
     shift = recorded_shift(load_frames(shot))
     facts = {
         "file": os.path.abspath(info.file),
@@ -67,12 +66,6 @@ def _unsteady(shot: Shot, fps: float) -> str:
     rows = load_frames(shot)["frames"]
     off = [float(row["seconds"]) - (int(row["frame"]) - int(rows[0]["frame"])) / fps for row in rows]
     return "its rate varies" if max(off) - min(off) > 0.5 / fps else ""
-
-
-def _differently_turned(shot: Shot) -> str:
-    """Why programs that do not turn pictures by their headers would show others; empty if they would not."""
-    reading: dict[str, Any] = load_frames(shot).get("reading") or {}
-    return "its pictures are turned differently by their headers" if reading.get("orientations") else ""
 
 
 def _beside(root: Path, file: str) -> str:
