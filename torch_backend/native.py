@@ -44,7 +44,7 @@ POINTER, INTEGER = (ctypes.c_uint64, "float*"), (ctypes.c_int64, "long long")
 
 
 PROCESSOR_VARIABLE = "SPLANNEQUIN_MARCH"
-"""Environment variable: compile kernels for this processor (Clang's -march, such as x86-64-v3) instead of this one."""
+"""Environment variable: compile kernels for this processor (as Clang names it: x86-64-v3) instead of this one."""
 
 
 def default_threads() -> int:
@@ -109,7 +109,7 @@ def initialised_warp() -> Any:
     wp.config.use_precompiled_headers = wp.config.use_precompiled_headers and folders.precompiled
     processor = os.environ.get(PROCESSOR_VARIABLE)
     if processor:  # its kernels lie beside the others: Warp's cache tells them apart by the flags
-        wp.config.cpu_compiler_flags = f"-march={processor}"
+        wp.config.cpu_compiler_flags = f"-target-cpu {processor}"
     with _without_notice():
         wp.init()
     if folders.headers is not None:

@@ -38,9 +38,9 @@ from .frozen import CandidateInstant, OutputFrame, best_instants, rank_instants
 from .grain import Grain, measure_plate
 from .take_cameras import intrinsics, output_size, plan
 
-TAKE_VERSION = 1
+TAKE_VERSION = 2
 """Rises when frames rendered before must not stand beside new ones."""
-DETAIL_VERSION = 19
+DETAIL_VERSION = 20
 """The same, of frames made of plates."""
 
 
