@@ -17,10 +17,10 @@ FRAMES = {"width": 640, "height": 480, "frames": [{"solve": n % 2 == 0} for n in
 
 
 class Heard:
-    """Keeps the bar; stops when the cameras are known if asked to."""
+    """Keeps the bar; ends all in the moment in which the cameras are known if asked to, as a kill would."""
 
     def __init__(self, stop=False):
-        self.bar, self.metrics, self.stop, self.stopped = [], [], stop, False
+        self.bar, self.metrics, self.stop = [], [], stop
 
     def progress(self, stage, done, total, message=""):
         assert stage == "solve"
@@ -28,7 +28,8 @@ class Heard:
 
     def metric(self, stage, values):
         self.metrics.append((stage, self.bar[-1], dict(values)))
-        self.stopped = self.stop and stage == CAMERAS_KNOWN
+        if self.stop and stage == CAMERAS_KNOWN:
+            raise Cancelled
 
     def image(self, label, path):
         pass
@@ -37,8 +38,7 @@ class Heard:
         pass
 
     def check_cancelled(self):
-        if self.stopped:
-            raise Cancelled
+        pass
 
 
 def stage(bar, name, *shares):
