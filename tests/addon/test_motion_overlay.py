@@ -1,4 +1,4 @@
-"""What moves, tinted over the plate behind the solved camera: drawn from the mattes, undone, and gone with the shot."""
+"""What moves, tinted over the plate behind the solved camera: drawn from the mattes, and gone with the shot."""
 
 import os
 
@@ -77,7 +77,7 @@ def test_what_was_painted_since_is_tinted_anew(addon, loaded):
     assert changed == {"000006.png"} and (frames(addon, loaded)[6][..., 3] > 100).all()
 
 
-def test_undo_takes_it_away_and_another_solve_and_removing_the_shot_do(addon, scene, loaded):
+def test_another_solve_and_removing_the_shot_take_it_away(addon, scene, loaded):
     overlay = addon("solve.motion_overlay")
     toggle()
     addon("solve.arrival").load_camera(scene, loaded)
