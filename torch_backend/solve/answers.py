@@ -13,6 +13,7 @@ from ..contract import POINTS_FILE
 from . import colmap_types as colmap
 from .mapping import first_camera, posed
 from .request import Request
+from .zoom import focal_change
 
 WIDEST_ZOOM = 16.0
 
@@ -38,6 +39,19 @@ def write_points(request: Request, model: pycolmap.Reconstruction) -> None:
         track=np.array([min(p.track.length(), 65535) for p in points], np.uint16),
         depth=smallest_depths(model, points),
     )
+
+
+def focal_changes(model: pycolmap.Reconstruction) -> dict[str, float | None]:
+    """Name of each posed image -> `zoom.focal_change`, None where it is not known."""
+    xyz, found = {number: p.xyz for number, p in colmap.points(model).items()}, dict[str, float | None]()
+    camera = first_camera(model)
+    for image in posed(model):
+        sighted = [p for p in image.points2D if p.has_point3D()]
+        seen = np.array(camera.cam_from_img(np.array([p.xy for p in sighted], np.float64).reshape(-1, 2)), np.float64)
+        points = np.array([xyz[p.point3D_id] for p in sighted], np.float64).reshape(-1, 3)
+        change = focal_change(seen, points, colmap.pose(image), camera.mean_focal_length())
+        found[image.name] = change if np.isfinite(change) else None
+    return found
 
 
 def write_undistortion(request: Request, camera: pycolmap.Camera, number: int) -> None:

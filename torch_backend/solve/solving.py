@@ -59,6 +59,7 @@ from .stored import load_cameras, load_points, load_record
 from .straight import Straight
 from .undistort import Undistorter, of_frames
 from .verdict import FAIR_ERROR_PX, doubt_of, quality_words
+from .zoom import zoom_words
 
 if TYPE_CHECKING:
     from .motion import StaticModel
@@ -400,10 +401,12 @@ def _finish(
         save_arrays(beside, points)
     replace_file(scratch / "model", staged.solve / COLMAP_FOLDER)
     write_json(staged.solve / CAMERAS_FILE, path.to_json())
-    flat = flat_words(points["xyz"])
-    result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0], flat is not None)
+    misled = flat_words(points["xyz"]) or zoom_words(
+        {int(Path(name).stem): change for name, change in answer.get("focal_changes", {}).items() if change is not None}
+    )
+    result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0], misled is not None)
     warnings = _warnings(frames, path, result, "given" in answer)
-    warnings = ([flat] if flat is not None else []) + warnings
+    warnings = ([misled] if misled is not None else []) + warnings
     warnings += doubts(answer) if "given" in answer else lens_remarks(answer)
     for message, hint in warnings:
         report.warning(message, hint)
@@ -535,7 +538,7 @@ def _undistort(
 
 
 def _result(
-    answer: dict[str, Any], path: CameraPath, solved: int, points: int, focal: float, flat: bool
+    answer: dict[str, Any], path: CameraPath, solved: int, points: int, focal: float, misled: bool
 ) -> SolveResult:
     sources = [f.source for f in path.frames]
     error = round(float(answer["reprojection_error_px"]), 4)
@@ -549,7 +552,7 @@ def _result(
         reprojection_error_px=error,
         points=points,
         focal_px=round(focal, 3),
-        quality=quality_words(registered, solved, error, "given" in answer, flat),
+        quality=quality_words(registered, solved, error, "given" in answer, misled),
     )
 
 

@@ -94,11 +94,11 @@ def fault_of(answer: dict[str, Any], frames: dict[str, Any]) -> Fault | None:
     return None
 
 
-def quality_words(registered: int, solved: int, error_px: float, given: bool = False, flat: bool = False) -> str:
-    """One sentence: Good, Fair or Poor, and the figures; cameras that were `given` are said to be. A `flat` scene is
-    poor, however well its points fit."""
+def quality_words(registered: int, solved: int, error_px: float, given: bool = False, misled: bool = False) -> str:
+    """One sentence: Good, Fair or Poor, and the figures; cameras that were `given` are said to be. One whose
+    premise does not hold, of a flat scene or a lens that zooms, is `misled`: poor, however well its points fit."""
     share = registered / max(1, solved)
-    if flat:
+    if misled:
         word = "Poor"
     elif share >= GOOD_SHARE and error_px <= GOOD_ERROR_PX:
         word = "Good"

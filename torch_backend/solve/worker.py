@@ -27,7 +27,7 @@ import pycolmap
 
 from ..contract import own_input
 from . import colmap_types as colmap
-from .answers import write_answers, write_points, write_undistortion
+from .answers import focal_changes, write_answers, write_points, write_undistortion
 from .lens_verdict import angle_deg, bends_of, impossible
 from .mapping import (
     agreement,
@@ -89,6 +89,7 @@ def main(path: str) -> int:
             "distortion": [float(camera.params[i]) for i in camera.extra_params_idxs()],
             "flow_px": shared.flow_px,
             "turning": turning(request),
+            "focal_changes": focal_changes(model),
             "localised": len(poses) - model.num_reg_images(),
             "lens": {
                 "doubt": doubt,

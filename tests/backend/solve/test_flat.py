@@ -26,7 +26,9 @@ def poster():
 def test_a_pan_over_a_still_is_flat_and_poor_however_small_its_error(poster):
     told = flat_words(turned(poster))
     assert told is not None and "one plane" in told[0]
-    assert quality_words(40, 40, 0.01, flat=True).startswith("Poor") and quality_words(40, 40, 0.01).startswith("Good")
+    assert quality_words(40, 40, 0.01, misled=True).startswith("Poor") and quality_words(40, 40, 0.01).startswith(
+        "Good"
+    )
 
 
 def test_a_wall_with_people_before_it_a_room_and_few_points_are_not_flat(poster):
