@@ -76,7 +76,7 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
         for name in ("solve_step", "fps"):
             layout.prop(props, name)
         layout.prop(props, "colour_space", text="Space")  # a sidebar of Blender's own width cuts its whole name
-        for name in ("matrix", "levels", "layer", "pixel_aspect", "set_up_scene"):
+        for name in ("lut", "matrix", "levels", "layer", "pixel_aspect", "set_up_scene"):
             layout.prop(props, name)
 
 

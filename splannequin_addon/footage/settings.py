@@ -66,6 +66,11 @@ class ImportSettings:
         **contract.panel(contract.ImportParams, "colour_space"),
         options=set(),
     )
+    lut = StringProperty(
+        **contract.panel(contract.ImportParams, "lut"),
+        subtype="FILE_PATH",
+        options=set(),
+    )
     layer = StringProperty(
         **contract.panel(contract.ImportParams, "layer"),
         options=set(),

@@ -39,6 +39,7 @@ class Import(Step):
         span = (props.first, props.last) if props.use_range else (None, None)
         params = contract.ImportParams(clip, *span, step=props.solve_step, fps=props.fps)
         params.start = props.start if props.use_start else None
+        params.lut = paths.absolute(props.lut) if props.lut else ""
         params.colour_space, params.layer = props.colour_space.strip(), props.layer.strip()
         params.pixel_aspect, params.matrix, params.levels = round(props.pixel_aspect, 6), props.matrix, props.levels
         return params

@@ -23,7 +23,7 @@ from ..scene.ownership import BAKES, DIGITS, MATTE_SHOT, TAG
 from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
-_SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "ignore_path", "people_path", "shot_seen")
+_SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "shot_seen")
 """Settings of a shot that hold a path."""
 _OUTPUT = "filepath"
 """Of a scene's render settings: the output path, which may be ours."""
@@ -185,7 +185,7 @@ def _slashed(path: str) -> str:
 def _known(path: Path, name: str) -> bool:
     """True if what the setting `name` is about is there; of a clip its shot is enough."""
     try:
-        if name in ("clip", "cameras_path", "st_map", "ignore_path", "people_path"):
+        if name in ("clip", "cameras_path", "st_map", "lut", "ignore_path", "people_path"):
             return _there(path) or (name == "clip" and contract.ShotFolder(selection.beside(path)).info_path.is_file())
         shot = _rendered_of(path) if name == _OUTPUT else path
         return shot is not None and contract.ShotFolder(shot).info_path.is_file()

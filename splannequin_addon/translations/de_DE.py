@@ -207,6 +207,8 @@ MESSAGES: dict[str, str] = {
     "First frame number of the clip to import": "Nummer des ersten Bildes, das importiert wird",
     "Last": "Letztes",
     "Last frame number to import, inclusive": "Nummer des letzten Bildes, das importiert wird, einschließlich",
+    "Look": "Look",
+    "The camera's .cube table, which makes sRGB or Rec.709 video of log footage; in place of a colour space": "Die .cube-Tabelle der Kamera, die aus Log-Material sRGB- oder Rec.709-Video macht; anstelle eines Farbraums",
     "First Frame of Its Own": "Eigenes erstes Bild",
     "Number the shot's frames from a number of your own instead of as the clip's files do": "Die Bilder des Shots ab einer eigenen Nummer zählen statt wie die Dateien des Clips",
     "Start": "Start",

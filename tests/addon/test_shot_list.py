@@ -38,7 +38,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     values = {"run_name": "b", "preset": "final", "use_range": True, "first": 3, "last": 9, "t_star": 6}
     values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
     values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
-    values |= {"overscan_percent": 4.0, "use_start": True, "start": 1001}
+    values |= {"overscan_percent": 4.0, "lut": "//look.cube", "use_start": True, "start": 1001}
     values |= {"detail": False, "develop": False}
     values |= {"cameras_from": "FILE", "cameras_path": "//model", "tracking_clip": tracked}
     values |= {"shot_seen": "//first.splannequin", "solve_step": 2, "fps": 25.0, "colour_space": "x"}

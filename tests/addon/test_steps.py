@@ -469,3 +469,10 @@ def test_what_the_artist_changed_since_is_not_taken_back(addon, scene, shot):
     assert scene.view_settings.exposure == 1.5 and scene.view_settings.view_transform == "AgX"
     assert (scene.render.fps, scene.render.fps_base) == rate and (scene.frame_start, scene.frame_end) == (1, 250)
     assert not [key for key in scene.keys() if key.startswith("splannequin_")]  # noqa: SIM118
+
+
+def test_a_look_that_was_chosen_is_asked_for(addon, scene, clip, tmp_path):
+    look = tmp_path / "camera.cube"
+    look.write_text("LUT_3D_SIZE 2\n" + "".join(f"{r} {g} {b}\n" for b in (0, 1) for g in (0, 1) for r in (0, 1)))
+    scene.splannequin.clip, scene.splannequin.lut = str(clip), str(look)
+    assert addon("process.steps").STEPS["import"].params(scene).lut == str(look)

@@ -159,6 +159,8 @@ class ImportParams:
         help="look of the camera, a 1D or 3D `.cube` table that makes sRGB or Rec.709 video of the footage, for logs "
         "that no OCIO configuration has; in place of `--colour-space`",
         words="none",
+        label="Look",
+        tip="The camera's .cube table, which makes sRGB or Rec.709 video of log footage; in place of a colour space",
     )
     """File of a look (.cube) through which the footage becomes display-referred; empty: none."""
     pixel_aspect: float = option(
