@@ -34,6 +34,7 @@ from torch_backend.raster import cuda_source as source
 from torch_backend.train import adam
 
 NAMES = [name for names in source.POINTERS.values() for name in names]
+FLOATS = [name for name, kind in source.FIELDS.items() if kind == "float32"]
 BUILDS = {
     "plain": ["-O1"],
     "address,undefined": ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"],
@@ -82,7 +83,7 @@ class Launches:
                 notes.bodies[whole] = _raster_function(whole, body[name])
                 values = [(True, int(getattr(args, pointer)), pointer) for pointer in NAMES]
                 values += [(False, _bits(int(getattr(args, size))), size) for size in source.SIZES]
-                values.append((False, _bits(float(args.near)), "near"))
+                values += [(False, _bits(float(getattr(args, name))), name) for name in FLOATS]
                 notes._note(whole, threads, values, lambda: call(self, name, args, threads, channels))
 
         def noting_launch(kernel: Any, dim: int, inputs: list[Any], device: torch.device) -> None:
@@ -191,10 +192,14 @@ def _kernels(bodies: dict[str, str]) -> str:
     """The rasteriser's parameter structure, and a function for each kernel that was launched."""
     fields = "".join(f"uint64_t {name}; " for name in NAMES) + "".join(f"int {name}; " for name in source.SIZES)
     filled = "".join(f"args_of_launch.{name} = values[{i}]; " for i, name in enumerate([*NAMES, *source.SIZES]))
-    near = len(NAMES) + len(source.SIZES)
-    text = f"struct Args {{ {fields}float near; }};\nstatic Args args_of_launch;\n"
+    floats = len(NAMES) + len(source.SIZES)
+    kept = "".join(f"float {name}; " for name in FLOATS)
+    text = f"struct Args {{ {fields}{kept}}};\nstatic Args args_of_launch;\n"
     text += f"static void fill(const uint64_t* values) {{ {filled}"
-    text += f"args_of_launch.near = same_bits<float>((int)values[{near}]); }}\n"
+    text += "".join(
+        f"args_of_launch.{name} = same_bits<float>((int)values[{floats + i}]); " for i, name in enumerate(FLOATS)
+    )
+    text += "}\n"
     rows = [f'{{"{name}", {name}, {int(name.startswith("raster_"))}}}' for name in sorted(bodies)]
     text += "".join(bodies[name] for name in sorted(bodies))
     text += "static const struct { const char* name; Kernel run; bool blocks; } "

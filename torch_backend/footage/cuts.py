@@ -33,6 +33,8 @@ _SHARP = 0.4
 """Sharpness of a frame as a share of its take's, below which it is smeared."""
 _AROUND = 8
 """Frames of a take by which its sharpness and exposure are told."""
+_LEAST_TAKE = 3
+"""Frames of a take that tell its own sharpness."""
 _ALIKE = 0.06
 """Share of quick features that unrelated pictures may have in common, with a margin: measured up to 0.04."""
 _NEAR = 0.2
@@ -158,6 +160,8 @@ def _breaks(frames: Frames, shown: list[int]) -> list[Transition]:
 def _is_sharp(frames: Frames, shown: list[int], n: int, way: int) -> bool:
     """Whether a frame is as sharp as its take, which lies before it (`way` -1) or after it (1)."""
     take = shown[max(0, n - _AROUND) : n + 1] if way < 0 else shown[n : n + _AROUND + 1]
+    if len(take) < _LEAST_TAKE:  # what is left at the clip's end may all be smeared: the other side tells
+        take = shown[max(0, n - _AROUND) : n + _AROUND + 1]
     usual = float(np.median([frames.quick[i].sharpness for i in take]))
     return frames.quick[shown[n]].sharpness >= _SHARP * usual
 
