@@ -1,8 +1,8 @@
 """Overscan in the compositor, pixel by pixel, and the way through the lens and back by Blender's own Map UV node."""
 
 import json
-import time
 import shutil
+import time
 from pathlib import Path
 
 import bpy
