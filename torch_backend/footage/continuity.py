@@ -82,13 +82,17 @@ def link(a: Features, b: Features) -> Link:
         return Link()
     here, there = a.points[[m.queryIdx for m in matches]], b.points[[m.trainIdx for m in matches]]
     cv2.setRNGSeed(0)  # the same answer each time
-    homography, found = cv2.findHomography(here, there, cv2.RANSAC, _TOLERANCE, maxIters=500)
-    inside = np.zeros(len(matches), bool) if found is None else found.ravel() > 0
+    # Both are None where no homography is found; OpenCV's types do not say so.
+    answer: tuple[Any, Any] = cv2.findHomography(here, there, cv2.RANSAC, _TOLERANCE, maxIters=500)
+    homography, found = answer
+    inside = np.zeros(len(matches), bool) if found is None else np.asarray(found).ravel() > 0
     if not inside.any():
         return Link()
     way = float(np.median(np.linalg.norm(there[inside] - here[inside], axis=1)))
     count = int(inside.sum())
-    return Link(count, count / min(len(a.points), len(b.points)), way / WIDTH, there[inside], homography)
+    return Link(
+        count, count / min(len(a.points), len(b.points)), way / WIDTH, there[inside], np.asarray(homography, np.float64)
+    )
 
 
 def small_grey(pixels: NDArray[Any]) -> NDArray[np.uint8]:
