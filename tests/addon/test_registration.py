@@ -45,6 +45,13 @@ def everything() -> tuple:
     return ours(), handlers(), entries, hasattr(bpy.types.Scene, "splannequin")
 
 
+class BrokenOperator(bpy.types.Operator):
+    """Blender refuses it: its identifier has no dot."""
+
+    bl_idname = "broken"
+    bl_label = "Broken"
+
+
 @pytest.mark.parametrize("where", ["a part", "half a part", "a class", "the last part"])
 def test_what_fails_while_it_is_enabled_leaves_nothing_behind(package, addon, monkeypatch, where):
     registration, preferences = addon("registration"), addon("ui.preferences")
@@ -57,8 +64,8 @@ def test_what_fails_while_it_is_enabled_leaves_nothing_behind(package, addon, mo
 
     failing = {
         "a part": (addon("translations"), "register", breaks),
-        "half a part": (preferences, "_CLASSES", (*preferences._CLASSES[:2], object)),
-        "a class": (registration, "_CLASSES", (*registration._CLASSES[:7], object, *registration._CLASSES[7:])),
+        "half a part": (preferences, "_CLASSES", (*preferences._CLASSES[:2], BrokenOperator)),
+        "a class": (registration, "_CLASSES", (*registration._CLASSES[:7], BrokenOperator, *registration._CLASSES[7:])),
         "the last part": (addon("command_line.command"), "register", breaks),
     }[where]
     try:
