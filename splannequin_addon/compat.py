@@ -27,8 +27,8 @@ HAS_TEXTURE_NODE = not HAS_COMPOSITING_GROUP
 """True where the compositor has a Texture node, which knows a pixel's place in the frame (until 5.0)."""
 CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
 """True where a Scale node that crops sets every pixel: before 4.5 a row or column at the border is left unset."""
-TURNS_VIDEOS = bpy.app.version >= (5, 0, 0)
-"""True if a video is turned by quarter turns as its header says. 4.2 and 4.3 show it as it is stored."""
+TURNS_VIDEOS = bpy.app.version >= (4, 5, 0)
+"""True if a video is turned by quarter turns as its header says. 4.2 and 4.3 show it as stored; 4.4 was not tried."""
 
 HAS_PATH_TEMPLATES = HAS_COMPOSITING_GROUP
 """True where braces in an output path are templates (5.0 on)."""
