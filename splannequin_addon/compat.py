@@ -30,8 +30,8 @@ CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
 TURNS_VIDEOS = bpy.app.version >= (4, 5, 0)
 """True if a video is turned by quarter turns as its header says. 4.2 and 4.3 show it as stored; 4.4 was not tried."""
 
-HAS_PATH_TEMPLATES = HAS_COMPOSITING_GROUP
-"""True where braces in an output path are templates (5.0 on)."""
+HAS_PATH_TEMPLATES = bpy.app.version >= (4, 5, 0)
+"""True where braces in an output path are templates (4.5 on)."""
 
 POINT_SHADERS = ("POINT_FLAT_COLOR", "FLAT_COLOR") if bpy.app.version >= (4, 5, 0) else ("FLAT_COLOR",)
 """Built-in shaders that colour points, the best first: points have one of their own since 4.5."""
