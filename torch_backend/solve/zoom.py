@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .poses import quat_to_rotation
+
 ZOOM = 0.02
 """Change of focal length within the take, in natural logarithms, from which on the lens zooms."""
 _LEAST_POINTS = 30
@@ -47,7 +49,7 @@ def focal_change(
         normal = _part(weighted.T @ jacobian.reshape(-1, 7))
         try:
             step = _part(-np.linalg.solve(normal, weighted.T @ residual.reshape(-1)))
-            turned = _rotation(_part(step[:3]))
+            turned = quat_to_rotation(np.array([1.0, *(0.5 * step[:3])]))  # a small turn, to first order
             rotation, shift = _part(turned @ rotation), _part(turned @ shift + step[3:6])
             change += float(step[6])
             if not abs(change) < _MOST:
@@ -130,12 +132,3 @@ def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return out - np.swapaxes(out, -1, -2)
-
-
-def _rotation(w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3, 3] of a rotation vector (Rodrigues)."""
-    angle = float(np.linalg.norm(w))
-    if angle < 1e-12:
-        return np.eye(3) + _cross(w)
-    k = _cross(w / angle)
-    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from torch_backend.solve.poses import quat_to_rotation
 from torch_backend.solve.verdict import quality_words
-from torch_backend.solve.zoom import ZOOM, _rotation, focal_change, zoom_words
+from torch_backend.solve.zoom import ZOOM, focal_change, zoom_words
 
 FOCAL = 500.0
 
@@ -14,10 +15,12 @@ def frame(change: float, seed: int = 0, noise_px: float = 0.3, depths: tuple[flo
     nearer to the scene, as a solve that knows no zoom leaves it."""
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.uniform(-1.5, 1.5, (300, 2)), rng.uniform(*depths, 300)])
-    rotation, shift = _rotation(np.array([0.05, -0.1, 0.02])), np.array([0.1, -0.05, 0.2])
+    rotation, shift = quat_to_rotation(np.array([1.0, 0.025, -0.05, 0.01])), np.array([0.1, -0.05, 0.2])
     at = points @ rotation.T + shift
     seen = np.exp(change) * at[:, :2] / at[:, 2:] + rng.normal(0.0, noise_px / FOCAL, (300, 2))
-    off = np.column_stack([_rotation(np.array([0.004, 0.003, 0.0])) @ rotation, shift - [0.0, 0.0, 2.0 * change]])
+    off = np.column_stack(
+        [quat_to_rotation(np.array([1.0, 0.002, 0.0015, 0.0])) @ rotation, shift - [0.0, 0.0, 2.0 * change]]
+    )
     return seen, points, off
 
 
