@@ -19,10 +19,8 @@ Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023,
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -31,17 +29,14 @@ from torch import Tensor
 
 from ..footage.display import PLAIN, Display
 from ..scene import Scene
-from ..shot import Shot
-from ..solve.motion import load_motion
 from ..torch_types import from_numpy
 from ..train import LoadedRun
 from .bands import bands, hand_back
 from .detail_config import DetailConfig
 from .fill import Fillers, Filling, fill, fillers_of
-from .frozen import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
+from .frozen import FrozenGaussians, FrozenImage, OutputFrame
 from .leading_plate import leading_matte, leading_plate
-from .missing_layer import InstantLayer, instant_layer, join
-from .posed import PosedFrame, posed_frame, with_overscan
+from .posed import PosedFrame, posed_frame
 from .reproject import resized
 from .sightings import MovingOf, PlateReader, Sightings
 from .transfer import to_display, to_linear
@@ -116,7 +111,6 @@ class Detailer:
         self._moving, self._bars = moving, bars
         self.seen = Sightings(run, scene, plates, moving, self.config.sightings)
         """The plates as the scene at hand has them: the run's, or that of a developed instant."""
-        self._layers: OrderedDict[tuple[int, float], InstantLayer | None] = OrderedDict()
 
     @torch.no_grad()
     def frame(
@@ -137,16 +131,14 @@ class Detailer:
             width, height: pixels of the frame without overscan.
             withheld: frames whose plates are not to be used.
         """
-        splat = image
         self._turn_to(frozen, output.t_star)
-        frozen, image = self._joined(output, frozen, image, width, height)
         posed = posed_frame(self.seen, output, frozen, image, width, height)
         usable = [frame for frame in self.seen.frames if frame not in withheld]
         leading = leading_plate(self.seen, output, posed, usable)
         matte, st, own = leading_matte(self.seen, self.config, output, posed, leading, usable, (width, height))
         bars = self._keep_bars(matte, leading) if own and leading == output.frame else None
         fillers = fillers_of(self.seen, self.config, posed, matte, leading, usable)
-        made = self._mix_frame(posed, splat, leading, matte, st, own, fillers)
+        made = self._mix_frame(posed, leading, matte, st, own, fillers)
         if bars is not None:  # they are shown as they are, at every instant
             made.support[bars], made.motion[bars] = 1.0, 0.0
         return made
@@ -172,38 +164,11 @@ class Detailer:
             config = self.config.sightings
             self.seen = Sightings(self.run, self.scene, self.plates, self._moving, config, developed, round(t_star))
 
-    def _joined(
-        self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, width: int, height: int
-    ) -> tuple[FrozenGaussians, FrozenImage]:
-        """The frozen scene with what plate t* shows and the model lacks, and its render."""
-        layer = self._layer(output.t_star, frozen) if frozen.descent is None else None  # developed ones have theirs
-        if layer is None:
-            return frozen, image
-        frozen = join(frozen, layer)
-        K, beyond = with_overscan(output.K, image, width, height)
-        exposed_at = self.scene.time_of_frame(output.exposed_like)
-        rows, columns = image.alpha.shape
-        exposure = self.run.model.exposure
-        return frozen, render_frozen(frozen, output.viewmat, K, columns, rows, exposure, exposed_at, beyond)
-
-    def _layer(self, t_star: float, frozen: FrozenGaussians) -> InstantLayer | None:
-        key = len(frozen.support), t_star
-        if not self.config.instant:
-            return None
-        if key not in self._layers:
-            folder = Shot(self.scene.folder.parent)
-            motion = partial(load_motion, folder)
-            self._layers[key] = instant_layer(self.run, self.scene, frozen, t_star, motion=motion)
-            while len(self._layers) > 2:
-                self._layers.popitem(last=False)
-        return self._layers[key]
-
     # ------------------------------------------------------------------------------------------------- the mix
 
     def _mix_frame(
         self,
         posed: PosedFrame,
-        splat: FrozenImage,
         leading: int,
         matte: Tensor,
         st: Tensor,
@@ -217,11 +182,8 @@ class Detailer:
             hand_back()
         gives = bool((matte > _NOTHING).any())
         plate = self.plates.linear(leading) if gives and not own else None
-        # A render that is not the splats' layer is no longer needed once it is mixed.
-        ours = image is not splat
         made = DetailedFrame(
-            image.color if ours else torch.empty(rows, columns, 3, device="cpu"),
-            image.alpha if ours else image.alpha.clone(), splat.color, splat.alpha,
+            torch.empty(rows, columns, 3, device="cpu"), image.alpha.clone(), image.color, image.alpha,
             torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
             torch.minimum(image.support, 1.0 - resized(posed.unseen, columns, rows)),
             resized(posed.moved, columns, rows), leading, st, matte, torch.zeros(rows, columns, 3, device="cpu"),

@@ -33,26 +33,6 @@ class DetailConfig:
     believed there if it bears the motion out: sways too small for the flow."""
     borne_out: float = 0.02
     """By how much, display-referred, the plate's own time must explain it better than t* does."""
-    carried: float = 2.0
-    """Travel in pixels from which on what the model moves belongs to what moves beside it: of a body that has turned,
-    a plain shirt looks the same in both plates."""
-    body: float = 64.0
-    """How far from what moves that may reach, pixels."""
-    alike: float = 0.15
-    """Low-passed difference of the frozen render and its own plate, display-referred, up to which they agree."""
-    denied: float = 0.15
-    """Low-passed difference of the frozen render and its own plate, display-referred, from which on that plate is not
-    believed where plate t* agrees with the render: something held still that was elsewhere."""
-    own_time: float = 0.3
-    """Share of such a difference that must be gone in the render of the plate's own time."""
-    of_its_time: tuple[float, float] = (0.06, 0.5)
-    """Where that render is nearer to the plate than the frozen one by so much, display-referred, and this share of the
-    difference, by which plate t* differs from it, too, the plate is not believed: it shows another time than t*."""
-    denied_too: float = 0.08
-    """The same, for what hangs together with such a spot."""
-    beyond: float = 100.0
-    """Square pixels from which on what the render alone says, where plate t* does not see, is let go of: along borders
-    of the picture and of what plate t* sees bits differ that are none."""
     thin: int = 3
     """Half the width in pixels below which such a spot, of either kind, is an outline, which a wrong depth explains."""
     moves: float = 0.25
@@ -114,8 +94,6 @@ class DetailConfig:
     agreement: float = 0.03
     """Low-passed difference, display-referred, between a plate of another time and plate t* at which the first is
     believed 1/e in what moves: it may show another state."""
-    instant: bool = True
-    """Give what plate t* shows and the model lacks a surface of its own (`missing_layer.py`)."""
     held: HeldConfig = field(default_factory=HeldConfig)
     """What is held for a while where it was not at t*."""
     sightings: SightingConfig = field(default_factory=SightingConfig)

@@ -1,7 +1,7 @@
 """Develop: a frozen instant is trained on as the static scene that it is, until it shows what plate t* shows.
 
-The field has to explain a whole clip; a freeze needs one instant of it. So the frozen Gaussians, with what plate t*
-shows and the field lost (`missing_layer.py`), become parameters of their own. Still pixels are learnt from all trained
+The field has to explain a whole clip; a freeze needs one instant of it. So the frozen Gaussians become
+parameters of their own. Still pixels are learnt from all trained
 frames, in each of which what moves stands where the field has it; what moves at t* is learnt from plate t* alone. Of
 what that sees from much farther than others do, it teaches nothing: a face of six pixels is right from there with its
 eyes anywhere. The pictures are larger than those of a preview run, so the frozen scene becomes sharper than the run.
@@ -113,7 +113,7 @@ def develop(
     stays as it was; and what moves does, or goes as far as t*'s neighbours bear.
 
     Args:
-        frozen: the run's scene at t*, and behind its Gaussians those of an instant's layer, if it has one.
+        frozen: the run's scene at t*.
         t_star: frame number. If it is none of the run's trained frames its plate is not looked at: what moves is learnt
             from the nearest trained frame on either side, in which it stands where the field has it.
         moving: what moves in the clip's frames.
@@ -141,17 +141,10 @@ class _Darkroom:
         self.params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in frozen.state.items()}
         self.optimizer = self._optimizer()
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
-        self.mover[len(run.model.gaussians) :] = 1.0
-        self.afar = torch.zeros_like(self.mover)
-        means = frozen.state["means"][: len(run.model.gaussians)]
-        self.afar[: len(means)] = seen_from_afar(run, scene, means, t_star, config.afar).float()
+        self.afar = seen_from_afar(run, scene, frozen.state["means"], t_star, config.afar).float()
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in spread(self.frames, config.looks)])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
-        # What is behind the run's own and was not seen at t* (`unseen.py`) is as its plate had it.
-        unseen = (torch.arange(len(frozen.support), device=self.device) >= len(means)) & (frozen.support < 1.0)
-        self.afar[unseen] = 1.0
-        self.held = (((self.afar > 0.5) & (moves.amax(0) > 0.5)) | unseen).nonzero()[:, 0]
-        opened[len(run.model.gaussians) :] = (~unseen[len(means) :]).float()
+        self.held = ((self.afar > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
         self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
         """Rows of what moves and stands, at t*, in what the plate says moves."""
 
@@ -240,7 +233,7 @@ class _Darkroom:
         them. 0 where there is nothing."""
         sums = torch.zeros(2, dtype=torch.float64, device=self.device)
         for frame in frames:
-            shown, pixels = self._shown(frame, carried=movers)
+            shown, pixels = self._shown(frame)
             if movers:
                 ignored, pixels = self.plates.ignored(frame), self.plates.matte(frame) > 0.5
                 pixels = pixels if ignored is None else pixels & ~ignored
@@ -262,16 +255,14 @@ class _Darkroom:
                 parameter.grad[self.held] = 0.0
         self.optimizer.step(guard=[total])
 
-    def _shown(self, frame: int, background: Tensor | None = None, carried: bool = False) -> tuple[Tensor, Tensor]:
+    def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """A frame as the scene has it, [H, W, 3], and bool [H, W]: what it says of the frozen scene.
 
-        `carried`: as `Travel.carried`, which is how frames that show t* are always looked at.
         What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         """
         background = torch.full((3,), 0.5, device=self.device) if background is None else background
         marks = torch.stack([self.mover, self.afar], dim=1)
-        travelled = self.travel.carried if carried or frame in self.instants else self.travel.moved
-        state = travelled(dict(self.params), frame)
+        state = self.travel.moved(dict(self.params), frame)
         out = render(
             state, self.frozen.sh_degree, *self.plates.camera(frame),
             background=torch.cat([background, background.new_zeros(2)]), colors=marks,

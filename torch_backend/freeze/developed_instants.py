@@ -8,31 +8,24 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..contract import DEVELOPED_FOLDER, JobError, Reporter, frame_file, frame_number, sweep_half_written
 from ..gaussians.model import PARAM_NAMES
 from ..scene import Scene
 from ..shot import Shot, content_key, path_error
-from ..solve.motion import load_motion, motion_key
+from ..solve.motion import motion_key
 from ..train import LoadedRun
 from ..train.checkpoint import load_checkpoint, read_meta, save_checkpoint
-from .adrift import adrift
 from .develop import DevelopConfig, develop
-from .frozen import FrozenGaussians, Turned, freeze_at, span_of
-from .missing_layer import instant_layer, join
+from .frozen import FrozenGaussians, freeze_at, span_of
 from .sightings import motion_mattes
-from .specks import without_specks
 from .static_twin import settled
-from .turned import turned
-from .unseen import with_unseen
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 22
+VERSION = 23
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -174,11 +167,9 @@ def load_developed(
     closed = tensors["closed"].to(device)
     base = {name: tensors[f"base.{name}"].to(device) for name in PARAM_NAMES}
     support, motion = frozen.support.index_fill(0, closed, 1.0), frozen.motion.index_fill(0, closed, 0.0)
-    added = tensors["added.support"].to(device)
-    support, motion = torch.cat([support, added]), torch.cat([motion, torch.ones_like(added)])  # a layer moves
     before = FrozenGaussians(base, frozen.sh_degree, support, motion)
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
-    return FrozenGaussians(state, frozen.sh_degree, support, motion, before, _turned_of(tensors))
+    return FrozenGaussians(state, frozen.sh_degree, support, motion, before)
 
 
 def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
@@ -187,29 +178,12 @@ def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
     closed = tensors.get("closed")
     if closed is None or closed.dtype != torch.long or closed.dim() != 1 or not all(n in tensors for n in names):
         return False
-    count, known = len(tensors["base.means"]) if tensors["base.means"].dim() else 0, len(frozen.support)
+    known = len(frozen.support)
     for name in names:
         like, value = frozen.state[name.partition(".")[2]], tensors[name]
-        if value.dtype != like.dtype or value.shape != (count, *like.shape[1:]) or not bool(value.isfinite().all()):
+        if value.dtype != like.dtype or value.shape != like.shape or not bool(value.isfinite().all()):
             return False
-    added = tensors.get("added.support")
-    if added is None or added.dtype != frozen.support.dtype or added.shape != (max(0, count - known),):
-        return False
-    if not bool(((added >= 0.0) & (added <= 1.0)).all()):
-        return False
-    maps = [tensors[name] for name in ("turned.first", "turned.last") if name in tensors]
-    if maps and (len(maps) != 2 or maps[0].shape != maps[1].shape):
-        return False
-    if any(each.dtype != torch.int32 or each.dim() != 2 or not each.numel() for each in maps):
-        return False
-    rooted = not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
-    return rooted and count >= known
-
-
-def _turned_of(tensors: dict[str, Tensor]) -> Turned | None:
-    """What a file says of it: both of its maps, or nothing."""
-    first, last = tensors.get("turned.first"), tensors.get("turned.last")
-    return None if first is None or last is None else Turned(first, last)
+    return not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
 
 
 def developed(
@@ -237,29 +211,7 @@ def _make(
     check: Callable[[int, int], None] | None = None,
 ) -> FrozenGaussians:  # fmt: skip
     moving = motion_mattes(shot)
-
-    def labels(frame: int) -> NDArray[np.uint8] | None:
-        return load_motion(shot, frame)
-
-    def begun() -> None:
-        if check is not None:
-            check(0, config.steps)
-
-    def ready(joined: FrozenGaussians) -> FrozenGaussians:
-        whole = with_unseen(run, scene, joined, t_star, labels, check=begun)
-        made = develop(run, scene, whole, t_star, moving, config, check)
-        return dataclasses.replace(made, turned=otherwise)
-
-    otherwise = turned(run, scene, frozen, t_star, labels, check=begun)
-    frozen = without_specks(run, scene, settled(run, scene, frozen, t_star, moving), t_star)
-    found = adrift(run, scene, frozen, t_star, labels)
-    if found is not None:
-        layer = instant_layer(run, scene, found.without, t_star, motion=labels, known=found.inverse)
-        if layer is not None and layer.stands_for(found.inverse > 0.0):
-            return ready(join(found.without, layer))
-        frozen = found.put_back
-    layer = instant_layer(run, scene, frozen, t_star, motion=labels)
-    return ready(frozen if layer is None else join(frozen, layer))
+    return develop(run, scene, settled(run, scene, frozen, t_star, moving), t_star, moving, config, check)
 
 
 def _save(
@@ -272,14 +224,10 @@ def _save(
     assert made.descent is not None
     path = developed_path(run, t_star)
     folder = shot.own(path.parent)
-    before = made.descent.motion[: len(field.motion)]
-    tensors = {"closed": torch.nonzero(before < field.motion).flatten()}
-    tensors["added.support"] = made.support[len(field.support) :].clone()
+    tensors = {"closed": torch.nonzero(made.descent.motion < field.motion).flatten()}
     # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
     tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
-    if made.turned is not None:
-        tensors |= {"turned.first": made.turned.first, "turned.last": made.turned.last}
     sweep_half_written(folder)
     meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
     save_checkpoint(path, tensors, meta)

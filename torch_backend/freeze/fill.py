@@ -29,8 +29,6 @@ class Fillers:
     """Their frame numbers."""
     moved: list[Tensor]
     """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
-    unknown: Tensor
-    """[h, w] in 0..1: share of it whose way nobody knows."""
     shown: list[Tensor]
     """[h, w] in 0..1 each: that plate shows it, and what is around it."""
     agreed: list[Tensor]
@@ -68,13 +66,13 @@ def fillers_of(
     if not bool((matte < WHOLE).any()):
         return None
     chosen = _chosen(sightings, config, posed, matte, leading, usable)
-    moved, unknown = displacements(sightings, posed, chosen)
+    moved = displacements(sightings, posed, chosen)
     shown = _shown(sightings, config, posed, chosen, moved)
     agreed = _agreed(sightings, config, posed, chosen, moved)
     residuals = [sightings.residual(frame) for frame in chosen]
     most = max(sightings.scene.display.most, *(sightings.most(frame) for frame in chosen))
     instant = instant_pixels(sightings, config, posed, leading, usable)
-    return Fillers(chosen, moved, unknown, shown, agreed, residuals, most, instant)
+    return Fillers(chosen, moved, shown, agreed, residuals, most, instant)
 
 
 def _shown(
@@ -132,7 +130,7 @@ def fill(
     pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
     small = pixels * posed.per_pixel
     points = unproject(pixels, posed.image.depth[rows][y, x], posed.viewmat, posed.K)
-    motion, unknown = look_up(posed.motion, small), look_up(fillers.unknown, small)
+    motion = look_up(posed.motion, small)
     larger = torch.tensor(
         [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
     )
@@ -140,10 +138,10 @@ def fill(
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
     same_state = torch.zeros(count, device="cpu")
-    untold = 1.0 - unknown
+    untold = torch.ones(count, device="cpu")
     truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
     if truth is not None:  # the better plate t* shows it, the less another time is needed
-        untold = untold * (1.0 - _near(sightings, config, posed, posed.t, truth))
+        untold = 1.0 - _near(sightings, config, posed, posed.t, truth)
     for n, frame in enumerate(fillers.chosen):
         if truth is not None and frame == posed.t:
             sighting = truth

@@ -25,27 +25,6 @@ SUPPORT_SECONDS = 2.0
 """The support matte of a moving Gaussian falls to 1/e at this distance from the nearest time it was seen."""
 
 
-ALWAYS = torch.iinfo(torch.int32).max
-"""A frame number later than any."""
-
-
-@dataclass(frozen=True)
-class Turned:
-    """Since when, and until when, plates show what plate t* shows, where no matte calls it moving: `turned.py`.
-
-    [h, w] of a small picture of plate t*, on the CPU.
-    """
-
-    first: Tensor
-    """[h, w] int32: number of the first frame that is known to show the same; 0: all before do, or nobody knows."""
-    last: Tensor
-    """[h, w] int32: number of the last; `ALWAYS`: all after do, or nobody knows."""
-
-    def otherwise(self, frame: int) -> Tensor:
-        """[h, w] bool: where a frame's plate may show something else than plate t*, though nothing moves there."""
-        return (frame < self.first) | (frame > self.last)
-
-
 @dataclass
 class FrozenGaussians:
     """A static scene: N Gaussians at one instant, in scene units, no gradients."""
@@ -59,10 +38,8 @@ class FrozenGaussians:
     motion: Tensor
     """[N] in 0..1: 1 for Gaussians that move in the clip."""
     descent: FrozenGaussians | None = None
-    """What a developed instant was before, row by row: the run's Gaussians at t*, and behind them those that the run
-    does not have. They still move as those do. None if it was not developed."""
-    turned: Turned | None = None
-    """What was otherwise before or after the instant without having been seen to move; None: nothing is known to."""
+    """A developed instant as it was before, row by row: the run's Gaussians at t*, which still move as the run moves
+    them. None if it was not developed."""
 
 
 @dataclass

@@ -55,7 +55,7 @@ class HeldConfig:
     least: float = 400.0
     """Square pixels that a region has at least,"""
     least_beside: float = 100.0
-    """or no farther than such gaps from one that was found, or is denied: a hand and its arm,"""
+    """or no farther than such gaps from one that was found: a hand and its arm,"""
     rim: float = 3.0
     """and pixels around it in which it is asked whether the plates agree there,"""
     share: float = 0.4
@@ -109,16 +109,13 @@ class Light:
         return colors * self.gain + self.offset
 
 
-def held(
-    both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, denied: Tensor, unit: float, config: HeldConfig
-) -> Tensor:
+def held(both: BothPlates, render: Tensor, off: Tensor, wrong: Tensor, unit: float, config: HeldConfig) -> Tensor:
     """[h, w] in 0..1: what hangs together with `wrong`, and where the own plate shows another thing than plate t*.
 
     Args:
         render: [h, w, 3] the frozen render, display-referred.
         off: [h, w] low-passed difference of it and the own plate.
         wrong: [h, w] in 0..1, where the own plate is let go of.
-        denied: [h, w] in 0..1, where it is because both others show another thing: a hand whose arm may be left.
         unit: pixels of decisions to one in which the configuration counts.
     """
     both = in_the_same_light(both, wrong, config.light * unit)
@@ -140,7 +137,7 @@ def held(
         """[h, w] in 0..1: how far each region of a bool mask is a thing that plate t* does not show."""
         out = torch.zeros_like(found)
         for region in sorted(components(mask), key=lambda each: int(each.sum()), reverse=True):
-            near = all_of(widened(region, 2 * gap), any_of(out, denied)).amax()
+            near = all_of(widened(region, 2 * gap), out).amax()
             enough = torch.maximum(above(float(region.sum()), least), near)
             if bool(enough > 0.0):
                 left = above(left_by_shifts(soft, region, unit, config), config.left)

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from ..torch_types import norm
 from .bands import bands
-from .decisions import above, all_of, any_of, first_least, none_of
+from .decisions import above, all_of, any_of, first_least
 from .detail_config import DetailConfig
 from .frozen import SUPPORT_SECONDS, OutputFrame
 from .held import BothPlates, held, with_holes
-from .posed import PosedFrame, added_share, displacements, parallax
-from .regions import closed, grown, larger, opened
+from .posed import PosedFrame, displacements, parallax
+from .regions import closed, opened
 from .reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
 from .sighted import Sighting
 from .sightings import Sightings
@@ -57,9 +57,6 @@ def leading_matte(
     own = posed.own
     truth = sightings.seen(posed.t, posed.points) if posed.t in usable else None
     hidden = torch.minimum(posed.motion, lead.moving) if own else posed.motion
-    added = added_share(sightings, posed)
-    if added is not None:  # what stands where no plate had it while t* looked elsewhere
-        hidden = torch.maximum(hidden, added)
     if truth is not None:
         posed.motion = truth.visible * truth.moving + (1.0 - truth.visible) * hidden
     else:
@@ -76,12 +73,8 @@ def leading_matte(
             within = within * resized(free, columns, rows)
         return within, st, own
     wrong = above(torch.maximum(posed.motion, lead.moving), 0.5)
-    found = None if truth is None else _otherwise(sightings, config, posed, leading, lead, truth)
     if own:
-        wrong, found = _let_go(sightings, config, posed, leading, usable, wrong, truth, found)
-    elif found is not None:
-        wrong = any_of(wrong, found)
-    if found is not None:
+        wrong, found = _let_go(sightings, config, posed, leading, wrong, truth)
         posed.held = widened(found, round(config.margin * sightings.unit))
     posed.doubt = widened(wrong, round(config.margin * sightings.unit))
     let_go = blurred(posed.doubt, config.feather * sightings.unit)
@@ -129,70 +122,24 @@ def _free(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor | None:
 
 
 def _let_go(
-    sightings: Sightings,
-    config: DetailConfig,
-    posed: PosedFrame,
-    frame: int,
-    usable: list[int],
-    moving: Tensor,
-    truth: Sighting | None,
-    otherwise: Tensor | None,
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, moving: Tensor, truth: Sighting | None
 ) -> tuple[Tensor, Tensor]:
     """([h, w] in 0..1: where the frame's own plate shows another instant than t*, [h, w] in 0..1: what of it `held`
-    found, or was `otherwise`).
+    found).
 
     Args:
         moving: [h, w] in 0..1, by the mattes.
         truth: how plate t* sees what is seen; None if it may not be used.
-        otherwise: as `_otherwise`.
     """
-    h, w = moving.shape
-    render = resized(posed.image.color, w, h)
+    render = resized(posed.image.color, moving.shape[1], moving.shape[0])
     off, gained = _off(sightings, posed, frame, render)
-    travel = _travel(sightings, posed, frame)
-    swayed, beside = _swayed(sightings, config, travel, gained), _beside(sightings, config, posed, frame, usable, off)
-    wrong = any_of(moving, swayed, beside)
-    both = None if truth is None else _both_plates(sightings, posed, frame, truth)
-    apart = off if both is None else sightings.difference(both.own, both.instant)
-    contrary, denied = torch.minimum(off, apart), torch.zeros_like(wrong)
+    wrong = any_of(moving, _swayed(sightings, config, _travel(sightings, posed, frame), gained))
+    found = torch.zeros_like(wrong)
     if truth is not None:
-        denied = _denied(sightings, config, truth, contrary)
-        wrong = any_of(wrong, _of_its_time(sightings, config, truth, off, gained, apart), denied)
-    # What the model lacks at the plate's own time, too, is its fault and no motion.
-    differs = sightings.contradicted(off)
-    wrong = sightings.whole(wrong, all_of(differs, above(gained, config.own_time * off)))
-    wrong = grown(wrong, above(travel, config.carried), round(config.body * sightings.unit))
-    if truth is not None:
-        wrong = sightings.whole(wrong, above(contrary, config.denied_too))
-        # Of what plate t* does not see the frozen render alone knows: an elbow that was further back.
-        beyond = all_of(sightings.whole(wrong, all_of(differs, none_of(above(truth.visible, 0.5)))), none_of(wrong))
-        wrong = any_of(wrong, larger(beyond, config.beyond * sightings.unit**2))
-    found = torch.zeros_like(wrong) if otherwise is None else otherwise
-    if both is not None:
-        found = any_of(found, held(both, render, off, wrong, denied, sightings.unit, config.held))
+        both = _both_plates(sightings, posed, frame, truth)
+        found = held(both, render, off, wrong, sightings.unit, config.held)
     wrong = closed(any_of(wrong, found), round(config.gap * sightings.unit))
     return with_holes(wrong, found, off, sightings.unit, config.held)
-
-
-def _otherwise(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, lead: Sighting, truth: Sighting
-) -> Tensor | None:
-    """[h, w] in 0..1: where plate `frame`, which sees what is seen as `lead` says, shows what was otherwise then, by
-    `turned.py`, and what hangs together with it in which it differs from plate t* (`truth`); None if nothing was."""
-    turned = posed.frozen.turned
-    if turned is None or not bool((then := turned.otherwise(frame)).any()):
-        return None
-    h, w = then.shape
-    scale = torch.tensor([w / sightings.size[0], h / sightings.size[1]], device="cpu")
-    known = all_of(above(look_up(then.float(), truth.pixels * scale), 0.5), above(truth.visible, 0.5))
-    seen = (lead.visible * truth.visible)[..., None]
-    own, instant = (
-        look_up(sightings.view(plate).picture.float(), sighting.pixels) * seen
-        for plate, sighting in ((frame, lead), (posed.t, truth))
-    )
-    differs = above(sightings.difference(own, instant), config.denied_too)
-    found = sightings.whole(all_of(known, differs), differs)
-    return found if bool(found.any()) else None
 
 
 def _off(sightings: Sightings, posed: PosedFrame, frame: int, render: Tensor) -> tuple[Tensor, Tensor]:
@@ -205,38 +152,6 @@ def _off(sightings: Sightings, posed: PosedFrame, frame: int, render: Tensor) ->
     off[inside] = sightings.difference(view.picture.float(), render[inside])
     gained[inside] = off[inside] - view.missed.float()
     return off, gained
-
-
-def _beside(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, usable: list[int], off: Tensor
-) -> Tensor:
-    """[h, w] in 0..1: what the plate before or after sees and calls moving, or both call moving that is before it.
-
-    What only one of three finds would come and go. Where its own plate shows what the frozen render does (`off`)
-    nothing would, and the plate stays.
-    """
-    h, w = posed.depth.shape
-    at, points = usable.index(frame), posed.points[::2, ::2]  # a quarter of the work
-    around = usable[max(0, at - 1) : at] + usable[at + 1 : at + 2]
-    found, both = torch.zeros(points.shape[:2], device="cpu"), torch.ones(points.shape[:2], device="cpu")
-    for neighbour in around:
-        sighting = sightings.seen(neighbour, points)
-        found, both = torch.maximum(found, sighting.visible * sighting.moving), both * sighting.moving
-    if len(around) == 2:
-        found = torch.maximum(found, both)
-    near = widened(above(off, config.alike), round(config.margin * sightings.unit))
-    return all_of(above(resized(found, w, h), 0.5), near)
-
-
-def _denied(sightings: Sightings, config: DetailConfig, truth: Sighting, off: Tensor) -> Tensor:
-    """[h, w] in 0..1: plate t* (`truth`) bears the frozen render out, its own plate differs from both, by `off`.
-
-    A hand that is held still where it was not at t* is still to the flow, and may be unknown to the model at any time.
-    What both plates show and the model lacks is no motion; a wrong depth explains edges only.
-    """
-    denied = all_of(above(off, config.denied), above(truth.visible * truth.explained, 0.5))
-    spots = opened(denied, round(config.thin * sightings.unit))
-    return sightings.whole(spots, above(off, config.denied_too))
 
 
 def _both_plates(sightings: Sightings, posed: PosedFrame, frame: int, truth: Sighting) -> BothPlates:
@@ -263,24 +178,11 @@ def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: 
     return opened(out, round(config.thin * sightings.unit))
 
 
-def _of_its_time(
-    sightings: Sightings, config: DetailConfig, truth: Sighting, off: Tensor, gained: Tensor, apart: Tensor
-) -> Tensor:
-    """[h, w] in 0..1: its own plate shows what the model has at its own time, and plate t* (`truth`) something else.
-
-    So an arm is found that no matte sees and that stands before a wall: there the frozen render shows what never moves.
-    Of what plate t* does not see the model alone would say it, and on truth lost more by that than it gained.
-    """
-    least, share = config.of_its_time
-    shown = all_of(above(gained, least), above(torch.minimum(gained, apart), share * off), above(truth.visible, 0.5))
-    return opened(shown, round(config.thin * sightings.unit))
-
-
 def _travel(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor:
     """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
     h, w = posed.depth.shape
     size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: Gaussians of what moves are larger than its pixels
-    moved, points = displacements(sightings, posed, [frame], size)[0][0], posed.points[::2, ::2]
+    moved, points = displacements(sightings, posed, [frame], size)[0], posed.points[::2, ::2]
     view = sightings.view(frame)
     ends = project(points + moved, view.viewmat, view.K)[0]
     travel = norm(ends - project(points, view.viewmat, view.K)[0], -1) / sightings.unit

@@ -11,7 +11,6 @@ from ..raster import RasterSettings
 from ..scene import resize_intrinsics
 from ..torch_types import norm_of_all
 from ..train.model import render
-from .decisions import above
 from .detail_config import DetailConfig
 from .frozen import FrozenGaussians, FrozenImage, OutputFrame
 from .reproject import pixel_centres, resized, unproject
@@ -124,22 +123,19 @@ def parallax(sightings: Sightings, config: DetailConfig, posed: PosedFrame, fram
 
 def displacements(
     sightings: Sightings, posed: PosedFrame, chosen: list[int], size: tuple[int, int] | None = None
-) -> tuple[list[Tensor], Tensor]:
-    """([h, w, 3] scene units from t* to each plate of what is seen, [h, w] share whose way nobody knows).
+) -> list[Tensor]:
+    """[h, w, 3] scene units from t* to each plate of what is seen.
 
     `size` (w, h) None: that of decisions.
     """
     w, h = size or posed.depth.shape[::-1]
     rows, state = sightings.rows, posed.frozen.state
-    strangers = sightings.stage.strangers(posed.frozen)
-    extra = torch.zeros(len(strangers), 3 * len(chosen) + 1, device=state["means"].device)
-    extra[strangers, -1] = 1.0
-    if len(rows):
-        now = state["means"][rows].cpu()
-        for n, frame in enumerate(chosen):
-            extra[rows, 3 * n : 3 * n + 3] = (sightings.view(frame).offsets - now).to(extra.device)
-    if not len(rows) and not bool(strangers.any()):
-        return [torch.zeros(h, w, 3, device="cpu") for _ in chosen], torch.zeros(h, w, device="cpu")
+    if not len(rows):
+        return [torch.zeros(h, w, 3, device="cpu") for _ in chosen]
+    extra = torch.zeros(len(state["means"]), 3 * len(chosen), device=state["means"].device)
+    now = state["means"][rows].cpu()
+    for n, frame in enumerate(chosen):
+        extra[rows, 3 * n : 3 * n + 3] = (sightings.view(frame).offsets - now).to(extra.device)
     rows_full, columns = posed.image.alpha.shape
     K = resize_intrinsics(posed.K[None], columns, rows_full, w, h)[0]
     out = render(
@@ -147,28 +143,7 @@ def displacements(
         settings=posed.settings(w, h),
     )  # fmt: skip
     shown = (out.colors[0, ..., 3:] / out.alphas[0].clamp_min(1e-3)[..., None]).cpu()
-    return [shown[..., 3 * n : 3 * n + 3] for n in range(len(chosen))], shown[..., -1]
-
-
-def added_share(sightings: Sightings, posed: PosedFrame) -> Tensor | None:
-    """[h, w] in 0..1: how much of what is seen is neither the run's nor was seen at t* (`unseen.py`); None: nothing."""
-    frozen = posed.frozen
-    added = sightings.stage.strangers(frozen) & (frozen.support < 1.0)
-    if not bool(added.any()):
-        return None
-    h, w = posed.depth.shape
-    rows, columns = posed.image.alpha.shape
-    viewmat, K = (
-        posed.viewmat.to(added.device),
-        resize_intrinsics(posed.K[None], columns, rows, w, h)[0].to(added.device),
-    )
-    out = render(
-        frozen.state, 0, viewmat, K, w, h, colors=added.float()[:, None], with_contributions=False,
-        settings=posed.settings(w, h),
-    )  # fmt: skip
-    share = (out.colors[0, ..., 3] / out.alphas[0].clamp_min(1e-3)).cpu()
-    # A trace of the wall behind it would bring that wall's plates in.
-    return torch.lerp(share, torch.ones_like(share), above(share, 0.5))
+    return [shown[..., 3 * n : 3 * n + 3] for n in range(len(chosen))]
 
 
 def with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> tuple[Tensor, tuple[int, int]]:

@@ -19,8 +19,7 @@ _KEPT = 90
 class Travel:
     """From a scene frozen at t* to the clip's frames.
 
-    The run's own Gaussians come first in the scene; what stands behind them (an instant's layer) is not moved, nor is
-    what was closed at t* (`static_twin.py`).
+    What was closed at t* (`static_twin.py`) is not moved.
     """
 
     def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int) -> None:
@@ -28,33 +27,16 @@ class Travel:
         rows = run.model.open_rows()
         self.rows = rows[frozen.motion[rows] > 0.5]
         """[M] int64, rows of the run's Gaussians that move."""
-        self.known = len(run.model.gaussians)
-        """How many Gaussians the run has."""
         self.t_star = t_star
         """Frame number."""
-        field = self._field(t_star)
-        self._mended = {name: frozen.state[name][self.rows] - field[name] for name in PARAM_NAMES}
-        """What was put elsewhere at t*, or taken out of it (`adrift.py`, `specks.py`)."""
         self._changes: dict[int, dict[str, Tensor]] = {}
-        self._at_t_star = field
+        self._at_t_star = self._field(t_star)
 
     def moved(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
-        """The scene, or what it was developed to, as it is in a frame; with gradients.
-
-        What was put elsewhere at t* is there at t* alone: in other frames it stands where the run has it, which is
-        where it is seen there.
-        """
-        if frame == self.t_star:
+        """The scene, or what it was developed to, as it is in a frame; with gradients."""
+        if frame == self.t_star or not len(self.rows):
             return dict(state)
-        return self._by(state, {name: value - self._mended[name] for name, value in self._change(frame).items()})
-
-    def carried(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
-        """The same, but what was put elsewhere at t* goes from there: for frames that show what t* shows."""
-        return self._by(state, self._change(frame))
-
-    def _by(self, state: dict[str, Tensor], change: dict[str, Tensor]) -> dict[str, Tensor]:
-        if not len(self.rows):
-            return dict(state)
+        change = self._change(frame)
         return {name: value.index_add(0, self.rows, change[name]) for name, value in state.items()}
 
     @torch.no_grad()
@@ -94,8 +76,3 @@ class Stage:
         if self.developed is None or self._travel is None:
             return freeze_at(self.run.model, self.scene.time_of_frame(frame), 1.0)
         return replace(self.developed, state=self._travel.moved(self.developed.state, frame))
-
-    def strangers(self, frozen: FrozenGaussians) -> Tensor:
-        """bool [N]: which Gaussians of a frozen scene the run does not have: nobody knows how they moved."""
-        known = len(self.run.model.gaussians)
-        return torch.arange(len(frozen.support), device=frozen.support.device) >= known

@@ -23,8 +23,7 @@ from torch_backend.freeze.developed_instants import (
 )
 from torch_backend.freeze.exr import read_key
 from torch_backend.freeze.from_afar import seen_from_afar
-from torch_backend.freeze.frozen import ALWAYS, Turned, render_frozen, span_of
-from torch_backend.freeze.missing_layer import InstantLayer, instant_layer, join
+from torch_backend.freeze.frozen import render_frozen, span_of
 from torch_backend.freeze.sightings import motion_mattes
 from torch_backend.freeze.static_twin import TwinConfig, held_still, settled
 from torch_backend.freeze.travel import Stage, Travel
@@ -118,33 +117,12 @@ def test_developed_gaussians_travel_with_those_they_descend_from(made):
     run, scene, frozen, now = made
     stage = Stage(run, scene, now, T_STAR)
     assert all(torch.equal(value, now.state[name]) for name, value in stage.at(T_STAR).state.items())
-    # From where it begins to be developed: a speck that was put back goes where the run has it.
-    begun = now.descent.state["means"][: len(frozen.motion)]
-    then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state["means"] - begun
+    then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state["means"] - frozen.state["means"]
     moved = stage.at(112).state["means"] - now.state["means"]
-    moves = (now.descent.motion > 0.5)[: len(then)]
+    moves = now.descent.motion > 0.5
     assert int(moves.sum()) > 30, "or the test says nothing"
-    torch.testing.assert_close(moved[: len(then)][moves], then[moves], atol=1e-5, rtol=1e-4)
-    assert not bool(moved[: len(then)][~moves].any()) and not bool(moved[len(then) :].any())
-    assert torch.equal(stage.strangers(now), torch.arange(len(moved)) >= len(then))
-
-
-def test_what_was_put_elsewhere_is_there_at_t_star_alone(made):
-    run, scene, frozen, _ = made
-    rows = run.model.open_rows()[:8]
-    state = {name: value.clone() for name, value in frozen.state.items()}
-    state["means"][rows] += 0.5
-    state["opacity_logits"][rows] -= 9.0
-    travel = Travel(run, scene, dataclasses.replace(frozen, state=state), T_STAR)
-    then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state
-    now, undone, carried = travel.moved(state, T_STAR), travel.moved(state, 112), travel.carried(state, 112)
-    at_t_star = travel.carried(state, T_STAR)
-    for name in ("means", "opacity_logits"):
-        assert torch.equal(now[name], state[name])
-        torch.testing.assert_close(at_t_star[name], state[name])
-        torch.testing.assert_close(undone[name], then[name], rtol=1e-5, atol=1e-5)
-        put = (state[name] - frozen.state[name])[rows]
-        torch.testing.assert_close((carried[name] - then[name])[rows], put, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(moved[moves], then[moves], atol=1e-5, rtol=1e-4)
+    assert not bool(moved[~moves].any())
 
 
 def in_tatters(run, frozen):
@@ -286,12 +264,9 @@ def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):
     run.model.gaussians.params["sh0"].data[rows] = 0.0
     run.model.gaussians.params["opacity_logits"].data[rows] -= 2.0
     lacking = field(run, scene)
-    layer = instant_layer(run, scene, lacking, T_STAR, motion=lambda frame: load_motion(world.shot, frame))
     back = developed(world.shot, run, scene, T_STAR, lacking, DevelopConfig(steps=250), keep=False)
-    seeded = join(lacking, layer)
     (moving, still), (was_moving, was_still) = (scores(world, run, scene, f) for f in (back, lacking))
     assert moving > was_moving + 6.0 and still > was_still - 0.5
-    assert moving > scores(world, run, scene, seeded)[0] + 1.0, "it is more than the layer alone"
 
 
 def test_what_has_gone_in_the_other_plates_is_not_erased(trained, made):
@@ -375,10 +350,7 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
     tensors, _ = load_checkpoint(path)
     wrong = [{"closed": torch.tensor([len(frozen.support)])}, {"closed": torch.zeros(2)}]
     wrong += [{"state.means": tensors["state.means"][:-1]}]
-    wrong += [
-        {"base.quats": tensors["base.quats"] / 0.0},
-        {"added.support": torch.ones(1 + len(tensors["added.support"]))},
-    ]
+    wrong += [{"base.quats": tensors["base.quats"] / 0.0}]
     for damage in (b"", whole[:1000], whole[:-9], b"x" * 99, *wrong):
         if isinstance(damage, bytes):
             path.write_bytes(damage)
@@ -388,53 +360,6 @@ def test_a_damaged_file_is_made_anew_and_so_is_one_that_does_not_fit(apart):
     assert same(make(), first)
     again = load_developed(shot, run, T_STAR, frozen, SHORT)
     assert again is not None and same(again, first)
-
-
-def with_more(frozen, rows, support):
-    """A scene with some of its Gaussians behind it once more, as seen at another time."""
-    grown = join(
-        frozen, InstantLayer({k: v[rows] for k, v in frozen.state.items()}, 0, *[torch.zeros(1)] * 3, []), True
-    )
-    return replace(
-        grown, support=grown.support.index_fill(0, torch.arange(len(frozen.support), len(grown.support)), support)
-    )
-
-
-def test_what_t_star_did_not_see_is_developed_by_no_plate_and_kept_as_that(apart, monkeypatch):
-    shot, run, scene, frozen = apart
-    added, config = torch.arange(40), DevelopConfig(steps=8, gain=-99.0)
-    monkeypatch.setattr(
-        developed_instants, "with_unseen", lambda run, scene, frozen, *_, **__: with_more(frozen, added, 0.4)
-    )
-    now = developed(shot, run, scene, T_STAR, frozen, config)
-    rows = slice(len(now.support) - len(added), len(now.support))
-    assert all(torch.equal(now.state[name][rows], value[rows]) for name, value in now.descent.state.items())
-    assert not torch.equal(now.state["sh0"], now.descent.state["sh0"])
-    assert bool((now.support[rows] == 0.4).all()) and bool((now.motion[rows] == 1.0).all())
-    again = load_developed(shot, run, T_STAR, frozen, config)
-    assert again is not None and same(again, now) and torch.equal(again.support, now.support)
-
-
-def test_what_turned_is_kept_with_the_instant(apart):
-    shot, run, scene, frozen = apart
-    made = developed(shot, run, scene, T_STAR, frozen, SHORT)
-    assert made.turned is None, "nothing did"
-    first = torch.zeros(9, 12, dtype=torch.int32)
-    first[2:5, 3:7] = 99
-    turned = Turned(first, torch.full_like(first, ALWAYS))
-    key = developed_key(shot, run, T_STAR, SHORT)
-    developed_instants._save(shot, run, T_STAR, frozen, replace(made, turned=turned), key)
-    again = load_developed(shot, run, T_STAR, frozen, SHORT)
-    assert again is not None and same(again, made) and again.turned is not None
-    assert torch.equal(again.turned.first, turned.first) and torch.equal(again.turned.last, turned.last)
-    path = developed_path(run, T_STAR)
-    tensors, meta = load_checkpoint(path)
-    for damage in ({"turned.last": first[:-1]}, {"turned.first": first.float()}, {"turned.first": first[0]}):
-        save_checkpoint(path, {**tensors, **damage}, {k: v for k, v in meta.items() if k != "version"})
-        assert load_developed(shot, run, T_STAR, frozen, SHORT) is None
-    del tensors["turned.first"]
-    save_checkpoint(path, tensors, {k: v for k, v in meta.items() if k != "version"})
-    assert load_developed(shot, run, T_STAR, frozen, SHORT) is None
 
 
 def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(apart):
