@@ -23,7 +23,7 @@ from benchmarks.sources import Log, load_source
 from benchmarks.synthetic.folder import SyntheticScene
 from torch_backend.contract import JobError
 from torch_backend.freeze.frozen import freeze_at, render_frozen, span_of
-from torch_backend.freeze.reproject import look_up, pixel_centres, project, unproject
+from torch_backend.freeze.views.reproject import look_up, pixel_centres, project, unproject
 from torch_backend.native import default_threads
 from torch_backend.report.evaluate import freeze_run, plate_detail
 from torch_backend.report.metrics import psnr_of

@@ -15,10 +15,17 @@ from benchmarks.detail_figures import STILL_MATTE, induced_places, inside, sampl
 from benchmarks.sources import Log
 from torch_backend.contract import FreezeParams
 from torch_backend.footage.plates import Plates
-from torch_backend.freeze.detail import DetailedFrame, Detailer
-from torch_backend.freeze.developed_instants import developed
-from torch_backend.freeze.frozen import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
-from torch_backend.freeze.take_plan import choose_t_star
+from torch_backend.freeze.composite.compositor import DetailedFrame, Detailer
+from torch_backend.freeze.frozen import (
+    FrozenGaussians,
+    FrozenImage,
+    OutputFrame,
+    freeze_at,
+    render_frozen,
+    span_of,
+)
+from torch_backend.freeze.instant.instants import developed
+from torch_backend.freeze.take.plan import choose_t_star
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.shot import Shot
 from torch_backend.solve.motion import load_motion

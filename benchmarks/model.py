@@ -37,11 +37,11 @@ from benchmarks.training_step import _Silent
 from torch_backend.contract import JobError, TrainParams
 from torch_backend.deformation import planes
 from torch_backend.footage.images import write_png
-from torch_backend.freeze.develop import develop
-from torch_backend.freeze.developed_instants import config_for, developed
 from torch_backend.freeze.frozen import FrozenGaussians, FrozenImage, freeze_at, render_frozen
-from torch_backend.freeze.sightings import motion_mattes
-from torch_backend.freeze.static_twin import settled
+from torch_backend.freeze.instant.develop import develop
+from torch_backend.freeze.instant.instants import config_for, developed
+from torch_backend.freeze.instant.static_baseline import settled
+from torch_backend.freeze.views.source_views import motion_mattes
 from torch_backend.raster import cpu as raster_cpu
 from torch_backend.raster import ssim
 from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of

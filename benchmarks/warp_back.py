@@ -56,8 +56,8 @@ def main() -> int:
 def _prepare(folder: Path, take: str, frame_list: str, work: Path) -> list[int]:
     """A light copy of the shot, plates and what is expected of them, under `work`; returns the frame numbers."""
     from torch_backend.footage.plates import Plates
+    from torch_backend.freeze.composite.warp import apply_warp, read_warp
     from torch_backend.freeze.exr import read_frozen_exr
-    from torch_backend.freeze.warp import apply_warp, read_warp
     from torch_backend.shot import Shot
 
     unused = shutil.ignore_patterns("runs", "jobs", "colmap", "motion", "raw", "preview")

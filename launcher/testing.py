@@ -39,12 +39,12 @@ OTHER_INSTRUCTIONS = {
 """Environment variables with which torch, our kernels, numpy and OpenCV compute as on an older processor: floats come
 out some 1e-7 otherwise. For processors of x86; on others torch's alone means something."""
 SENSITIVE = (
-    "tests/backend/freeze/test_decisions.py", "tests/backend/freeze/test_overscan.py",
-    "tests/backend/freeze/test_regions.py", "tests/backend/freeze/test_held.py",
-    "tests/backend/freeze/test_ghosts.py", "tests/backend/freeze/test_instant_pixels.py",
-    "tests/backend/freeze/test_detail.py", "tests/backend/freeze/test_honest.py",
-    "tests/backend/freeze/test_turned.py", "tests/backend/freeze/test_sighted.py",
-    "tests/backend/freeze/test_unseen.py", "tests/backend/raster",
+    "tests/backend/freeze/views/test_decisions.py", "tests/backend/freeze/composite/test_overscan.py",
+    "tests/backend/freeze/views/test_regions.py", "tests/backend/freeze/composite/test_foreground_change.py",
+    "tests/backend/freeze/composite/test_ghosting.py", "tests/backend/freeze/composite/test_reference_pixels.py",
+    "tests/backend/freeze/composite/test_compositor.py", "tests/backend/freeze/composite/test_honest.py",
+    "tests/backend/freeze/views/test_visibility.py",
+    "tests/backend/raster",
 )  # fmt: skip
 """Tests of what decides by floats, and of the kernels: those that `test --instructions` runs."""
 ADDON_TESTS = ("tests/addon", "tests/addon_free")

@@ -125,16 +125,16 @@ def test_what_a_row_names_says_something_of_its_module(row: Row):
 @pytest.mark.parametrize(
     ("text", "direct", "at_all"),
     [
-        ("from torch_backend.freeze.grain import draw", True, True),
-        ("from torch_backend.freeze import exr, grain", True, True),
-        ("from torch_backend.freeze import (\n    exr,\n    grain,\n)", True, True),
-        ("torch_backend/freeze/grain.py", True, True),
-        ("from torch_backend.freeze import take", False, True),
+        ("from torch_backend.freeze.composite.grain import draw", True, True),
+        ("from torch_backend.freeze.composite import fill, grain", True, True),
+        ("from torch_backend.freeze.composite import (\n    fill,\n    grain,\n)", True, True),
+        ("torch_backend/freeze/composite/grain.py", True, True),
+        ("from torch_backend.freeze.composite import fill", False, True),
         ("the Brush of a grain", False, True),
         ("from torch_backend.freezer import grain", False, False),
         ("from torch_backend.train import run  # Brushes", False, False),
     ],
 )
 def test_what_counts_as_a_test_of_a_module(text: str, direct: bool, at_all: bool):
-    module = Path("torch_backend/freeze/grain.py")
+    module = Path("torch_backend/freeze/composite/grain.py")
     assert (imports_it(text, module), reaches(Path("test_take.py"), text, module)) == (direct, at_all)

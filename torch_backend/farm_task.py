@@ -3,7 +3,7 @@
 It speaks Open Job Description: lines `openjd_progress: PERCENT`, `openjd_status: TEXT` and, of a task that failed,
 `openjd_fail: TEXT` on the standard output. Every task may run twice, also at once, and after it was killed: import,
 solve and training wait for each other by the shot's lock and find what is done done; a take is made in parts
-(`freeze/parts.py`); what is baked is renamed into its place whole.
+(`freeze/take/parts.py`); what is baked is renamed into its place whole.
 """
 
 from __future__ import annotations

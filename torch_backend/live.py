@@ -31,8 +31,7 @@ from torch import Tensor
 from . import contract
 from .contract import NO_DEPTH, JobError, LiveView, from_dict, own_input, path_error, read_message, write_message
 from .footage.plates import Plates
-from .freeze.detail import DetailConfig, DetailedFrame, Detailer
-from .freeze.developed_instants import developed_path, load_developed
+from .freeze.composite.compositor import DetailConfig, DetailedFrame, Detailer
 from .freeze.frozen import (
     FrozenGaussians,
     FrozenImage,
@@ -41,8 +40,9 @@ from .freeze.frozen import (
     render_frozen,
     span_of,
 )
-from .freeze.sightings import SightingConfig, motion_mattes
-from .freeze.take_plan import suggested_instants
+from .freeze.instant.instants import developed_path, load_developed
+from .freeze.take.plan import suggested_instants
+from .freeze.views.source_views import SightingConfig, motion_mattes
 from .scene import Scene, load_scene
 from .shot import Shot
 from .train import LoadedRun, load_run

@@ -1,4 +1,4 @@
-"""Nodes that freeze a plate by a take's warp: matte * plate(ST) + fill, as `torch_backend/freeze/warp.py` says.
+"""Nodes that freeze a plate by a take's warp: matte * plate(ST) + fill (`torch_backend/freeze/composite/warp.py`).
 
 Blender's own smooth filters differ from version to version, and none leaves a pixel that does not move as it is. So the
 four pixels around a place are looked up as they are, and blended by how far the place lies between them, in steps of

@@ -13,7 +13,7 @@ import pytest
 from torch_backend import contract, job
 from torch_backend.contract import ExitCode, TrainParams
 from torch_backend.footage.images import write_png
-from torch_backend.freeze.video import write_video
+from torch_backend.freeze.take.video import write_video
 from torch_backend.shot import Shot, is_disk_full
 from torch_backend.train.checkpoint import read_meta
 

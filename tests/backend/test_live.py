@@ -26,7 +26,7 @@ from torch_backend.contract import (
 from torch_backend.footage.color import linear_to_srgb
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.freeze.take_plan import choose_t_star
+from torch_backend.freeze.take.plan import choose_t_star
 from torch_backend.live import _TINT, _TINTED, LiveSession, Superseded, _Waiting
 from torch_backend.shot import write_json
 from torch_backend.train import device

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.published import compared, main, video_frames
 from torch_backend.contract import JobError
-from torch_backend.freeze.video import write_video
+from torch_backend.freeze.take.video import write_video
 
 WIDTH, HEIGHT = 96, 64
 

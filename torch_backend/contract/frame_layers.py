@@ -15,7 +15,7 @@ class FrameLayer:
     name: str
     """Socket of Blender's Image node, 4.2 to 5.2."""
     channels: tuple[str, ...]
-    """Channels of the file, in order. One letter after the dot makes a value, R G B A a colour; see freeze/exr.py."""
+    """Channels of the file, in order. One letter after the dot makes a value, R G B A a colour (freeze/exr.py)."""
     stored: str
     """half or float."""
     shown: str

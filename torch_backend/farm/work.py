@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..contract import PRESET_STEPS, PRESET_WIDTHS
-from ..freeze.develop import DevelopConfig
+from ..freeze.instant.develop import DevelopConfig
 from .shots import FarmShot
 
 STEPS = ("import", "solve", "train", "open", "freeze", "finish", "bake", "deliver")

@@ -7,18 +7,10 @@ they are made as a whole, and what is made in bands is the same.
 from __future__ import annotations
 
 import ctypes
-import math
 import sys
-
-import torch
-from torch import Tensor
-
-from .reproject import look_up
 
 BAND_PIXELS = 1 << 19
 """Pixels of a band: 17 bands of 3840 x 2160, one of 640 x 480."""
-_REACH = 3
-"""Rows beyond a place that a bicubic look-up may touch."""
 
 
 def bands(rows: int, columns: int) -> list[slice]:
@@ -35,20 +27,3 @@ def hand_back() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)
-
-
-def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:
-    """`reproject.look_up`, bicubic, of places that lie near to each other: only the rows that they need become float32.
-
-    Equal to it but for the rounding of coordinates, some 1e-4 pixels.
-    """
-    height, width = picture.shape[:2]
-    if height * width <= BAND_PIXELS or not pixels.numel():
-        return look_up(picture, pixels, "bicubic")
-    least, most = (float(y) for y in torch.aminmax(pixels[..., 1]))
-    if not (math.isfinite(least) and math.isfinite(most)):
-        return look_up(picture, pixels, "bicubic")
-    top = min(max(0, math.floor(least) - _REACH), height - 1)
-    bottom = max(min(height, math.ceil(most) + _REACH), top + 1)
-    down = torch.tensor([0.0, float(top)], dtype=pixels.dtype, device=pixels.device)
-    return look_up(picture[top:bottom], pixels - down, "bicubic")

@@ -16,9 +16,9 @@ from torch import Tensor
 from ..contract import CHECKPOINT_FILE, METRICS_FILE, SUMMARY_FILE, JobError, Reporter, read_json
 from ..footage.images import write_png
 from ..footage.plates import Plates
-from ..freeze.detail import Detailer
-from ..freeze.developed_instants import Instants
+from ..freeze.composite.compositor import Detailer
 from ..freeze.frozen import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
+from ..freeze.instant.instants import Instants
 from ..scene import Scene, evenly_spaced, load_scene, read_image, split_frames
 from ..shot import Shot
 from ..solve.motion import find_motion

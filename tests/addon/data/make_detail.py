@@ -81,8 +81,8 @@ def main() -> None:
     import OpenImageIO as oiio
     import torch
 
+    from torch_backend.freeze.composite.warp import WarpMetadata, snap, write_warp
     from torch_backend.freeze.exr import DetailLayers, FrameMetadata, linear_spec, write_exr, write_frozen_exr
-    from torch_backend.freeze.warp import WarpMetadata, snap, write_warp
 
     ones, size = np.ones((HEIGHT, WIDTH), np.float32), np.array([WIDTH, HEIGHT])
     for frame, folder, light in (*((n, FOLDER, "rec709") for n in FRAMES), (6, FOLDER.with_name("detail_ap1"), "ap1")):

@@ -19,8 +19,8 @@ FOLDER = Path(__file__).with_name("grain")
 def main() -> None:
     """Writes grain/NNNNNN.exr beside this file."""
     from torch_backend.footage.display import PLAIN
+    from torch_backend.freeze.composite.grain import BINS, Grain, draw
     from torch_backend.freeze.exr import FrameMetadata, write_frozen_exr
-    from torch_backend.freeze.grain import BINS, Grain, draw
 
     FOLDER.mkdir(exist_ok=True)
     grain = Grain(np.repeat(np.array(DEVIATION, np.float32)[:, None], BINS, axis=1), 0.6, np.eye(3, dtype=np.float32))

@@ -1,0 +1,257 @@
+"""What moved is let go of whole, though mattes miss parts of it: nothing of it stays, no speck and no outline."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from tests.backend.freeze.composite.test_compositor import H, W, board_at, build, off, widened
+from torch_backend.deformation import Deformation, Deltas
+from torch_backend.freeze.composite.compositor import DetailConfig, Detailer
+from torch_backend.freeze.composite.foreground_change import HeldConfig
+from torch_backend.freeze.take.frames import small_share
+from torch_backend.freeze.views.regions import closed, grown, opened
+from torch_backend.freeze.views.source_views import SightingConfig
+
+FRAME, T_STAR = 3, 11
+"""The board stands wholly apart in these two."""
+BLIND = {
+    "denied": 9.0, "denied_too": 9.0, "held": HeldConfig(apart=9.0), "travel": 1e9, "carried": 1e9,
+    "of_its_time": (9.0, 1.0),
+}  # fmt: skip
+"""Of `DetailConfig`: what the model and plate t* say is not asked."""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory, quiet):
+    return build(tmp_path_factory.mktemp("honest"), quiet())
+
+
+class Stays(Deformation):
+    """No motion: the board stands where it is at T_STAR."""
+
+    def forward(self, means, times, own=None):
+        return Deltas(torch.tensor([board_at(T_STAR), 0.0, 0.0]).expand(len(means), 3))
+
+
+def narrowed(mask, by):
+    return ndimage.binary_erosion(mask, np.ones((2 * by + 1,) * 2))
+
+
+def make(world, mattes, sightings=None, masked=None, **config):
+    """The frame at T_STAR; `mattes` frame -> bool [H, W], of those that are not as they should be.
+
+    `masked`: bool [H, W], what plate t* is not to show; None: nothing.
+    """
+
+    def moving(frame):
+        on = mattes.get(frame)
+        return torch.from_numpy(world.seen_at(frame)[1] if on is None else on).float()
+
+    settings = DetailConfig(depth_error=0.01, sightings=sightings or SightingConfig(), **config)
+    detailer = Detailer(world.run, world.scene, world.plates(), settings, moving)
+    if masked is not None:
+        at_t = torch.from_numpy(masked).float()
+        detailer.seen.ignored = lambda frame: at_t if frame == T_STAR else None
+    return world.make(world.output(FRAME, T_STAR), detailer)
+
+
+def shows_its_own_board(world, made):
+    """Share of the pixels where the frame's own plate has the board and t* has not, that look like that board."""
+    (plate, on), (truth, there) = world.seen_at(FRAME), world.truth(world.output(FRAME, T_STAR))
+    gone = on & ~widened(there, 4)
+    assert gone.sum() > 3000
+    near = [np.abs(np.asarray(made.color) - picture).mean(-1) for picture in (plate, truth)]
+    return float((near[0] < near[1])[gone].mean())
+
+
+def test_a_matte_that_ends_short_of_what_moves_leaves_nothing_of_it(world):
+    """The flow misses 9 pixels of the board all around: in the frame's own plate and in those that fill."""
+    short = {frame: narrowed(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
+    made = make(world, short, **BLIND)
+    assert shows_its_own_board(world, made) < 0.01
+    alone = make(world, short, SightingConfig(contradicted=9.0), **BLIND)
+    assert shows_its_own_board(world, alone) > 0.1, "else there is nothing to mend"
+
+
+def test_what_is_held_still_and_was_elsewhere_at_t_star_is_not_shown(world):
+    """For a second nobody moves, so no matte says anything; plate t* shows the wall, as the frozen frame does."""
+    still = {frame: np.zeros((H, W), bool) for frame in range(FRAME - 2, FRAME + 3)}
+    made = make(world, still)
+    assert shows_its_own_board(world, made) < 0.01
+    assert shows_its_own_board(world, make(world, still, **BLIND)) > 0.9, "else there is nothing to mend"
+    wall = ~widened(world.seen_at(FRAME)[1] | world.truth(world.output(FRAME, T_STAR))[1], 24)
+    assert (made.matte.numpy()[wall] == 1.0).all(), "and nothing else is let go of"
+
+
+def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
+    """As before, but the model leaves the board where it was at t*: that plate and plate t* differ has to do."""
+    before = world.run.model
+    world.run.model = replace(before, field=Stays())
+    still = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
+    try:
+        made, alone = make(world, still), make(world, still, **BLIND)
+    finally:
+        world.run.model = before
+    assert shows_its_own_board(world, made) < 0.01
+    assert shows_its_own_board(world, alone) > 0.9, "else there is nothing to mend"
+
+
+def test_where_plate_t_star_does_not_see_the_render_says_what_goes_with_what_moves(world):
+    """The model leaves the board where it was at t*, whose plate is masked where it had been; mattes end short."""
+    before, (_, on) = world.run.model, world.seen_at(FRAME)
+    short = narrowed(on, 9)
+    mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14)} | {FRAME: short}
+    hidden = widened(on, 30) & ~widened(world.seen_at(T_STAR)[1], 4)
+    world.run.model = replace(before, field=Stays())
+    try:
+        made, alone = (make(world, mattes, masked=hidden, beyond=least) for least in (100.0, 1e9))
+    finally:
+        world.run.model = before
+    rim = on & hidden & ~widened(short, 4)
+    assert rim.sum() > 300 and made.matte.numpy()[rim].mean() < 0.05
+    assert alone.matte.numpy()[rim].mean() > 0.5, "else something else says so"
+
+
+def test_what_the_model_moves_goes_with_what_moves_beside_it(world):
+    """The matte has a corner of the board of t*; of the rest nothing is asked but how far the model moves it."""
+    there = world.truth(world.output(FRAME, T_STAR))[1]
+    rows, columns = np.nonzero(there)
+    corner = there & (np.arange(W) < columns.min() + 12) & (np.arange(H)[:, None] < rows.min() + 12)
+    mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14)} | {T_STAR: corner}
+    deaf = {**BLIND, "body": 640.0, "sightings": SightingConfig(contradicted=9.0)}
+    made = make(world, mattes, **{**deaf, "carried": DetailConfig().carried})
+    assert made.matte.numpy()[narrowed(there, 6)].max() < 0.01
+    assert make(world, mattes, **deaf).matte.numpy()[narrowed(there, 6)].mean() > 0.8, "else there is nothing to mend"
+
+
+def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
+    """At the plate's own time the board stood before the wall: there the frozen render shows what never moves."""
+    none = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
+    made, alone = (
+        make(world, none, **{**BLIND, "of_its_time": told}) for told in (DetailConfig().of_its_time, (9.0, 1))
+    )
+    gone = narrowed(world.seen_at(FRAME)[1], 6) & ~widened(world.truth(world.output(FRAME, T_STAR))[1], 6)
+    assert gone.sum() > 1000 and made.matte.numpy()[gone].max() < 0.01
+    assert alone.matte.numpy()[gone].min() > 0.99, "else something else says so"
+
+
+def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(world):
+    """The model has the wall wrong in a spot, at every time: that is no motion."""
+    spot = world.run.model.gaussians.params["means"][:, :2]
+    wrong = (spot - torch.tensor([-2.2, 1.7])).norm(dim=1) < 0.4
+    colors = world.run.model.gaussians.params["sh0"]
+    before = colors.detach().clone()
+    try:
+        with torch.no_grad():
+            colors[wrong] += 1.5
+        made = make(world, {})
+        shown = np.abs((made.splat - torch.from_numpy(world.truth(world.output(FRAME, T_STAR))[0]).float()).numpy())
+        spoilt = (shown.max(-1) > 0.2) & ~widened(world.seen_at(FRAME)[1], 24)
+        spoilt &= ~widened(world.truth(world.output(FRAME, T_STAR))[1], 24)
+        assert spoilt.sum() > 500
+        assert (made.matte.numpy()[spoilt] == 1.0).all()
+    finally:
+        with torch.no_grad():
+            colors.copy_(before)
+
+
+def test_what_the_plates_before_and_after_call_moving_is_moving(world):
+    blind = SightingConfig(contradicted=9.0)
+    missing = {FRAME: np.zeros((H, W), bool)}
+    both = world.seen_at(FRAME - 1)[1] & world.seen_at(FRAME + 1)[1] & world.seen_at(FRAME)[1]
+    assert both.sum() > 3000
+    made = make(world, missing, blind, **BLIND)
+    assert made.matte.numpy()[narrowed(both, 6)].max() < 0.01
+    alone = {frame: np.zeros((H, W), bool) for frame in (FRAME - 1, FRAME, FRAME + 1)}
+    assert make(world, alone, blind, **BLIND).matte.numpy()[narrowed(both, 6)].min() > 0.99, "else nothing is told"
+
+
+def test_plates_that_fill_show_nothing_of_it_either(world):
+    """Flow found the board in the frame's own plate alone, and the model leaves it where it was at t*."""
+    before = world.run.model
+    world.run.model = replace(before, field=Stays())
+    try:
+        mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14) if frame not in (FRAME, T_STAR)}
+        made = make(world, mattes, SightingConfig(contradicted=9.0))
+        believed = make(world, mattes, SightingConfig(contradicted=9.0, unexplained=1e6), agreement=1e6)
+    finally:
+        world.run.model = before
+    assert shows_its_own_board(world, made) < 0.01
+    assert shows_its_own_board(world, believed) > 0.1, "else there is nothing to mend"
+
+
+def test_gaps_within_what_moves_belong_to_it(world):
+    """What plate t* sees flickers where depth is rough: here its matte has gaps of four pixels in every fourteen."""
+    there = world.truth(world.output(FRAME, T_STAR))[1]
+    torn = world.seen_at(T_STAR)[1] & (np.arange(W) % 14 >= 4)
+    bare = {**BLIND, "margin": 0, "sightings": SightingConfig(margin=0, contradicted=9.0)}
+    made, alone = (make(world, {T_STAR: torn}, gap=gap, **bare) for gap in (DetailConfig().gap, 0))
+    assert made.matte.numpy()[narrowed(there, 12)].max() < 0.01
+    assert alone.matte.numpy()[narrowed(there, 12)].max() > 0.9, "else there is nothing to mend"
+
+
+def test_where_mattes_ended_short_the_wall_is_as_sharp_as_its_plates(world):
+    truth, there = world.truth(world.output(FRAME, T_STAR))
+    gone = world.seen_at(FRAME)[1] & ~widened(there, 4)
+    short = {frame: narrowed(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
+    made = make(world, short)
+    assert off(made.color, truth, gone) < min(0.01, 0.2 * off(made.splat, truth, gone))
+
+
+# ------------------------------------------------------------------------------------------------- regions
+
+
+def blobs():
+    """A mask of two blobs, 24 pixels apart, and a line from the first one outwards."""
+    mask = np.zeros((120, 160), bool)
+    mask[20:60, 20:60] = mask[20:60, 84:120] = True
+    mask[60:116, 38:44] = True
+    return mask
+
+
+def test_a_region_grows_along_what_hangs_together_and_no_farther_than_its_reach():
+    mask, seeds = blobs(), np.zeros((120, 160), bool)
+    seeds[26:34, 26:34] = True
+    found = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 200).numpy() > 0.5
+    first = ndimage.label(mask)[0] == ndimage.label(mask)[0][30, 30]
+    assert (found & ~first).sum() == 0 and (first & ~found).mean() < 0.002
+    near = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 40).numpy() > 0.5
+    rows = np.nonzero(near[:, 40])[0]
+    assert abs(rows.max() - (33 + 40)) <= 2 and not near[:, 84:].any()
+    thick = grown(torch.from_numpy(seeds), torch.from_numpy(mask), 200, 4).numpy() > 0.5
+    assert thick[20:60, 20:60].mean() > 0.99 and not thick[64:].any(), "along the line, which is thin, it goes nowhere"
+
+
+def test_growing_keeps_seeds_that_lie_elsewhere_and_leaves_what_no_seed_touches():
+    seeds = np.zeros((120, 160), bool)
+    seeds[90:94, 100:104] = True
+    found = grown(torch.from_numpy(seeds), torch.from_numpy(blobs()), 12).numpy()
+    assert (found == seeds).all()
+
+
+def test_opening_and_closing_are_those_of_their_masks():
+    rng = np.random.default_rng(0)
+    mask = ndimage.gaussian_filter(rng.standard_normal((90, 130)), 3.0) > 0.05
+    side, inner = np.ones((9, 9)), (slice(9, -9), slice(9, -9))
+    torn = torch.from_numpy(mask)
+    assert (opened(torn, 4).numpy()[inner] == ndimage.binary_opening(mask, side)[inner]).all()
+    found, want = closed(torn, 4).numpy()[inner], ndimage.binary_closing(mask, side)[inner]
+    assert (found == want).mean() > 0.95 and want.mean() > mask[inner].mean() + 0.1, "at half size, so nearly"
+    assert (found >= mask[inner]).all() and (closed(torn, 0).numpy() == mask).all()
+
+
+def test_what_moves_and_no_plate_near_t_star_shows_is_a_guess(world):
+    """Its Gaussians are known at every time, as those that were never opened are: the plates have to say it."""
+    output = world.output(FRAME, T_STAR)
+    board = narrowed(world.truth(output)[1], 6)
+    wall = ~widened(world.seen_at(FRAME)[1] | world.truth(output)[1], 24)
+    seen, guessed = world.make(output), world.make(output, withheld=[n for n in range(1, 14) if n != FRAME])
+    assert seen.support.numpy()[board].min() > 0.95
+    assert guessed.support.numpy()[board].max() < 0.05
+    for made in (seen, guessed):
+        assert made.support.numpy()[wall].min() > 0.99
+    shares = [float(small_share(made.plate, made.support).mean()) for made in (seen, guessed)]
+    assert shares[0] - shares[1] > 0.8 * float(torch.from_numpy(board).float().mean())

@@ -1,0 +1,130 @@
+"""What a take says of its footage: where it is, what its numbers mean, the map that takes its lens away."""
+
+import json
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+
+from tests.backend.footage.test_plates import solved
+from torch_backend.contract import PROBE
+from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.footage.color import srgb_to_linear
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.footage.ocio import BUILT_IN, light_of
+from torch_backend.footage.plates import Plates
+from torch_backend.freeze.composite.warp import sample
+from torch_backend.freeze.take.footage_facts import footage_facts
+from torch_backend.shot import Shot
+from torch_backend.solve.plate_lens import load_plate_lenses
+
+
+class Quiet:
+    """A reporter that says nothing."""
+
+    def __getattr__(self, name):
+        return lambda *words, **more: None
+
+
+def pictures(folder, count=9, size=(96, 128), suffix="png", **attributes):
+    """A camera that pans over a smooth texture."""
+    folder.mkdir()
+    y, x = np.mgrid[0 : size[0], 0 : size[1] + 4 * count]
+    wide = np.stack([0.5 + 0.3 * np.sin(x / 9 + k) * np.cos(y / (7 + k)) for k in range(3)], -1)
+    wide += np.random.default_rng(0).uniform(-0.02, 0.02, wide.shape)
+    for n in range(count):
+        picture = np.ascontiguousarray(wide[:, 4 * n : 4 * n + size[1]])
+        path = str(folder / f"a.{1001 + n}.{suffix}")
+        if suffix == "png":
+            write_png(path, np.rint(picture * 255).astype(np.uint8))
+            continue
+        spec = oiio.ImageSpec(size[1], size[0], 3, "half")
+        for key, value in attributes.items():
+            spec.attribute(key, value)
+        out = oiio.ImageOutput.create(path)
+        assert out.open(path, spec) and out.write_image(picture.astype(np.float32)) and out.close()
+    return folder
+
+
+@pytest.fixture
+def shot_of(tmp_path):
+    def make(folder, radial=0.0, **config):
+        shot = Shot.create(tmp_path / "a.splannequin")
+        import_footage(shot, str(folder), FootageConfig(working_height=48, **config), Quiet())
+        return solved(shot, radial)
+
+    return make
+
+
+def facts_of(shot):
+    take = shot.take("t")
+    take.mkdir(parents=True, exist_ok=True)
+    return footage_facts(shot, take), take
+
+
+def test_footage_without_a_lens(tmp_path, shot_of):
+    facts, take = facts_of(shot_of(pictures(tmp_path / "plate")))
+    assert facts["file"] == str(tmp_path / "plate" / "a.1001.png") and facts["beside"] == "../plate/a.1001.png"
+    assert (facts["size"], facts["first"], facts["last"], facts["unlike"]) == ([128, 96], 1001, 1009, "")
+    assert facts["probe"] == pytest.approx(srgb_to_linear(PROBE)) and facts["map"] == "" and not list(take.iterdir())
+
+
+def test_the_map_takes_the_lens_away_as_plates_do_at_full_size(tmp_path, shot_of):
+    """Where to look in the footage, in its own pixels; seen through it, the footage is the plate."""
+    shot = shot_of(pictures(tmp_path / "plate"), radial=-0.2)
+    facts, take = facts_of(shot)
+    assert facts["map"] == "stmap/undistort.exr"
+    st = np.asarray(oiio.ImageBuf(str(take / facts["map"])).get_pixels(oiio.FLOAT))
+    where = load_plate_lenses(shot)[1005].where(128, 96)
+    assert np.abs(st[..., 0] * 128 - where[..., 0]).max() < 1e-3
+    assert np.abs((1.0 - st[..., 1]) * 96 - where[..., 1]).max() < 1e-3 and (st[..., 2] == 1.0).all()
+    assert np.abs(where - (np.mgrid[0:96, 0:128][::-1].transpose(1, 2, 0) + 0.5)).max() > 1.0, "else nothing is bent"
+    raw = torch.from_numpy(read_png(tmp_path / "plate" / "a.1005.png").astype(np.float32) / 255.0)
+    seen, plate = sample(raw, torch.from_numpy(st[..., :2].copy())), Plates(shot).display(1005)
+    assert float((seen - plate).abs()[3:-3, 3:-3].mean()) < 0.01 < float((raw - plate).abs().mean())
+
+
+def test_the_map_is_made_once_for_a_solve(tmp_path, shot_of):
+    shot = shot_of(pictures(tmp_path / "plate"), radial=-0.2)
+    _, take = facts_of(shot)
+    file = take / "stmap" / "undistort.exr"
+    before = file.stat().st_mtime_ns
+    facts_of(shot)
+    assert file.stat().st_mtime_ns == before
+    pixels = file.read_bytes()
+    solved(shot, -0.15)
+    facts_of(shot)
+    assert file.read_bytes() != pixels
+
+
+def test_log_footage_says_what_light_it_means(tmp_path, shot_of):
+    facts, _ = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr"), colour_space="S-Log3 S-Gamut3"))
+    expected = light_of(np.array([[PROBE]], np.float32), "S-Log3 S-Gamut3", BUILT_IN)[0, 0]
+    assert facts["probe"] == pytest.approx(expected, rel=1e-4) and facts["space"] == "S-Log3 S-Gamut3 (OCIO)"
+
+
+def test_what_other_programs_would_show_otherwise_is_told(tmp_path, shot_of):
+    facts, _ = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr", PixelAspectRatio=2.0)))
+    assert facts["unlike"] == "its pixels are not square"
+
+
+def test_a_rate_that_varies_is_told(tmp_path, shot_of):
+    shot = shot_of(pictures(tmp_path / "plate"))
+    record = json.loads(shot.listing.read_text())
+    record["frames"][-1]["seconds"] += 0.03
+    shot.listing.write_text(json.dumps(record))
+    assert facts_of(shot)[0]["unlike"] == "its rate varies"
+
+
+def test_footage_that_is_gone_or_another_is_not_named(tmp_path, shot_of):
+    shot = shot_of(pictures(tmp_path / "plate"))
+    for file in (tmp_path / "plate").iterdir():
+        file.rename(file.with_suffix(".away"))
+    assert facts_of(shot)[0] == {}
+
+
+def test_how_a_picture_is_turned_is_told(tmp_path, shot_of):
+    """Blender shows pictures as they are stored."""
+    facts = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr", Orientation=6)))[0]
+    assert facts["size"] == [96, 128] and facts["unlike"] == "its pictures are turned clockwise by their header"

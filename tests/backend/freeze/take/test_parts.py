@@ -1,0 +1,192 @@
+"""A take in parts: the same bytes as at once, whatever the order, twice, after a kill, and not from another run."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torch_backend.contract import FreezeParams, JobError
+from torch_backend.freeze import finish_take, freeze_part, freeze_shot, open_take
+from torch_backend.shot import Shot, write_json
+
+ASK = dict(t_star=104, first=103, last=108, only_missing=True)
+
+
+@pytest.fixture(scope="module")
+def own(trained, quiet, tmp_path_factory):
+    """A copy of the trained shot, with a take that was made at once."""
+    world, _ = trained
+    root = tmp_path_factory.mktemp("parts") / "tiny.splannequin"
+    shutil.copytree(world.shot.root, root)
+    shot = Shot.open(root)
+    freeze_shot(shot, FreezeParams(take="whole", **ASK), quiet())
+    return shot
+
+
+def files(folder):
+    found = [p for p in folder.rglob("*") if p.suffix in (".exr", ".png") and p.stem.isdecimal()]
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in found}
+
+
+def part(shot, take, first, last, report):
+    return freeze_part(shot, FreezeParams(**{**ASK, "take": take, "first": first, "last": last}), report)
+
+
+def test_frames_made_in_parts_are_those_made_at_once(own, quiet):
+    params = FreezeParams(take="parts", **ASK)
+    assert open_take(own, params, quiet()) == {"t_star": 104, "first": 103, "last": 108, "frames": 6}
+    assert part(own, "parts", 107, 109, quiet()) == {"frames": 3, "rendered": 3}
+    with pytest.raises(JobError, match=r"lacks 4 of 6 frames, the first is 103"):
+        finish_take(own, params, quiet())
+    assert not (own.take("parts") / "take.json").exists()
+    assert part(own, "parts", 103, 105, quiet()) == {"frames": 3, "rendered": 3}
+    assert part(own, "parts", 106, 106, quiet()) == {"frames": 1, "rendered": 1}
+    assert part(own, "parts", 900, 910, quiet()) == {"frames": 0, "rendered": 0}
+    facts = finish_take(own, params, quiet())
+    assert (facts["first"], facts["last"], facts["frames"]) == (103, 109, 7)
+    at_once, apart = files(own.take("whole")), files(own.take("parts"))
+    assert len(at_once) == 18
+    assert all(apart[name] == data for name, data in at_once.items())
+
+
+def test_a_part_that_was_killed_is_made_again_and_the_rest_is_left_alone(own, quiet):
+    folder, params = own.take("killed"), FreezeParams(take="killed", **ASK)
+    open_take(own, params, quiet())
+    part(own, "killed", 103, 104, quiet())
+    before = (folder / "000103.exr").stat().st_mtime_ns
+    (folder / "preview" / "000104.png").unlink()
+    (folder / "000105.exr.tmp").write_bytes(b"half")
+    open_take(own, params, quiet())
+    assert part(own, "killed", 103, 105, quiet()) == {"frames": 3, "rendered": 2}
+    assert (folder / "000103.exr").stat().st_mtime_ns == before
+    assert part(own, "killed", 103, 105, quiet()) == {"frames": 3, "rendered": 0}
+
+
+def test_an_instant_that_two_develop_at_once_is_the_first_ones(own, quiet, monkeypatch):
+    from torch_backend.freeze.instant import instants as developed_instants
+
+    path = own.run("main") / "developed" / "000106.safetensors"
+    make, first = developed_instants._make, []
+
+    def meanwhile(*words):
+        if not first:
+            first.append(True)
+            open_take(own, FreezeParams(take="other", **{**ASK, "t_star": 106}), quiet())
+            first.append(path.read_bytes())
+        return make(*words)
+
+    monkeypatch.setattr(developed_instants, "_make", meanwhile)
+    open_take(own, FreezeParams(take="late", **{**ASK, "t_star": 106}), quiet())
+    inode = path.stat().st_ino
+    assert path.read_bytes() == first[1]
+    freeze_part(own, FreezeParams(take="late", **{**ASK, "t_star": 106, "last": 103}), quiet())
+    assert path.stat().st_ino == inode
+
+
+def test_parts_of_what_was_not_opened_or_of_another_run_are_refused(own, quiet):
+    with pytest.raises(JobError, match="was not opened"):
+        part(own, "unopened", 103, 103, quiet())
+    open_take(own, FreezeParams(take="parts2", **ASK), quiet())
+    state = own.take("parts2") / "state.json"
+    part(own, "parts2", 103, 103, quiet())
+    write_json(state, {"version": 1, "key": "other", "t_star": 104, "frames": "other"})
+    with pytest.raises(JobError, match="another run, other footage"):
+        part(own, "parts2", 104, 104, quiet())
+    open_take(own, FreezeParams(take="parts2", **ASK), quiet())
+    os.remove(own.run("main") / "developed" / "000104.safetensors")
+    with pytest.raises(JobError, match="is not kept"):
+        part(own, "parts2", 104, 104, quiet())
+
+
+def test_frames_of_before_stay_until_the_take_is_finished(own, quiet):
+    params = FreezeParams(take="again", **{**ASK, "last": 104, "develop": "off"})
+    freeze_shot(own, params, quiet())
+    params.t_star = 110
+    open_take(own, params, quiet())
+    assert not (own.take("again") / "take.json").exists(), "it told of another instant"
+    assert (own.take("again") / "000104.exr").is_file()
+    params.last = 103
+    freeze_part(own, params, quiet())
+    finish_take(own, params, quiet())
+    assert sorted(p.name for p in own.take("again").glob("*.exr")) == ["000103.exr"]
+    assert not (own.take("again") / "preview" / "000104.png").exists()
+
+
+KILLED = """
+import os, signal, sys
+from torch_backend.contract import FreezeParams
+from torch_backend.freeze import freeze_part, open_take
+from torch_backend.shot import Shot
+
+class Quiet:
+    def progress(self, *words): ...
+    metric = image = warning = check_cancelled = progress
+
+root, take, writes = sys.argv[1], sys.argv[2], int(sys.argv[3])
+shot, replace, seen = Shot.open(root), os.replace, []
+params = FreezeParams(take=take, t_star=110, first=103, last=104, only_missing=True, develop="off")
+open_take(shot, params, Quiet())
+
+def counted(source, target):
+    replace(source, target)
+    seen.append(target)
+    if len(seen) == writes:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+os.replace = counted
+freeze_part(shot, params, Quiet())
+"""
+"""Freezes two frames at another instant, and kills itself after so many files have taken their names."""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
+@pytest.mark.parametrize("writes", [1, 2])
+def test_what_a_killed_part_of_another_instant_left_is_in_no_frame(own, quiet, writes):
+    take = f"mixed{writes}"
+    params = FreezeParams(take=take, **{**ASK, "last": 104, "develop": "off"})
+    freeze_shot(own, params, quiet())
+    before = files(own.take(take))
+    environ = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[4])}
+    command = [sys.executable, "-P", "-c", KILLED, str(own.root), take, str(writes)]
+    assert subprocess.run(command, env=environ).returncode == -signal.SIGKILL
+    assert not (own.take(take) / "take.json").exists() and files(own.take(take)) != before
+    open_take(own, params, quiet())
+    freeze_part(own, params, quiet())
+    finish_take(own, params, quiet())
+    assert files(own.take(take)) == before
+
+
+def test_a_part_stops_when_its_take_is_opened_with_something_else(own, quiet):
+    """A host that slept through the new job would write old frames over new ones."""
+    params = FreezeParams(take="straggler", **{**ASK, "last": 105, "develop": "off"})
+    open_take(own, params, quiet())
+    other = FreezeParams(take="straggler", **{**ASK, "last": 105, "t_star": 110, "develop": "off"})
+
+    class Meanwhile(type(quiet())):
+        def check_cancelled(self):
+            super().check_cancelled()
+            if (own.take("straggler") / "000103.exr").is_file() and not frames:
+                frames.append(True)
+                open_take(own, other, quiet())
+                freeze_part(own, other, quiet())
+
+    frames = []
+    with pytest.raises(JobError, match="opened with something else"):
+        freeze_part(own, params, Meanwhile())
+    facts = finish_take(own, other, quiet())
+    assert frames and facts["frames"] == 3
+
+
+@pytest.mark.parametrize("name", ["000103.exr", "warp/000103.exr", "preview/000103.png"])
+def test_a_frame_that_a_copy_cut_off_is_made_again(own, quiet, name):
+    params = FreezeParams(take="cut", **{**ASK, "last": 103})
+    freeze_shot(own, params, quiet())
+    file = own.take("cut") / name
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) * 3 // 4])
+    freeze_shot(own, params, quiet())
+    assert file.read_bytes() == data

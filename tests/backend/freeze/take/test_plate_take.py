@@ -1,0 +1,321 @@
+"""Takes made of plates, as files: what stands beside the frames, killed and gone on with, light beyond white."""
+
+import dataclasses
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from scipy.ndimage import binary_dilation, binary_erosion
+
+from torch_backend.contract import CameraPath, FreezeParams, TrainParams
+from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.footage.color import InputSpace, linear_to_srgb
+from torch_backend.footage.display import ROLLED
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.footage.plates import Plates
+from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.composite.warp import apply_warp, read_warp
+from torch_backend.freeze.exr import read_frozen_exr, read_key
+from torch_backend.raster import rasterize
+from torch_backend.shot import Shot
+from torch_backend.solve.motion import PAINTED, STILL, write_matte
+from torch_backend.train import train_shot
+
+ROOT = Path(__file__).resolve().parents[4]
+RANGE = {"t_star": 105, "first": 103, "last": 108}
+
+
+def digest(path):
+    """Of all that a picture holds but the time at which it was written."""
+    image = oiio.ImageBuf(str(path))
+    told = image.spec().serialize("text", "detailed").splitlines()
+    told = [line for line in told if not line.strip().startswith(("DateTime", "oiio:SourcePath"))]
+    return hashlib.sha256(image.get_pixels(oiio.FLOAT).tobytes() + str(told).encode()).hexdigest()
+
+
+def files(folder):
+    """Digests of a take's frames, warps and previews by their place in it."""
+    found = [*folder.glob("*.exr"), *(folder / "warp").glob("*.exr"), *(folder / "preview").glob("*.png")]
+    return {str(path.relative_to(folder)): digest(path) for path in found}
+
+
+@pytest.fixture(scope="module")
+def take(trained, quiet):
+    world, _ = trained
+    facts = freeze_shot(world.shot, FreezeParams(take="whole", **RANGE), quiet())
+    return world.shot.take("whole"), facts
+
+
+def test_a_frame_is_its_warp_over_the_plate(trained, take):
+    world, _ = trained
+    folder, facts = take
+    plates = Plates(world.shot)
+    assert facts["warp_dir"] == str(folder / "warp")
+    for n in range(103, 109):
+        frame, warp = read_frozen_exr(folder / f"{n:06d}.exr"), read_warp(folder / "warp" / f"{n:06d}.exr")
+        np.testing.assert_allclose(apply_warp(plates.linear(n), warp), frame.rgba[..., :3], atol=1e-3)
+        assert warp.metadata.key == frame.metadata.key and warp.metadata.leading == n
+        still = frame.detail.plate == 1.0
+        assert still.mean() > 0.5
+    rows = facts["detail"]["per_frame"]
+    assert [row["frame"] for row in rows] == list(range(103, 109))
+    assert facts["detail"]["plate_share"] == pytest.approx(np.mean([row["plate_share"] for row in rows]), abs=1e-3)
+    assert all(np.mean(row["regions"]) == pytest.approx(row["invented_share"], abs=0.02) for row in rows)
+    assert rows[2]["plate_share"] > 0.999, "frame 105 is its plate"  # a pixel of 3072 may be another's
+
+
+def test_without_detail_splats_alone_are_left(trained, take, quiet):
+    world, _ = trained
+    folder, _ = take
+    whole = files(folder)
+    facts = freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, detail="off"), quiet())
+    bare = world.shot.take("bare")
+    assert not (bare / "warp").exists() and "detail" not in facts and "warp_dir" not in facts
+    for n in (103, 108):
+        plain, made = read_frozen_exr(bare / f"{n:06d}.exr"), read_frozen_exr(folder / f"{n:06d}.exr")
+        assert plain.detail is None
+        splat = np.asarray(made.detail.splat)[..., :3]
+        np.testing.assert_allclose(splat, plain.rgba[..., :3], rtol=4e-3, atol=1e-4)
+    freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, only_missing=True), quiet())
+    assert files(bare) == whole, "asked for plates, none of the old frames is right"
+    freeze_shot(world.shot, FreezeParams(take="bare", **RANGE, only_missing=True, detail="off"), quiet())
+    assert not list((bare / "warp").glob("*.exr")), "warps of frames that are gone are gone"
+
+
+def test_a_frame_alone_is_the_frame_among_others(trained, take, quiet):
+    world, _ = trained
+    freeze_shot(world.shot, FreezeParams(take="one", **{**RANGE, "first": 107, "last": 107}), quiet())
+    one, whole = files(world.shot.take("one")), files(take[0])
+    assert len(one) == 3
+    assert all(whole[name] == content for name, content in one.items())
+
+
+CHILD = """
+import os, signal, sys
+sys.path.insert(0, sys.argv[3])
+from tests.backend.conftest import Quiet
+from torch_backend.contract import FreezeParams
+from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.take import frames as take_frames
+from torch_backend.shot import Shot
+
+def dies(folder, output, *rest):
+    if output.frame == 106:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return written(folder, output, *rest)
+
+written, take_frames._write_frame = take_frames._write_frame, dies
+freeze_shot(Shot.open(sys.argv[1]), FreezeParams(take=sys.argv[2], t_star=105, first=103, last=108), Quiet())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
+def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
+    """It died with a warp written and its frame not."""
+    world, _ = trained
+    name = "killed"
+    words = ["-P", "-c", CHILD, str(world.shot.root), name, str(ROOT)]
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    folder = world.shot.take(name)
+    left = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
+    assert sorted(left) == ["000103.exr", "000104.exr", "000105.exr"]
+    assert (folder / "warp" / "000106.exr").is_file()
+    freeze_shot(world.shot, FreezeParams(take=name, **RANGE, only_missing=True), quiet())
+    assert files(folder) == files(take[0])
+    assert all((folder / n).stat().st_mtime_ns == time for n, time in left.items())
+    facts = [json.loads((f / "take.json").read_text())["detail"] for f in (folder, take[0])]
+    assert facts[0]["per_frame"][3:] == facts[1]["per_frame"][3:]
+    assert facts[0]["plate_share"] == pytest.approx(facts[1]["plate_share"], abs=2e-3)
+
+
+def test_a_frame_whose_warp_is_gone_is_made_again(trained, take, quiet):
+    world, _ = trained
+    ask = FreezeParams(take="torn", **{**RANGE, "last": 104}, only_missing=True)
+    freeze_shot(world.shot, ask, quiet())
+    folder = world.shot.take("torn")
+    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
+    (folder / "warp" / "000104.exr").unlink()
+    freeze_shot(world.shot, ask, quiet())
+    assert (folder / "warp" / "000104.exr").is_file()
+    after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.exr")}
+    assert [name for name in after if after[name] != before[name]] == ["000104.exr"]
+
+
+def test_a_painted_matte_makes_frames_stale(trained, quiet):
+    world, _ = trained
+    ask = FreezeParams(take="painted", develop="off", t_star=105, first=110, last=110, only_missing=True)
+    path = world.shot.root / PAINTED / "000110.png"
+    before = path.read_bytes()
+    try:
+        keys = []
+        for matte in (None, None, np.full((48, 64), STILL, np.uint8)):
+            if matte is not None:
+                write_matte(path, matte)
+            freeze_shot(world.shot, ask, quiet())
+            keys.append(read_key(world.shot.take("painted") / "000110.exr"))
+        assert keys[0] == keys[1] != keys[2]
+    finally:
+        path.write_bytes(before)
+
+
+def test_a_ramp_that_runs_is_the_clip(trained, quiet):
+    """Each frame at its own instant: plates, bit for bit but for half floats; then time stands still."""
+    world, _ = trained
+    ramp = {str(n): float(min(n, 105)) for n in range(101, 117)}
+    part = dict(t_star_per_frame=ramp, first=104, last=106, develop="off")
+    freeze_shot(world.shot, FreezeParams(take="runs", **part), quiet())
+    plates = Plates(world.shot)
+    for n in (104, 105):
+        frame = read_frozen_exr(world.shot.take("runs") / f"{n:06d}.exr")
+        np.testing.assert_allclose(frame.rgba[..., :3], plates.linear(n), rtol=1e-3, atol=1e-6)
+    frozen = read_frozen_exr(world.shot.take("runs") / "000106.exr")
+    assert frozen.metadata.t_star_frame == 105.0 and (frozen.detail.source == 105).any()
+
+
+@pytest.fixture(scope="module")
+def bright(tmp_path_factory, world, quiet):
+    """A still wall filmed on half-float EXR twice as large as it is solved, with lamps of 50 and below black."""
+    folder = tmp_path_factory.mktemp("bright")
+    (folder / "source").mkdir()
+    rng = np.random.default_rng(4)
+    lamps = [(int(y), int(x)) for y, x in rng.integers(4, 60, (12, 2))]
+    for n in range(16):
+        small = world.image(n, 0.0).numpy().astype(np.float32) ** 2.2
+        picture = np.kron(small, np.ones((2, 2, 1), np.float32)) * rng.uniform(0.9, 1.1, (96, 128, 1))
+        for k, (y, x) in enumerate(lamps):
+            picture[y : y + 2, x : x + 2] = [50.0, 12.0, -0.02 * k]
+        spec = oiio.ImageSpec(128, 96, 3, "half")
+        out = oiio.ImageOutput.create(str(folder / "source" / f"a.{101 + n}.exr"))
+        assert out.open(str(folder / "source" / f"a.{101 + n}.exr"), spec)
+        assert out.write_image(picture.astype(np.float16)) and out.close()
+    shot = Shot.create(folder / "bright.splannequin")
+    import_footage(shot, str(folder / "source"), FootageConfig(working_height=48), quiet())
+    for name in ("cameras.json", "points.npz"):
+        shot.solve.mkdir(exist_ok=True)
+        (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
+    told = {"version": 1, "key": "k", "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
+    (shot.solve / "solve.json").write_text(json.dumps(told))
+    for n in range(101, 117):
+        write_png(shot.frames / f"{n:06d}.png", read_png(shot.frames / "raw" / f"{n:06d}.png"))
+        path = shot.root / PAINTED / f"{n:06d}.png"
+        path.parent.mkdir(exist_ok=True)
+        write_matte(path, np.full((48, 64), STILL, np.uint8))
+    train_shot(shot, TrainParams(iterations=60, max_gaussians=900), quiet())
+    return shot
+
+
+def test_light_beyond_white_and_below_black_is_the_plates(bright, quiet):
+    facts = freeze_shot(bright, FreezeParams(t_star=108, first=103, last=104, develop="off"), quiet())
+    assert (facts["width"], facts["height"]) == (128, 96)
+    for n in (103, 104):
+        source = oiio.ImageBuf(str(bright.root.parent / "source" / f"a.{n}.exr")).get_pixels(oiio.FLOAT)
+        frame = read_frozen_exr(bright.take("freeze") / f"{n:06d}.exr")
+        warp = read_warp(bright.take("freeze") / "warp" / f"{n:06d}.exr")
+        still = warp.matte.numpy() == 1.0
+        assert still.mean() > 0.9 and source[still].max() == 50.0 and source[still].min() < -0.05
+        np.testing.assert_allclose(frame.rgba[..., :3][still], source[still], rtol=1e-3, atol=1e-6)
+        graded = torch.from_numpy(source) * torch.tensor([2.0, 0.5, 1.0])
+        again = apply_warp(graded, warp).numpy()
+        np.testing.assert_allclose(again[still], graded.numpy()[still], rtol=1e-3, atol=1e-6)
+
+
+def test_acescg_footage_is_frozen_in_acescg(bright, quiet):
+    """The same frames, told of as ACEScg in the record: frames and warps leave in its light, and stale ones go."""
+    ask = FreezeParams(take="aces", t_star=108, first=103, last=103, develop="off", only_missing=True)
+    freeze_shot(bright, ask, quiet())
+    folder = bright.take("aces")
+    plain, plain_warp = read_frozen_exr(folder / "000103.exr"), read_warp(folder / "warp" / "000103.exr")
+    record = json.loads(bright.listing.read_text())
+    bright.listing.write_text(json.dumps({**record, "reading": {**record["reading"], "light": "ap1"}}))
+    try:
+        freeze_shot(bright, ask, quiet())
+    finally:
+        bright.listing.write_text(json.dumps(record))
+    for file, fill in (("000103.exr", plain.rgba[..., :3]), ("warp/000103.exr", plain_warp.fill.numpy())):
+        image = oiio.ImageBuf(str(folder / file))
+        assert image.spec().getattribute("oiio:ColorSpace") == "lin_ap1_scene"
+        stored = np.asarray(image.get_pixels(oiio.FLOAT))[..., :3]
+        expected = InputSpace("lin", "ap1").to_linear(stored)
+        assert np.abs(expected - fill).max() < 1e-3 * max(1.0, np.abs(fill).max())
+    again = read_frozen_exr(folder / "000103.exr")
+    np.testing.assert_allclose(again.rgba, plain.rgba, atol=0.05)
+    assert again.metadata.light == "ap1" and again.metadata.key != plain.metadata.key
+
+
+LAMP = 20.0
+
+
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory, world, quiet):
+    """The wall filmed as scene-linear EXR, its patch a lamp that hangs still: imported, trained on."""
+    folder = tmp_path_factory.mktemp("lit")
+    (folder / "source").mkdir()
+    state = world.at(0.0)
+    lamp = {name: value[world.moving] for name, value in state.items()}
+    for n in range(16):
+        view = dict(viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
+        covered = rasterize(**lamp, **view).alphas[0].numpy() > 0.5
+        picture = (0.8 * world.image(n, 0.0).numpy()) ** 2.2
+        picture[covered] = LAMP
+        path = str(folder / "source" / f"a.{101 + n}.exr")
+        out = oiio.ImageOutput.create(path)
+        assert out.open(path, oiio.ImageSpec(64, 48, 3, "half"))
+        assert out.write_image(picture.astype(np.float16)) and out.close()
+    shot = Shot.create(folder / "lit.splannequin")
+    import_footage(shot, str(folder / "source"), FootageConfig(), quiet())
+    shot.solve.mkdir(exist_ok=True)
+    for name in ("cameras.json", "points.npz"):
+        (shot.solve / name).write_bytes((world.shot.solve / name).read_bytes())
+    for n in range(101, 117):
+        (shot.frames / f"{n:06d}.png").write_bytes((shot.raw / f"{n:06d}.png").read_bytes())
+        path = shot.root / PAINTED / f"{n:06d}.png"
+        path.parent.mkdir(exist_ok=True)
+        write_matte(path, np.full((48, 64), STILL, np.uint8))
+    train_shot(shot, TrainParams(iterations=300, max_gaussians=1500, method="static"), quiet())
+    return shot
+
+
+def test_a_lamp_is_a_lamp_in_splats_alone(lit, quiet):
+    """Cut at white, it could be no brighter than 1; and what is no lamp is as it was."""
+    facts = freeze_shot(lit, FreezeParams(t_star=108, first=106, last=106, detail="off", develop="off"), quiet())
+    frame = read_frozen_exr(lit.take("freeze") / "000106.exr")
+    source = oiio.ImageBuf(str(lit.root.parent / "source" / "a.106.exr")).get_pixels(oiio.FLOAT)
+    inside = binary_erosion(source[..., 1] > 10.0)
+    away = ~binary_dilation(source[..., 1] > 10.0, iterations=4)
+    assert inside.sum() > 20 and away.sum() > 1000
+    assert np.median(frame.rgba[..., :3][inside]) == pytest.approx(LAMP, rel=0.3)
+    off = linear_to_srgb(frame.rgba[..., :3][away]) - linear_to_srgb(source[away])
+    assert np.abs(off).mean() < 0.03 and frame.rgba[..., :3][away].max() < 2.0
+    assert frame.rgba.max() < 1.01 * LAMP
+    assert np.abs(frame.grain[inside]).max() < 0.1, "grain is not what a lamp flickers by"
+    preview = read_png(lit.take("freeze") / "preview" / "000106.png") / 255.0
+    shown = ROLLED.from_light(frame.rgba[..., :3])
+    assert facts["grain"] is not None and np.abs(preview - shown)[away].max() < 1.5 / 255
+    assert 0.9 < np.median(preview[inside]) < 1.0
+
+
+def test_a_lamp_that_plates_fill_stays_a_lamp(lit, quiet):
+    """Seen from between the clip's frames, from which no plate is looked at as it stands."""
+    path = CameraPath.from_json(json.loads((lit.solve / "cameras.json").read_text()))
+    before, after = (np.array(path.frames[n].viewmat) for n in (5, 6))
+    between = dataclasses.replace(path.frames[5], viewmat=(0.5 * (before + after)).tolist())
+    camera = lit.root / "between.json"
+    camera.write_text(json.dumps(dataclasses.replace(path, frames=[between]).to_json()))
+    ask = FreezeParams(take="between", t_star=108, camera_path=str(camera), width=64, develop="off", grain=False)
+    freeze_shot(lit, ask, quiet())
+    frame = read_frozen_exr(lit.take("between") / "000106.exr").rgba[..., :3]
+    assert frame.max() == pytest.approx(LAMP, rel=0.01)
+    assert 0.5 < (frame > 10.0).sum() / (_lamp_of(lit, 106) + _lamp_of(lit, 107)) / 0.5 < 1.5
+
+
+def _lamp_of(shot, frame):
+    source = oiio.ImageBuf(str(shot.root.parent / "source" / f"a.{frame}.exr")).get_pixels(oiio.FLOAT)
+    return (source > 10.0).sum()

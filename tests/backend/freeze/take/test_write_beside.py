@@ -1,0 +1,74 @@
+"""Frames written beside the next: in order, one at a time, errors told, nothing left half done."""
+
+import threading
+
+import pytest
+
+from torch_backend.contract import Cancelled
+from torch_backend.freeze.take.write_beside import HELD_BYTES, WriteBeside
+
+
+def test_a_frame_is_written_while_the_next_is_made():
+    free, done = threading.Event(), []
+    with WriteBeside() as out:
+        out.write(lambda: done.append(free.wait(20)), 1)
+        assert done == []
+        free.set()  # what the main thread does next lets the first end: it does not wait for it
+    assert done == [True]
+
+
+def test_one_is_written_at_a_time_and_in_order():
+    done, most, now, lock = [], 0, 0, threading.Lock()
+
+    def work(n):
+        nonlocal most, now
+        with lock:
+            now += 1
+            most = max(most, now)
+        done.append(n)
+        with lock:
+            now -= 1
+
+    with WriteBeside() as out:
+        for n in range(20):
+            out.write(lambda n=n: work(n), 1)
+            assert done[:n] == list(range(n)), "the one before is on disk by now"
+    assert done == list(range(20)) and most == 1
+
+
+def test_a_frame_that_is_too_large_to_be_held_is_written_at_once():
+    thread = []
+    with WriteBeside() as out:
+        out.write(lambda: thread.append(threading.current_thread()), HELD_BYTES + 1)
+        assert thread == [threading.main_thread()]
+        out.write(lambda: thread.append(threading.current_thread()), HELD_BYTES)
+    assert thread[1] is not threading.main_thread()
+
+
+def fails():
+    raise OSError(28, "No space left on device")
+
+
+def test_what_a_write_raises_comes_out_of_the_next_one_and_nothing_more_is_written():
+    done = []
+    with pytest.raises(OSError, match="No space left"), WriteBeside() as out:
+        out.write(fails, 1)
+        out.write(lambda: done.append(1), 1)
+    assert done == []
+
+
+def test_what_the_last_write_raises_comes_out_at_the_end():
+    with pytest.raises(OSError, match="No space left"), WriteBeside() as out:
+        out.write(fails, 1)
+
+
+def test_a_cancel_lets_what_was_begun_be_written():
+    free, done = threading.Event(), []
+    with pytest.raises(Cancelled), WriteBeside() as out:
+        out.write(lambda: done.append(free.wait(20)), 1)
+        free.set()
+        raise Cancelled
+    assert done == [True]
+    with pytest.raises(Cancelled), WriteBeside() as out:
+        out.write(fails, 1)
+        raise Cancelled

@@ -1,0 +1,1 @@
+"""One frozen frame: which source gives each pixel, and what fills the rest."""

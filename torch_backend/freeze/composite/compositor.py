@@ -1,0 +1,237 @@
+"""Frozen frames made of the plates: splats give geometry, motion and occlusion, plates give the pixels.
+
+For a camera and an instant t*, with C the frozen render, I_m plate m and R_m the model's own render of plate m (its
+camera, its time, its exposure), a pixel x is
+
+    out(x) = A(x) I_n(p_n(x)) + (1 - A(x)) (C(x) + b(x) sum_m w_m(x) (I_m - R_m)(p_m(x)) / sum_m w_m(x))
+
+n is the leading plate: the frame's own on the clip's poses, the nearest in pose on others. A, its matte, is 1 wherever
+nothing that moves is seen, at t* or in the plate; so a still world is the plate itself, bit for bit. The rest is
+filled: what the model missed in other plates (texture, edges, light) is carried along the surface point that x shows
+to where plate m shows the same point, moved from t* to m as the model moves it. Plate t* is believed even where the
+model cannot explain it, because what it shows is the truth of the frozen instant; others where nothing moves, or where
+they agree with the model. b fades to the splats alone where no plate can be believed. Residuals are carried in display
+space, in which splats blend and highlights have a shoulder; A mixes scene-linear light, so that the same mix of an
+artist's plate gives the frame.
+
+Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023, "DynIBaR"; figures: docs/benchmarks.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...footage.display import PLAIN, Display
+from ...scene import Scene
+from ...torch_types import from_numpy
+from ...train import LoadedRun
+from ..bands import bands, hand_back
+from ..frozen import FrozenGaussians, FrozenImage, OutputFrame
+from ..views.reproject import resized
+from ..views.source_views import MovingOf, PlateReader, Sightings
+from ..views.target_view import PosedFrame, posed_frame
+from .config import DetailConfig
+from .fill import Fillers, Filling, fill, fillers_of
+from .primary_source import leading_matte, leading_plate
+from .transfer import to_display, to_linear
+from .warp import sample
+
+_NOTHING = 0.5 / 1024.0
+"""Matte up to which it rounds to nothing."""
+
+
+@dataclass
+class DetailedFrame:
+    """One frozen frame made of plates, on the CPU, with overscan if the render had it."""
+
+    linear: Tensor
+    """[H, W, 3] premultiplied, scene-linear: matte * plate(st) + fill."""
+    alpha: Tensor
+    """[H, W] in 0..1."""
+    splat: Tensor
+    """[H, W, 3] premultiplied, on `display`: the splats alone."""
+    splat_alpha: Tensor
+    """[H, W] in 0..1: how much of the pixel they cover."""
+    plate: Tensor
+    """[H, W] in 0..1: share of the pixel that is plate; 0: invented by splats."""
+    source: Tensor
+    """[H, W] float32: number of the frame whose plate gives most; 0 where `plate` is 0."""
+    depth: Tensor
+    """[H, W] as in `FrozenImage`."""
+    support: Tensor
+    """[H, W] in 0..1: 1: what is seen stands still, or was seen near t*; 0: how it looked at t* nobody saw."""
+    motion: Tensor
+    """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell. On the clip's own
+    poses 1 also where the frame's own plate shows what moves and is let go of: where it is 0 that plate may stand."""
+    leading: int
+    """Frame number of the plate that `st` looks into."""
+    st: Tensor
+    """[H, W, 2] s to the right, t up, 0..1 over the undistorted plate `leading`, pixel centres at (i + 0.5) / size."""
+    matte: Tensor
+    """[H, W] in 0..1: how much of the pixel the leading plate gives."""
+    fill: Tensor
+    """[H, W, 3] scene-linear, premultiplied by 1 - matte: the rest of the pixel."""
+    display: Display = PLAIN
+    """What `splat` and `color` are shown on."""
+
+    @property
+    def color(self) -> Tensor:
+        """[H, W, 3] `linear` on its display, uncut; made anew each time, because few need it whole."""
+        out = torch.empty_like(self.linear)
+        for rows in bands(*self.alpha.shape):
+            out[rows] = to_display(self.linear[rows], self.display)
+        return out
+
+
+BarsOf = Callable[[int], "NDArray[np.bool_] | None"]
+"""Frame number -> [H, W], what of its plate is a bar beside the picture and no part of the scene; None: nothing."""
+
+
+class Detailer:
+    """Makes frozen frames of one run out of plates. What it computes of a plate serves all frames that use it."""
+
+    def __init__(
+        self,
+        run: LoadedRun,
+        scene: Scene,
+        plates: PlateReader,
+        config: DetailConfig | None = None,
+        moving: MovingOf | None = None,
+        bars: BarsOf | None = None,
+    ) -> None:
+        """`moving`: see `Sightings`. `bars`: see `BarsOf`; None: the footage has none."""
+        self.run, self.scene, self.plates = run, scene, plates
+        self.config = config or DetailConfig()
+        self._moving, self._bars = moving, bars
+        self.seen = Sightings(run, scene, plates, moving, self.config.sightings)
+        """The plates as the scene at hand has them: the run's, or that of a developed instant."""
+
+    @torch.no_grad()
+    def frame(
+        self,
+        output: OutputFrame,
+        frozen: FrozenGaussians,
+        image: FrozenImage,
+        width: int,
+        height: int,
+        withheld: Collection[int] = (),
+    ) -> DetailedFrame:
+        """One frozen frame.
+
+        Args:
+            output: its camera and instant.
+            frozen: the scene frozen at `output.t_star`.
+            image: the splats' render of it, which may show more around the frame: overscan.
+            width, height: pixels of the frame without overscan.
+            withheld: frames whose plates are not to be used.
+        """
+        self._turn_to(frozen, output.t_star)
+        posed = posed_frame(self.seen, output, frozen, image, width, height)
+        usable = [frame for frame in self.seen.frames if frame not in withheld]
+        leading = leading_plate(self.seen, output, posed, usable)
+        matte, st, own = leading_matte(self.seen, self.config, output, posed, leading, usable, (width, height))
+        bars = self._keep_bars(matte, leading) if own and leading == output.frame else None
+        fillers = fillers_of(self.seen, self.config, posed, matte, leading, usable)
+        made = self._mix_frame(posed, leading, matte, st, own, fillers)
+        if bars is not None:  # they are shown as they are, at every instant
+            made.support[bars], made.motion[bars] = 1.0, 0.0
+        return made
+
+    def _keep_bars(self, matte: Tensor, frame: int) -> Tensor | None:
+        """Has a frame's own plate give the bars beside its picture: `matte` [H, W] becomes 1 there."""
+        found = None if self._bars is None else self._bars(frame)
+        if found is None:
+            return None
+        (rows, columns), (height, width) = matte.shape, found.shape
+        top, left = (rows - height) // 2, (columns - width) // 2
+        bars = torch.zeros(rows, columns, dtype=torch.bool, device="cpu")
+        bars[top : top + height, left : left + width] = from_numpy(found)
+        matte[bars] = 1.0
+        return bars
+
+    # ------------------------------------------------------------------------------------------------- the frame
+
+    def _turn_to(self, frozen: FrozenGaussians, t_star: float) -> None:
+        """Looks at the plates as a scene has them; frames of one instant come one after another."""
+        developed = frozen if frozen.descent is not None else None
+        if developed is not self.seen.stage.developed:
+            config = self.config.sightings
+            self.seen = Sightings(self.run, self.scene, self.plates, self._moving, config, developed, round(t_star))
+
+    # ------------------------------------------------------------------------------------------------- the mix
+
+    def _mix_frame(
+        self,
+        posed: PosedFrame,
+        leading: int,
+        matte: Tensor,
+        st: Tensor,
+        own: bool,
+        fillers: Fillers | None,
+    ) -> DetailedFrame:
+        image = posed.image
+        rows, columns = image.alpha.shape
+        parts = bands(rows, columns)
+        if len(parts) > 1:
+            hand_back()
+        gives = bool((matte > _NOTHING).any())
+        plate = self.plates.linear(leading) if gives and not own else None
+        made = DetailedFrame(
+            torch.empty(rows, columns, 3, device="cpu"), image.alpha.clone(), image.color, image.alpha,
+            torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
+            torch.minimum(image.support, 1.0 - resized(posed.unseen, columns, rows)),
+            resized(posed.moved, columns, rows), leading, st, matte, torch.zeros(rows, columns, 3, device="cpu"),
+            self.scene.display,
+        )  # fmt: skip
+        for band in parts:
+            filling = None if fillers is None else fill(self.seen, self.config, posed, fillers, matte, band)
+            matte[band] = (matte[band] * 1024.0).round() / 1024.0
+            lead = sample(plate, st[band]) if plate is not None else None
+            if gives and own:
+                lead = self._placed(leading, rows, columns, band)
+            self._mix_rows(made, filling, lead, band)
+        return made
+
+    def _placed(self, frame: int, rows: int, columns: int, band: slice) -> Tensor:
+        """[h, columns, 3] scene-linear: some rows of a plate in the middle of `rows` x `columns`, 0 around it."""
+        height, width = self.plates.height, self.plates.width
+        if (height, width) == (rows, columns):
+            return self.plates.linear(frame, band)
+        out = torch.zeros(band.stop - band.start, columns, 3, device="cpu")
+        top, left = (rows - height) // 2, (columns - width) // 2
+        first, last = max(band.start, top), min(band.stop, top + height)
+        if first < last:
+            part = self.plates.linear(frame, slice(first - top, last - top))
+            out[first - band.start : last - band.start, left : left + width] = part
+        return out
+
+    def _mix_rows(self, made: DetailedFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
+        """Fills some rows of a frame whose `matte` is settled and whose `alpha` is the splats'.
+
+        `lead` [h, W, 3] are the leading plate's pixels there, scene-linear; None where it gives nothing.
+        """
+        matte, alpha, fill = made.matte[rows], made.alpha[rows], made.fill[rows]
+        share = matte.clone()
+        source = torch.full_like(share, float(made.leading))
+        if filling is not None:
+            at = filling.y, filling.x
+            left = 1.0 - matte[at]
+            alpha[at] += (1.0 - alpha[at]) * filling.share
+            covered = torch.maximum(alpha, matte)[at].clamp_min(1e-4)[:, None]
+            color = filling.color if self.plates.deep else filling.color.clamp(0.0, 1.0)
+            color = color / covered
+            if made.display.bends:  # what is carried a little too far would be many times as bright
+                color = color.clamp_max(filling.most)
+            fill[at] = left[:, None] * covered * to_linear(color, made.display)
+            share[at] += left * filling.share
+            source[at] = torch.where(left > 0.5, filling.source, float(made.leading))
+        torch.maximum(alpha, matte, out=alpha)
+        source[share <= 0.0] = 0.0
+        made.plate[rows], made.source[rows] = share, source
+        made.linear[rows] = fill if lead is None else torch.addcmul(fill, matte[..., None], lead)

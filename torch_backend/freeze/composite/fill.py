@@ -1,0 +1,252 @@
+"""What fills a frozen frame where its leading plate is not believed: splats, and what they missed of other plates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ...torch_types import norm
+from ..views.decisions import first_best
+from ..views.reproject import blurred, look_up, look_up_near, narrowed, project, resized, unproject, widened
+from ..views.source_views import Sightings
+from ..views.target_view import PosedFrame, displacements, parallax
+from ..views.visibility import Sighting
+from .config import DetailConfig
+from .reference_pixels import InstantPixels, instant_pixels
+
+WHOLE = 1.0 - 0.5 / 1024.0
+"""Matte from which on the leading plate gives the whole pixel: it is rounded to 1024 steps, this one to 1."""
+
+
+@dataclass
+class Fillers:
+    """The plates that fill what the leading one does not give."""
+
+    chosen: list[int]
+    """Their frame numbers."""
+    moved: list[Tensor]
+    """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
+    shown: list[Tensor]
+    """[h, w] in 0..1 each: that plate shows it, and what is around it."""
+    agreed: list[Tensor]
+    """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
+    residuals: list[Tensor]
+    """[H, W, 3] float16 each, as `Sightings.residual`."""
+    most: float
+    """The largest number in any of them, or in a working frame if that is more."""
+    instant: InstantPixels | None = None
+    """Plate t*, where it stands in place of the splats."""
+
+
+@dataclass
+class Filling:
+    """Pixels of some rows that the leading plate does not give, P of them."""
+
+    y: Tensor
+    """[P] int64 row, from the first of these rows."""
+    x: Tensor
+    """[P] int64 column."""
+    color: Tensor
+    """[P, 3] premultiplied, display-referred."""
+    share: Tensor
+    """[P] in 0..1: how much of it is plate."""
+    source: Tensor
+    """[P] number of the frame that gives most."""
+    most: float = 1.0
+    """As in `Fillers`."""
+
+
+def fillers_of(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, matte: Tensor, leading: int, usable: list[int]
+) -> Fillers | None:
+    """The plates for what the leading one does not give; None if it gives everything."""
+    if not bool((matte < WHOLE).any()):
+        return None
+    chosen = _chosen(sightings, config, posed, matte, leading, usable)
+    moved = displacements(sightings, posed, chosen)
+    shown = _shown(sightings, config, posed, chosen, moved)
+    agreed = _agreed(sightings, config, posed, chosen, moved)
+    residuals = [sightings.residual(frame) for frame in chosen]
+    most = max(sightings.scene.display.most, *(sightings.most(frame) for frame in chosen))
+    instant = instant_pixels(sightings, config, posed, leading, usable)
+    return Fillers(chosen, moved, shown, agreed, residuals, most, instant)
+
+
+def _shown(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], moved: list[Tensor]
+) -> list[Tensor]:
+    """[h, w] in 0..1 for each plate: it shows what is seen and what is around that; of use where something moves."""
+    near = widened(_uneasy(posed.motion, posed.doubt) > 0.0, 4 * config.rough + 1)  # elsewhere it is not asked for
+    points, out = posed.points[near], list[Tensor]()
+    for frame, way in zip(chosen, moved, strict=True):
+        visible = torch.ones_like(posed.depth)
+        visible[near] = sightings.seen(frame, points if frame == posed.t else points + way[near]).visible
+        out.append(blurred(narrowed(visible, config.rough), float(config.rough)))
+    return out
+
+
+def _uneasy(motion: Tensor, doubt: Tensor) -> Tensor:
+    """[...] in 0..1: how far edges of what moves may be near."""
+    return torch.maximum(motion, doubt).clamp(0.0, 1.0)
+
+
+def _agreed(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], moved: list[Tensor]
+) -> list[Tensor]:
+    """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
+    h, w = posed.depth.shape
+    if posed.t not in chosen:
+        return [torch.ones_like(posed.depth) for _ in chosen]
+    points = posed.points[::2, ::2]  # a quarter of the work: it is low-passed
+    truth = sightings.seen(posed.t, points)
+    shown_at_t = look_up(sightings.view(posed.t).picture.float(), truth.pixels)
+    out: list[Tensor] = []
+    for frame, way in zip(chosen, moved, strict=True):
+        if frame == posed.t:
+            out.append(torch.ones_like(posed.depth))
+            continue
+        sighting = sightings.seen(frame, points + way[::2, ::2])
+        says = look_up(sightings.view(frame).picture.float(), sighting.pixels)
+        both = (truth.visible * sighting.visible)[..., None]
+        off = sightings.difference(says * both, shown_at_t * both, 0.5)
+        out.append(resized(torch.exp(-(off / config.agreement).square()), w, h))
+    return out
+
+
+def fill(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, fillers: Fillers, matte: Tensor, rows: slice
+) -> Filling:
+    """What the leading plate does not give of some rows: the splats, with what they missed from other plates."""
+    at = (matte[rows] < WHOLE).nonzero()
+    y, x = at[:, 0], at[:, 1]
+    count = len(at)
+    share, source = (torch.zeros(count, device="cpu") for _ in range(2))
+    filling = Filling(y, x, posed.image.color[rows][y, x], share, source)
+    if not count:
+        return filling
+    pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
+    small = pixels * posed.per_pixel
+    points = unproject(pixels, posed.image.depth[rows][y, x], posed.viewmat, posed.K)
+    motion = look_up(posed.motion, small)
+    larger = torch.tensor(
+        [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
+    )
+    doubt, elsewhere = look_up(posed.doubt, small), look_up(posed.held, small)
+    uneasy = _uneasy(motion, doubt)
+    weights, places = list[Tensor](), list[Tensor]()
+    same_state = torch.zeros(count, device="cpu")
+    untold = torch.ones(count, device="cpu")
+    truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
+    if truth is not None:  # the better plate t* shows it, the less another time is needed
+        untold = 1.0 - _near(sightings, config, posed, posed.t, truth)
+    for n, frame in enumerate(fillers.chosen):
+        if truth is not None and frame == posed.t:
+            sighting = truth
+        else:
+            sighting = sightings.seen(frame, points + look_up(fillers.moved[n], small))
+        sighting = _doubted(sighting, doubt)
+        around = torch.minimum(sighting.visible, look_up(fillers.shown[n], small))
+        sighting.visible = torch.lerp(sighting.visible, around, uneasy)
+        agreed = look_up(fillers.agreed[n], small)
+        unmoved = _unmoved(sightings, config, frame, points, sighting) * agreed
+        if frame != posed.t:
+            same_state = torch.maximum(same_state, unmoved * _near(sightings, config, posed, frame, sighting))
+        sway = config.sway_trust * unmoved * untold
+        still = 1.0 - elsewhere * (1.0 - agreed)
+        weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, still))
+        places.append(sighting.pixels * larger)
+    believed = torch.stack(weights)
+    filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[first_best(believed)]
+    total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
+    filling.share = total / (total + config.doubt)
+    for n, residual in enumerate(fillers.residuals):
+        carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n])
+    filling.color += carried * filling.share[:, None]
+    if fillers.instant is not None:
+        # A plate near in pose that shows the same, a little swayed, has it at its place: plate t* may be a pixel off.
+        # What it adds is what the model missed of it, so it rids nothing of a ghost.
+        haunted = look_up(fillers.instant.haunted, small)
+        told = look_up(fillers.instant.where, small) * (1.0 - same_state * (1.0 - haunted))
+        on = told > 0.0
+        shown = fillers.instant.at(small[on], larger)
+        filling.color[on] = torch.lerp(filling.color[on], shown, told[on][:, None])
+        filling.share = torch.lerp(filling.share, torch.ones_like(told), told)
+        filling.source = torch.where(told > 0.5, float(posed.t), filling.source)
+    filling.most = fillers.most
+    return filling
+
+
+def _doubted(sighting: Sighting, doubt: Tensor) -> Sighting:
+    """The sighting, with what it shows of points in doubt [...] taken for moving where the model says otherwise."""
+    return replace(sighting, moving=torch.maximum(sighting.moving, doubt * (1.0 - sighting.explained)))
+
+
+def _unmoved(sightings: Sightings, config: DetailConfig, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
+    """[...] in 0..1: what moves is in plate `frame` nearly as at t*: the model agrees, and moved it little."""
+    view = sightings.view(frame)
+    travel = norm(project(points, view.viewmat, view.K)[0] - sighting.pixels, -1)
+    trust = torch.exp(-travel / (config.sway * sightings.unit))
+    return sighting.explained * trust
+
+
+def _near(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, sighting: Sighting) -> Tensor:
+    """[...] in 0..1: how surely a plate shows points where the depth says."""
+    return sighting.visible / (1.0 + parallax(sightings, posed, frame, sighting.depth, config.depth_error))
+
+
+def _weight(
+    sightings: Sightings,
+    config: DetailConfig,
+    posed: PosedFrame,
+    frame: int,
+    sighting: Sighting,
+    motion: Tensor,
+    sway: Tensor,
+    still: Tensor | float = 1.0,
+) -> Tensor:
+    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*; what stands still in
+    it by `still` at most."""
+    near = _near(sightings, config, posed, frame, sighting)
+    if frame == posed.t:
+        return near
+    still = still * (1.0 - motion) * (1.0 - sighting.moving)
+    return near * (still + (1.0 - still) * sway)
+
+
+def _chosen(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, matte: Tensor, leading: int, usable: list[int]
+) -> list[int]:
+    """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
+    h, w = posed.depth.shape
+    need = 1.0 - resized(matte, w, h)[::4, ::4]
+    points, motion, doubt = (of[::4, ::4] for of in (posed.points, posed.motion, posed.doubt))
+    k = sightings.frames.index(leading)
+    around = {k + side * step for step in config.reach for side in (-1, 1)} | {k}
+    reach = {sightings.frames[i] for i in around if 0 <= i < len(sightings.frames)} | {posed.t}
+    zero = torch.zeros_like(motion)
+    gains = {
+        frame: need
+        * _weight(sightings, config, posed, frame, _doubted(sightings.seen(frame, points), doubt), motion, zero)
+        for frame in sorted(reach)
+        if frame in usable
+    }
+    first = [frame for frame in (posed.t, leading) if frame in gains]
+    chosen, have = list(dict.fromkeys(first)), torch.zeros_like(need)
+    for frame in chosen:
+        have = have + gains[frame]
+    while len(chosen) < min(config.sources, len(gains)):
+        # Diminishing returns: a second plate of the same wall helps less than a first one of another.
+        worth = {
+            frame: float((torch.log1p(10.0 * (have + gain)) - torch.log1p(10.0 * have)).sum())
+            for frame, gain in gains.items()
+            if frame not in chosen
+        }
+        candidates = sorted(worth, key=lambda candidate: abs(candidate - leading))
+        frame = candidates[int(first_best(torch.tensor([worth[each] for each in candidates], device="cpu")))]
+        if worth[frame] < 1e-3 * float(need.sum()):
+            break
+        chosen.append(frame)
+        have = have + gains[frame]
+    return chosen

@@ -1,0 +1,1 @@
+"""The scene at t*: the run frozen, held against a static baseline, fine-tuned, and kept."""

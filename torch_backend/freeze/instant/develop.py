@@ -1,0 +1,289 @@
+"""Develop: a frozen instant is trained on as the static scene that it is, until it shows what plate t* shows.
+
+The field has to explain a whole clip; a freeze needs one instant of it. So the frozen Gaussians become
+parameters of their own. Still pixels are learnt from all trained
+frames, in each of which what moves stands where the field has it; what moves at t* is learnt from plate t* alone. Of
+what that sees from much farther than others do, it teaches nothing: a face of six pixels is right from there with its
+eyes anywhere. The pictures are larger than those of a preview run, so the frozen scene becomes sharper than the run.
+
+A run as sharp as its pictures has nothing to gain where nothing moves, and is left alone there. What moves it may show
+blurred all the same. That is trained alone then, and goes part of the way to what plate t* made of it: as far as its
+neighbours in time bear, in which what one plate got wrong would stand in the wrong place.
+
+Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/benchmarks.md, "Developed instants").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...scene import Scene
+from ...torch_types import backward, integers
+from ...train import LoadedRun
+from ...train.adam import FusedAdam
+from ...train.average import ParameterMean
+from ...train.losses import photometric
+from ...train.model import render
+from ..frozen import FrozenGaussians
+from ..views.scene_flow import Travel
+from ..views.source_views import MovingOf
+from ..views.working_plates import WorkingPlates, showing, spread
+from .undersampled import seen_from_afar
+
+Check = Callable[[int, int], None]
+"""Called with (steps done, steps in all); raises to cancel."""
+
+
+@dataclass(frozen=True)
+class DevelopConfig:
+    """How an instant is developed. Rates are in scene units."""
+
+    steps: int = 300
+    """Training steps, of one frame each."""
+    width: int = 640
+    """Pixels of the pictures that are trained on, at most; never above the working frames'."""
+    frames: int = 160
+    """Frames that are trained on, at most, evenly over the clip."""
+    probes: int = 6
+    """Trained frames that are left out, at most, to see whether developing helped."""
+    gain: float = 0.2
+    """dB that the still pixels of the frames left out must gain: by less, at the size of the run, frozen truth lost
+    half a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it."""
+    alone: float = 0.2
+    """Where they gain less, what moves is trained alone, on plate t*, in so many steps as a share of `steps`;"""
+    near: int = 2
+    """trained frames on either side of t* that are asked about it then:"""
+    worth: float = 3.0
+    """of the way to what it became it goes so far that plate t* gains most beyond so many times what those lose (mean
+    squared errors),"""
+    ways: int = 4
+    """in so many parts."""
+    instant_share: float = 0.1
+    """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training."""
+    afar: float = 2.0
+    """Plate t* teaches nothing of what it sees from more than so many times as far as some trained frame does."""
+    looks: int = 12
+    """Frames, at most, that are asked whether such a thing moves: then nothing of it is learnt, for they show it at
+    other times."""
+    margin: int = 2
+    """Pixels of pictures 640 wide around what moves that are left out with it."""
+    dssim: float = 0.2
+    """As in `TrainConfig`."""
+    lr_means: float = 1e-4
+    """Start rate of means."""
+    lr_quats: float = 2e-3
+    """Of quaternions."""
+    lr_scales: float = 1.2e-2
+    """Of log-scales."""
+    lr_opacities: float = 2e-2
+    """Of opacity logits."""
+    lr_sh0: float = 6e-3
+    """Of the constant colour."""
+    lr_sh_rest: float = 1e-3
+    """Of the other harmonics."""
+    lr_end: float = 0.3
+    """Share of its start that each rate has at the end."""
+    average: float = 0.3
+    """Share of the steps, the last ones, whose mean is kept."""
+    warm: float = 0.15
+    """Share of the steps over which the rates rise: Adam has no memory of the gradients at first."""
+    opacity_weight: float = 1e-3
+    """Weight of the mean opacity."""
+    seed: int = 0
+    """Of the order of frames."""
+
+
+def develop(
+    run: LoadedRun,
+    scene: Scene,
+    frozen: FrozenGaussians,
+    t_star: int,
+    moving: MovingOf,
+    config: DevelopConfig | None = None,
+    check: Check | None = None,
+) -> FrozenGaussians:
+    """Trains a frozen scene on as the static scene that it is.
+
+    Returns what became of it. If frames that were left out gained nothing where nothing moves, or plate t* lost, that
+    stays as it was; and what moves does, or goes as far as t*'s neighbours bear.
+
+    Args:
+        frozen: the run's scene at t*.
+        t_star: frame number. If it is none of the run's trained frames its plate is not looked at: what moves is learnt
+            from the nearest trained frame on either side, in which it stands where the field has it.
+        moving: what moves in the clip's frames.
+        check: reports progress, and cancels.
+    """
+    return _Darkroom(run, scene, frozen, t_star, moving, config or DevelopConfig()).run(check)
+
+
+class _Darkroom:
+    """One development."""
+
+    def __init__(
+        self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int, moving: MovingOf,
+        config: DevelopConfig,
+    ) -> None:  # fmt: skip
+        self.trained, self.scene, self.frozen, self.config, self.t_star = run, scene, frozen, config, t_star
+        self.device = frozen.support.device
+        self.plates = WorkingPlates(scene, config.width, moving, config.margin, self.device)
+        self.instants = showing(run.train_frames, t_star)
+        frames = [frame for frame in spread(run.train_frames, config.frames) if frame not in self.instants]
+        self.probes = spread(frames[1:-1], min(config.probes, len(frames) // 4))
+        self.frames = sorted({*frames, *self.instants} - {*self.probes})
+        self.travel = Travel(run, scene, frozen, t_star)
+        self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
+        self.params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in frozen.state.items()}
+        self.optimizer = self._optimizer()
+        self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
+        self.afar = seen_from_afar(run, scene, frozen.state["means"], t_star, config.afar).float()
+        moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in spread(self.frames, config.looks)])
+        opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
+        self.held = ((self.afar > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
+        self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
+        """Rows of what moves and stands, at t*, in what the plate says moves."""
+
+    def run(self, check: Check | None) -> FrozenGaussians:
+        """All steps, and the judgement."""
+        steps, before = self.config.steps, self._judged()
+
+        def checked(done: int) -> None:
+            if check is not None:
+                check(done, steps)
+
+        self._train(steps, self.config.instant_share, checked)
+        after = self._judged()
+        state = {name: p.detach() for name, p in self.params.items()}
+        if after[0] < before[0] + self.config.gain or after[1] < before[1]:
+            state = self._movers_alone(lambda _: checked(steps))
+        was = self.frozen
+        return FrozenGaussians(state, was.sh_degree, was.support, was.motion, was)
+
+    def _train(self, steps: int, instant_share: float, check: Callable[[int], None]) -> None:
+        """So many steps, a share of them on plate t*; `check` is called with how many are done."""
+        order: list[int] = []
+        mean = ParameterMean()
+        for n in range(steps):
+            check(n)
+            for group in self.optimizer.param_groups:
+                group["lr"] = (
+                    group["first"]
+                    * self.config.lr_end ** (n / steps)
+                    * min(1.0, (n + 1) / (self.config.warm * steps + 1))
+                )
+            if float(torch.rand(1, generator=self.generator, device="cpu")) < instant_share:
+                frame = self.instants[n % len(self.instants)]
+            else:
+                order = order or integers(torch.randperm(len(self.frames), generator=self.generator, device="cpu"))
+                frame = self.frames[order.pop()]
+            self._step(frame)
+            if n >= steps - round(self.config.average * steps):
+                mean.add(self.params)
+        mean.put_into(self.params)
+
+    def _movers_alone(self, check: Callable[[int], None]) -> dict[str, Tensor]:
+        """The scene as it was, but for what moves at t*: that is trained on plate t*, and goes as far towards it as
+        t*'s neighbours bear, which may be not at all."""
+        was, rows, near = self.frozen.state, self.alone, self._near()
+        kept = dict(was)
+        if not len(rows) or not near:
+            return kept
+        self._show(was)
+        self.optimizer = self._optimizer()
+        self.held = torch.ones_like(self.mover).index_fill(0, rows, 0.0).index_fill(0, self.held, 1.0).nonzero()[:, 0]
+        steps = max(1, round(self.config.alone * self.config.steps))
+        self._train(steps, 1.0, check)
+        developed = {name: p.detach()[rows] for name, p in self.params.items()}
+        best, first = 0.0, (0.0, 0.0)
+        for n in range(self.config.ways + 1):
+            part = n / self.config.ways
+            state = {k: v.index_copy(0, rows, torch.lerp(v[rows], developed[k], part)) for k, v in was.items()}
+            self._show(state)
+            errors = self._error(self.instants, movers=True), self._error(near, movers=True)
+            first = first if n else errors
+            worth = first[0] - errors[0] - self.config.worth * max(0.0, errors[1] - first[1])
+            if worth > best:
+                best, kept = worth, state
+        return kept
+
+    def _show(self, state: dict[str, Tensor]) -> None:
+        for name, value in state.items():
+            self.params[name].data = value.clone()
+
+    def _near(self) -> list[int]:
+        """Trained frames on either side of those that show t*, without them."""
+        frames, most = self.trained.train_frames, self.config.near
+        before = [frame for frame in frames if frame < min(self.instants)]
+        after = [frame for frame in frames if frame > max(self.instants)]
+        return [*before[len(before) - min(most, len(before)) :], *after[:most]]
+
+    def _judged(self) -> tuple[float, float]:
+        """(PSNR in dB of the still pixels of the probes, of plate t* or its neighbours)."""
+        still, instants = (-10.0 * math.log10(max(self._error(of), 1e-12)) for of in (self.probes, self.instants))
+        return still, instants
+
+    @torch.no_grad()
+    def _error(self, frames: list[int], movers: bool = False) -> float:
+        """Mean squared error of frames, display-referred: of what they say of the frozen scene, or of what moves in
+        them. 0 where there is nothing."""
+        sums = torch.zeros(2, dtype=torch.float64, device=self.device)
+        for frame in frames:
+            shown, pixels = self._shown(frame)
+            if movers:
+                ignored, pixels = self.plates.ignored(frame), self.plates.matte(frame) > 0.5
+                pixels = pixels if ignored is None else pixels & ~ignored
+            error = (shown.clamp(0.0, 1.0) - self.plates.picture(frame)).square().mean(-1)[pixels]
+            sums += torch.stack([error.double().sum(), torch.tensor(float(error.numel()), device=self.device)])
+        return float(sums[0] / sums[1].clamp_min(1.0))
+
+    def _step(self, frame: int) -> None:
+        shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
+        target = torch.where(learnt[..., None], self.plates.picture(frame), shown.detach())
+        loss = photometric(shown, target, self.config.dssim)
+        # What may be taught by no frame would only fade.
+        shares = torch.sigmoid(self.params["opacity_logits"]) * (1.0 - self.afar)
+        total = loss + self.config.opacity_weight * shares.mean()
+        self.optimizer.zero_grad(set_to_none=True)
+        backward(total)
+        for parameter in self.params.values():
+            if parameter.grad is not None:
+                parameter.grad[self.held] = 0.0
+        self.optimizer.step(guard=[total])
+
+    def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """A frame as the scene has it, [H, W, 3], and bool [H, W]: what it says of the frozen scene.
+
+        What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
+        """
+        background = torch.full((3,), 0.5, device=self.device) if background is None else background
+        marks = torch.stack([self.mover, self.afar], dim=1)
+        state = self.travel.moved(dict(self.params), frame)
+        out = render(
+            state, self.frozen.sh_degree, *self.plates.camera(frame),
+            background=torch.cat([background, background.new_zeros(2)]), colors=marks,
+            with_contributions=False,
+        )  # fmt: skip
+        shown = self.trained.model.exposure.apply(out.colors[0, ..., :3], self.scene.time_of_frame(frame))
+        return shown, self._learnt(frame, *out.colors[0, ..., 3:].detach().unbind(-1))
+
+    def _learnt(self, frame: int, mover: Tensor, afar: Tensor) -> Tensor:
+        """bool [H, W]: which pixels of a frame say what the frozen scene should show there."""
+        matte, ignored = self.plates.matte(frame), self.plates.ignored(frame)
+        learnt = (matte < 0.5) & (mover < 0.1)
+        if frame in self.instants:
+            learnt = learnt | (afar < 0.5)
+        return learnt if ignored is None else learnt & ~ignored
+
+    def _optimizer(self) -> FusedAdam:
+        c, p = self.config, self.params
+        rates = {
+            "means": c.lr_means, "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities,
+            "sh0": c.lr_sh0, "shN": c.lr_sh_rest,
+        }  # fmt: skip
+        groups = [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()]
+        return FusedAdam(groups, eps=1e-15)

@@ -1,0 +1,238 @@
+"""Instants of a run, developed once and kept in its folder: one safetensors file each, known by what made it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...contract import DEVELOPED_FOLDER, JobError, Reporter, frame_file, frame_number, sweep_half_written
+from ...gaussians.model import PARAM_NAMES
+from ...scene import Scene
+from ...shot import Shot, content_key, path_error
+from ...solve.motion import motion_key
+from ...train import LoadedRun
+from ...train.checkpoint import load_checkpoint, read_meta, save_checkpoint
+from ..frozen import FrozenGaussians, freeze_at, span_of
+from ..views.source_views import motion_mattes
+from .develop import DevelopConfig, develop
+from .static_baseline import settled
+
+FOLDER = DEVELOPED_FOLDER
+"""Of developed instants, in a run's folder."""
+VERSION = 23
+"""Rises when instants developed before are not to be used any more."""
+MOST = 6
+"""Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
+jumps to another make in the middle of a ramp."""
+
+
+class Instants:
+    """The scenes of a take: the run at each of its instants, developed where that is wanted and can be done."""
+
+    def __init__(
+        self, shot: Shot, run: LoadedRun, scene: Scene, query: str, t_stars: Iterable[float], on: bool = True
+    ) -> None:
+        """`query` as in `FreezeParams`; `t_stars`: all instants of the take, as frame numbers; `on` False: none is
+        developed. The shot's motion mattes must have been found (`find_motion`): keys tell them apart."""
+        self.shot, self.run, self.scene, self.query = shot, run, scene, query
+        distinct, trained = sorted(set(t_stars)), set(run.train_frames)
+        to_develop = distinct if on and len(distinct) <= MOST else []
+        self.config = config_for(run)
+        self.keys = {t: developed_key(shot, run, int(t), self.config, query) for t in to_develop if t in trained}
+        """t* -> key, of those that are developed: of trained frames, whose plates the run knows."""
+        self._held: dict[float, FrozenGaussians] = {}
+        self._at: tuple[float, FrozenGaussians] | None = None
+
+    @property
+    def frames(self) -> list[int]:
+        """Numbers of the frames that are developed, ascending."""
+        return sorted(int(t) for t in self.keys)
+
+    def is_kept(self, t_star: float) -> bool:
+        """True if an instant lies developed in the run's folder."""
+        return t_star not in self._held and self._kept(t_star) is not None
+
+    def prepare(self, t_stars: Iterable[float], report: Reporter) -> None:
+        """Develops those of `t_stars` that are to be and are not there yet. `Cancelled` leaves no half of one."""
+        missing = [t for t in dict.fromkeys(t_stars) if t in self.keys and self._kept(t) is None]
+        for n, t_star in enumerate(missing):
+            self._at = None  # before the next takes its room
+            self._develop(t_star, report, n, len(missing))
+
+    def at(self, t_star: float, report: Reporter) -> FrozenGaussians:
+        """The scene at an instant; developed now if it is to be and is not."""
+        if self._at is not None and self._at[0] == t_star:
+            return self._at[1]
+        self._at = None  # before the next takes its room
+        if t_star in self.keys:
+            made = self._kept(t_star) or self._develop(t_star, report)
+        else:
+            made = self._field(t_star)
+        self._at = t_star, made
+        return made
+
+    def _field(self, t_star: float) -> FrozenGaussians:
+        return freeze_at(self.run.model, self.scene.time_of_frame(t_star), span_of(self.scene, self.run), self.query)
+
+    def _kept(self, t_star: float) -> FrozenGaussians | None:
+        held = self._held.get(t_star)
+        if held is not None:
+            return held
+        return load_developed(self.shot, self.run, int(t_star), self._field(t_star), self.config, self.query)
+
+    def _develop(self, t_star: float, report: Reporter, n: int = 0, count: int = 1) -> FrozenGaussians:
+        told: set[int] = set()
+
+        def check(done: int, steps: int) -> None:
+            report.check_cancelled()
+            if done not in told:  # before the first step it is asked often
+                told.add(done)
+                text = f"t* {int(t_star)}, step {done} of {steps}"
+                report.progress("developing", n * steps + done, count * steps, text)
+
+        frozen = self._field(t_star)
+        made = _make(self.shot, self.run, self.scene, int(t_star), frozen, self.config, check)
+        # Another job may have developed it meanwhile, and others may be at work with that one: the first stays.
+        there = self._kept(t_star)
+        made = made if there is None else there
+        self._at = t_star, made
+        report.progress("developing", n + 1, count, f"t* {int(t_star)}")
+        if self.run.stale:
+            self._held[t_star] = made
+            return made
+        if there is not None:
+            return made
+        try:
+            _save(self.shot, self.run, int(t_star), frozen, made, self.keys[t_star])
+        except (OSError, JobError) as error:
+            self._held[t_star] = made
+            problem = error if isinstance(error, JobError) else path_error(error)
+            why = f"{error}." if problem is None else problem.message
+            report.warning(f"The developed instant is not kept: {why}", "The next freeze at this t* develops it again.")
+        return made
+
+
+def config_for(run: LoadedRun) -> DevelopConfig:
+    """How instants of a run are developed: as large as it was trained, at least `DevelopConfig.width`."""
+    usual = DevelopConfig()
+    larger = max(1.0, run.width / usual.width)
+    return dataclasses.replace(usual, width=max(usual.width, run.width), steps=round(usual.steps * larger))
+
+
+def developed_key(
+    shot: Shot, run: LoadedRun, t_star: int, config: DevelopConfig | None = None, query: str = "nearest"
+) -> str:
+    """Identifies what a developed instant is made from and how; `query` as in `FreezeParams`."""
+    return _key(shot, run, t_star, config, query, run.stamp)
+
+
+def _key(
+    shot: Shot, run: LoadedRun, t_star: int, config: DevelopConfig | None, query: str, stamp: str | list[Any]
+) -> str:  # fmt: skip
+    how = dataclasses.asdict(config or config_for(run))
+    return content_key(VERSION, stamp, query, int(t_star), motion_key(shot), how)
+
+
+def developed_path(run: LoadedRun, t_star: int) -> Path:
+    """Where a run's instant is kept once it is developed."""
+    return run.folder / FOLDER / frame_file(t_star, ".safetensors")
+
+
+def load_developed(
+    shot: Shot, run: LoadedRun, t_star: int, frozen: FrozenGaussians, config: DevelopConfig | None = None,
+    query: str = "nearest",
+) -> FrozenGaussians | None:  # fmt: skip
+    """The instant as it was developed before; None if it was not, or from something else, or its file is damaged.
+
+    `frozen` is the run's scene at t*, asked as `query` says.
+    """
+    path = developed_path(run, t_star)
+    try:
+        # An instant of an earlier version is known by the time of its run's checkpoint.
+        keys = [_key(shot, run, t_star, config, query, stamp) for stamp in (run.stamp, run.former_stamp)]
+        if not path.is_file() or read_meta(path).get("key") not in keys:
+            return None
+        tensors, _ = load_checkpoint(path)
+    except (JobError, OSError):
+        return None
+    if not _whole(tensors, frozen):
+        return None
+    device = frozen.support.device
+    closed = tensors["closed"].to(device)
+    base = {name: tensors[f"base.{name}"].to(device) for name in PARAM_NAMES}
+    support, motion = frozen.support.index_fill(0, closed, 1.0), frozen.motion.index_fill(0, closed, 0.0)
+    before = FrozenGaussians(base, frozen.sh_degree, support, motion)
+    state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
+    return FrozenGaussians(state, frozen.sh_degree, support, motion, before)
+
+
+def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
+    """True if tensors of a file fit each other and the run: it may come from anywhere."""
+    names = [f"{part}.{name}" for part in ("base", "state") for name in PARAM_NAMES]
+    closed = tensors.get("closed")
+    if closed is None or closed.dtype != torch.long or closed.dim() != 1 or not all(n in tensors for n in names):
+        return False
+    known = len(frozen.support)
+    for name in names:
+        like, value = frozen.state[name.partition(".")[2]], tensors[name]
+        if value.dtype != like.dtype or value.shape != like.shape or not bool(value.isfinite().all()):
+            return False
+    return not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
+
+
+def developed(
+    shot: Shot, run: LoadedRun, scene: Scene, t_star: int, frozen: FrozenGaussians,
+    config: DevelopConfig | None = None, keep: bool = True,
+) -> FrozenGaussians:  # fmt: skip
+    """The scene frozen at frame `t_star`, developed: from the run's folder if it is there, else made now and kept.
+
+    Args:
+        frozen: the run's scene at t*, asked at the nearest time at which it was seen.
+        keep: write it into the run's folder. OSError or JobError if that cannot be done.
+    """
+    config = config or config_for(run)
+    made = load_developed(shot, run, t_star, frozen, config)
+    if made is not None:
+        return made
+    made = _make(shot, run, scene, t_star, frozen, config)
+    if keep and not run.stale:
+        _save(shot, run, t_star, frozen, made, developed_key(shot, run, t_star, config))
+    return made
+
+
+def _make(
+    shot: Shot, run: LoadedRun, scene: Scene, t_star: int, frozen: FrozenGaussians, config: DevelopConfig,
+    check: Callable[[int, int], None] | None = None,
+) -> FrozenGaussians:  # fmt: skip
+    moving = motion_mattes(shot)
+    return develop(run, scene, settled(run, scene, frozen, t_star, moving), t_star, moving, config, check)
+
+
+def _save(
+    shot: Shot, run: LoadedRun, t_star: int, field: FrozenGaussians, made: FrozenGaussians, key: str
+) -> None:  # fmt: skip
+    """Writes an instant of the run's `field`; those of other trainings of the run go.
+
+    OSError, or JobError where a link leads elsewhere.
+    """
+    assert made.descent is not None
+    path = developed_path(run, t_star)
+    folder = shot.own(path.parent)
+    tensors = {"closed": torch.nonzero(made.descent.motion < field.motion).flatten()}
+    # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
+    tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
+    tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
+    sweep_half_written(folder)
+    meta: dict[str, Any] = {"key": key, "t_star": t_star, "run": run.stamp}
+    save_checkpoint(path, tensors, meta)
+    stamps = run.stamp, run.former_stamp
+    for other in folder.glob("*.safetensors"):
+        with contextlib.suppress(OSError):  # known by its key, it does no harm but take room
+            if frame_number(other.stem) is not None and other != path and read_meta(other).get("run") not in stamps:
+                other.unlink()

@@ -1,0 +1,198 @@
+"""No worse than a static model: what the field harms in a frozen scene is closed before the instant is developed.
+
+A field is trained to explain every frame at its own time. Time standing still asks it for something nobody checked:
+how the world of t* looks from the other poses, the wall behind a person, say, that the field let fade while she stood
+there. The static twin of a frozen scene has the same Gaussians, the open ones at the mean of the times at which they
+were seen. Scene and twin are held against plates: that of t*, and the still pixels of others, all over the clip. A
+Gaussian is closed where the others are worse for it by more than plate t* gains; where the mattes see nothing move at
+t* and it only sways, by more than a third of that. It is asked of neighbours together: errors are noisy, and things
+move in pieces. Where it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call
+still, a mean is always nearer. They miss whole arms, too. So of what went farther than a sway, what the run shows at a
+plate's own time better than the twin counts against the twin: that plate says nothing of t*.
+
+Of what t* sees from afar its plate cannot say how it looks: a face of six pixels fits it with its eyes anywhere. Plates
+that see such a thing from near are asked with all of its pixels, whether they move or not; and there, where they do
+move, what the run shows better at the plate's own time counts against the twin even of a sway.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...gaussians.neighbours import nearest
+from ...scene import Scene
+from ...torch_types import from_numpy, norm
+from ...train import LoadedRun
+from ...train.model import gathered, render
+from ...train.movers import mean_of
+from ..frozen import FrozenGaussians, freeze_at
+from ..views.reproject import project
+from ..views.source_views import MovingOf
+from ..views.working_plates import WorkingPlates, showing, spread
+
+_SEEN = 0.05
+"""Pixels that a plate has to see of a Gaussian before it counts."""
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """How a frozen scene is compared with its static twin."""
+
+    width: int = 320
+    """Pixels of the pictures that are compared, at most; never above the working frames'."""
+    plates: int = 12
+    """Trained frames that are looked at beside t*, at most, evenly over the clip."""
+    margin: float = 2.0
+    """Pixels of pictures 640 wide around what moves that do not count as still."""
+    neighbours: int = 16
+    """So many nearest open Gaussians are asked together."""
+    doubted: float = 3.0
+    """So many times what the others lose must plate t* gain for what only sways where the mattes say that nothing moves
+    at t*: a field also bends to what is wrong with the camera of that one plate, the edge of a desk for instance."""
+    sways: float = 4.0
+    """Pixels of pictures 640 wide from t* to a plate from which on a Gaussian does not only sway: what the run at that
+    plate's time shows better than the twin then counts. Held-still people sway by less; their mean is as good."""
+    nearer: float = 0.5
+    """A plate sees a Gaussian from near if its distance is at most so much of that at t*."""
+    rounds: int = 2
+    """Comparisons: what stays open is held against the twin again without what was closed."""
+
+
+def settled(
+    run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int, moving: MovingOf,
+    config: TwinConfig | None = None,
+) -> FrozenGaussians:  # fmt: skip
+    """A run's scene at t*, in which what only does harm there stands still: `closed`.
+
+    Args:
+        frozen: the run's own Gaussians at t*, nothing behind them.
+        t_star: frame number; one that the run was not trained on is judged by the trained plates beside it.
+        moving: what moves in the clip's frames.
+    """
+    config = config or TwinConfig()
+    rows = run.model.open_rows()
+    if not len(rows):
+        return frozen
+    plates = WorkingPlates(scene, config.width, moving, config.margin, frozen.support.device)
+    movers = (plates.moving_share(frozen, t_star) > 0.5).float()
+    shown_at_t_star = showing(run.train_frames, t_star)
+    others = [frame for frame in spread(run.train_frames, config.plates) if frame not in shown_at_t_star]
+    for _ in range(config.rounds):
+        left = rows[frozen.motion[rows] > 0.5]
+        if not len(left):
+            break
+        twin = held_still(run, frozen, left)
+        pair = _Pair(run, plates, frozen, twin, left, movers, t_star, config)
+        near = _nearest(frozen.state["means"][left], config.neighbours)
+        gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
+        least = torch.where((movers[left] > 0.5) | pair.went, harm, config.doubted * harm)
+        stays = (harm <= 0.0) | (gain > least)
+        if bool(stays.all()):
+            break
+        frozen = held_still(run, frozen, left[~stays])
+    return frozen
+
+
+@torch.no_grad()
+def held_still(run: LoadedRun, frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
+    """A frozen scene in which `rows` [M] int64 of the run's Gaussians are what they are on average, and do not move."""
+    mean, state = mean_of(run.model, rows), dict(frozen.state)
+    for name, value in state.items():
+        state[name] = value.index_copy(0, rows, mean[name])
+    support, motion = (v.index_fill(0, rows, to) for v, to in ((frozen.support, 1.0), (frozen.motion, 0.0)))
+    return replace(frozen, state=state, support=support, motion=motion)
+
+
+class _Pair:
+    """A frozen scene and its twin, which differ by `rows` [M]; `movers` [N] is 1 for what moves in plate t*."""
+
+    def __init__(
+        self, run: LoadedRun, plates: WorkingPlates, frozen: FrozenGaussians, twin: FrozenGaussians, rows: Tensor,
+        movers: Tensor, t_star: int, config: TwinConfig,
+    ) -> None:  # fmt: skip
+        self.sways = config.sways * plates.width / 640
+        """Pixels of the plates."""
+        places = frozen.state["means"][rows]
+        self.from_near = config.nearer * norm(places - plates.centre(t_star), -1)
+        """[M] distance up to which a plate sees each of the rows from near."""
+        self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, twin)
+        self.went = torch.zeros(len(rows), dtype=torch.bool, device=movers.device)
+        """[M] True for what some plate that was asked saw farther from its place at t* than a sway."""
+        self.marks = torch.stack([torch.zeros_like(movers).index_fill(0, rows, 1.0), movers], dim=1)
+
+    def worse(self, frames: list[int], near: Tensor, still: bool = True) -> Tensor:
+        """[M]: squared error of the scene over that of its twin, in pixels, for the mean frame that sees a Gaussian.
+
+        A pixel's difference is shared by the Gaussians that paint it in either; each is given the mean of those `near`
+        [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*, unless the plate sees the
+        Gaussian from near; and what the twin's error there exceeds that of the run at the frame's own time by is
+        subtracted for what went farther than a sway, and for what is seen from near.
+        """
+        sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
+        for frame in frames:
+            worse, seen = self._blamed(frame, still).unbind(1)
+            sees = seen[near].mean(1) > _SEEN
+            sums, counts = sums + torch.where(sees, worse[near].mean(1), 0.0), counts + sees
+        return sums / counts.clamp_min(1.0)
+
+    def _blamed(self, frame: int, still: bool) -> Tensor:
+        """[M, 2]: how much worse a frame is for each of the rows, and how many pixels it sees of it."""
+        camera, plate = self.plates.camera(frame), self.plates.picture(frame)
+        ignored = self.plates.ignored(frame)
+        whole = torch.ones(plate.shape[:2], device=plate.device) > 0 if ignored is None else ~ignored
+        shown = [self._shown(scene, frame) for scene in self.scenes]
+        ours, twins = ((picture - plate).square().mean(-1) for picture, _ in shown)
+        paint = (shown[0][1][..., 0] + shown[1][1][..., 0]).clamp_min(1e-2)
+        masks = [whole]
+        if still:
+            rests = whole & (self.plates.matte(frame) < 0.5)
+            for _, marks in shown:
+                rests = rests & (marks[..., 1] < 0.1)
+            masks.append(rests)
+        own = torch.zeros_like(ours)
+        then = freeze_at(self.run.model, self.plates.scene.time_of_frame(frame), 1.0) if still else None
+        if then is not None:
+            own = (twins - (self._shown(then, frame)[0] - plate).square().mean(-1)).clamp_min(0.0)
+        stacked = torch.cat(
+            [torch.stack([(ours - twins) * mask / paint, mask.float(), own * mask / paint], dim=-1) for mask in masks],
+            dim=-1,
+        )
+        first, second = (gathered(scene.state, *camera, stacked)[self.rows] for scene in self.scenes)
+        told = (first + second).reshape(len(self.rows), len(masks), 3)
+        if then is None:
+            return told[:, 0, :2]
+        near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), -1) <= self.from_near
+        told = torch.where(near[:, None], told[:, 0], told[:, 1])
+        went = self._travel(then, frame) > self.sways
+        self.went |= went & (told[:, 1] > _SEEN)
+        told[:, 0] -= told[:, 2] * (near | went)
+        return told[:, :2]
+
+    def _travel(self, then: FrozenGaussians, frame: int) -> Tensor:
+        """[M] pixels by which the rows move from t* to a frame's own time, as that frame sees it."""
+        viewmat, K, _, _ = self.plates.camera(frame)
+        here, there = (project(scene.state["means"][self.rows], viewmat, K)[0] for scene in (self.scenes[0], then))
+        return norm(here - there, -1)
+
+    @torch.no_grad()
+    def _shown(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:
+        """(picture [H, W, 3] in 0..1, marks [H, W, 2]) of a scene from the camera of a frame, over grey."""
+        grey = torch.tensor([0.5, 0.5, 0.5, 0.0, 0.0], device=self.marks.device)
+        out = render(
+            scene.state, scene.sh_degree, *self.plates.camera(frame), background=grey, colors=self.marks,
+            with_contributions=False,
+        )  # fmt: skip
+        time = self.plates.scene.time_of_frame(frame)
+        return self.run.model.exposure.apply(out.colors[0, ..., :3], time).clamp(0.0, 1.0), out.colors[0, ..., 3:]
+
+
+def _nearest(means: Tensor, count: int) -> Tensor:
+    """[M, K] int64: the nearest of means [M, 3] to each, itself among them."""
+    count = min(count, len(means))
+    places = means.cpu().numpy()
+    found = nearest(places, places, count)[1]
+    return from_numpy(np.ascontiguousarray(found, np.int64)).to(means.device)

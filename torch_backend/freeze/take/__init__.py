@@ -1,0 +1,1 @@
+"""A take on disk: its plan, its frames as files, its parts on a farm, its verdict."""

@@ -1,0 +1,158 @@
+"""The folder of a take: which of its frames are right, and how new ones take the place of those of before."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Set
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...contract import (
+    LAYERS,
+    PICTURE,
+    ExitCode,
+    FreezeParams,
+    JobError,
+    TakeFolder,
+    frame_number,
+    is_whole_picture,
+    remove_file,
+    replace_file,
+    sweep_half_written,
+)
+from ...shot import make_folder, write_json
+from ..exr import read_key
+from .plan import PlannedTake
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a take's frames are rendered to."""
+
+    folder: TakeFolder
+    """The take's own; or `beside`."""
+    beside: TakeFolder | None
+    """A folder in it, as long as another take of that name stands there whole: that one stays until this is done."""
+    right_here: set[int]
+    """Frames in the take's own folder that are as they would be rendered now."""
+    right_beside: set[int]
+    """Those in `beside`: it was begun before."""
+    of_before: bool = False
+    """There are frames of an earlier version, whose files do not say which belong together: they are made anew."""
+
+
+def place_of(take: PlannedTake, params: FreezeParams) -> Place:
+    """Makes the folder that the take is rendered to, and finds the frames that are right.
+
+    One that is not asked for now is among them: a part of the range does not undo the rest of the take.
+    """
+    folder, with_warps = take.folder, take.spec.detail is not None
+    make_folders(folder, with_warps)
+    keys = stored_keys(folder, with_warps) if params.only_missing else {}
+    here, beside, of_before = right_frames(take, keys), folder.next, "" in keys.values()
+    there = set[int]()
+    if params.only_missing and beside.root.is_dir():
+        there = right_frames(take, stored_keys(beside, with_warps))
+    for n in set(_numbers(beside)) - there:
+        for file in files_of(beside, n):
+            remove_file(file)
+    stands = folder.facts.is_file() and bool(set(frames_of(folder)) - here)
+    if not stands:
+        place = Place(folder, beside, here, there)
+        if beside.root.is_dir():  # killed while it took over
+            take_over(take, place)
+        return Place(folder, None, here | there, set(), of_before)
+    _prepare(beside, with_warps)
+    return Place(beside, beside, here, there, of_before)
+
+
+def right_frames(take: PlannedTake, keys: dict[int, str | None]) -> set[int]:
+    """The frames that are as they would be rendered now, of `stored_keys`."""
+    return {n for n, key in keys.items() if key is not None and key == take.keys.get(n)}
+
+
+def stored_keys(folder: TakeFolder, with_warps: bool) -> dict[int, str | None]:
+    """Frame -> `stored_key`, of all frames of a take's folder."""
+    return {n: stored_key(folder, n, with_warps) for n in frames_of(folder)}
+
+
+def stored_key(folder: TakeFolder, frame: int, with_warps: bool) -> str | None:
+    """The key that all files of a frame carry. Empty if one carries none: an earlier version wrote it.
+
+    None if one lacks, is cut off, or is of another frame or take than the rest: a process was killed between them.
+    """
+    files = [folder.frame(frame), folder.preview(frame), *([folder.warp(frame)] if with_warps else [])]
+    if not all(map(is_whole_picture, files)):  # a copy may have been cut off
+        return None
+    keys = {read_key(file) for file in files}
+    if None in keys:
+        return None
+    return "" if "" in keys else keys.pop() if len(keys) == 1 else None
+
+
+def made_before(take: str) -> tuple[str, str]:
+    """What to say of a take with frames of an earlier version, and why."""
+    return (
+        f"Frames of the take {take} were made by an earlier version, whose files do not say which belong together: "
+        "they are made again.",
+        "Name another take to keep them.",
+    )
+
+
+def clear(take: PlannedTake, done: Set[int]) -> None:
+    """Removes all frames of before but those that are `done`: nobody shall take old ones for a part of this take."""
+    folder = take.folder
+    stale = set(_numbers(folder)) - done
+    for old in [folder.facts, *(file for n in stale for file in files_of(folder, n))] if stale else ():
+        remove_file(old)
+    write_json(folder.state, {"version": 1, "key": take.key})
+
+
+def take_over(take: PlannedTake, place: Place) -> None:
+    """The frames rendered beside a take of before stand in its place. Killed meanwhile, the next freeze goes on."""
+    assert place.beside is not None
+    clear(take, place.right_here)
+    for n in frames_of(place.beside):
+        for file, target in zip(reversed(files_of(place.beside, n)), reversed(files_of(take.folder, n)), strict=True):
+            if file.is_file():  # the EXR last: a frame that has one has the others
+                replace_file(file, target)
+    shutil.rmtree(place.beside.root, ignore_errors=True)
+
+
+def files_of(folder: TakeFolder, frame: int) -> list[Path]:
+    """All files that a frame of a take has: EXR, warp, preview."""
+    return [folder.frame(frame), folder.warp(frame), folder.preview(frame)]
+
+
+def make_folders(folder: TakeFolder, with_warps: bool) -> None:
+    """Makes a take's folder. JobError if it holds frames of someone else's."""
+    if not folder.state.is_file() and _numbers(folder):
+        raise JobError(
+            f"{folder.root} holds numbered pictures that were not made here.",
+            "Name another take, or move them away.",
+            ExitCode.FREEZE,
+        )
+    _prepare(folder, with_warps)
+
+
+def _prepare(folder: TakeFolder, with_warps: bool) -> None:
+    """Makes the folders of a take's frames, and removes what was half written to them."""
+    for used in (folder.root, folder.previews, *([folder.warps] if with_warps else [])):
+        make_folder(used)
+        sweep_half_written(used)
+
+
+def frames_of(folder: TakeFolder) -> list[int]:
+    """Numbers of the frames that a take's folder has, ascending."""
+    return _frames_in(folder.root.glob("*" + LAYERS))
+
+
+def _numbers(folder: TakeFolder) -> list[int]:
+    """Those of all files of frames."""
+    files = folder.root.glob("*" + LAYERS), folder.previews.glob("*" + PICTURE), folder.warps.glob("*" + LAYERS)
+    return sorted({n for found in files for n in _frames_in(found)})
+
+
+def _frames_in(paths: Iterable[Path]) -> list[int]:
+    """Numbers of those files that are frames, ascending."""
+    return sorted(n for p in paths if (n := frame_number(p.stem)) is not None)

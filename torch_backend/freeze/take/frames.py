@@ -1,0 +1,217 @@
+"""The frames of a take: rendered one by one, and written with their layers, warps and previews."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Set
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...contract import (
+    NO_DEPTH,
+    Reporter,
+    TakeFolder,
+)
+from ...footage.color import on_straight_colour
+from ...footage.display import PLAIN, Display
+from ...footage.images import write_png
+from ...scene import Scene
+from ...shot import disk_error, is_disk_full, need_disk
+from ...torch_types import from_numpy
+from ..bands import bands
+from ..composite.compositor import DetailedFrame
+from ..composite.grain import Brush, Grain
+from ..composite.transfer import to_display
+from ..composite.warp import WarpMetadata, write_warp
+from ..exr import DetailLayers, FrameMetadata, Made, write_frozen_exr
+from ..frozen import FrozenImage, OutputFrame, render_frozen
+from ..views.reproject import resized
+from .plan import FrameSpec, PlannedTake
+from .write_beside import WriteBeside
+
+
+def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> None:
+    """Develops the instants of those of `frames` that are not done. JobError if the disk has no room for the frames."""
+    spec, missing = take.spec, [f for f in frames if f.frame not in done]
+    each = spec.whole[0] * spec.whole[1] * (20.0 + (6.0 if spec.grain else 0.0) + (24.0 if spec.detail else 0.0))
+    need_disk(take.folder.root, len(missing) * each, "the take")
+    spec.instants.prepare((f.t_star for f in missing), report)
+
+
+def render_frames(
+    take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter,
+    before_each: Callable[[], None] | None = None,
+) -> dict[int, Tensor]:  # fmt: skip
+    """Renders and writes those of `frames` that are not done, if the disk has room for them. What `before_each` raises
+    before a frame is written ends it.
+
+    Returns frame number -> [h, w] share of plate, small, of those rendered. JobError if the disk is full.
+    """
+    make_ready(take, frames, done, report)
+    try:
+        return _render_all(take, frames, done, report, before_each)
+    except OSError as error:
+        raise (disk_error(take.folder.root) if is_disk_full(error) else error) from error
+
+
+def _render_all(
+    take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter,
+    before_each: Callable[[], None] | None,
+) -> dict[int, Tensor]:  # fmt: skip
+    folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
+    shares: dict[int, Tensor] = {}
+    with WriteBeside() as out:
+        for n, output in enumerate(frames):
+            report.check_cancelled()
+            report.progress("freezing", n, len(frames), f"frame {output.frame}")
+            if output.frame in done:
+                continue
+            image = _render(output, scene, spec, report)
+            if isinstance(image, DetailedFrame):
+                shares[output.frame] = small_share(image.plate, image.support)
+            if before_each is not None:
+                before_each()
+            write = functools.partial(_write, folder, output, image, scene, spec, keys[output.frame])
+            out.write(write, sum(value.nbytes for value in vars(image).values() if isinstance(value, Tensor)))
+            del image, write  # at 4K the next frame needs their gigabyte
+    report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
+    return shares
+
+
+def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter) -> FrozenImage | DetailedFrame:
+    """A frame of the take, of splats or of plates."""
+    frozen = spec.instants.at(output.t_star, report)
+    exposed_at = scene.time_of_frame(output.exposed_like)
+    K = output.K.clone()
+    K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
+    image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
+    return image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+
+
+def _write(
+    folder: TakeFolder, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
+) -> None:
+    """All files of a frame. Each carries the frame's key, by which `take_folder.stored_key` tells a whole frame from
+    files of two; the EXR comes last, so that readers who look for it alone find the others."""
+    if isinstance(image, DetailedFrame):
+        _write_warp(folder, output, image, spec, key)
+    _write_frame(folder, output, image, scene, spec, key)
+
+
+def _write_frame(
+    folder: TakeFolder, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
+) -> None:
+    """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
+    write_png(folder.preview(output.frame), _preview(image, spec), key)
+    viewmat = output.viewmat.double().clone()
+    viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ from_numpy(scene.centre)
+    size = tuple(image.alpha.shape)
+    alpha = image.alpha.numpy()
+
+    def depth(rows: slice) -> np.ndarray:
+        return torch.where(image.depth[rows] < NO_DEPTH, image.depth[rows] / scene.scale, NO_DEPTH).numpy()
+
+    def rgba(rows: slice) -> np.ndarray:
+        if isinstance(image, DetailedFrame):
+            return np.concatenate([image.linear[rows].numpy(), alpha[rows][..., None]], axis=2)
+        return scene_linear(image.color[rows].numpy(), alpha[rows], scene.display)
+
+    layers = None
+    if isinstance(image, DetailedFrame):
+        splat, covered = image.splat.numpy(), image.splat_alpha.numpy()
+        shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows], scene.display))
+        layers = DetailLayers(shown, image.plate, image.source)
+    write_frozen_exr(
+        folder.frame(output.frame),
+        Made((*size, 4), rgba),
+        Made(size, depth),
+        image.support.numpy(),
+        image.motion.numpy(),
+        FrameMetadata(
+            output.frame,
+            output.t_star,
+            viewmat.float().numpy(),
+            output.K.numpy(),
+            timecode=spec.timecode(output.frame),
+            key=key,
+            light=spec.light,
+        ),
+        spec.beyond,
+        None if spec.grain is None else _grain(spec.grain, output.frame, image, spec, scene.display),
+        layers,
+    )
+
+
+def _grain(
+    grain: Grain, frame: int, image: FrozenImage | DetailedFrame, spec: FrameSpec, display: Display
+) -> Made:  # fmt: skip
+    """The layer of a frame's grain, [H, W, 3] scene-linear, premultiplied. It was measured on sRGB, whatever `display`
+    the frame's splats are shown on."""
+    brush = Brush(grain, frame, image.alpha.shape, spec.whole_grain_size)
+
+    def drawn(rows: slice) -> np.ndarray:
+        colour = to_display(image.linear[rows], PLAIN) if isinstance(image, DetailedFrame) else image.color[rows]
+        shown = torch.cat([colour, image.alpha[rows][..., None]], dim=2).numpy()
+        if display.bends and not isinstance(image, DetailedFrame):
+            shown = on_straight_colour(shown, lambda x: display.straightened(np.asarray(x, np.float32)))
+        made = brush.rows(rows, shown)
+        if isinstance(image, DetailedFrame):  # plates have theirs
+            made = made * (1.0 - image.plate[rows].numpy()[..., None])
+        return made
+
+    return Made((*image.alpha.shape, 3), drawn)
+
+
+def _display(image: FrozenImage | DetailedFrame, rows: slice) -> Tensor:
+    """[h, W, 3] some rows of a frame, premultiplied, on the scene's display."""
+    return to_display(image.linear[rows], image.display) if isinstance(image, DetailedFrame) else image.color[rows]
+
+
+def _preview(image: FrozenImage | DetailedFrame, spec: FrameSpec) -> np.ndarray:
+    """[H, W, 3] uint8 the frame without overscan as it stands over the plate; so contact sheet and video show it."""
+    (width, height), (left, top) = spec.size, spec.beyond
+    out = np.empty((height, width, 3), np.uint8)
+    for part in bands(height, width):
+        rows = slice(part.start + top, part.stop + top)
+        shown = _display(image, rows) + (1.0 - image.alpha[rows][..., None]) * 0.5
+        shown = shown[:, left : left + width].clamp(0.0, 1.0) * 255.0 + 0.5
+        out[part] = shown.to(torch.uint8).numpy()
+    return out
+
+
+def _write_warp(folder: TakeFolder, output: OutputFrame, made: DetailedFrame, spec: FrameSpec, key: str) -> None:
+    assert spec.detail is not None
+    plates = spec.detail.plates
+    write_warp(
+        folder.warp(output.frame),
+        made.st,
+        made.matte,
+        made.fill,
+        made.alpha,
+        WarpMetadata(output.frame, made.leading, output.t_star, plates.width, plates.height, key, light=spec.light),
+        spec.beyond,
+    )
+
+
+def small_share(plate: Tensor, support: Tensor) -> Tensor:
+    """[H, W] share of plate, averaged to a picture about 160 pixels wide, for figures.
+
+    A plate that shows what nobody saw near t* is none for the instant, by so much as `support` [H, W] says.
+    """
+    plate = torch.minimum(plate, support)
+    height, width = plate.shape
+    small = min(width, 160)
+    return resized(plate, small, max(4, round(height * small / width)))
+
+
+def scene_linear(color: np.ndarray, alpha: np.ndarray, display: Display) -> np.ndarray:
+    """Premultiplied colour [H, W, 3] of a display and alpha [H, W] -> premultiplied scene-linear RGBA [H, W, 4].
+
+    Splats blend in display space; the conversion acts on the colour that is seen, so it goes through straight alpha.
+    """
+    # Beyond what any frame of the clip shows there was nothing to match in training: overshoot is noise, which at the
+    # end of a shoulder would be many times as bright.
+    capped = np.clip(color, 0.0, alpha[..., None] * np.float32(display.most))
+    return display.premultiplied_to_light(np.concatenate([capped, alpha[..., None]], axis=2))

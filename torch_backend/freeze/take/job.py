@@ -1,0 +1,235 @@
+"""The freeze station: makes a take, and writes what leaves for Blender and for the artist's eyes."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...contract import (
+    ExitCode,
+    FreezeParams,
+    JobError,
+    Reporter,
+    TakeFolder,
+    Verdict,
+    path_error,
+)
+from ...footage.images import read_png
+from ...gaussians.ply import write_ply
+from ...scene import Scene
+from ...shot import Shot, disk_error, is_disk_full, remove_file, write_json
+from ...solve.stmap import write_take_map
+from ...torch_types import from_numpy
+from ..exr import read_frozen_exr
+from ..frozen import FrozenGaussians, OutputFrame
+from .cameras import in_range, intrinsics
+from .contact_sheet import write_contact_sheet
+from .folder import clear, made_before, place_of, take_over
+from .footage_facts import footage_facts
+from .frames import make_ready, render_frames, small_share
+from .plan import FrameSpec, PlannedTake, planned, run_verdict
+from .verdict import judge_take, unsure
+from .video import write_video
+
+
+def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
+    """Renders a take of a run and writes EXRs, previews, contact sheet, video and PLY into takes/<name>.
+
+    Returns the take's figures (also in take.json). JobError in words if it cannot be done.
+    """
+    take = planned(shot, params, report)
+    frames = in_range(take.whole, params)
+    place = place_of(take, params)
+    if place.of_before:
+        report.warning(*made_before(params.take))
+    done = place.right_here | place.right_beside
+    make_ready(take, frames, done, report)  # what can fail, or be cancelled, before anything of before goes
+    if place.beside is None:
+        clear(take, done)
+    shares = render_frames(dataclasses.replace(take, folder=place.folder), frames, done, report)
+    if place.beside is not None:
+        take_over(take, place)
+    frames_on_disk = done | {f.frame for f in frames}
+    facts = finish(shot, params, take, [f for f in take.whole if f.frame in frames_on_disk], shares, report)
+    shot.update(t_star=take.t_star)
+    if take.spec.run.stale:
+        report.warning(
+            "The run was trained while it was frozen: the take shows what it was before.", "Freeze it again."
+        )
+    return facts
+
+
+def finish(
+    shot: Shot, params: FreezeParams, take: PlannedTake, frames: list[OutputFrame], shares: dict[int, Tensor],
+    report: Reporter,
+) -> dict[str, Any]:  # fmt: skip
+    """Contact sheet, video, PLY and take.json of all frames that the take has by now; they are on disk.
+
+    Returns what take.json holds. `shares` as `render_frames` gives them. JobError if the disk is full.
+    """
+    try:
+        return _finish(shot, params, take, frames, shares, report)
+    except OSError as error:
+        raise (disk_error(take.folder.root) if is_disk_full(error) else error) from error
+
+
+def _finish(
+    shot: Shot, params: FreezeParams, take: PlannedTake, frames: list[OutputFrame], shares: dict[int, Tensor],
+    report: Reporter,
+) -> dict[str, Any]:  # fmt: skip
+    folder, scene, t_star, spec = take.folder, take.scene, take.t_star, take.spec
+    run, size = spec.run, spec.size
+    numbers = [f.frame for f in frames]
+    report.progress("finishing the take", 0, 3, "contact sheet")
+    previews = [folder.preview(n) for n in numbers]
+    made_of = _made_of(folder, numbers, spec, shares)
+    inputs = {"t_star_per_frame": params.t_star_per_frame, "camera_path": params.camera_path}
+    verdict = judge_take({"t_star_frame": t_star, **inputs, "detail": made_of.get("detail")}, run_verdict(run))
+    info = shot.info()
+    title = f"{info.name}, {Path(info.source).name}: t* = frame {t_star}, run {params.run}"
+    with missable("contact sheet", report):
+        _contact_sheet(shot, params, numbers, previews, title, t_star, verdict)
+    report.check_cancelled()
+    report.progress("finishing the take", 1, 3, "video")
+    with missable("video", report):
+        note = write_video(folder.video, (read_png(p) for p in previews), info.fps or 24.0)
+        if note:
+            report.warning(note)
+    report.progress("finishing the take", 2, 3, "PLY")
+    frozen = spec.instants.at(float(t_star), report)
+    with missable("PLY", report):
+        _write_ply(folder.ply, frozen, scene)
+    redistort = _redistort(shot, folder, size, spec.beyond, intrinsics(frames), report)
+    facts = {
+        "version": 1,
+        "key": take.key,
+        "take": params.take,
+        "run": params.run,
+        "checkpoint": run.stamp,
+        "t_star_frame": t_star,
+        "t_star_per_frame": params.t_star_per_frame,
+        "camera_path": params.camera_path,
+        "query": params.query,
+        **({"developed": spec.instants.frames} if params.develop == "on" else {}),
+        "width": size[0],
+        "height": size[1],
+        "overscan": params.overscan,
+        "margin": list(spec.beyond),
+        "redistort": str(redistort or ""),
+        "first": numbers[0],
+        "last": numbers[-1],
+        "frames": len(numbers),
+        "frames_in_all": len(take.whole),
+        **({} if params.t_star is None else {"t_star_asked": params.t_star}),
+        "fps": shot.info().fps,
+        "scale": scene.scale,
+        "grain": None if spec.grain is None else spec.grain.to_json(),
+        "footage": footage_facts(shot, folder.root),
+        "exr_dir": str(folder.root),
+        "contact_sheet": str(folder.contact_sheet),
+        "video": str(folder.video),
+        "ply": str(folder.ply),
+        **made_of,
+        **({} if verdict is None else {"verdict": vars(verdict)}),
+    }
+    write_json(folder.facts, facts)
+    report.image("contact sheet", folder.contact_sheet)
+    report.progress("finishing the take", 3, 3, "done")
+    return facts
+
+
+@contextlib.contextmanager
+def missable(what: str, report: Reporter) -> Generator[None]:
+    """Writes a file that a take can do without: on Windows that of before cannot be replaced while a player has it
+    open. A full disk is none of these."""
+    try:
+        yield
+    except OSError as error:
+        told = None if is_disk_full(error) else path_error(error)
+        if told is None:
+            raise
+        report.warning(f"The {what} is not written: {told.message}", "The frames are. Close it, then freeze again.")
+
+
+def _made_of(folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]) -> dict[str, Any]:
+    """What take.json says of plate detail; {} without it. `shares` are of the frames that this job rendered."""
+    if spec.detail is None:
+        return {}
+    for n in (n for n in numbers if n not in shares):
+        frame = read_frozen_exr(folder.frame(n))
+        if frame.detail is not None:
+            plate, support = (np.asarray(layer, np.float32) for layer in (frame.detail.plate, frame.support))
+            shares[n] = small_share(from_numpy(plate), from_numpy(support))
+    return {"detail": detail_facts(shares), "warp_dir": str(folder.warps)}
+
+
+def _redistort(
+    shot: Shot, folder: TakeFolder, size: tuple[int, int], beyond: tuple[int, int], Ks: np.ndarray, report: Reporter
+) -> Path | None:
+    """The map back through the lens over overscanned frames; None where the shot's own map fits, or none does."""
+    remove_file(folder.redistort)
+    if not any(beyond):
+        return None
+    try:
+        return write_take_map(shot, folder.redistort, *size, beyond, Ks)
+    except JobError as error:
+        if error.exit_code != ExitCode.SOLVE:
+            raise
+        report.warning(f"{error.message} The take has no ST map.", error.hint)
+        return None
+
+
+def _contact_sheet(
+    shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int,
+    verdict: Verdict | None,
+) -> None:  # fmt: skip
+    seen = [i for i, n in enumerate(numbers) if shot.plate(n).is_file()]  # all but those that the footage lacks
+    own_poses = not params.camera_path and bool(seen)
+    if own_poses:
+        previews, numbers = [previews[i] for i in seen], [numbers[i] for i in seen]
+    plates = [shot.plate(n) for n in numbers]
+    path = TakeFolder(shot.take(params.take)).contact_sheet
+    note, doubt = ("", set[int]()) if verdict is None else (" ".join(verdict.lines()), unsure(verdict, numbers))
+    write_contact_sheet(
+        path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt
+    )
+
+
+def _write_ply(path: Path, frozen: FrozenGaussians, scene: Scene) -> None:
+    """The frozen instant in solve units, as every splat viewer reads it."""
+    s = {name: value.cpu() for name, value in frozen.state.items()}
+    means = s["means"].double() / scene.scale + from_numpy(scene.centre)
+    sh = torch.cat([s["sh0"], s["shN"]], dim=1)
+    write_ply(
+        path, means.float().numpy(), s["quats"].numpy(), (s["log_scales"] - float(np.log(scene.scale))).numpy(),
+        s["opacity_logits"].numpy(), sh.numpy(),
+    )  # fmt: skip
+
+
+def detail_facts(shares: dict[int, Tensor]) -> dict[str, Any]:
+    """What a take's frames are made of, for take.json: means over frames, and each frame with a grid of regions.
+
+    `plate_share` is the mean share of plate; `invented_share` the share of pixels of which splats invented more than
+    half; `regions` the same on a grid of 4 x 4, rows from the top.
+    """
+    rows: list[dict[str, Any]] = []
+    for frame, share in sorted(shares.items()):
+        invented = (share < 0.5).float()
+        grid = torch.nn.functional.adaptive_avg_pool2d(invented[None, None], 4)[0, 0]
+        rows.append(
+            {
+                "frame": frame,
+                "plate_share": round(float(share.mean()), 4),
+                "invented_share": round(float(invented.mean()), 4),
+                "regions": [[round(float(v), 3) for v in row] for row in grid],
+            }
+        )
+    means = {name: round(float(np.mean([row[name] for row in rows])), 4) for name in ("plate_share", "invented_share")}
+    return {**means, "per_frame": rows}

@@ -1,0 +1,265 @@
+"""What a take will show, before any of it is rendered: its instant, its frames, what each of them is known by."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...contract import (
+    SUMMARY_FILE,
+    ExitCode,
+    FreezeParams,
+    JobError,
+    Reporter,
+    TakeFolder,
+    Verdict,
+    later,
+    parse_timecode,
+    read_json,
+    verdict_of,
+)
+from ...footage.color import LIGHTS
+from ...footage.importing import load_frames
+from ...footage.plates import Plates
+from ...scene import Scene, frame_table, load_scene
+from ...shot import Shot, content_key
+from ...solve.motion import find_motion, motion_key
+from ...solve.stmap import margin
+from ...torch_types import floats
+from ...train import LoadedRun, choose_device, load_run, static_views
+from ..composite.compositor import Detailer
+from ..composite.grain import Grain, measure_plate
+from ..frozen import CandidateInstant, OutputFrame, best_instants, rank_instants
+from ..instant.instants import Instants
+from .cameras import intrinsics, output_size, plan
+from .footage_facts import footage_light
+
+TAKE_VERSION = 2
+"""Rises when frames rendered before must not stand beside new ones."""
+DETAIL_VERSION = 20
+"""The same, of frames made of plates."""
+
+
+@dataclass
+class FrameSpec:
+    """What every frame of a take has in common."""
+
+    run: LoadedRun
+    """The run that is frozen."""
+    instants: Instants
+    """Its scenes at the take's instants."""
+    query: str
+    """As in `FreezeParams`."""
+    size: tuple[int, int]
+    """Width and height of the frames in pixels, without overscan."""
+    beyond: tuple[int, int]
+    """Pixels beyond the frame on the left and right, and above and below: overscan."""
+    grain: Grain | None
+    """The plate's, None if it is not wanted."""
+    grain_size: tuple[int, int]
+    """Width and height in pixels at which a frame's grain is drawn, without overscan."""
+    detail: Detailer | None = None
+    """Makes the frames of plates; None: splats alone."""
+    detail_key: str = ""
+    """Identifies the plates and mattes that it uses; empty without it."""
+    light: str = LIGHTS[0]
+    """Primaries of the light in which frames leave, one of `LIGHTS`: the footage's own."""
+    start: tuple[str, int, float] = ("", 0, 0.0)
+    """Timecode of one of the clip's frames, that frame's number, and frames per second; no code: the clip has none."""
+
+    def timecode(self, frame: int) -> str:
+        """Of a frame, as its file carries it: empty without one, and beyond 40 frames per second, which EXR cannot."""
+        code, at, fps = self.start
+        return later(code, frame - at, fps) if code and 1 <= round(fps) <= 40 else ""
+
+    @property
+    def whole(self) -> tuple[int, int]:
+        """Width and height of the frames in pixels, with overscan."""
+        return self.size[0] + 2 * self.beyond[0], self.size[1] + 2 * self.beyond[1]
+
+    @property
+    def whole_grain_size(self) -> tuple[int, int]:
+        """Width and height in pixels at which a frame's grain is drawn, with overscan."""
+        width, height = (n * w / s for n, w, s in zip(self.grain_size, self.whole, self.size, strict=True))
+        return round(width), round(height)
+
+    def key(self, output: OutputFrame) -> str:
+        """Identifies what a frame shows and from what, to tell stale frames from good ones."""
+        return content_key(
+            TAKE_VERSION,
+            self.run.stamp,
+            self.query,
+            self.size,
+            None if self.grain is None else [self.grain.to_json(), self.grain_size],
+            output.t_star,
+            output.exposed_like,
+            floats(output.viewmat.flatten()),
+            floats(output.K.flatten()),
+            *([self.beyond] if any(self.beyond) else []),
+            *([self.detail_key] if self.detail_key else []),
+            *([self.light] if self.light != LIGHTS[0] else []),
+            *([self.instants.keys[output.t_star]] if output.t_star in self.instants.keys else []),
+        )
+
+
+@dataclass(frozen=True)
+class PlannedTake:
+    """What a take will show, before any of it is rendered."""
+
+    folder: TakeFolder
+    """takes/NAME; or where its frames are rendered to."""
+    scene: Scene
+    """Of the shot."""
+    t_star: int
+    """Frame at which time stands still."""
+    whole: list[OutputFrame]
+    """All frames that it can have."""
+    spec: FrameSpec
+    """What they have in common."""
+    keys: dict[int, str]
+    """Frame -> `FrameSpec.key`."""
+    key: str
+    """`take_key`."""
+
+
+def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | None = None) -> PlannedTake:
+    """What `params` ask for. Nothing of the take is written; motion mattes are, if the shot has none.
+
+    `t_star`: the instant, where it is settled already; None: as `params` say, or suggested. JobError in words if it
+    cannot be done.
+    """
+    run = load_run(shot, params.run, choose_device(params.device, report, "Freezing"))
+    scene = load_scene(shot)
+    if t_star is None:
+        t_star = choose_t_star(shot, scene, run, params, report)
+    width, height = output_size(shot, scene, params)
+    whole = plan(scene, params, t_star, width, height)
+    folder = TakeFolder(shot.own(shot.take(params.take)))
+    for inner in (folder.previews, folder.redistort.parent, folder.warps, folder.next.root):
+        shot.own(inner)
+    beyond = margin(shot, params, width, height, intrinsics(whole))
+    grain = plate_grain(shot, scene) if params.grain else None
+    # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
+    plate = (shot.info().width, round(shot.info().width * height / width))
+    if params.detail == "on" or params.develop == "on":
+        find_motion(shot, report, static_model=static_views)  # of shots solved before the solve looked for it
+    detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
+    instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
+    spec = FrameSpec(
+        run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail),
+        footage_light(shot),
+        _start(shot),
+    )  # fmt: skip
+    keys = {f.frame: spec.key(f) for f in whole}
+    key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))
+    return PlannedTake(folder, scene, t_star, whole, spec, keys, key)
+
+
+def plate_detail(
+    shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, first: OutputFrame, size: tuple[int, int],
+    report: Reporter,
+) -> Detailer | None:  # fmt: skip
+    """What makes a take's frames of plates; None where `params` wants splats alone. `first` is any frame of the take.
+    The shot's motion mattes must have been found.
+
+    Plates are read at the scale of the frames, so that one pixel answers one: at their own size by default.
+    """
+    if params.detail == "off":
+        return None
+    plates = Plates(shot)
+    scale = float(first.K[0, 0]) / float(scene.Ks[0, 0, 0] * plates.width / scene.width)
+    if not params.camera_path and size != (plates.width, plates.height):
+        plates = Plates(shot, size)
+    elif params.camera_path and scale < 0.99:
+        plates = Plates(shot, (max(16, round(plates.width * scale)), max(16, round(plates.height * scale))))
+    if plates.note:
+        report.warning(plates.note)
+    return Detailer(run, scene, plates, bars=plates.bars)
+
+
+def detail_key(shot: Shot, detail: Detailer | None) -> str:
+    """Identifies what plate detail is made of, beside the run; empty without it."""
+    if detail is None or not isinstance(detail.plates, Plates):
+        return ""
+    return content_key(DETAIL_VERSION, detail.plates.key, motion_key(shot), dataclasses.asdict(detail.config))
+
+
+def plate_grain(shot: Shot, scene: Scene) -> Grain:
+    """Grain of the shot's undistorted frames, which frozen ones are mixed with."""
+    files = [shot.plate(n) for n in scene.frames]
+    return measure_plate([path for path in files if path.is_file()], scene.display)
+
+
+def run_verdict(run: LoadedRun) -> Verdict | None:
+    """The verdict on the run as it was trained last; None if its summary has none, or cannot be read."""
+    try:
+        return verdict_of(read_json(run.folder / SUMMARY_FILE))
+    except (OSError, ValueError):
+        return None
+
+
+def suggested_instants(shot: Shot, scene: Scene, run: LoadedRun) -> list[tuple[int, CandidateInstant]]:
+    """(frame number, figures) of the trained frames that are good instants to freeze, best first.
+
+    Only frames of the span that the run's verdict recommends are suggested: elsewhere the run does not show the clip.
+    """
+    trained, table = run.train_frames, frame_table(shot)
+    sharpness = np.array([table[f]["sharpness"] if f in table else 0.0 for f in trained])
+    ranking = rank_instants(run.model, np.array([scene.time_of_frame(f) for f in trained]), sharpness)
+    verdict = run_verdict(run)
+    if verdict is not None and len(verdict.instants) == 2:
+        first, last = verdict.instants
+        # A verdict of other frames than these recommends none of them: all are ranked then.
+        ranking = [i for i in ranking if first <= trained[i.index] <= last] or ranking
+    return [(trained[i.index], i) for i in best_instants(ranking)]
+
+
+def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, report: Reporter) -> int:
+    """The frame to freeze at, snapped to a trained one: a time that no frame constrains is a guess."""
+    trained = np.array(run.train_frames)
+    if params.t_star is None:
+        return suggested_instants(shot, scene, run)[0][0]
+    if not scene.frames[0] <= params.t_star <= scene.frames[-1]:
+        raise JobError(
+            f"t* is frame {params.t_star}, the shot has frames {scene.frames[0]} to {scene.frames[-1]}.",
+            "Choose a frame of the shot.",
+            ExitCode.FREEZE,
+        )
+    nearest = int(trained[np.abs(trained - params.t_star).argmin()])
+    if nearest != params.t_star:
+        report.warning(
+            f"Frame {params.t_star} was not trained on: time stands still at frame {nearest}, the nearest that was."
+        )
+    return nearest
+
+
+def _start(shot: Shot) -> tuple[str, int, float]:
+    """See `FrameSpec.start`."""
+    record = load_frames(shot)
+    return parse_timecode(str(record.get("timecode", ""))), int(record["frames"][0]["frame"]), float(record["fps"])
+
+
+def take_key(
+    run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, beyond: tuple[int, int] = (0, 0),
+    developed: Sequence[str] = (),
+) -> str:  # fmt: skip
+    """Identifies what a take shows. The frame range is not part of it. Frames have keys of their own, see
+    `FrameSpec.key`; this one tells about frames that were rendered before they had. `developed`: keys of the instants
+    that are."""
+    path = Path(params.camera_path) if params.camera_path else ""
+    return content_key(
+        TAKE_VERSION,
+        run.stamp,
+        t_star,
+        params.t_star_per_frame,
+        params.query,
+        width,
+        height,
+        path,
+        *([beyond] if any(beyond) else []),
+        *([list(developed)] if developed else []),
+    )

@@ -1,0 +1,26 @@
+"""What of the plates is no part of the scene, by the mask that the artist gave the solve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from ...shot import Shot
+from ...solve.masks import IGNORE, given_masks, load_mask
+from ...torch_types import from_numpy
+
+IgnoredOf = Callable[[int], "Tensor | None"]
+"""Frame number -> [h, w] in 0..1, what of its plate is no part of the scene, or None if all of it is."""
+
+
+def ignore_mattes(shot: Shot) -> IgnoredOf:
+    """What the masks of a shot's solve say is no part of the scene."""
+    if IGNORE not in given_masks(shot):
+        return lambda frame: None
+
+    def ignored(frame: int) -> Tensor | None:
+        mask = load_mask(shot, IGNORE, frame)
+        return None if mask is None else from_numpy(mask).float()
+
+    return ignored

@@ -1,0 +1,78 @@
+"""How the Gaussians of a frozen scene stand in the clip's other frames, as the run moves them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ...gaussians.model import PARAM_NAMES
+from ...scene import Scene
+from ...train import LoadedRun
+from ..frozen import FrozenGaussians, freeze_at
+
+_KEPT = 90
+"""Frames whose changes are kept: of 25,000 open Gaussians about 3 MB each."""
+
+
+class Travel:
+    """From a scene frozen at t* to the clip's frames.
+
+    What was closed at t* (`static_twin.py`) is not moved.
+    """
+
+    def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int) -> None:
+        self.run, self.scene = run, scene
+        rows = run.model.open_rows()
+        self.rows = rows[frozen.motion[rows] > 0.5]
+        """[M] int64, rows of the run's Gaussians that move."""
+        self.t_star = t_star
+        """Frame number."""
+        self._changes: dict[int, dict[str, Tensor]] = {}
+        self._at_t_star = self._field(t_star)
+
+    def moved(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
+        """The scene, or what it was developed to, as it is in a frame; with gradients."""
+        if frame == self.t_star or not len(self.rows):
+            return dict(state)
+        change = self._change(frame)
+        return {name: value.index_add(0, self.rows, change[name]) for name, value in state.items()}
+
+    @torch.no_grad()
+    def _change(self, frame: int) -> dict[str, Tensor]:
+        """What the field changes from t* to a frame, of the rows that move."""
+        if frame not in self._changes:
+            then, now = self._field(frame), self._at_t_star
+            self._changes[frame] = {name: then[name] - now[name] for name in PARAM_NAMES}
+            while len(self._changes) > _KEPT:
+                del self._changes[next(iter(self._changes))]
+        return self._changes[frame]
+
+    @torch.no_grad()
+    def _field(self, frame: int) -> dict[str, Tensor]:
+        state = freeze_at(self.run.model, self.scene.time_of_frame(frame), 1.0).state
+        return {name: state[name][self.rows] for name in PARAM_NAMES}
+
+
+class Stage:
+    """The scene as it stood in every frame of the clip: the run's own, or that which an instant was developed to."""
+
+    def __init__(
+        self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians | None = None, t_star: int | None = None
+    ) -> None:
+        """`frozen` is the scene at frame `t_star`; None or not developed: the run's own, and no t* is needed."""
+        self.run, self.scene, self.developed = run, scene, None
+        self.rows = run.model.open_rows()
+        """[M] int64, rows of the scene's Gaussians that move."""
+        self._travel = None
+        if frozen is not None and frozen.descent is not None:
+            assert t_star is not None
+            self.developed, self._travel = frozen, Travel(run, scene, frozen.descent, t_star)
+            self.rows = self._travel.rows
+
+    def at(self, frame: int) -> FrozenGaussians:
+        """The scene in a frame."""
+        if self.developed is None or self._travel is None:
+            return freeze_at(self.run.model, self.scene.time_of_frame(frame), 1.0)
+        return replace(self.developed, state=self._travel.moved(self.developed.state, frame))

@@ -1,0 +1,304 @@
+"""What a run knows of the clip's plates: where their surfaces are, what moves in them, what its own render missed.
+
+All of it is computed once for a plate and serves every frozen frame that uses that plate.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...scene import Scene, read_image, resize_intrinsics
+from ...shot import Shot
+from ...solve.motion import MOVING, UNKNOWN, load_motion
+from ...torch_types import from_numpy
+from ...train import LoadedRun
+from ..frozen import FrozenGaussians, FrozenImage, render_frozen
+from .decisions import above
+from .ignored import ignore_mattes
+from .regions import grown
+from .reproject import blurred, look_up, pixel_centres, resized, widened
+from .scene_flow import Stage
+from .visibility import Sighting, sighted
+
+MovingOf = Callable[[int], "Tensor | None"]
+"""Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
+DOUBT = 0.4
+"""How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
+_LENGTHS_OF = 640.0
+_VIEWS, _VIEWS_BYTES = 90, 700e6
+"""Plates kept at most. Between two uses of a plate, 16 frames apart, 80 others are looked at: with fewer every one was
+made three times on its way through a take."""
+_RESIDUALS_BYTES = 250e6
+_FINEST = 1280
+"""Width at which the model's own render of a plate is made at most: splats show no more, and 4K costs memory."""
+_ROWS = 256
+
+
+class PlateReader(Protocol):
+    """What plates are asked for: `footage.plates.Plates`."""
+
+    width: int
+    """Pixels of the undistorted plates."""
+    height: int
+    """Pixels."""
+    frames: list[int]
+    """Every frame of the clip's range that has a plate, ascending."""
+
+    deep: bool
+    """True if values may lie beyond 0 and 1."""
+
+    def display(self, frame: int) -> Tensor:
+        """[height, width, 3] float32, in the scene's display, uncut."""
+        ...
+
+    def linear(self, frame: int, rows: slice = ...) -> Tensor:
+        """The same, scene-linear: all of it, or some rows."""
+        ...
+
+
+@dataclass
+class PlateView:
+    """Plate m as the model has it, [h, w] at the size of decisions."""
+
+    viewmat: Tensor
+    """[4, 4] world-to-camera, scene units."""
+    K: Tensor
+    """[3, 3] pixels of the size of decisions."""
+    surface: Tensor
+    """[h, w, 3], looked up together: median depth; in 0..1, something that moves in the clip is seen there; in 0..1,
+    the model shows there what the plate shows, but for detail."""
+    picture: Tensor
+    """[h, w, 3] float16, the plate, display-referred."""
+    missed: Tensor
+    """[h, w] float16 in 0..1: low-passed difference between plate and the model's own render of it."""
+    offsets: Tensor
+    """[M, 3] means of the open Gaussians in that frame, scene units."""
+    shown: Tensor | None
+    """[h, w, 3] float16, the model's own render of it, where plates are no larger than decisions; else None."""
+    ignored: Tensor | None
+    """[h, w, 1] in 0..1: what of it is no part of the scene, as if something stood in front; None: nothing."""
+
+
+@dataclass(frozen=True)
+class SightingConfig:
+    """At what size plates are looked at for decisions, and how finely. Lengths are in pixels of pictures 640 wide."""
+
+    width: int = 640
+    """Mattes, depth and visibility are compared at this width at most: they are soft, and the model is no finer."""
+    depth_tolerance: float = 0.03
+    """Share of the depth by which a point may lie off the surface that a plate shows and still be it."""
+    margin: int = 2
+    """What moves is widened by this: the flow's own error, motion blur."""
+    lowpass: float = 4.0
+    """Sigma under which plate and render are compared: splats are soft, that alone contradicts nothing."""
+    unexplained: float = 0.1
+    """Low-passed difference, display-referred, at which a plate is believed 1/e."""
+    region: int = 4
+    """A difference speaks for so many pixels around it: half-rejected movers leave their outlines."""
+    contradicted: float = 0.2
+    """Low-passed difference, display-referred, from which on a pixel beside what moves belongs to it."""
+    reach: int = 16
+    """How far from what the matte calls moving such a region may go: a model that is wrong all over has no end."""
+    thin: int = 2
+    """Half the width below which such a difference is an edge, not a region."""
+
+
+class Sightings:
+    """The plates of a clip as one run sees them."""
+
+    def __init__(
+        self,
+        run: LoadedRun,
+        scene: Scene,
+        plates: PlateReader,
+        moving: MovingOf | None = None,
+        config: SightingConfig | None = None,
+        frozen: FrozenGaussians | None = None,
+        t_star: int | None = None,
+    ) -> None:
+        """`moving` None: the shot's motion mattes, and where it has none the model's own matte.
+
+        `frozen`: an instant that was developed, at frame `t_star`, which then is the model; None: the run.
+        """
+        self.run, self.scene, self.plates = run, scene, plates
+        self.moving = moving or motion_mattes(Shot(scene.folder.parent))
+        self.ignored = ignore_mattes(Shot(scene.folder.parent))
+        self.config = config or SightingConfig()
+        self.index = {frame: i for i, frame in enumerate(scene.frames)}
+        have = set(plates.frames)
+        self.frames = [frame for frame in scene.frames if frame in have]
+        """Frames of the clip that have both a plate and a camera, ascending."""
+        width = min(plates.width, self.config.width)
+        self.size = width, max(8, round(plates.height * width / plates.width))
+        self.unit = width / _LENGTHS_OF
+        """Pixels of decisions to a pixel in which lengths are configured."""
+        self.stage = Stage(run, scene, frozen, t_star)
+        """The model in every frame."""
+        self.rows = self.stage.rows.cpu()
+        views = scene.viewmats
+        self.centres = -torch.einsum("nji,nj->ni", views[:, :3, :3], views[:, :3, 3])
+        """[F, 3] camera centres of the clip's frames, scene units."""
+        self._views: OrderedDict[int, PlateView] = OrderedDict()
+        self._residuals: OrderedDict[int, Tensor] = OrderedDict()
+        self._displayed: tuple[int, Tensor] | None = None
+        self._most: dict[int, float] = {}
+
+    def camera(self, frame: int, width: int, height: int) -> tuple[Tensor, Tensor]:
+        """(viewmat [4, 4], K [3, 3]) of a frame of the clip at a picture size."""
+        i = self.index[frame]
+        return (
+            self.scene.viewmats[i],
+            resize_intrinsics(self.scene.Ks[i][None], self.scene.width, self.scene.height, width, height)[0],
+        )
+
+    def view(self, frame: int) -> PlateView:
+        """Plate `frame` as the model has it."""
+        if frame not in self._views:
+            self._views[frame] = self._make_view(frame)
+            width, height = self.size
+            shown = 6.0 if self.size == (self.plates.width, self.plates.height) else 0.0
+            each = (20.0 + shown) * width * height + 12.0 * len(self.rows)
+            room = _VIEWS_BYTES - 24.0 * self.plates.width * self.plates.height  # frames of 4K need it more
+            while len(self._views) > max(12, min(_VIEWS, room / each)):
+                self._views.popitem(last=False)
+        self._views.move_to_end(frame)
+        return self._views[frame]
+
+    def residual(self, frame: int) -> Tensor:
+        """[H, W, 3] float16: plate `frame` less the model's own render of it, display-referred, at the plates' size."""
+        if frame not in self._residuals:
+            self._residuals[frame] = self._missed(frame)
+            each = 6.0 * self.plates.width * self.plates.height
+            while len(self._residuals) > max(5, min(16, _RESIDUALS_BYTES / each)):
+                self._residuals.popitem(last=False)
+        self._residuals.move_to_end(frame)
+        return self._residuals[frame]
+
+    def displayed(self, frame: int) -> Tensor:
+        """[H, W, 3] float16: plate `frame`, display-referred, uncut; the last one that was asked for is kept."""
+        if self._displayed is None or self._displayed[0] != frame:
+            self._displayed = frame, self.plates.display(frame).half()
+        return self._displayed[1]
+
+    def most(self, frame: int) -> float:
+        """The largest number in plate `frame`."""
+        if frame not in self._most:
+            self.residual(frame)
+        return self._most[frame]
+
+    def difference(self, a: Tensor, b: Tensor, lowpass: float = 0.5) -> Tensor:
+        """[h, w] greatest difference over channels of two pictures [h, w, 3] of decisions, under `lowpass` of ours."""
+        h, w = a.shape[:2]
+        sigma = lowpass * self.config.lowpass * self.unit
+        if sigma < 1.5:
+            return blurred(a - b, sigma).abs().amax(dim=-1)
+        half = resized(a - b, (w + 1) // 2, (h + 1) // 2)  # what is left needs no more pixels
+        return resized(blurred(half, 0.5 * sigma).abs().amax(dim=-1), w, h)
+
+    def seen(self, frame: int, points: Tensor) -> Sighting:
+        """Where plate `frame` shows world points [..., 3]."""
+        view = self.view(frame)
+        return sighted(points, view.viewmat, view.K, view.surface, view.ignored, self.config.depth_tolerance)
+
+    def whole(self, moving: Tensor, differs: Tensor) -> Tensor:
+        """[h, w] in 0..1: `moving`, and the regions that touch it in which plate and model differ (`differs`).
+
+        Flow ends some pixels before what moves does, or says nothing within it. What was missed would stand where it
+        is as specks and outlines.
+        """
+        if not bool(moving.any()):
+            return moving
+        reach, thin = (round(length * self.unit) for length in (self.config.reach, self.config.thin))
+        return grown(moving, differs, reach, thin)
+
+    def contradicted(self, off: Tensor) -> Tensor:
+        """[h, w] in 0..1: where plate and model differ enough, by `off` [h, w], to be of what moves beside it."""
+        return above(off, self.config.contradicted)
+
+    def _missed(self, frame: int) -> Tensor:
+        width, height = self.plates.width, self.plates.height
+        fine = min(1.0, _FINEST / width)
+        shown = self.view(frame).shown
+        if shown is None:
+            shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
+        plate = self.plates.display(frame)
+        self._most[frame] = float(plate.max())
+        out = torch.empty(height, width, 3, dtype=torch.float16, device="cpu")
+        ignored = self.view(frame).ignored
+        if fine == 1.0 and ignored is None:
+            return torch.sub(plate, shown).half()
+        for top in range(0, height, _ROWS):  # a second picture of 4K would be another 100 MB
+            rows = plate[top : top + _ROWS]
+            at = pixel_centres(width, len(rows))
+            at[..., 1] += top
+            missed = rows - look_up(shown, at * fine)
+            if ignored is not None:
+                missed = missed * (1.0 - look_up(ignored, at * (self.size[0] / width)))
+            out[top : top + _ROWS] = missed.half()
+        return out
+
+    def _own_render(self, frame: int, width: int, height: int) -> tuple[FrozenGaussians, FrozenImage]:
+        time = self.scene.time_of_frame(frame)
+        frozen = self.stage.at(frame)
+        viewmat, K = self.camera(frame, width, height)
+        return frozen, render_frozen(frozen, viewmat, K, width, height, self.run.model.exposure, time)
+
+    def _make_view(self, frame: int) -> PlateView:
+        width, height = self.size
+        frozen, image = self._own_render(frame, width, height)
+        matte = self.moving(frame)
+        moving = image.motion if matte is None else resized(matte, width, height)
+        # The working frame will do, and need not be decoded from 4K footage.
+        plate = read_image(self.scene.image_path(self.index[frame]), width, height, self.scene.display)
+        ignored = self._ignored(frame)
+        if ignored is not None:  # there is nothing that the model could miss
+            plate = torch.lerp(plate, image.color, ignored)
+        missed = self.difference(plate, image.color)
+        off = self.difference(plate, image.color, 1.0)
+        region = round(self.config.region * self.unit)
+        off = blurred(widened(off, region), 0.5 * region)
+        explained = torch.exp(-(off / self.config.unexplained).square()).half().float()
+        return PlateView(
+            *self.camera(frame, width, height),
+            torch.stack([image.depth, widened(moving, round(self.config.margin * self.unit)), explained], dim=-1),
+            plate.half(),
+            missed.half(),
+            frozen.state["means"].cpu()[self.rows],
+            image.color.half() if self.size == (self.plates.width, self.plates.height) else None,
+            ignored,
+        )
+
+    def _ignored(self, frame: int) -> Tensor | None:
+        """As in `PlateView`: widened as mattes are, with a soft edge."""
+        mask = self.ignored(frame)
+        if mask is None or not bool((mask > 0).any()):
+            return None
+        margin = max(1, round(self.config.margin * self.unit))
+        return blurred(widened(resized(mask, *self.size), 2 * margin), 0.5 * margin).clamp(0.0, 1.0)[..., None]
+
+
+def motion_mattes(shot: Shot) -> MovingOf:
+    """The motion mattes of a shot as `MovingOf`: 0 still, `DOUBT` unknown, 1 moving."""
+
+    def moving(frame: int) -> Tensor | None:
+        stored = load_motion(shot, frame)
+        return None if stored is None else matte_of(stored)
+
+    return moving
+
+
+def matte_of(stored: NDArray[np.uint8]) -> Tensor:
+    """[h, w] in 0..1 of a motion matte as it is stored, [h, w]: 0 still, `DOUBT` unknown, 1 moving."""
+    matte = torch.zeros(stored.shape, device="cpu")
+    codes = from_numpy(stored)
+    matte[codes == UNKNOWN] = DOUBT
+    matte[codes == MOVING] = 1.0
+    return matte

@@ -1,0 +1,90 @@
+"""The shot's working frames as an instant is developed from them: pictures and what moves in them, at one size."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ...scene import Scene, read_image
+from ...shot import Shot
+from ...train.model import gathered
+from ..frozen import FrozenGaussians
+from .ignored import ignore_mattes
+from .reproject import resized, widened
+from .source_views import MovingOf
+
+_SEEN = 0.05
+"""Pixels that a camera has to see of a Gaussian before it can say whether that moves."""
+
+
+class WorkingPlates:
+    """Pictures, cameras and mattes of a shot's frames at `width` pixels, at most the working frames' own."""
+
+    def __init__(self, scene: Scene, width: int, moving: MovingOf, margin: float, device: torch.device) -> None:
+        """`margin`: pixels of pictures 640 wide around what moves that count as moving too."""
+        self.scene, self.moving, self.device = scene, moving, device
+        self.width = min(scene.width, width)
+        self.height = max(16, round(scene.height * self.width / scene.width))
+        self.index = {frame: i for i, frame in enumerate(scene.frames)}
+        self.margin = round(margin * self.width / 640)
+        self._Ks, self._viewmats = scene.camera_at(self.width, self.height).to(device), scene.viewmats.to(device)
+        self._pictures: dict[int, Tensor] = {}
+        self._mattes: dict[int, Tensor] = {}
+        self._ignored = ignore_mattes(Shot(scene.folder.parent))
+
+    def camera(self, frame: int) -> tuple[Tensor, Tensor, int, int]:
+        """(world-to-camera [4, 4], K [3, 3], width, height) of a frame, as `render` wants them."""
+        i = self.index[frame]
+        return self._viewmats[i], self._Ks[i], self.width, self.height
+
+    def centre(self, frame: int) -> Tensor:
+        """[3] where a frame's camera is, scene units."""
+        viewmat = self._viewmats[self.index[frame]]
+        return -viewmat[:3, :3].T @ viewmat[:3, 3]
+
+    def picture(self, frame: int) -> Tensor:
+        """[H, W, 3] in 0..1 of the scene's display."""
+        if frame not in self._pictures:
+            path = self.scene.image_path(self.index[frame])
+            image = read_image(path, self.width, self.height, self.scene.display)
+            self._pictures[frame] = (image * 255.0).round().byte()
+        return self._pictures[frame].to(self.device).float() / 255.0
+
+    def matte(self, frame: int) -> Tensor:
+        """[H, W] in 0..1; still where nobody has looked."""
+        if frame not in self._mattes:
+            found = self.moving(frame)
+            found = torch.zeros(self.height, self.width, device="cpu") if found is None else found
+            found = resized(found.float(), self.width, self.height)
+            self._mattes[frame] = widened(found, self.margin).half()
+        return self._mattes[frame].to(self.device).float()
+
+    def ignored(self, frame: int) -> Tensor | None:
+        """bool [H, W]: what of a frame is no part of the scene, and around it; None: nothing."""
+        mask = self._ignored(frame)
+        if mask is None:
+            return None
+        return (widened(resized(mask, self.width, self.height), max(1, self.margin)) > 0.0).to(self.device)
+
+    def moving_share(self, frozen: FrozenGaussians, frame: int) -> Tensor:
+        """[N] in 0..1: of what a frame's camera sees of each Gaussian, the share that lies in what moves there."""
+        matte = self.matte(frame)
+        weights = torch.stack([matte, torch.ones_like(matte)], dim=-1)
+        inside, whole = gathered(frozen.state, *self.camera(frame), weights).unbind(1)
+        return torch.where(whole > _SEEN, inside / whole.clamp_min(1e-6), 0.0)
+
+
+def showing(trained: list[int], t_star: int) -> list[int]:
+    """The trained frames that show an instant: its own, else the nearest on either side of it."""
+    if t_star in trained:
+        return [t_star]
+    before, after = [f for f in trained if f < t_star], [f for f in trained if f > t_star]
+    return [*before[-1:], *after[:1]]
+
+
+def spread(frames: list[int], most: int) -> list[int]:
+    """At most so many of ascending frames, evenly."""
+    if len(frames) <= most:
+        return list(frames)
+    step = len(frames) / max(1, most)
+    return [frames[int((n + 0.5) * step)] for n in range(most)]
