@@ -4,7 +4,7 @@
 // motion, explained; ignored: [height][width] or null; pixels: [count][2]; depth, visible, moving, explained: [count].
 using I = int __attribute__((ext_vector_type(16)));
 auto fma = FN(F a, F b, F c) -> F { return __builtin_elementwise_fma(a, b, c); };
-#include "../../kernels/exp2.cpp"
+#include "../../../kernels/exp2.cpp"
 const long long N = P.count, W = P.width, H = P.height;
 const float* V = P.camera;
 const float fx = V[12], fy = V[13], cx = V[14], cy = V[15], wide = (float)W, high = (float)H;
