@@ -22,7 +22,7 @@ from torch import Tensor
 
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.make import scene_name
-from benchmarks.synthetic.shot import SolvedPixels, exact_shot, solved_shot
+from benchmarks.synthetic.shot import SolvedPixels, exact_shot, similarity_to_exact, solved_shot
 from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import read_json
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
@@ -85,6 +85,18 @@ class SyntheticTruth:
         seen, moving = (_nearest(mask, width, height) for mask in (regions.seen, regions.moving))
         things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
         return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving, **things}
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Metres per solve unit of the shot: 1 with exact cameras."""
+        return 1.0 if self.cameras == "exact" else similarity_to_exact(self._scene, self.shot).scale
+
+    def depth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
+        """[height, width] metres along the camera's axis, to a millimetre, inf for sky; of the nearest pixel."""
+        depth = self._pixels.regions(self._scene.regions(t_star, pose)).depth
+        return torch.nn.functional.interpolate(
+            torch.from_numpy(depth)[None, None], (height, width), mode="nearest-exact"
+        )[0, 0]
 
     def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
         """What was rendered without the scene's thing, as `truth` is."""

@@ -1,0 +1,159 @@
+"""What each rule of the freeze is worth: `python -m benchmarks.ablate SCENE ... --clip SHOT ... --results DIR`.
+
+Every rule and term of the freeze is switched off by itself, and in named combinations (`switches.py`). SCENE is a
+folder of benchmarks/synthetic, SHOT a trained clip. Against truth: dB of delivered and developed frames by region, and
+recall of things. On clips, at instants drawn by a seed that nothing was tuned at: dB of still pixels, flow left and
+flicker between neighbouring frozen frames, CPU seconds. Each variant at each instant is one JSON file in
+DIR/ablate/CODE, so that an interrupted run goes on where it was. `--table` prints the tables of what is there.
+
+Flicker is the mean absolute difference of two neighbouring frozen frames, the second brought to the first by frozen
+depth and cameras, over the pixels that both see, of 255. The spread in the table is the standard deviation over
+instants, scenes and seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import torch
+
+from benchmarks.ablate.cases import Case, clip_case, pairs_of, scene_case
+from benchmarks.ablate.instants import Instants
+from benchmarks.ablate.measures import FrameMaker, Row, judge, poses_of
+from benchmarks.ablate.switches import of_frames, variants
+from benchmarks.ablate.table import CLIPS, MASKS, TRUTH, Store, case_table, code_version, table
+from torch_backend.contract import JobError
+from torch_backend.native import default_threads
+
+ROOT = Path(__file__).resolve().parents[2]
+SHOWN_BY_CASE = ("today", "null", "P")
+"""Variants whose figures are told for each case."""
+
+
+class Ablation:
+    """One run of the bench."""
+
+    def __init__(self, store: Store, kept: Path, args: argparse.Namespace) -> None:
+        self.store, self.kept, self.args = store, kept, args
+        self.ends = time.monotonic() + args.seconds if args.seconds else float("inf")
+
+    def run(self, cases: Sequence[Case]) -> None:
+        """Measures what has no record yet: the first instant of every case, then the second, until time is up."""
+        most = self.args.instants or max(len(case.t_stars) for case in cases)
+        for n in range(most):
+            for case in cases:
+                if n < len(case.t_stars):
+                    self._instant(case, case.t_stars[n])
+
+    def _instant(self, case: Case, t_star: int) -> None:
+        names = variants(tuple(self.args.variants))
+        if case.truth is None and self.args.clip_variants:
+            names = variants(tuple(self.args.clip_variants))
+        todo = {name: off for name, off in names.items() if not self.store.has(case.name, t_star, name)}
+        instants = Instants(case.clip, t_star, self.kept)
+        for scene_off, group in _by_scene(todo):
+            if time.monotonic() > self.ends:
+                return
+            since = time.monotonic()
+            self._scene(case, instants, scene_off, group)
+            what = f"{len(group)} variants on the scene without {', '.join(sorted(scene_off)) or 'nothing'}"
+            print(f"{case.name}, t* {t_star}: {what}, {time.monotonic() - since:.0f} s", flush=True)
+
+    def _scene(
+        self, case: Case, instants: Instants, scene_off: frozenset[str], group: dict[str, frozenset[str]]
+    ) -> None:
+        t_star, made = instants.t_star, instants.make(scene_off)
+        done = {name: self._judged(case, t_star, made.key, of_frames(off)) for name, off in group.items()}
+        left = {name: of_frames(off) for name, off in group.items() if done[name] is None}
+        if left:
+            poses = [] if case.truth is None else poses_of(case.truth, t_star, self.args.every)
+            pairs = [] if case.truth is not None else pairs_of(case, t_star, self.args.pairs, self.args.draw)
+            done |= judge(case, FrameMaker(case.clip, t_star, made), left, poses, pairs)
+        for name, row in done.items():
+            assert row is not None
+            facts = {"scene": made.key, "frame_rules": sorted(of_frames(group[name])), "seconds": made.seconds}
+            self.store.save(case.name, t_star, name, row | facts)
+
+    def _judged(self, case: Case, t_star: int, key: str, off: frozenset[str]) -> Row | None:
+        """The figures of another variant that is the same scene with the same rules of frames off; None: there is
+        none."""
+        place = self.store.path(case.name, t_star, "today").parent
+        for record in Store(place.parent).records() if place.is_dir() else ():
+            if (record["t_star"], record["scene"], record["frame_rules"]) == (t_star, key, sorted(off)):
+                return {"frames": record["frames"]}
+        return None
+
+
+def _by_scene(todo: dict[str, frozenset[str]]) -> Iterator[tuple[frozenset[str], dict[str, frozenset[str]]]]:
+    """(rules of the scene that are off, variants that share them)."""
+    groups: dict[frozenset[str], dict[str, frozenset[str]]] = {}
+    for name, off in todo.items():
+        groups.setdefault(off - of_frames(off), {})[name] = off
+    yield from groups.items()
+
+
+def tables(store: Store) -> list[str]:
+    """All tables of what was measured."""
+    records = store.records()
+    lines = [f"Records of the freeze {store.folder.name}: {len(records)}."]
+    for title, columns in (("Against truth", TRUTH), ("On clips", CLIPS), ("Masks painted by hand", MASKS)):
+        lines += ["", f"{title}: difference to `today`, mean ± standard deviation over instants, scenes and seeds", ""]
+        lines += table(records, columns)
+        lines += ["", *case_table(records, columns, SHOWN_BY_CASE)]
+    drawn = sorted({(record["case"], record["t_star"]) for record in records})
+    return [*lines, "", "Instants: " + ", ".join(f"{case} {t_star}" for case, t_star in drawn) + "."]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", type=Path, metavar="SCENE")
+    parser.add_argument("--clip", action="append", type=Path, default=[], metavar="SHOT", help="a trained shot")
+    parser.add_argument("--run", default="main", metavar="NAME", help="of clips")
+    parser.add_argument("--results", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--lent", type=Path, metavar="DIR", help="results of benchmarks.detail_truth to copy runs from")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], metavar="N", help="of the trainings of scenes")
+    parser.add_argument("--draw", type=int, default=62, metavar="N", help="seed of the instants and frames of clips")
+    parser.add_argument(
+        "--variants", nargs="+", default=["combinations", "frame", "scene"], metavar="NAME",
+        help="groups (combinations, frame, scene) or single variants",
+    )  # fmt: skip
+    parser.add_argument(
+        "--clip-variants", nargs="+", metavar="NAME", help="the same, of clips (default: as --variants)"
+    )
+    parser.add_argument("--every", type=int, default=3, metavar="K", help="only every K-th pose of a scene")
+    parser.add_argument("--pairs", type=int, default=2, metavar="N", help="neighbouring frames of a clip's instant")
+    parser.add_argument("--instants", type=int, default=0, metavar="N", help="of each case at most (default: all)")
+    parser.add_argument("--seconds", type=float, default=0.0, metavar="S", help="start nothing after so many")
+    parser.add_argument("--table", action="store_true", help="only print what is there")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    args = _parser().parse_args(argv)
+    torch.set_num_threads(default_threads())
+    how = f"every{args.every}-pairs{args.pairs}-draw{args.draw}"
+    store = Store(args.results / "ablate" / f"{code_version(ROOT)}-{how}")
+    try:
+        if not args.table:
+            results = args.results.absolute()
+            cases = [scene_case(folder, seed, results, args.lent) for seed in args.seeds for folder in args.scenes]
+            cases += [clip_case(path, args.run, args.draw) for path in args.clip]
+            if cases:
+                Ablation(store, args.results / "ablate" / "instants", args).run(cases)
+    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    print("\n".join(["", *tables(store)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,121 @@
+"""Instants of one t*, made with rules off. Steps that several variants share are made once."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.ablate.switches import STAGES, of_stage, replaced, switched_off
+from benchmarks.detail_clip import DetailClip
+from torch_backend.freeze.frozen import FrozenGaussians
+from torch_backend.freeze.instant import instants as developed_instants
+
+
+@dataclass
+class Instant:
+    """A scene frozen at t*, made with some rules off."""
+
+    frozen: FrozenGaussians
+    """The scene."""
+    key: str
+    """Identifies its content: variants that have it alike are the same scene."""
+    seconds: dict[str, float]
+    """CPU seconds of each step that made it."""
+
+
+class Instants:
+    """Makes the instants of one t* of a clip. Results of steps are kept by what went into them."""
+
+    def __init__(self, clip: DetailClip, t_star: int, folder: Path | None = None) -> None:
+        """`folder`: where developed scenes are kept for a later process; None: nowhere."""
+        self.clip, self.t_star, self.folder = clip, t_star, folder
+        self._kept: dict[str, tuple[Any, float]] = {}
+
+    def make(self, off: frozenset[str]) -> Instant:
+        """The instant with rules `off`."""
+        seconds: dict[str, float] = {}
+        run, scene = self.clip.run, self.clip.scene
+        field = self.clip.field(self.t_star)
+        config = developed_instants.config_for(run)
+        with self._sharing(off, seconds), switched_off(off):
+            made = developed_instants._make(self.clip.shot, run, scene, self.t_star, field, config)  # pyright: ignore[reportPrivateUsage]
+        return Instant(made, digest(made), seconds)
+
+    @contextlib.contextmanager
+    def _sharing(self, off: frozenset[str], seconds: dict[str, float]) -> Iterator[None]:
+        """While this lasts, steps that are asked again with the same input answer with what they made before."""
+        with contextlib.ExitStack() as stack:
+            for stage in filter(partial(hasattr, developed_instants), STAGES):
+                # A step that is off as a whole is replaced over this, and costs nothing.
+                stack.enter_context(replaced("developed_instants", stage, self._shared(stage, off, seconds)))
+            yield
+
+    def _shared(
+        self, stage: str, off: frozenset[str], seconds: dict[str, float]
+    ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+        rules = sorted(of_stage(off, stage))
+
+        def wrap(step: Callable[..., Any]) -> Callable[..., Any]:
+            def shared(*args: Any, **more: Any) -> Any:
+                key = f"{stage}-{digest([rules, args, more])}"
+                if key not in self._kept:
+                    self._kept[key] = self._made(stage, key, lambda: step(*args, **more))
+                made, took = self._kept[key]
+                seconds[stage] = seconds.get(stage, 0.0) + took
+                return made
+
+            return shared
+
+        return wrap
+
+    def _made(self, stage: str, key: str, make: Callable[[], Any]) -> tuple[Any, float]:
+        """(what a step makes, its CPU seconds): from the folder if it lies there."""
+        path = None if self.folder is None or stage != "develop" else self.folder / f"{key}.pt"
+        if path is not None and path.is_file():
+            return torch.load(path, weights_only=False)
+        since = time.process_time()
+        made = make(), time.process_time() - since
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            torch.save(made, path.with_suffix(".part"))
+            path.with_suffix(".part").replace(path)
+        return made
+
+
+def digest(value: Any) -> str:
+    """Identifies tensors, arrays, numbers, words and collections and dataclasses of them by content.
+
+    Functions, and objects that belong to the clip, count for nothing: they are the same for all variants of a t*.
+    """
+    found = hashlib.sha256()
+    _feed(found, value)
+    return found.hexdigest()[:16]
+
+
+def _feed(found: Any, value: Any) -> None:
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        found.update(f"{value.dtype}{value.shape}".encode())
+        found.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, dict):
+        _feed(found, [*sorted(value.items())])
+    elif isinstance(value, list | tuple):
+        found.update(f"[{len(value)}".encode())
+        for each in value:
+            _feed(found, each)
+    elif isinstance(value, FrozenGaussians) or type(value).__name__ in ("Turned", "DevelopConfig"):
+        assert is_dataclass(value)
+        _feed(found, [getattr(value, f.name) for f in fields(value)])
+    elif value is None or isinstance(value, str | int | float | bool):
+        found.update(repr(value).encode())

@@ -1,0 +1,133 @@
+"""Records of the ablation, and the one table of what each rule is worth."""
+
+from __future__ import annotations
+
+import re
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.ablate.measures import summary
+from torch_backend.contract import read_json
+from torch_backend.shot import content_key, write_json
+
+RECORD_VERSION = 1
+"""Rises when records made before are not to be used any more."""
+TRUTH = {
+    "delivered whole": "whole", "delivered never_seen": "never seen", "delivered moving": "moving",
+    "delivered static": "static", "recall": "recall", "over splats": "moving, delivered less developed",
+}  # fmt: skip
+"""Figure of a record -> its column, against truth; dB, but for recall."""
+CLIPS = {
+    "still": "still, dB", "excess": "flow left p99, moving less still, px", "moving_p50": "p50 moving, px",
+    "moving_p99": "p99 moving, px", "flicker": "flicker, /255", "decision_s": "decision, CPU s a frame",
+    "instant_s": "instant, CPU s",
+}  # fmt: skip
+"""The same, of clips."""
+MASKS = {"iou": "IoU of masks"}
+"""The same, of hand-painted masks."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """Records in a folder, one JSON file for each variant at each instant of a case."""
+
+    folder: Path
+    """Folder of the records of one version of the code."""
+
+    def path(self, case: str, t_star: int, variant: str) -> Path:
+        """Where a record lies."""
+        words = [re.sub(r"[^\w+-]+", "-", word).strip("-") for word in (case, f"t{t_star:06d}", variant)]
+        return self.folder / words[0] / words[1] / f"{words[2]}.json"
+
+    def has(self, case: str, t_star: int, variant: str) -> bool:
+        """True if a variant was measured."""
+        return self.path(case, t_star, variant).is_file()
+
+    def save(self, case: str, t_star: int, variant: str, row: dict[str, Any]) -> None:
+        """Writes a record whole."""
+        facts = {"version": RECORD_VERSION, "case": case, "t_star": t_star, "variant": variant}
+        path = self.path(case, t_star, variant)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, facts | row)
+
+    def records(self) -> list[dict[str, Any]]:
+        """All of them."""
+        return [read_json(path) for path in sorted(self.folder.rglob("t*/*.json"))]
+
+
+def code_version(root: Path) -> str:
+    """Identifies the text of the freeze and of this bench."""
+    files = [*sorted((root / "torch_backend" / "freeze").rglob("*.py"))]
+    files += [root / "benchmarks" / "ablate" / f"{name}.py" for name in ("switches", "measures", "instants")]
+    return content_key(RECORD_VERSION, [path.read_text(encoding="utf-8") for path in files])[:12]
+
+
+def figures(record: dict[str, Any]) -> dict[str, float | None]:
+    """Figures of a record by the names of `TRUTH`, `CLIPS` and `MASKS`."""
+    found = summary(record)
+    moving, splats = found["delivered moving"], found["developed moving"]
+    found["over splats"] = None if moving is None or splats is None else moving - splats
+    found["instant_s"] = sum(record.get("seconds", {}).values())
+    found["iou"] = record.get("iou")
+    return found
+
+
+def table(records: Iterable[dict[str, Any]], columns: dict[str, str]) -> list[str]:
+    """Markdown: a row for each variant, its mean difference to `today` over instants, and their standard deviation.
+
+    An instant counts where both were measured. "Fires" counts the instants at which any figure but seconds differs.
+    """
+    by_variant: dict[str, dict[tuple[str, int], dict[str, float | None]]] = {}
+    for record in records:
+        of = figures(record)
+        if any(of.get(name) is not None for name in columns if not name.endswith("_s")):
+            by_variant.setdefault(record["variant"], {})[record["case"], record["t_star"]] = of
+    today = by_variant.get("today", {})
+    lines = [f"| variant | fires | {' | '.join(columns.values())} |", f"|---|---:|{'---:|' * len(columns)}"]
+    absolute = [_cell([of[name] for of in today.values()], False) for name in columns]
+    lines.append(f"| **today** | {len(today)} instants | {' | '.join(absolute)} |")
+    for variant, found in by_variant.items():
+        both = [(found[at], today[at]) for at in found if at in today]
+        if variant == "today" or not both:
+            continue
+        cells = [_cell([_less(a[name], b[name]) for a, b in both], True) for name in columns]
+        lines.append(f"| {variant} | {sum(_differs(a, b) for a, b in both)} of {len(both)} | {' | '.join(cells)} |")
+    return lines
+
+
+def case_table(records: Iterable[dict[str, Any]], columns: dict[str, str], variants: Sequence[str]) -> list[str]:
+    """Markdown: figures of some variants by case, means over its instants."""
+    rows: dict[tuple[str, str], list[dict[str, float | None]]] = {}
+    for record in records:
+        if record["variant"] in variants:
+            rows.setdefault((record["case"], record["variant"]), []).append(figures(record))
+    lines = [
+        f"| case | variant | instants | {' | '.join(columns.values())} |",
+        f"|---|---|---:|{'---:|' * len(columns)}",
+    ]
+    for (case, variant), found in sorted(rows.items(), key=lambda row: (row[0][0], variants.index(row[0][1]))):
+        cells = [_cell([of.get(name) for of in found], False) for name in columns]
+        if any(cell != "–" for cell, name in zip(cells, columns, strict=True) if not name.endswith("_s")):
+            lines.append(f"| {case} | {variant} | {len(found)} | {' | '.join(cells)} |")
+    return lines
+
+
+def _less(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else a - b
+
+
+def _differs(a: dict[str, float | None], b: dict[str, float | None]) -> bool:
+    return any(a[name] != b[name] for name in a if not name.endswith("_s"))
+
+
+def _cell(values: Sequence[float | None], signed: bool) -> str:
+    """Mean and standard deviation of what is known."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return "–"
+    sign = "+" if signed else ""
+    spread = f" ± {statistics.stdev(known):.2f}" if len(known) > 1 else ""
+    return f"{statistics.fmean(known):{sign}.2f}{spread}"

@@ -1,0 +1,236 @@
+"""Depth of frozen frames against truth: `python -m benchmarks.depth SCENE ... --results DIR`.
+
+SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot and an `auto` run
+for each training seed are made in DIR if they are missing. Judged is the depth that a take writes as Z, at the size of
+the plates, for every instant and pose that has a truth. Truth is the depth of the scene's triangles along the rays
+through the pixel centres. It is in metres; exact cameras have scale 1, solved ones that of their similarity.
+
+Two regions are judged apart, by truth: `still`, and `moving` (people and what they move). Sky, glass and mirrors are
+left out. Figures pool the pixels of all frames of a scene:
+
+- Median of |depth - truth| / truth, and the share of pixels beyond 1 %, inside surfaces: at least `INSIDE` pixels from
+  every occlusion boundary and from the border of the region.
+- F-score of occlusion boundaries at a tolerance of one pixel: see `occlusion_edges`.
+- If frames have a standard deviation of depth: the share of pixels inside surfaces whose error is below two of it.
+
+DIR gets depth-NAME.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from benchmarks.detail_clip import DetailClip
+from benchmarks.detail_figures import widened
+from benchmarks.detail_truth import trained
+from benchmarks.sources import SyntheticTruth, load_source
+from torch_backend.contract import SWITCH, JobError
+from torch_backend.native import default_threads
+from torch_backend.report.truth import PANES
+from torch_backend.shot import write_json
+
+INSIDE = 2
+"""Pixels between what counts as inside a surface and the next occlusion boundary."""
+STEP = 1.05
+"""Ratio of the depths of two neighbouring pixels from which on one occludes the other."""
+SAME_SLOPE = 0.5
+"""A step in inverse depth is a slope, not an occlusion, if a step beside it is at least this share of it."""
+TOLERANCE = 1
+"""Pixels, along rows and columns, by which a boundary may be off."""
+NEAR_MOVER = 3
+"""A boundary belongs to `moving` if something that moves is this near, in pixels: else to `still`."""
+BEYOND = 0.01
+"""Relative error from which on a card placed by depth visibly passes through a surface."""
+FARTHEST = 1000.0
+"""Metres beyond which everything counts as equally far, sky included."""
+REGIONS = ("still", "moving")
+
+
+def occlusion_edges(depth: Tensor) -> Tensor:
+    """bool [H, W]: pixels that occlude a neighbour in their row or column, from depth [H, W] in metres.
+
+    The nearer of two neighbours is such a pixel if their depths differ by a factor of `STEP`, and inverse depth does
+    not change by nearly as much, in the same direction, on either side of the pair: that is a slanted surface, or a
+    boundary that is smeared over several pixels.
+    """
+    inverse = 1.0 / depth.clamp(1e-3, FARTHEST)
+    return _edges_in_rows(inverse) | _edges_in_rows(inverse.T).T
+
+
+def _edges_in_rows(inverse: Tensor) -> Tensor:
+    step = inverse[:, 1:] - inverse[:, :-1]
+    ratio = torch.maximum(inverse[:, 1:], inverse[:, :-1]) / torch.minimum(inverse[:, 1:], inverse[:, :-1])
+    before, after = F.pad(step, (1, 0))[:, :-1], F.pad(step, (0, 1))[:, 1:]
+    slope = torch.maximum(before * step.sign(), after * step.sign())
+    occludes = (ratio > STEP) & (slope < SAME_SLOPE * step.abs())
+    edges = torch.zeros_like(inverse, dtype=torch.bool)
+    edges[:, 1:] |= occludes & (step > 0)
+    edges[:, :-1] |= occludes & (step < 0)
+    return edges
+
+
+@dataclass
+class Pooled:
+    """What is known of one region of a scene: errors inside surfaces, and counts of boundary pixels."""
+
+    errors: list[Tensor] = field(default_factory=list[Tensor])
+    """Relative errors of depth, [P] per frame."""
+    within: list[Tensor] = field(default_factory=list[Tensor])
+    """bool [P] per frame: error below two standard deviations; empty if frames have none."""
+    found: int = 0
+    """Boundary pixels of the frames that have one of the truth within `TOLERANCE`,"""
+    shown: int = 0
+    """of so many;"""
+    recalled: int = 0
+    """boundary pixels of the truth that have one of the frames so near,"""
+    true: int = 0
+    """of so many."""
+
+    def add_boundary(self, depth: Tensor, truth: Tensor, region: Tensor) -> None:
+        """Boundary pixels of one frame that lie in `region`."""
+        true_edges, edges = occlusion_edges(truth), occlusion_edges(depth)
+        self.found += int((edges & region & widened(true_edges, TOLERANCE)).sum())
+        self.shown += int((edges & region).sum())
+        self.recalled += int((true_edges & region & widened(edges, TOLERANCE)).sum())
+        self.true += int((true_edges & region).sum())
+
+    def add_surface(self, depth: Tensor, truth: Tensor, region: Tensor, sigma: Tensor | None) -> None:
+        """Pixels of one frame that lie inside surfaces of `region`."""
+        sky = ~torch.isfinite(truth)
+        outside = occlusion_edges(truth) | sky | ~region
+        inside = ~widened(outside, INSIDE)
+        off = (depth[inside] - truth[inside]).abs()
+        self.errors.append(off / truth[inside])
+        if sigma is not None:
+            self.within.append(off < 2.0 * sigma[inside])
+
+    def figures(self) -> dict[str, float | None]:
+        """median and beyond (shares), boundary_f, precision, recall, within_2_sigma; None where nothing is known."""
+        errors = torch.cat(self.errors) if self.errors else torch.empty(0)
+        within = torch.cat(self.within) if self.within else torch.empty(0)
+        precision = self.found / self.shown if self.shown else None
+        recall = self.recalled / self.true if self.true else None
+        both = None if precision is None or recall is None else precision + recall
+        return {
+            "median": float(errors.median()) if len(errors) else None,
+            "beyond": float((errors > BEYOND).float().mean()) if len(errors) else None,
+            "boundary_f": None
+            if both is None
+            else (2.0 * (precision or 0.0) * (recall or 0.0) / both if both else 0.0),
+            "precision": precision,
+            "recall": recall,
+            "within_2_sigma": float(within.float().mean()) if len(within) else None,
+        }
+
+
+def add_frame(
+    pooled: dict[str, Pooled], depth: Tensor, truth: Tensor, moving: Tensor, left_out: Tensor, sigma: Tensor | None
+) -> None:
+    """Adds one frame to both of `REGIONS`: depth, truth and sigma [H, W] in metres, masks bool [H, W]."""
+    near = widened(moving, NEAR_MOVER)
+    pooled["still"].add_surface(depth, truth, ~moving & ~left_out, sigma)
+    pooled["moving"].add_surface(depth, truth, moving & ~left_out, sigma)
+    pooled["still"].add_boundary(depth, truth, ~near & ~left_out)
+    pooled["moving"].add_boundary(depth, truth, near & ~left_out)
+
+
+def judge(
+    truth: SyntheticTruth, run_name: str, t_stars: Sequence[int], every: int = 1, develop: bool = True
+) -> dict[str, dict[str, float | None]]:
+    """Region -> `Pooled.figures` of every `every`-th pose of the instants."""
+    clip, pooled = DetailClip(truth.shot, run_name, 0, develop), {region: Pooled() for region in REGIONS}
+    size = clip.width, clip.height
+    metres = truth.metres_per_unit / clip.scene.scale
+    for t_star in t_stars:
+        for pose in truth.poses(t_star, [])[::every]:
+            frame = clip.view(pose, t_star).detailed
+            regions = truth.regions(t_star, pose, *size)
+            left_out = torch.zeros_like(regions["moving"])
+            for pane in PANES:
+                left_out |= regions.get(pane, left_out)
+            sigma = getattr(frame, "depth_sigma", None)
+            add_frame(
+                pooled, frame.depth * metres, truth.depth(t_star, pose, *size), regions["moving"], left_out,
+                None if sigma is None else sigma * metres,
+            )  # fmt: skip
+        print(f"{truth.name}, t* {t_star}: {_text(pooled['still'].figures())} still so far", flush=True)
+    return {region: of.figures() for region, of in pooled.items()}
+
+
+def _text(of: dict[str, float | None]) -> str:
+    def said(name: str, unit: float, digits: int) -> str:
+        value = of[name]
+        return "–" if value is None else f"{unit * value:.{digits}f}"
+
+    cells = said("median", 100.0, 2), said("beyond", 100.0, 1), said("boundary_f", 1.0, 3), said("precision", 1.0, 3)
+    return " | ".join((*cells, said("recall", 1.0, 3), said("within_2_sigma", 100.0, 1)))
+
+
+def table(found: dict[str, dict[str, dict[str, float | None]]]) -> list[str]:
+    """Figures by scene and region in Markdown."""
+    head = "| scene | region | median error, % | beyond 1 %, % | boundary F | precision | recall | within 2 sigma, % |"
+    lines = [
+        f"| {scene} | {region} | {_text(of)} |" for scene, regions in found.items() for region, of in regions.items()
+    ]
+    return [head, "|---|---|---:|---:|---:|---:|---:|---:|", *lines]
+
+
+def mean_of(found: Sequence[dict[str, dict[str, float | None]]]) -> dict[str, dict[str, float | None]]:
+    """Mean of the figures of several trainings."""
+    mean: dict[str, dict[str, float | None]] = {}
+    for region, of in found[0].items():
+        known = {name: [v for f in found if (v := f[region][name]) is not None] for name in of}
+        mean[region] = {name: statistics.fmean(values) if values else None for name, values in known.items()}
+    return mean
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
+    parser.add_argument("--results", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
+    parser.add_argument("--t-star", type=int, nargs="+", metavar="N", help="only these")
+    parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th pose")
+    parser.add_argument("--iterations", type=int, default=1500)
+    parser.add_argument("--gaussians", type=int, default=10_000)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of the trainings")
+    parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
+    args = parser.parse_args(argv)
+    torch.set_num_threads(default_threads())
+    found: dict[str, dict[str, dict[str, float | None]]] = {}
+    results = args.results.absolute()
+    try:
+        for folder in args.scenes:
+            source = f"{args.cameras}:{folder.absolute()}"
+            truth = load_source(source, results)
+            if not isinstance(truth, SyntheticTruth):
+                raise ValueError(f"{folder}: depth is only known of scenes of benchmarks/synthetic")
+            of: dict[str, Any] = {}
+            for seed in args.seeds:
+                run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
+                of[f"seed {seed}"] = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on")
+            found[truth.name] = mean_of(list(of.values()))
+            write_json(results / f"depth-{truth.name.replace(' ', '-')}.json", {"version": 1, **of})
+    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    print("\n".join(["", *table(found)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

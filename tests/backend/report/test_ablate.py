@@ -1,0 +1,140 @@
+"""The ablation on the tiny world, and its switches, records and table."""
+
+import argparse
+import importlib
+from collections import Counter
+
+import pytest
+import torch
+
+from benchmarks.ablate.__main__ import Ablation, tables
+from benchmarks.ablate.cases import TUNED_AT, Case, drawn, pairs_of
+from benchmarks.ablate.instants import Instants, digest
+from benchmarks.ablate.measures import FrameMaker, summary
+from benchmarks.ablate.switches import COMBINATIONS, FRAME, RULES, detail_config, replaced, switched_off, variants
+from benchmarks.ablate.table import TRUTH, Store, table
+from benchmarks.detail_ceiling import chosen
+from benchmarks.detail_clip import open_clip
+
+
+@pytest.fixture(scope="module")
+def clip(trained):
+    return open_clip(trained[0].shot.root)
+
+
+@pytest.fixture(scope="module")
+def instants(clip):
+    return Instants(clip, clip.run.train_frames[6])
+
+
+def held(switch):
+    found = importlib.import_module(f"torch_backend.freeze.{switch.module}")
+    for name in switch.name.split("."):
+        found = getattr(found, name)
+    return found
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=lambda rule: rule.name)
+def test_a_rule_is_off_and_on_again(rule):
+    before = [held(switch) for switch in rule.switches]
+    with pytest.raises(ArithmeticError), switched_off(frozenset({rule.name})):
+        assert all(held(switch) is not was for switch, was in zip(rule.switches, before, strict=True))
+        raise ArithmeticError  # even if what is measured fails
+    assert [held(switch) for switch in rule.switches] == before
+    config = detail_config(frozenset({rule.name}))
+    assert all(getattr(config, name) == value for name, value in rule.numbers.items())
+    assert rule.switches or rule.numbers
+
+
+def test_groups_of_variants():
+    assert COMBINATIONS["P"] < variants(("combinations",))["null"] | {"ghosts"}
+    frame, scene = variants((FRAME,)), variants(("scene",))
+    assert not frame.keys() & scene.keys() - {"today"} and len(frame) + len(scene) == len(RULES) + 2
+    with pytest.raises(ValueError, match="no group or variant 'bent'"):
+        variants(("bent",))
+
+
+def test_steps_that_variants_share_are_made_once(instants, clip):
+    """With `develop` off the steps before it are those of today; with frame rules off all of them are."""
+    made = Counter[str]()
+
+    def counted(step):
+        def count(*args, **more):
+            made["develop"] += 1
+            return step(*args, **more)
+
+        return count
+
+    with replaced("developed_instants", "develop", counted):
+        today = instants.make(frozenset())
+        assert instants.make(frozenset({next(n for n, r in RULES.items() if r.stage == FRAME)})).key == today.key
+    assert made == {"develop": 1}
+    plain = instants.make(frozenset({"develop"}))
+    assert plain.key != today.key and plain.frozen.descent is not None
+    assert torch.equal(plain.frozen.state["means"], plain.frozen.descent.state["means"])
+    assert set(plain.seconds) == set(today.seconds) - {"develop"} and all(s >= 0.0 for s in today.seconds.values())
+
+
+def test_a_rule_of_frames_changes_the_frame_and_not_for_long(instants, clip):
+    maker = FrameMaker(clip, instants.t_star, instants.make(frozenset()))
+    frame = clip.frames[1]
+    today = maker.make(frame, frozenset())[0]
+    bare, decided, took = maker.make(frame, frozenset({"residuals"}))
+    assert not torch.equal(bare.linear, today.linear) and torch.equal(bare.matte, today.matte)
+    assert 0.0 < decided < took
+    again = maker.make(frame, frozenset())[0]
+    assert torch.equal(again.linear, today.linear) and torch.equal(again.depth, today.depth)
+
+
+def test_what_was_measured_is_not_measured_again(clip, tmp_path):
+    case = Case("tiny", clip, [clip.run.train_frames[6]], None)
+    args = argparse.Namespace(
+        variants=["no residuals", "no develop"], clip_variants=None, every=1, pairs=2, draw=0, instants=0, seconds=0.0
+    )
+    store = Store(tmp_path / "code")
+    Ablation(store, tmp_path / "kept", args).run([case])
+    first = {path: path.stat().st_mtime_ns for path in store.folder.rglob("*.json")}
+    assert {path.stem for path in first} == {"today", "no-residuals", "no-develop"}
+    assert list((tmp_path / "kept").glob("develop-*.pt"))
+    told = "\n".join(tables(store))
+    assert "| no residuals | " in told and "| no develop | 1 of 1 | " in told and told.endswith("tiny 107.")
+    Ablation(store, tmp_path / "kept", args).run([case])
+    assert {path: path.stat().st_mtime_ns for path in store.folder.rglob("*.json")} == first
+
+
+def test_instants_and_pairs_are_drawn_by_seed_and_never_where_rules_were_tuned(clip):
+    frames = list(range(1, 75))
+    ways = [drawn("sitting", frames, seed) for seed in range(20)]
+    assert ways[0] == drawn("sitting", frames, 0) != ways[1] and all(len(set(way)) == 6 for way in ways)
+    assert not {frame for way in ways for frame in way} & set(TUNED_AT["sitting"])
+    case, t_star = Case("tiny", clip, [], None), clip.frames[4]
+    pairs = pairs_of(case, t_star, 3, 0)
+    assert len(pairs) == 3 and all(clip.frames.index(b) == clip.frames.index(a) + 1 for a, b in pairs)
+    assert not any(t_star in pair for pair in pairs)
+
+
+def test_differences_are_of_instants_that_both_variants_have():
+    def record(variant: str, t_star: int, whole: float, seconds: float = 1.0) -> dict:
+        frame = {"delivered": {"whole": whole}, "developed": {}, "recalled": {"arm": [1, 4]}, "decision_s": seconds}
+        return {"case": "a", "t_star": t_star, "variant": variant, "frames": [frame], "seconds": {}}
+
+    rows = [record("today", 1, 30.0), record("today", 2, 20.0), record("no x", 1, 30.5), record("no x", 3, 90.0)]
+    assert summary(rows[0])["recall"] == 0.25 and summary(rows[0])["delivered whole"] == 30.0
+    told = table([*rows, record("no y", 1, 30.0, 2.0)], TRUTH)
+    assert told[2].startswith("| **today** | 2 instants | 25.00 ± 7.07 |")
+    assert told[3].startswith("| no x | 1 of 1 | +0.50 |") and told[4].startswith("| no y | 0 of 1 | +0.00 |")
+
+
+def test_digests_tell_content_and_not_objects():
+    a, b = torch.zeros(3), torch.zeros(3)
+    assert digest([a, {"x": 1}, object()]) == digest([b, {"x": 1}, object()])
+    assert len({digest([a]), digest([a.double()]), digest([a[:2]]), digest([a + 1]), digest([])}) == 5
+
+
+def test_the_best_label_of_each_block():
+    truth = torch.zeros(5, 6, 3)
+    sources = torch.stack([truth + 0.1, truth + 0.2])
+    sources[1, 0, 0] = 0.0  # better in one pixel, worse in its block
+    assert torch.equal(chosen(sources, truth, 4), sources[0])
+    best = chosen(sources, truth, 1)
+    assert bool((best[0, 0] == 0.0).all()) and torch.equal(best[1:], sources[0, 1:])
