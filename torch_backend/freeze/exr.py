@@ -25,10 +25,10 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
-from ...contract import FRAME_LAYERS, UserError, channels_of, layers_of, parse_timecode, regular_file
-from ...contract.timecode import smpte_bits
-from ...footage.color import LIGHTS, PRIMARIES, InputSpace, in_light, light_matrix, light_of_chromaticities
-from ...shot import atomic_path
+from ..contract import FRAME_LAYERS, UserError, channels_of, layers_of, parse_timecode, regular_file
+from ..contract.timecode import smpte_bits
+from ..footage.color import LIGHTS, PRIMARIES, InputSpace, in_light, light_matrix, light_of_chromaticities
+from ..shot import atomic_path
 
 CHANNELS = channels_of("")
 """Channel names in the order of the arrays: colour, depth, support matte, motion matte."""

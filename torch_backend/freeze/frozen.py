@@ -8,15 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...contract import UserError
-from ...raster import RasterSettings
-from ...scene import Scene
-from ...supervision import nearest_bin, support_confidence
-from ...torch_types import norm
-from ...train import LoadedRun
-from ...train.exposure import Exposure
-from ...train.model import DynamicModel, render
-from ..views.bands import bands
+from ..contract import UserError
+from ..raster import RasterSettings
+from ..scene import Scene
+from ..supervision import nearest_bin, support_confidence
+from ..torch_types import norm
+from ..train import LoadedRun
+from ..train.exposure import Exposure
+from ..train.model import DynamicModel, render
+from .bands import bands
 
 _ENDS = 0.08
 """An instant this near to an end of the clip, as a share of the trained frames, has plates on one side only to tell how

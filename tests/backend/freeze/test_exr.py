@@ -21,7 +21,7 @@ from torch_backend.freeze.exr import (
     read_key,
     write_frozen_exr,
 )
-from torch_backend.freeze.take.job import exr
+from torch_backend.freeze.take import exr
 
 VIEWMAT = np.array([[0, -1, 0, 0.25], [1, 0, 0, -2], [0, 0, 1, 3.5], [0, 0, 0, 1]], dtype=np.float32)
 K = np.array([[1000.5, 0, 31.5], [0, 999.25, 24.5], [0, 0, 1]], dtype=np.float32)
