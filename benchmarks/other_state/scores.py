@@ -39,13 +39,13 @@ class Counts:
 
     @property
     def iou(self) -> float | None:
-        """Intersection over union; None if nothing is painted or let go of."""
-        return _ratio(self.both, self.both + self.extra + self.missed)
+        """Intersection over union; None if nothing is painted: `extra_share` judges such a frame."""
+        return _ratio(self.both, self.both + self.extra + self.missed) if self.both + self.missed else None
 
     @property
     def precision(self) -> float | None:
-        """Share of what was let go of that is painted; None if nothing was let go of."""
-        return _ratio(self.both, self.both + self.extra)
+        """Share of what was let go of that is painted; None if nothing was let go of or nothing is painted."""
+        return _ratio(self.both, self.both + self.extra) if self.both + self.missed else None
 
     @property
     def recall(self) -> float | None:

@@ -69,10 +69,12 @@ def test_scores_are_those_counted_by_hand() -> None:
     assert vars(counts) == {"both": 20, "extra": 10, "missed": 20, "right": 40}
     assert counts.iou == 0.4 and counts.recall == 0.5 and counts.extra_share == 0.2
     assert counts.precision == pytest.approx(2 / 3)
-    nothing = count(np.zeros((10, 10), bool), np.full((10, 10), SAME, np.uint8))
-    assert nothing.iou is None and nothing.extra_share == 0.0
-    assert mean_counts([counts, nothing])["iou"] == 0.4, "a frame in which nothing changed has no IoU"
-    assert pooled_counts([counts, counts]).both == 40 and pooled_counts([counts, nothing]).extra_share == 0.1 * 10 / 15
+    unchanged = count(is_let_go, np.full((10, 10), SAME, np.uint8))
+    assert unchanged.iou is None and unchanged.precision is None and unchanged.extra_share == 0.4
+    means = mean_counts([counts, unchanged])
+    assert means["iou"] == 0.4, "a frame in which nothing changed has no IoU"
+    assert means["extra_share"] == pytest.approx(0.3)
+    assert pooled_counts([counts, unchanged]).extra_share == pytest.approx(50 / 150)
 
 
 def test_a_clip_without_masks_is_named(tmp_path: Path) -> None:
