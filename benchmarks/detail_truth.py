@@ -33,7 +33,7 @@ from torch_backend.native import default_threads
 from torch_backend.report.metrics import WHOLE, score
 from torch_backend.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
 from torch_backend.report.things import overall, recall_of
-from torch_backend.report.truth import REGIONS, TruthScene
+from torch_backend.report.truth import HELD, REGIONS, TruthScene
 from torch_backend.shot import write_json
 from torch_backend.train import load_run
 
@@ -102,7 +102,7 @@ def perceived(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
 def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """{region: {variant: mean dB over the poses in which the region is not empty}}; regions that never are."""
     found = {}
-    for region in (WHOLE, *REGIONS):
+    for region in (WHOLE, *REGIONS, HELD):
         known = [row for row in rows if row[SPLATS].get(region) is not None]
         if known:
             found[region] = {v: statistics.fmean(row[v][region] for row in known) for v in VARIANTS}

@@ -99,10 +99,10 @@ class SyntheticTruth:
         )[0, 0]
 
     def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """What was rendered without the scene's thing, as `truth` is."""
-        pixels = self._scene.behind(t_star, pose)
-        name = self._scene.info.get("thing")
-        return {} if pixels is None or name is None else {name: self._resampled(pixels, width, height)}
+        """{thing: what was rendered without it, or with it in its other state}, as `truth` is."""
+        pixels, info = self._scene.behind(t_star, pose), self._scene.info
+        names = [each["thing"] for each in info.get("held", [])] + ([info["thing"]] if "thing" in info else [])
+        return {} if pixels is None else dict.fromkeys(names, self._resampled(pixels, width, height))
 
     def _resampled(self, pixels: NDArray[np.uint8], width: int, height: int) -> Tensor:
         image = torch.from_numpy(self._pixels.picture(pixels).astype(np.float32) / 255.0).permute(2, 0, 1)[None]

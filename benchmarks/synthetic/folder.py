@@ -37,7 +37,8 @@ class Regions:
     seen: NDArray[np.bool_]
     """[H, W] the surface point is visible in the clip's own frame t*."""
     things: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    """name -> [H, W]: what a hard scene is about: glass, mirror and the wall beside them, swinging, arm, hair."""
+    """name -> [H, W]: what a hard scene is about: glass, mirror and the wall beside them, swinging, arm, hair, what is
+    held, and the region held."""
 
     @classmethod
     def of(cls, data: Mapping[str, NDArray]) -> Regions:
@@ -129,7 +130,8 @@ class SyntheticScene:
             return Regions.of(data)
 
     def behind(self, t_star: int, pose: int) -> NDArray[np.uint8] | None:
-        """[H, W, 3] uint8 sRGB: the truth without the thing that the scene is about, black away from it.
+        """[H, W, 3] uint8 sRGB: the truth without the thing that the scene is about, or with all that is held in its
+        other state; black away from it.
 
         None if the kind has none, or that view does not show it.
         """

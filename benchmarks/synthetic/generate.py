@@ -7,6 +7,7 @@ everything that moves), textures/*.png, and plan.json, last: what render_bpy.py 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from torch_backend.shot import atomic_path, write_json
 from .cameras import FOCAL_PER_WIDTH, CameraMove, intrinsics
 from .geometry import Builder, Mesh, turn
 from .hard import Staging, Thing, apple, arm_of, hair_of, share_in_view, stage
+from .held import Held, cast, perform
 from .noise import Array, stream
 from .panes import GLASS, GLASS_INDEX, MIRROR, MIRROR_SHARE
 from .places import Furnisher, Keepout, Place
@@ -36,6 +38,10 @@ SHUTTER_SECONDS = 0.06
 SHUTTER_BANDS = 9
 BEHIND_MARGIN = 6
 """Pixels around a thing that are rendered without it."""
+SHUTTER_FRAMES, SUBFRAMES, SUBFRAME_OVERSIZE = 0.5, 3, 2
+"""Of `held`: how long the shutter is open, in frame intervals (a 180 degree shutter); how many pictures are averaged
+over it, in steps of 0.8 px at `quick`, where the camera moves by 2.5 px meanwhile; and the largest `oversize` that they
+are rendered at, because each of them samples the pixels again."""
 WALK_METRES = 3.2
 """How far the one in `walker` goes, against the camera: one who goes along with it looks like one who stands nearer."""
 
@@ -81,8 +87,9 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
     camera = camera_of(seed, size, kind)
     path = camera.eyes_and_targets(np.linspace(0.0, camera.duration, 60))[0][:, :2]
     staging = stage(kind, seed, path, camera.world_to_camera(np.linspace(0.0, camera.duration, 12)))
-    people = _people(seed, kind, path, camera, staging)
-    kept = [Keepout(*p.place, 0.45) for p in people] + staging.clear
+    scene = cast(seed, size, camera) if kind == "held" else None
+    people = [part.person for part in scene.parts] if scene else _people(seed, kind, path, camera, staging)
+    kept = [Keepout(*p.place, 0.45) for p in people] + staging.clear + (scene.clear if scene else [])
     kept += [Keepout(x, p.place[1], 0.45) for p in people if p.walks for x in np.linspace(*_ends(p), 8)]
     furnisher = Furnisher(seed, path, kept, staging.ahead)
     movers: list[Mover] = []
@@ -103,11 +110,16 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
             thing = arm_of(bodies, person.name)
         if kind == "hair" and person is people[0]:
             made = hair_of(folder, bodies, body, seed, seconds)
+        if scene:
+            for extra in perform(folder, scene.part_of(person), bodies, body, furnisher, seed, seconds):
+                movers.append(Mover(extra[0], extra[1].astype(np.float32), extra[2], f"{extra[0]}.png"))
     if staging.apple:
         made = apple(folder, seed, seconds, staging.apple, path)
     if made:
         vertices, mesh, thing = made
         movers.append(Mover(thing.mover, vertices.astype(np.float32), mesh, f"{thing.mover}.png"))
+    if scene:
+        scene.furnish(furnisher)
     place, static = furnisher.room() if place_of(seed, kind) == "room" else furnisher.ground()
     if kind == "fast-mover":
         movers.append(_thrown_ball(folder, seed, seconds))
@@ -122,7 +134,48 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
     if thing:
         with atomic_path(folder / "geometry" / "thing.npz") as beside:
             np.savez(beside, faces=thing.faces, gone=thing.gone)
-    write_json(folder / "plan.json", _plan(key, seed, kind, size, camera, people, movers, thing, place))
+    plan = _plan(key, seed, kind, size, camera, people, movers, thing, place)
+    if scene:
+        _write_held(folder, plan, size, camera, scene, movers)
+    write_json(folder / "plan.json", plan)
+
+
+def _write_held(
+    folder: Path, plan: dict[str, Any], size: Size, camera: CameraMove, scene: Held, movers: list[Mover]
+) -> None:
+    """geometry/held.npz, and in the plan: what is held, its other state behind it, and motion blur."""
+    things = [thing for part in scene.parts for thing in part.things]
+    with atomic_path(folder / "geometry" / "held.npz") as beside:
+        np.savez(beside, allow_pickle=False, **{thing.name: thing.faces for thing in things})
+    plan["held"] = [
+        {"thing": thing.name, "mover": thing.mover} | part.to_json() for part in scene.parts for thing in part.things
+    ]
+    plan["samples"] = max(1, round(size.samples / SUBFRAMES))
+    plan["oversize"] = min(size.oversize, SUBFRAME_OVERSIZE)
+    for job in plan["jobs"]:
+        job["shutter"] = _shutter(job, size, camera)
+    by_name = {mover.name: mover for mover in movers}
+    plan["jobs"] = _with_behind(plan["jobs"], size, [(by_name[thing.mover], thing.faces) for thing in things])
+    for job in plan["jobs"]:
+        if "box" in job:
+            # Only compared with by colour, so that one moment is enough.
+            job["shutter"] = job["shutter"][SUBFRAMES // 2 : SUBFRAMES // 2 + 1]
+            job["elsewhen"] = {
+                name: float(np.clip(part.other_time(job["bands"][0]["time"] / size.fps) * size.fps, 0, size.frames - 1))
+                for part in scene.parts
+                for name in part.movers
+            }
+
+
+def _shutter(job: dict[str, Any], size: Size, camera: CameraMove) -> list[dict[str, Any]]:
+    """Moments over which a picture is averaged. Frozen scenes have the blur of the camera, none of their own."""
+    offsets = SHUTTER_FRAMES * ((np.arange(SUBFRAMES) + 0.5) / SUBFRAMES - 0.5)
+    pose = int(Path(job["out"]).stem) - 1
+    views = camera.world_to_camera((pose + offsets) / size.fps)
+    times = np.clip(job["bands"][0]["time"] + offsets, 0, size.frames - 1)
+    if job["out"].startswith("truth/"):
+        times = np.full(SUBFRAMES, job["bands"][0]["time"])
+    return [{"time": float(t), "world_to_camera": v.tolist()} for t, v in zip(times, views, strict=True)]
 
 
 def _plan(
@@ -163,7 +216,7 @@ def _plan(
         plan["thing"] = {"name": thing.name, "mover": thing.mover}
         if thing.gone.any():
             mover = next(m for m in movers if m.name == thing.mover)
-            plan["jobs"] = _with_behind(plan["jobs"], size, mover, thing.faces)
+            plan["jobs"] = _with_behind(plan["jobs"], size, [(mover, thing.faces)])
     return plan
 
 
@@ -308,9 +361,9 @@ def _jobs(seed: int, kind: str, size: Size, camera: CameraMove) -> list[dict[str
 
 
 def _with_behind(
-    jobs: list[dict[str, Any]], size: Size, mover: Mover, faces: NDArray[np.bool_]
+    jobs: list[dict[str, Any]], size: Size, things: Sequence[tuple[Mover, NDArray[np.bool_]]]
 ) -> list[dict[str, Any]]:
-    """After each truth that shows the scene's thing, what stands behind it there: only the pixels around it."""
+    """After each truth that shows one of the scene's things, what stands behind them: only the pixels around them."""
     K, found = intrinsics(size.width, size.height), []
     for job in jobs:
         found.append(job)
@@ -318,19 +371,30 @@ def _with_behind(
             continue
         band = job["bands"][0]
         view = np.array(band["world_to_camera"])
-        points = mover.vertices[round(band["time"])][np.unique(mover.mesh.triangles[faces])]
-        local = points @ view[:3, :3].T + view[:3, 3]
-        pixels = (local[:, :2] / np.maximum(local[:, 2:], 0.05) * K[[0, 1], [0, 1]] + K[:2, 2])[local[:, 2] > 0.05]
-        if len(pixels) == 0:
-            continue
-        least, most = np.zeros(2), np.array([size.width, size.height])
-        low = np.clip(np.floor(pixels.min(axis=0)) - BEHIND_MARGIN, least, most).astype(int)
-        high = np.clip(np.ceil(pixels.max(axis=0)) + BEHIND_MARGIN, least, most).astype(int)
-        if (high > low).all():
+        boxes = [
+            _box_of(mover.vertices[round(band["time"])][np.unique(mover.mesh.triangles[faces])], view, K, size)
+            for mover, faces in things
+        ]
+        boxes = [box for box in boxes if box is not None]
+        if boxes:
             name = Path(job["out"])
             out = (name.parent / "behind" / name.name).as_posix()
+            edges = np.array(boxes)
+            low, high = edges[:, :2].min(axis=0), edges[:, 2:].max(axis=0)
             found.append({**job, "out": out, "box": [*map(int, low), *map(int, high)]})
     return found
+
+
+def _box_of(points: NDArray[np.float32], view: Array, K: Array, size: Size) -> Array | None:
+    """[4] left, top, right, bottom of points [P, 3] in a picture, with a margin; None if it does not show them."""
+    local = points @ view[:3, :3].T + view[:3, 3]
+    pixels = (local[:, :2] / np.maximum(local[:, 2:], 0.05) * K[[0, 1], [0, 1]] + K[:2, 2])[local[:, 2] > 0.05]
+    if len(pixels) == 0:
+        return None
+    least, most = np.zeros(2), np.array([size.width, size.height])
+    low = np.clip(np.floor(pixels.min(axis=0)) - BEHIND_MARGIN, least, most)
+    high = np.clip(np.ceil(pixels.max(axis=0)) + BEHIND_MARGIN, least, most)
+    return np.concatenate([low, high]) if (high > low).all() else None
 
 
 def _job(out: str, seed: int, kind: str, size: Size, time: int, pose: int, views: Array) -> dict[str, Any]:

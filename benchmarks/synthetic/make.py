@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any
 from torch_backend.shot import content_key, need_disk, write_json
 
 from .cameras import intrinsics
-from .generate import EXPOSURE_RAMP_STOPS, SHUTTER_SECONDS, frame_number, frame_seconds, write_geometry
+from .generate import (
+    EXPOSURE_RAMP_STOPS,
+    SHUTTER_FRAMES,
+    SHUTTER_SECONDS,
+    SUBFRAMES,
+    frame_number,
+    frame_seconds,
+    write_geometry,
+)
 from .panes import GLASS, MIRROR, MIRROR_SHARE
 from .regions import views_of, write_regions
 from .sizes import FORMAT_VERSION, MOVING_PX, Size, camera_move_of, place_of
@@ -194,6 +202,13 @@ def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seco
     }
     if "thing" in plan:
         record["thing"] = plan["thing"]["name"]
+    if "held" in plan:
+        record["held"] = plan["held"]
+        record["motion_blur"] = {
+            "shutter_frames": SHUTTER_FRAMES,
+            "pictures_averaged": SUBFRAMES,
+            "truth": "the blur of the camera at its pose; what is frozen has none of its own",
+        }
     write_json(folder / "scene.json", record)
 
 

@@ -33,6 +33,12 @@ def bumps(rng: np.random.Generator, seconds: Array, every: float, width: float) 
     return np.exp(-((nearest / (0.5 * width)) ** 4))
 
 
+def smooth_step(seconds: Array, begin: float, end: float) -> Array:
+    """[T] from 0 at `begin` to 1 at `end`, with no speed at either."""
+    share = np.clip((seconds - begin) / (end - begin), 0.0, 1.0)
+    return share * share * (3.0 - 2.0 * share)
+
+
 def fractal(
     rng: np.random.Generator, size: int, slope: float = 1.6, stretch: tuple[float, float] = (1.0, 1.0)
 ) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from .geometry import turn
-from .noise import Array, bumps, solid, stream, wander
+from .noise import Array, bumps, smooth_step, solid, stream, wander
 from .rays import RayScene
 from .textures import Picture, colour, halved, hsv
 
@@ -99,6 +99,8 @@ class Person:
     """wave or point: what the right arm does all the time, from the pose `stand`; empty: nothing."""
     walks: bool = False
     """Swings legs and arms as in walking: the case in which a freeze does not hold."""
+    changes: tuple[tuple[float, float, Pose], ...] = ()
+    """(begin, end, pose after it): what bones do once, in seconds and in order; kind `held`."""
 
 
 @dataclass
@@ -149,6 +151,7 @@ class Bodies:
 
         return {
             "right_arm": of("upperarm", "lowerarm", "wrist", "finger", "metacarpal", end=".R"),
+            "right_hand": of("wrist", "finger", "metacarpal", end=".R"),
             "arms": of("upperarm", "lowerarm", "wrist", "finger", "metacarpal"),
             "chest": of("spine01", "spine02", "spine03"),
             "hips": of("root", "pelvis"),
@@ -232,6 +235,11 @@ class Bodies:
         def add(bone: str, degrees: Array) -> None:
             angles[bone] = angles.get(bone, np.zeros((count, 3))) + degrees
 
+        for begin, end, after in person.changes:
+            share = smooth_step(seconds, begin, end)[:, None]
+            for bone, value in after.items():
+                before = angles.get(bone, np.zeros((count, 3)))
+                angles[bone] = before + share * (np.asarray(value, np.float64) - before)
         r = person.restless
         for bone, value in person.accents.items():
             add(bone, np.asarray(value, np.float64))

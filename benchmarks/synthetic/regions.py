@@ -13,11 +13,13 @@ glass.
 Hard scenes have masks of their things (`Regions.things`). `glass` and `mirror` are the pixels of panes in which nothing
 moves, `wall` those of the still wall that they are in, within `WALL_METRES` of one. `swinging`, `arm` and `hair` are
 the pixels whose centre shows the thing; hair is thinner than a pixel, so a pixel is hair if at least `HAIR_SHARE` of
-`HAIR_RAYS` squared rays through it meet a strand.
+`HAIR_RAYS` squared rays through it meet a strand. Scenes of the kind `held` have a mask per thing that is held, and the
+region `held`: see `held_elsewhere`.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 from collections.abc import Callable
@@ -35,12 +37,17 @@ from .generate import camera_of, frame_name, frame_number, frame_seconds
 from .noise import Array
 from .panes import MIRROR, Pane
 from .rays import Hits, RayScene
-from .sizes import MOVING_PX, THING, Size
+from .sizes import HELD, MOVING_PX, THING, Size
 
 DEPTH_STEPS_PER_METRE = 1000.0
 HAIR_RAYS, HAIR_SHARE = 4, 0.15
 NUDGE = 1e-4
 """Metres by which a ray that a pane reflects begins before it."""
+STILL_SECONDS = 0.5
+"""How long before and after a plate nothing moves in a pixel of the region `held`."""
+ELSEWHERE_METRES, SWAY_METRES = 0.04, 0.02
+"""A surface point stood elsewhere if it was farther away than the first, and stands still while it is never farther
+away than the second: see docs/synthetic.md for how far those who hold still sway."""
 WALL_METRES, WALL_DEPTH = 0.6, 0.04
 """How far around a pane the wall is beside it, and how far before or behind the pane's plane a point is on the wall:
 bare wall, and pictures on it, but no furniture."""
@@ -58,10 +65,8 @@ class Geometry:
     """[F, 3]."""
     panes: list[Pane]
     """Which are not among the triangles."""
-    thing: str
-    """Name of the thing that a hard scene is about; empty: it has none."""
-    thing_faces: NDArray[np.bool_]
-    """[F] which triangles are it."""
+    things: dict[str, NDArray[np.bool_]]
+    """{name of a thing that a hard scene is about: [F] which triangles are it}."""
 
     @classmethod
     def load(cls, folder: Path) -> Geometry:
@@ -70,8 +75,7 @@ class Geometry:
         with np.load(folder / "geometry" / "static.npz", allow_pickle=False) as data:
             static, triangles = data["vertices"], [data["triangles"]]
         moving, at = [], len(static)
-        thing = plan.get("thing", {"name": "", "mover": ""})
-        its = [np.zeros(len(triangles[0]), bool)]
+        things, starts, faces = _thing_faces(folder, plan), {}, len(triangles[0])
         for mover in plan["movers"]:
             if not mover["in_view"]:
                 continue
@@ -80,17 +84,29 @@ class Geometry:
                 triangles.append(data["triangles"] + at)
             moving.append(vertices)
             at += vertices.shape[1]
-            its.append(np.zeros(len(triangles[-1]), bool))
-            if mover["name"] == thing["mover"]:
-                with np.load(folder / "geometry" / "thing.npz", allow_pickle=False) as data:
-                    its[-1] = data["faces"]
+            starts[mover["name"]] = faces
+            faces += len(triangles[-1])
         panes = [Pane.from_json(pane) for pane in plan.get("panes", [])]
-        every = np.concatenate(triangles)
-        return cls(static, np.concatenate(moving, axis=1), every, panes, thing["name"], np.concatenate(its))
+        its = {name: np.zeros(faces, bool) for name, _, _ in things}
+        for name, mover, chosen in things:
+            its[name][starts[mover] : starts[mover] + len(chosen)] = chosen
+        return cls(static, np.concatenate(moving, axis=1), np.concatenate(triangles), panes, its)
 
     def at(self, index: int) -> RayScene:
         """The scene as it stands at a frame."""
         return RayScene(np.concatenate([self.static, self.moving[index]]), self.triangles)
+
+
+def _thing_faces(folder: Path, plan: dict[str, Any]) -> list[tuple[str, str, NDArray[np.bool_]]]:
+    """(name, mover, which of the mover's triangles) of everything that a hard scene is about."""
+    found: list[tuple[str, str, NDArray[np.bool_]]] = []
+    if "thing" in plan:
+        with np.load(folder / "geometry" / "thing.npz", allow_pickle=False) as data:
+            found.append((plan["thing"]["name"], plan["thing"]["mover"], data["faces"]))
+    if "held" in plan:
+        with np.load(folder / "geometry" / "held.npz", allow_pickle=False) as data:
+            found += [(each["thing"], each["mover"], data[each["thing"]]) for each in plan["held"]]
+    return found
 
 
 @dataclass
@@ -140,14 +156,18 @@ def write_regions(folder: Path, seed: int, kind: str, size: Size, progress: Call
     if not todo:
         return
     geometry = Geometry.load(folder)
+    standing = functools.lru_cache(maxsize=None)(geometry.at) if kind == "held" else geometry.at
     total, done = sum(map(len, todo.values())), 0
     for index, missing in todo.items():
-        scene = geometry.at(index)
+        scene = standing(index)
         for pose, path in missing:
             own = views[index]
             maps = region_maps(geometry, scene, index, own if pose is None else views[pose], own)
             if pose is None:
                 del maps["seen"]
+            elif kind == "held":
+                window = round(STILL_SECONDS * size.fps)
+                maps[THING + HELD] = held_elsewhere(geometry, standing, index, pose, views[pose], window)
             with atomic_path(path) as beside:
                 np.savez_compressed(beside, **maps)
             done += 1
@@ -249,9 +269,8 @@ def _things(
         points = view.eye + view.rays() * np.where(still, hits.distance, 0.0)[:, None]
         near = [p.within(points, WALL_METRES) & (np.abs(p.above(points)) < WALL_DEPTH) for p in geometry.panes]
         masks["wall"] = still & np.any(near, axis=0)
-    if geometry.thing:
-        its = geometry.thing_faces
-        if geometry.thing == "hair":
+    for name, its in geometry.things.items():
+        if name == "hair":
             share = np.zeros(len(hits.face))
             at = (np.arange(HAIR_RAYS) + 0.5) / HAIR_RAYS
             for dx, dy in itertools.product(at, at):
@@ -260,7 +279,7 @@ def _things(
                 share += (face >= 0) & its[np.maximum(face, 0)]
             masks["hair"] = share >= HAIR_SHARE * HAIR_RAYS**2
         else:
-            masks[geometry.thing] = (hits.face >= 0) & its[np.maximum(hits.face, 0)]
+            masks[name] = (hits.face >= 0) & its[np.maximum(hits.face, 0)]
     return masks
 
 
@@ -284,3 +303,40 @@ def _moving(
         farthest = np.maximum(farthest, np.linalg.norm(project(time) - now, axis=1))
     moving[which] = farthest > MOVING_PX
     return moving
+
+
+def held_elsewhere(
+    geometry: Geometry, standing: Callable[[int], RayScene], index: int, pose: int, view: View, window: int
+) -> NDArray[np.bool_]:
+    """[H, W] pixels in which plate `pose` shows another state than the scene of frame `index`, and stands still.
+
+    The surface that the truth shows stood elsewhere when the plate was taken, or the plate's surface stands elsewhere
+    in the truth; and in no frame up to `window` before or after the plate did either surface of the pixel move.
+
+    Args:
+        standing: the scene of a frame.
+        view: the camera of frame `pose`.
+    """
+    rays = view.rays()
+    origins = np.broadcast_to(view.eye, rays.shape)
+    truth, plate = (standing(time).cast(origins, rays) for time in (index, pose))
+    mask = _displaced(geometry, truth, index, pose) > ELSEWHERE_METRES
+    mask |= _displaced(geometry, plate, pose, index) > ELSEWHERE_METRES
+    which = np.flatnonzero(mask)
+    plate = Hits(plate.distance[which], plate.face[which], plate.barycentric[which])
+    for time in range(max(0, pose - window), min(len(geometry.moving), pose + window + 1)):
+        near = standing(time).cast(origins[which], rays[which])
+        moves = _displaced(geometry, plate, pose, time) > SWAY_METRES
+        mask[which] &= ~(moves | (_displaced(geometry, near, time, pose) > SWAY_METRES))
+    return mask.reshape(view.height, view.width)
+
+
+def _displaced(geometry: Geometry, hits: Hits, time: int, other: int) -> Array:
+    """[R] metres between where the surface points that rays met at a frame are and where they are at another."""
+    corners = geometry.triangles[np.maximum(hits.face, 0)] - len(geometry.static)
+    which = np.flatnonzero((hits.face >= 0) & (corners[:, 0] >= 0))
+    moved = np.zeros(len(hits.face))
+    if len(which):
+        apart = geometry.moving[other][corners[which]] - geometry.moving[time][corners[which]]
+        moved[which] = np.linalg.norm(np.einsum("nk,nkd->nd", hits.barycentric[which], apart), axis=1)
+    return moved

@@ -77,14 +77,16 @@ class Stage:
         surfaces = [self._material(m["file"], m["emission"]) for m in plan["materials"]]
         self._mesh("static", surfaces, smooth=False)
         self.movers: list[tuple[Any, np.ndarray]] = []
+        self.mover_names: dict[str, int] = {}
         for mover in plan["movers"]:
             made = self._mesh(mover["name"], [self._material(mover["texture"], 0.0)], smooth=True)
             made.visible_camera = mover["in_view"]
             path = folder / "geometry" / f"{mover['name']}.npy"
+            self.mover_names[mover["name"]] = len(self.movers)
             self.movers.append((made.data, np.load(path, mmap_mode="r", allow_pickle=False)))
             if mover["name"] == plan.get("thing", {}).get("mover"):
                 self.thing, self.without = made, self._without(mover, made)
-        self.time: float | None = None
+        self.time: tuple[float, dict[str, float]] | None = None
         camera = bpy.data.cameras.new("camera")
         camera.sensor_fit, camera.sensor_width = "HORIZONTAL", 36.0
         camera.lens = 36.0 * plan["focal_per_width"]
@@ -310,19 +312,25 @@ class Stage:
         self.collection.objects.link(made)
         return made
 
-    def _go_to(self, moment: float) -> None:
-        """Moves everything to a time in (fractional) frames, between neighbouring frames linearly."""
-        if moment == self.time:
+    def _go_to(self, time: float, elsewhen: dict[str, float]) -> None:
+        """Moves everything to a time in (fractional) frames, between neighbouring frames linearly.
+
+        `elsewhen`: {mover: the time that it goes to instead}.
+        """
+        if (time, elsewhen) == self.time:
             return
-        before = int(np.floor(moment))
-        share = np.float32(moment - before)
-        for mesh, vertices in self.movers:
+        moments = [time] * len(self.movers)
+        for name, other in elsewhen.items():
+            moments[self.mover_names[name]] = other
+        for moment, (mesh, vertices) in zip(moments, self.movers, strict=True):
+            before = int(np.floor(moment))
+            share = np.float32(moment - before)
             at = vertices[before]
             if share:
                 at = (1 - share) * at + share * vertices[min(before + 1, len(vertices) - 1)]
             mesh.vertices.foreach_set("co", np.ascontiguousarray(at, np.float32).ravel())
             mesh.update()
-        self.time = moment
+        self.time = (time, dict(elsewhen))
 
     def _place_camera(self, world_to_camera: list[list[float]]) -> None:
         # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
@@ -342,7 +350,7 @@ class Stage:
             render.use_border = high - low < height
             # Blender counts rows from below.
             render.border_min_y, render.border_max_y = 1.0 - high / height, 1.0 - low / height
-            light[low:high] = self._light_of(band)[low:high]
+            light[low:high] = self._exposed(job, band)[low:high]
         render.use_border = False
         beside = out.with_name(f".{out.stem}.{os.getpid()}.tmp.png")
         beside.write_bytes(png(srgb(light * 2.0 ** (stops + job["stops"]))))
@@ -356,13 +364,25 @@ class Stage:
         render.border_min_x, render.border_max_x = left / width, right / width
         render.border_min_y, render.border_max_y = 1.0 - bottom / height, 1.0 - top / height
         self._take_away(True)
-        light[top:bottom, left:right] = self._light_of(job["bands"][0])[top:bottom, left:right]
+        light[top:bottom, left:right] = self._exposed(job, job["bands"][0])[top:bottom, left:right]
         self._take_away(False)
         render.border_min_x, render.border_max_x = 0.0, 1.0
 
-    def _light_of(self, band: dict[str, Any]) -> np.ndarray:
+    def _exposed(self, job: dict[str, Any], band: dict[str, Any]) -> np.ndarray:
+        """[h, w, 3] scene-linear: the band, or the mean over the moments while the shutter is open."""
+        elsewhen = job.get("elsewhen", {})
+        if "shutter" not in job:
+            return self._light_of(band, elsewhen)
+        pictures = []
+        for number, moment in enumerate(job["shutter"]):
+            # Each moment has noise of its own, so that the mean has less.
+            self.scene.cycles.seed = (job["noise"] + number) % (1 << 31)
+            pictures.append(self._light_of(moment, elsewhen))
+        return np.mean(pictures, axis=0)
+
+    def _light_of(self, band: dict[str, Any], elsewhen: dict[str, float] | None = None) -> np.ndarray:
         """[h, w, 3] scene-linear, rows downwards: the rendered pixels averaged to those of the picture."""
-        self._go_to(band["time"])
+        self._go_to(band["time"], elsewhen or {})
         self._place_camera(band["world_to_camera"])
         path = self.folder / f".render.{os.getpid()}.exr"
         self.scene.render.filepath = str(path)

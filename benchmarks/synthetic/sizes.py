@@ -11,9 +11,11 @@ LIMITS = ("moving-shadow", "exposure-ramp", "fast-mover", "rolling-shutter")
 """Kinds of scenes beside `plain`: each breaks one assumption of the method."""
 VERDICTS = ("walker", "still", "tripod")
 """Kinds of scenes that the verdict is tried on: somebody walks through, nothing moves, the camera only turns."""
-HARD = ("glass", "swinging", "arm", "hair")
+HARD = ("glass", "swinging", "arm", "hair", "held")
 """Kinds of scenes each with a thing that a freeze loses: a window and a mirror, an apple on a thread, an arm that waves
-or points, fine hair before a bright window."""
+or points, fine hair before a bright window, and what stands still in two states (held.py)."""
+HELD = "held"
+"""The kind of held.py, and the region of its truth that another state stood in."""
 THING = "thing_"
 """What the names of a hard scene's masks begin with in its .npz files."""
 KINDS = ("plain", *LIMITS, *VERDICTS, *HARD)

@@ -33,13 +33,13 @@ def world() -> Geometry:
         Pane.of(MIRROR, [-1.2, 2.98, 0.9], [1.0, 0, 0], [0, 0, 1.2]),
         Pane.of(GLASS, [0.3, 3.0, 0.9], [1.0, 0, 0], [0, 0, 1.2]),
     ]
-    return Geometry(fixed.vertices, vertices, triangles, panes, "", np.zeros(len(triangles), bool))
+    return Geometry(fixed.vertices, vertices, triangles, panes, {})
 
 
 def with_board(world: Geometry, moved: list[float]) -> Geometry:
     """The same world with the board elsewhere."""
     moving = world.moving + np.array(moved, np.float32)
-    return Geometry(world.static, moving, world.triangles, world.panes, world.thing, world.thing_faces)
+    return Geometry(world.static, moving, world.triangles, world.panes, world.things)
 
 
 def view(yaw: float = 0.0, eye: np.ndarray = EYE) -> View:

@@ -28,7 +28,12 @@ REGIONS = ("seen", "never_seen", "moving", "static")
 """By truth: visible in the clip's frame at t*; not; on something that moves in the clip; on nothing that does."""
 PANES = ("glass", "mirror")
 """Of a hard scene: pixels of a window's pane and of a mirror in which nothing moves, by truth."""
-THINGS = (*PANES, "wall", "swinging", "arm", "hair")
+HELD = "held"
+"""Optional: pixels in which the plate of the pose shows another state than t*, although nothing moves there within half
+a second of that plate."""
+HELD_THINGS = ("raised", "turned", "resting", "leaving", "set_down")
+"""An arm that is raised once; a head that turns unseen; a hand that leaves a table; a person who leaves; a box."""
+THINGS = (*PANES, "wall", "swinging", "arm", "hair", *HELD_THINGS, HELD)
 """Besides: the still wall around panes; something that swings on a thread; an arm that gestures; loose hair."""
 RIGID = "rigid"
 """The region of a real clip in which the plate is the truth."""

@@ -10,6 +10,8 @@ import torch
 
 from benchmarks import detail, detail_cost, detail_flow, detail_truth, still_truth
 from benchmarks.detail_clip import VARIANTS, open_clip
+from benchmarks.other_state import OTHER, Painted, Pair, Polygon, score
+from benchmarks.other_state import __main__ as other_state
 from torch_backend.footage.images import read_png
 from torch_backend.footage.plates import Plates
 from torch_backend.shot import Shot, write_json
@@ -61,6 +63,19 @@ def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
     assert found["clip"]["delivered"]["excess_px"] is None
     assert detail_flow.verdicts([found]) == ["t* 109: nothing moves in these frames, or nothing is still."]
     assert "| t* 109, plate | – | – |" in detail_flow.table("tiny", [found])[2]
+
+
+def test_what_is_let_go_of_is_scored_against_painted_masks(shot, capsys, tmp_path):
+    clip = open_clip(shot.root, develop=False)
+    t_star, frame = clip.frames[8], clip.frames[12]
+    whole = Polygon(np.array([(0, 0), (64, 0), (64, 48), (0, 48)], float), "everything", OTHER)
+    pairs = (Pair(t_star, t_star, 2, (whole,)), Pair(t_star, frame, 2, (whole,)), Pair(t_star, frame, 2, ()))
+    itself, all_other, all_same = (row.counts["delivered"] for row in score(clip, Painted("tiny", "", 64, 48, pairs)))
+    assert itself.recall == 0.0, "plate t* shows t*"
+    assert all_other.recall is not None and 0.02 < all_other.recall < 0.9, "the patch moved, the rest did not"
+    assert all_same.extra == all_other.both and all_same.right == all_other.missed
+    assert other_state.main([str(shot.root), "--results", str(tmp_path)]) == 1
+    assert "no masks were painted" in capsys.readouterr().err
 
 
 def test_the_verdict_is_of_frames_and_of_all_together():

@@ -1,0 +1,24 @@
+"""Hand-painted masks of real plates: which pixels of plate m show another state of the scene than plate t*.
+
+The masks are polygons in `sitting.json`, `kitchen.json` and `hall.json` beside this file; each says how it was painted.
+`score` compares them with what a frozen frame lets go of its own plate.
+"""
+
+from .masks import OTHER, SAME, UNSCORED, Painted, Pair, Polygon, load_masks, plate_labels
+from .scores import Counts, Row, mean_counts, pooled_counts, score
+
+__all__ = [
+    "OTHER",
+    "SAME",
+    "UNSCORED",
+    "Counts",
+    "Painted",
+    "Pair",
+    "Polygon",
+    "Row",
+    "load_masks",
+    "mean_counts",
+    "plate_labels",
+    "pooled_counts",
+    "score",
+]

@@ -1,0 +1,144 @@
+"""Scores of what a frozen frame lets go of its own plate, against the painted masks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.detail_clip import DetailClip, View, over
+from benchmarks.detail_figures import MOVER_MATTE
+from torch_backend.solve.plate_lens import load_plate_lenses
+
+from .masks import OTHER, SAME, Labels, Painted, plate_labels
+
+LET_GO = 0.5
+"""A pixel's own plate is let go of where its matte is below this: more than half of the pixel comes from elsewhere."""
+METHODS = ("delivered", "mattes")
+"""What the delivered frame lets go of; what motion mattes alone would let go of: the plate's own matte, and that of
+plate t* carried to the plate by the frozen depth."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Scored pixels of one frame or of several."""
+
+    both: int
+    """Let go of, and painted as another state."""
+    extra: int
+    """Let go of, although plate t* would show the same."""
+    missed: int
+    """Kept, although painted as another state."""
+    right: int
+    """Kept, and the same at t*."""
+
+    @property
+    def iou(self) -> float | None:
+        """Intersection over union; None if nothing is painted: `extra_share` judges such a frame."""
+        return _ratio(self.both, self.both + self.extra + self.missed) if self.both + self.missed else None
+
+    @property
+    def precision(self) -> float | None:
+        """Share of what was let go of that is painted; None if nothing was let go of or nothing is painted."""
+        return _ratio(self.both, self.both + self.extra) if self.both + self.missed else None
+
+    @property
+    def recall(self) -> float | None:
+        """Share of what is painted that was let go of; None if nothing is painted."""
+        return _ratio(self.both, self.both + self.missed)
+
+    @property
+    def extra_share(self) -> float | None:
+        """Share of the pixels that are the same at t* that was let go of all the same."""
+        return _ratio(self.extra, self.extra + self.right)
+
+    def figures(self) -> dict[str, float | int | None]:
+        """All of it for a JSON."""
+        ratios = {"iou": self.iou, "precision": self.precision, "recall": self.recall, "extra_share": self.extra_share}
+        return {**ratios, **vars(self)}
+
+
+@dataclass(frozen=True)
+class Row:
+    """The scores of one pair of t* and frame."""
+
+    t_star: int
+    """Frame number of the frozen instant."""
+    frame: int
+    """Frame number of the plate."""
+    counts: dict[str, Counts]
+    """By METHODS."""
+
+    def figures(self) -> dict[str, Any]:
+        """All of it for a JSON."""
+        named = {name: counts.figures() for name, counts in self.counts.items()}
+        return {"t_star": self.t_star, "frame": self.frame, **named}
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+def count(is_let_go: NDArray[np.bool_], labels: Labels) -> Counts:
+    """Counts of one frame, both [H, W]."""
+    is_other, is_same = labels == OTHER, labels == SAME
+    return Counts(
+        int((is_let_go & is_other).sum()), int((is_let_go & is_same).sum()),
+        int((~is_let_go & is_other).sum()), int((~is_let_go & is_same).sum()),
+    )  # fmt: skip
+
+
+def pooled_counts(counts: Iterable[Counts]) -> Counts:
+    """The sum over frames: large regions weigh more."""
+    rows = [(c.both, c.extra, c.missed, c.right) for c in counts]
+    return Counts(*(sum(column) for column in zip(*rows, strict=True))) if rows else Counts(0, 0, 0, 0)
+
+
+def mean_counts(counts: Sequence[Counts]) -> dict[str, float | None]:
+    """{figure: mean over the frames that have one}; each frame weighs the same."""
+    means: dict[str, float | None] = {}
+    for name in ("iou", "precision", "recall", "extra_share"):
+        values = [value for c in counts if (value := getattr(c, name)) is not None]
+        means[name] = float(np.mean(values)) if values else None
+    return means
+
+
+def score(clip: DetailClip, masks: Painted) -> list[Row]:
+    """The scores of a trained shot's frozen frames, a row for every painted pair.
+
+    Frames are rendered as a take renders them; instants are developed if the clip develops.
+    """
+    return [row for row, _, _ in judged(clip, masks)]
+
+
+def judged(clip: DetailClip, masks: Painted) -> Iterable[tuple[Row, View, Labels]]:
+    """(scores, frozen frame, labels [H, W] of its plate) of every painted pair, one after the other."""
+    # A shot with cameras of truth has no record of a solve: its frames never went through a lens.
+    lenses = load_plate_lenses(clip.shot) if clip.shot.solve_record.is_file() else {}
+    scale = np.array([masks.width / clip.width, masks.height / clip.height], np.float32)
+    straight = np.stack(np.meshgrid(np.arange(clip.width) + 0.5, np.arange(clip.height) + 0.5), -1).astype(np.float32)
+    for pair in masks.pairs:
+        image = clip.splats(pair.frame, pair.t_star)
+        detailed = clip.detailed(pair.frame, pair.t_star, image)
+        view = View(image, detailed, over(image.color, image.alpha), over(detailed.color, detailed.alpha))
+        where = lenses[pair.frame].where(clip.width, clip.height) if lenses else straight
+        labels = plate_labels(masks.labels(pair), where * scale)
+        counts = {
+            name: count(let_go.numpy(), labels)
+            for name, let_go in zip(METHODS, _let_go(clip, pair.t_star, pair.frame, view), strict=True)
+        }
+        yield Row(pair.t_star, pair.frame, counts), view, labels
+
+
+def _let_go(clip: DetailClip, t_star: int, frame: int, view: View) -> tuple[Tensor, Tensor]:
+    """Bool [H, W] by METHODS."""
+    detailed = view.detailed
+    # On the clip's own poses the frame's own plate leads. If another one did, nothing of the own plate would be kept.
+    delivered = (detailed.matte < LET_GO) | (detailed.leading != frame)
+    own, frozen = clip.mattes(frame, t_star, view)
+    return delivered, torch.maximum(own, frozen) > MOVER_MATTE

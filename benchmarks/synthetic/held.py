@@ -1,0 +1,463 @@
+"""Kind `held`: what stands still for seconds in one state, changes within a second, and stands still in another.
+
+Optical flow between neighbouring frames calls it still in both states. Each scene has three people, and each of them
+plays one of five roles (`ROLES`), chosen by the seed (`CAST`). Every change happens between two instants t*, so that
+nothing changes at an instant. Metres, z up; times in seconds of the clip.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_backend.footage.images import write_png
+
+from .cameras import CameraMove
+from .geometry import Builder, Mesh
+from .hard import Thing, share_in_view
+from .noise import Array, fractal, smooth_step, stream
+from .places import Furnisher, Keepout
+from .sizes import Size
+
+if TYPE_CHECKING:
+    from .people import Bodies, Body, Person, Pose
+
+RAISED, TURNED, RESTING, LEAVING, SET_DOWN = "raised", "turned", "resting", "leaving", "set_down"
+ROLES = (RAISED, TURNED, RESTING, LEAVING, SET_DOWN)
+"""An arm that is raised once and kept up (before a panel of its own colour in even seeds); a head that turns while a
+column hides it from the camera; a hand that rests on a table and leaves it; a person who walks into a cubicle and stays
+there; a box that is held and then set down."""
+CAST = (
+    (RAISED, RESTING, LEAVING),
+    (RAISED, RESTING, SET_DOWN),
+    (RAISED, TURNED, LEAVING),
+    (RAISED, TURNED, SET_DOWN),
+    (RAISED, RESTING, SET_DOWN),
+    (RAISED, LEAVING, SET_DOWN),
+    (RAISED, TURNED, SET_DOWN),
+    (TURNED, RESTING, LEAVING),
+    (RAISED, LEAVING, SET_DOWN),
+    (RAISED, RESTING, LEAVING),
+)
+"""Roles by `seed % 10`. A head turns only where the camera goes aside and returns or orbits (`seed % 4` of 2 or 3): one
+that walks forward or pans does not pass a column and still see both states."""
+CHANGE_SECONDS = {RAISED: 0.6, TURNED: 0.6, RESTING: 0.6, LEAVING: 1.2, SET_DOWN: 1.0}
+"""How long a change takes: an arm moves as people move it without haste, a walk of 1.5 m at 1.3 m/s."""
+REST_SECONDS = 0.5
+"""Least time between a change and an instant, where the clip leaves that much."""
+RESTLESS = 0.2
+"""Factor on the drift of these people: 95 % of their vertices stay within 3 cm while a state lasts (0.3: 4 cm)."""
+SPOTS, GOOD_SPOTS, LAYOUTS = 400, 150, 20
+"""Random places that are tried for a role, how many of the best are kept, and random layouts of those that are improved
+place by place: the one with the best view of every role is taken."""
+COLUMN_SHARE = 0.45
+"""Where the column stands on the line from the head to the camera: nearer to the camera it hides more than the head."""
+HEAD_RADIUS, ARM_RADIUS = 0.13, 0.4
+"""Metres around the middle of a head, and of anything else that is held, that should be in sight."""
+COLUMN_HEIGHT = 2.1
+PANEL_SIZE, PANEL_BEHIND = (1.9, 0.06, 2.3), 0.5
+"""Metres: width, depth and height of the panel of the arm's own colour, and how far behind the person it stands."""
+CUBICLE, WALK_METRES = 1.0, 1.5
+"""Side of the cubicle, and how far its middle is from where the one who leaves stood."""
+CUBICLE_HEIGHT = 2.2
+BOX_SIZE = (0.2, 0.2, 0.24)
+
+_ARM_DOWN: Pose = {"upperarm01.R": (4, -30, 0), "lowerarm01.R": (22, 0, 0)}
+_ARM_UP: tuple[Pose, ...] = (
+    {"upperarm01.R": (-20, 95, 0), "lowerarm01.R": (30, 0, 0)},
+    {"upperarm01.R": (0, 28, 0), "lowerarm01.R": (-35, 40, 0)},
+    {"upperarm01.R": (-10, 60, 0), "lowerarm01.R": (0, 0, 0)},
+)
+_HAND_ON_TABLE: Pose = {"upperarm01.R": (-22, -16, 0), "lowerarm01.R": (-14, 0, 0)}
+_HAND_UP: Pose = {"upperarm01.R": (-22, 22, 0), "lowerarm01.R": (-62, 0, 12)}
+_HOLDS: Pose = {"upperarm01.R": (-20, -10, 0), "lowerarm01.R": (-52, 0, 0)}
+_OVER_TABLE: Pose = {"upperarm01.R": (-30, -16, 0), "lowerarm01.R": (-6, 0, 0)}
+_HEAD_TURN: Pose = {"neck01": (0, 0, 18), "head": (0, 0, 22)}
+_STRIDE: Pose = {
+    "upperleg01.L": (-24, 0, 0),
+    "lowerleg01.L": (10, 0, 0),
+    "upperleg01.R": (16, 0, 0),
+    "lowerleg01.R": (24, 0, 0),
+}
+_OTHER_STRIDE: Pose = {bone[:-1] + ("R" if bone.endswith("L") else "L"): v for bone, v in _STRIDE.items()}
+_LEGS_DOWN: Pose = dict.fromkeys(_STRIDE, (0, 0, 0))
+
+
+@dataclass
+class Part:
+    """One role of a scene and who plays it."""
+
+    role: str
+    person: Person
+    begin: float
+    """Seconds at which the change begins."""
+    end: float
+    """Seconds at which it is over."""
+    things: list[Thing] = field(default_factory=list)
+    """What is held, as triangles of a mover; filled by `perform`."""
+    movers: list[str] = field(default_factory=list)
+    """Everything that the change moves; filled by `perform`."""
+
+    def other_time(self, seconds: float) -> float:
+        """A time at which the other state stands still, seen from the state at `seconds`."""
+        return self.end + 0.25 if seconds < 0.5 * (self.begin + self.end) else self.begin - 0.25
+
+    def to_json(self) -> dict[str, object]:
+        """As it stands in plan.json."""
+        return {"name": self.role, "movers": self.movers, "begin": self.begin, "end": self.end}
+
+
+@dataclass
+class Held:
+    """The roles of one scene, and where its furniture stands."""
+
+    parts: list[Part]
+    clear: list[Keepout]
+    """Ground that people, props and the lines of sight to them need."""
+    columns: list[tuple[float, float, float]]
+    """x, y and radius of what hides a head while it turns."""
+
+    def part_of(self, person: Person) -> Part:
+        """The role that a person plays."""
+        return next(part for part in self.parts if part.person is person)
+
+    def furnish(self, furnisher: Furnisher) -> None:
+        """Puts up columns and cubicles."""
+        for x, y, radius in self.columns:
+            furnisher.build.cylinder([x, y, 0.0], radius, COLUMN_HEIGHT, furnisher.material("bricks"))
+        for part in self.parts:
+            if part.role == LEAVING:
+                x, y = _walks_to(part.person.place, part.person.heading)
+                size = [CUBICLE, CUBICLE, CUBICLE_HEIGHT]
+                furnisher.build.box([x, y, CUBICLE_HEIGHT / 2], size, furnisher.material("fabric"), part.person.heading)
+
+
+def change_times(size: Size, role: str, rng: np.random.Generator) -> tuple[float, float]:
+    """(begin, end) in seconds of a change: in the middle between two instants, or nearly there.
+
+    A clip with a single instant changes before it; one whose instants leave no room (`paper`) in its middle third.
+    """
+    length, duration = CHANGE_SECONDS[role], (size.frames - 1) / size.fps
+    instants = [index / size.fps for index in size.t_star_indices()]
+    gaps = [(a, b) for a, b in itertools.pairwise(instants) if b - a > length]
+    if len(instants) == 1:
+        gaps = [(0.0, instants[0])]
+    begin, end = gaps[int(rng.integers(len(gaps)))] if gaps else (duration / 3, 2 * duration / 3)
+    spare = max(0.0, 0.5 * (end - begin - length) - REST_SECONDS)
+    middle = 0.5 * (begin + end) + spare * float(rng.uniform(-1.0, 1.0))
+    return middle - 0.5 * length, middle + 0.5 * length
+
+
+# ------------------------------------------------------------------------------------------------- who stands where
+
+
+@dataclass
+class _Spot:
+    """Where a role is played, in one layout that is tried."""
+
+    place: Array
+    """[2] metres."""
+    middle: Array
+    """[2] the middle of what is held, in its two states."""
+    heading: float
+    solid: list[Array]
+    """Discs (x, y, radius) that hide what is behind them: the person and the props."""
+    column: Array | None = None
+    """The one of them that may hide its own person."""
+
+
+def cast(seed: int, size: Size, camera: CameraMove) -> Held:
+    """Who plays what, where and when."""
+    rng = stream(seed, "held")
+    roles = CAST[seed % 10]
+    times = [change_times(size, role, rng) for role in roles]
+    seconds = np.linspace(0.0, camera.duration, 24)
+    views = camera.world_to_camera(seconds)
+    eyes = _eyes(views)
+    choices: list[list[_Sight]] = []
+    for role, time in zip(roles, times, strict=True):
+        tried = [_spot(role, time, seed, camera, eyes, rng) for _ in range(SPOTS)]
+        fits = [_Sight.of(spot, time, seconds, views) for spot in tried if spot]
+        choices.append(sorted(fits, key=lambda sight: -sight.shown([]))[:GOOD_SPOTS])
+    spots = [sight.spot for sight in _layout(choices, rng)]
+    parts = [
+        Part(role, _person(seed, number, role, spot, time), *time)
+        for number, (role, spot, time) in enumerate(zip(roles, spots, times, strict=True))
+    ]
+    clear = [Keepout(float(x), float(y), float(r) + 0.1) for spot in spots for x, y, r in spot.solid]
+    for spot, (eye, share) in itertools.product(spots, itertools.product(eyes[::6], np.arange(0.3, 0.9, 0.1))):
+        at = spot.place + share * (eye - spot.place)
+        clear.append(Keepout(float(at[0]), float(at[1]), 0.2))
+    columns = [(float(s.column[0]), float(s.column[1]), float(s.column[2])) for s in spots if s.column is not None]
+    return Held(parts, clear, columns)
+
+
+def _spot(
+    role: str, time: tuple[float, float], seed: int, camera: CameraMove, eyes: Array, rng: np.random.Generator
+) -> _Spot | None:
+    """A random place for a role with its props; None if it is in the camera's way or leaves the place."""
+    place = np.array([rng.uniform(-2.3, 2.3), rng.uniform(-1.4, 2.2)])
+    away = eyes[len(eyes) // 2] - place
+    away = away / np.linalg.norm(away)
+    facing = float(np.arctan2(away[0], -away[1]))
+    # The body looks along (sin, -cos) of its heading; turned to its left, the right arm is nearer to the camera.
+    turned = {RAISED: 0.0, TURNED: 0.0, RESTING: 40.0, SET_DOWN: 55.0}
+    solid, column = [np.array([*place, 0.3])], None
+    if role == LEAVING:
+        side = float(rng.choice([-1.0, 1.0]))
+        heading = float(facing + side * np.pi / 2)
+        booth = np.array([*_walks_to((place[0], place[1]), heading), 0.72 * CUBICLE])
+        solid.append(booth)
+        if abs(booth[0]) > 2.8 or booth[1] > 2.5:
+            return None
+    else:
+        heading = facing + np.radians(turned[role])
+    ahead = np.array([np.sin(heading), -np.cos(heading)])
+    right = np.array([-np.cos(heading), -np.sin(heading)])
+    middle = place + {RAISED: 0.3 * right, RESTING: 0.25 * ahead, SET_DOWN: 0.25 * ahead}.get(role, 0.0 * ahead)
+    if role in (RESTING, SET_DOWN):
+        solid.append(np.array([*(place + 0.45 * ahead), 0.35]))
+    if role == RAISED and seed % 2 == 0:
+        solid.append(np.array([*(place - PANEL_BEHIND * away), 0.5]))
+    if role == TURNED:
+        column = _column(place, 0.5 * sum(time), camera)
+        solid.append(column)
+    if any(np.hypot(*(eyes - disc[:2]).T).min() < disc[2] + 0.75 for disc in solid):
+        return None
+    return _Spot(place, middle, heading, solid, column)
+
+
+def _column(place: Array, middle: float, camera: CameraMove) -> Array:
+    """[3] x, y, radius of a column that hides a head from 0.4 s before the middle of its turn until 0.4 s after."""
+    views = camera.world_to_camera(middle + np.linspace(-0.4, 0.4, 9))
+    eyes = _eyes(views)
+    at = place + COLUMN_SHARE * (eyes[4] - place)
+    lines = (eyes - place) / np.linalg.norm(eyes - place, axis=1, keepdims=True)
+    off = np.abs(lines[:, 0] * (at - place)[1] - lines[:, 1] * (at - place)[0]).max()
+    return np.array([*at, off + HEAD_RADIUS * (1.0 - COLUMN_SHARE)])
+
+
+def _walks_to(place: tuple[float, float], heading: float) -> tuple[float, float]:
+    """x, y of the middle of the cubicle."""
+    return place[0] + WALK_METRES * float(np.sin(heading)), place[1] - WALK_METRES * float(np.cos(heading))
+
+
+@dataclass
+class _Sight:
+    """From where a spot is seen, in T views."""
+
+    spot: _Spot
+    lines: Array
+    """[T, 2] unit vectors to the camera."""
+    length: Array
+    """[T] metres to the camera."""
+    in_view: NDArray[np.bool_]
+    """[T] whether the picture shows it, and its own column does not hide it."""
+    states: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+    """[T] which views are before the change, and which after it."""
+
+    @classmethod
+    def of(cls, spot: _Spot, time: tuple[float, float], seconds: Array, views: Array) -> _Sight:
+        """The sight of a spot whose change takes `time`, in views [T] at seconds [T]."""
+        away = _eyes(views) - spot.middle
+        length = np.linalg.norm(away, axis=1)
+        point = np.array([*spot.middle, 1.2])
+        in_view = np.array([share_in_view(views[i : i + 1], point) > 0.5 for i in range(len(views))])
+        sight = cls(spot, away / length[:, None], length, in_view, (seconds < time[0], seconds > time[1]))
+        if spot.column is not None:
+            sight.in_view &= sight._is_open([spot.column])
+        return sight
+
+    def _is_open(self, discs: list[Array]) -> NDArray[np.bool_]:
+        """[T] whether none of the discs (x, y, radius) stands before it."""
+        is_open, width = np.ones(len(self.length), bool), HEAD_RADIUS if self.spot.column is not None else ARM_RADIUS
+        for x, y, radius in discs:
+            to = np.array([x, y]) - self.spot.middle
+            along, off = self.lines @ to, np.abs(self.lines[:, 0] * to[1] - self.lines[:, 1] * to[0])
+            is_open &= (along < 0.0) | (along > self.length) | (off > radius + width * (1.0 - along / self.length))
+        return is_open
+
+    def shown(self, others: list[_Sight]) -> float:
+        """In what share of the views of the rarer state it is seen past other spots; less where it is far away."""
+        shown = self.in_view & self._is_open([disc for other in others for disc in other.spot.solid])
+        return float(min(shown[state].mean() for state in self.states)) - 0.04 * float(self.length.mean())
+
+
+def _layout(choices: list[list[_Sight]], rng: np.random.Generator) -> list[_Sight]:
+    """One spot per role: the best of some random layouts, each improved role by role. ValueError if none fits."""
+    best, found = -np.inf, None
+    for _ in range(LAYOUTS):
+        layout = [sights[int(rng.integers(len(sights)))] for sights in choices]
+        for role in [*range(len(choices))] * 2:
+            scores = [_worth([*layout[:role], sight, *layout[role + 1 :]]) for sight in choices[role]]
+            layout[role] = choices[role][int(np.argmax(scores))]
+        if _worth(layout) > best:
+            best, found = _worth(layout), layout
+    if found is None:
+        raise ValueError("no layout of held things fits this seed")
+    return found
+
+
+def _worth(layout: list[_Sight]) -> float:
+    """How well a layout shows its roles, the worst first; -inf if two of them touch."""
+    for a, b in itertools.combinations(layout, 2):
+        for one, other in itertools.product(a.spot.solid, b.spot.solid):
+            if np.hypot(*(one[:2] - other[:2])) < one[2] + other[2] + 0.15:
+                return -np.inf
+    shares = [sight.shown([other for other in layout if other is not sight]) for sight in layout]
+    return min(shares) + 0.3 * float(np.mean(shares))
+
+
+def _eyes(views: Array) -> Array:
+    """[T, 2] x, y of the cameras [T, 4, 4]."""
+    return -np.einsum("tji,tj->ti", views[:, :3, :3], views[:, :3, 3])[:, :2]
+
+
+def _person(seed: int, number: int, role: str, spot: _Spot, time: tuple[float, float]) -> Person:
+    """An adult who holds still but for the change of the role."""
+    from .people import Person
+
+    rng = stream(seed, "held", role)
+    phenotype = {
+        "gender": float(rng.uniform()),
+        "age": float(rng.choice([rng.uniform(0.62, 0.75), rng.uniform(0.85, 0.95)])),
+        "muscle": float(rng.uniform(0.35, 0.7)),
+        "weight": float(rng.uniform(0.3, 0.7)),
+        "height": float(rng.uniform(0.4, 0.6)),
+        "proportions": float(rng.uniform(0.4, 0.8)),
+    }
+    place = (float(spot.place[0]), float(spot.place[1]))
+    person = Person(f"person{number}", phenotype, "stand", place, float(spot.heading), RESTLESS)
+    return replace(person, changes=_changes(role, time, rng))
+
+
+def _changes(role: str, time: tuple[float, float], rng: np.random.Generator) -> tuple[tuple[float, float, Pose], ...]:
+    """(begin, end, pose after it) in seconds; what a role begins with is reached before the clip does."""
+    before, (begin, end) = (-2.0, -1.0), time
+    half = 0.5 * (begin + end)
+    if role == RAISED:
+        return ((begin, end, _ARM_UP[int(rng.integers(len(_ARM_UP)))]),)
+    if role == TURNED:
+        sign = float(rng.choice([-1.0, 1.0]))
+        first, last = ({b: (0.0, 0.0, s * v[2]) for b, v in _HEAD_TURN.items()} for s in (-sign, sign))
+        return (*before, first), (begin, end, last)
+    if role == RESTING:
+        return (*before, _HAND_ON_TABLE), (begin, end, _HAND_UP)
+    if role == SET_DOWN:
+        return (*before, _HOLDS), (begin, half, _OVER_TABLE), (half, end, _ARM_DOWN)
+    steps = np.linspace(begin, end, 5)
+    poses = (_STRIDE, _OTHER_STRIDE, _STRIDE, _LEGS_DOWN)
+    return tuple((float(a), float(b), pose) for (a, b), pose in zip(itertools.pairwise(steps), poses, strict=True))
+
+
+# ------------------------------------------------------------------------------------------------- what they do
+
+
+Extra = tuple[str, Array, Mesh]
+"""Name, vertices [T, V, 3] and mesh of something that stands beside a person; its picture is textures/<name>.png."""
+
+
+def perform(
+    folder: Path, part: Part, bodies: Bodies, body: Body, furnisher: Furnisher, seed: int, seconds: Array
+) -> list[Extra]:
+    """Moves the body and puts up the props of a role, and says which triangles are the held thing.
+
+    `seconds` [T]; `body.vertices` is changed in place for who walks. Pictures of extras are written.
+    """
+    name, role = part.person.name, part.role
+    part.movers = [name]
+    faces = np.ones(len(body.triangles), bool)
+    extras: list[Extra] = []
+    if role == LEAVING:
+        share = smooth_step(seconds, part.begin, part.end)[:, None, None]
+        to = np.subtract(_walks_to(part.person.place, part.person.heading), part.person.place)
+        body.vertices += (share * np.array([*to, 0.0])).astype(np.float32)
+    elif role == TURNED:
+        faces = _faces(bodies.influence["head"] + bodies.influence["eyes"], body)
+    else:
+        faces = _faces(bodies.influence["right_arm"], body)
+    if role == RESTING:
+        hand = body.vertices[_index(seconds, part.begin - 0.1), bodies.influence["right_hand"] > 0.9]
+        _table(furnisher, part.person, hand.astype(np.float64), float(hand[:, 2].min()) + 0.004)
+    if role == RAISED and seed % 2 == 0:
+        extras.append(_panel(folder, part, body, faces, seed, seconds))
+    if role == SET_DOWN:
+        extras.append(_set_down(folder, part, bodies, body, furnisher, seed, seconds))
+        part.movers.append(extras[0][0])
+        part.things = [Thing(role, extras[0][0], every := np.ones(len(extras[0][2].triangles), bool), every)]
+    else:
+        part.things = [Thing(role, name, faces, faces)]
+    return extras
+
+
+def _index(seconds: Array, at: float) -> int:
+    """Frame nearest to a time."""
+    return int(np.abs(seconds - at).argmin())
+
+
+def _faces(influence: Array, body: Body) -> NDArray[np.bool_]:
+    """[F] triangles that mostly follow some bones."""
+    return influence[body.triangles].mean(axis=1) > 0.5
+
+
+def _table(furnisher: Furnisher, person: Person, above: Array, height: float) -> None:
+    """A small round table whose top is at `height` below points [P, 3], mostly on their side away from the person."""
+    ahead = np.array([np.sin(person.heading), -np.cos(person.heading)])
+    x, y = above[:, :2].mean(axis=0) + 0.08 * ahead
+    wood = furnisher.material("planks")
+    furnisher.build.cylinder([x, y, 0.0], 0.18, 0.03, wood)
+    furnisher.build.cylinder([x, y, 0.03], 0.03, height - 0.06, wood, 12)
+    furnisher.build.cylinder([x, y, height - 0.03], 0.22, 0.03, wood)
+    # The underside: a cylinder has none.
+    furnisher.build.cylinder([x, y, height - 0.03], 0.22, 0.0, wood)
+
+
+def _panel(folder: Path, part: Part, body: Body, faces: NDArray[np.bool_], seed: int, seconds: Array) -> Extra:
+    """A panel behind the arm, in the arm's own colours in patches of its own size."""
+    rng = stream(seed, "held", "panel")
+    a, b, c = (body.vertices[0, body.triangles[faces, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    # By area: a hand has as many triangles as the rest of the arm.
+    uv = body.uv[faces].mean(axis=1)[rng.choice(len(area), 4096, p=area / area.sum())]
+    size = len(body.texture)
+    row, column = (np.clip((v * size).astype(int), 0, size - 1) for v in (1.0 - uv[:, 1], uv[:, 0]))
+    tones = body.texture[row, column].astype(np.float64)
+    tones = tones[np.argsort(tones.sum(axis=1))]
+    pattern = fractal(rng, 128, 1.3)
+    rank = pattern.ravel().argsort().argsort().reshape(pattern.shape) / pattern.size
+    picture = tones[(rank * len(tones)).astype(int)]
+    write_png(folder / "textures" / "panel.png", np.round(picture).astype(np.uint8))
+    heading = part.person.heading
+    back = np.array([-np.sin(heading), np.cos(heading)])
+    builder = Builder([1.0])
+    at = np.asarray(part.person.place) + PANEL_BEHIND * back
+    builder.box([*at, PANEL_SIZE[2] / 2], PANEL_SIZE, 0, heading)
+    mesh = builder.mesh()
+    return "panel", np.tile(mesh.vertices.astype(np.float64), (len(seconds), 1, 1)), mesh
+
+
+def _set_down(
+    folder: Path, part: Part, bodies: Bodies, body: Body, furnisher: Furnisher, seed: int, seconds: Array
+) -> Extra:
+    """A box that follows the hand until the middle of the change and then stands on a table."""
+    from .textures import TEXTURES
+
+    heading = part.person.heading
+    ahead = np.array([np.sin(heading), -np.cos(heading), 0.0])
+    hands = body.vertices[:, bodies.influence["right_hand"] > 0.9].mean(axis=1).astype(np.float64)
+    half = 0.5 * (part.begin + part.end)
+    down = hands[_index(seconds, half)]
+    held = smooth_step(seconds, half - 0.05, half + 0.05)[:, None]
+    at = (1.0 - held) * hands + held * down + 0.1 * ahead
+    builder = Builder([0.0])
+    builder.box([0.0, 0.0, 0.0], BOX_SIZE, 0, heading)
+    mesh = builder.mesh()
+    write_png(folder / "textures" / "box.png", TEXTURES["poster"].draw(stream(seed, "held", "box"), 256))
+    vertices = mesh.vertices[None] + at[:, None]
+    _table(furnisher, part.person, at[-1:], float(at[-1, 2] - 0.5 * BOX_SIZE[2]) - 0.002)
+    return "box", vertices, mesh

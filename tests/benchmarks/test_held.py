@@ -1,0 +1,109 @@
+"""Kind `held`: changes that happen once, the region that shows another state, and motion blur. Seed 0 of `tiny`."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+if importlib.util.find_spec("anny") is None:
+    pytest.skip("anny is not installed (requirements/bench.txt)", allow_module_level=True)
+
+from benchmarks.synthetic.cameras import intrinsics
+from benchmarks.synthetic.generate import SHUTTER_FRAMES, SUBFRAMES, write_geometry
+from benchmarks.synthetic.held import CAST, ROLES, change_times
+from benchmarks.synthetic.people import Bodies
+from benchmarks.synthetic.regions import Geometry, View, held_elsewhere, region_maps, views_of
+from benchmarks.synthetic.sizes import HELD, SIZES, THING
+
+TINY, SEED, FINER = SIZES["tiny"], 0, 4
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory) -> Path:
+    """Folder with the geometry."""
+    folder = tmp_path_factory.mktemp("held")
+    write_geometry(folder, SEED, HELD, TINY, "", Bodies(TINY.texture_step))
+    return folder
+
+
+def maps(folder: Path, time: int, pose: int, window: int = 1) -> dict[str, np.ndarray]:
+    """Things at a frame from the camera of another, and the region `held`, at `FINER` times the size of `tiny`."""
+    geometry, views = Geometry.load(folder), views_of(SEED, TINY, HELD)
+    width, height = FINER * TINY.width, FINER * TINY.height
+    own, other = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
+    found = region_maps(geometry, geometry.at(time), time, other, own)
+    return found | {THING + HELD: held_elsewhere(geometry, geometry.at, time, pose, other, window)}
+
+
+def test_what_is_held_stands_still_before_and_after_its_change(held):
+    """Seed 0 of `tiny`: an arm and a hand change between frames 2 and 6, a person leaves between 0 and 8."""
+    plan = json.loads((held / "plan.json").read_text())
+    assert [each["name"] for each in plan[HELD]] == list(CAST[SEED])
+    geometry = Geometry.load(held)
+    for each in plan[HELD]:
+        vertices = np.load(held / "geometry" / f"{each['mover']}.npy")
+        its = np.unique(geometry.triangles[geometry.things[each["name"]]]) - len(geometry.static)
+        begin, end = int(each["begin"] * TINY.fps), int(np.ceil(each["end"] * TINY.fps))
+        assert begin < end < TINY.t_star_indices()[0] + 1
+
+        def moved(a: int, b: int, its=its) -> np.ndarray:
+            return np.linalg.norm(geometry.moving[b][its] - geometry.moving[a][its], axis=1)
+
+        assert np.quantile(moved(end, TINY.frames - 1), 0.95) < 0.04 < np.median(moved(begin, end)) / 2
+        assert vertices.shape[0] == TINY.frames
+
+
+def test_the_region_held_is_where_a_still_plate_shows_another_state(held):
+    """t* 8, after every change, from the poses 0 (before) and 10 (after)."""
+    before, after = (maps(held, 8, pose, window=0) for pose in (0, 10))
+    assert set(CAST[SEED]) | {HELD} == {name.removeprefix(THING) for name in before if name.startswith(THING)}
+    assert not after[THING + HELD].any()
+    region, arm = before[THING + HELD], before[THING + "raised"]
+    assert region[arm].mean() > 0.6  # the plate shows the panel there: the arm was down
+    left = maps(held, 0, 0)[THING + "leaving"]  # where the plate shows the one who has left by t* 8
+    assert left.sum() > 300 and region[left].mean() > 0.8 and not before[THING + "leaving"][left].any()
+    # She starts to walk at once: with a frame around the plate looked at, hers are pixels in which something moves.
+    assert maps(held, 8, 0)[THING + HELD][left].mean() < 0.1
+    assert region.sum() < 2.5 * (arm | left | before[THING + "resting"]).sum()
+
+
+def test_what_a_plate_shows_in_the_middle_of_its_change_is_not_in_the_region_held(held):
+    """At frame 4 the arm and the hand move, and one person walks: flow sees that."""
+    region, shown = maps(held, 8, 4)[THING + HELD], maps(held, 4, 4)
+    for name in CAST[SEED]:
+        assert shown[THING + name].sum() > 50 and region[shown[THING + name]].mean() < 0.15
+
+
+def test_frames_have_motion_blur_and_the_truth_only_that_of_the_camera(held):
+    plan = json.loads((held / "plan.json").read_text())
+    for job in plan["jobs"]:
+        times, views = ([moment[name] for moment in job["shutter"]] for name in ("time", "world_to_camera"))
+        pose = int(Path(job["out"]).stem) - 1
+        assert len(times) == (1 if "box" in job else SUBFRAMES) and all(views[0] != view for view in views[1:])
+        if job["out"].startswith("truth/"):
+            assert set(times) == {8.0}
+        elif 0 < pose < TINY.frames - 1:
+            assert max(times) - min(times) == pytest.approx(SHUTTER_FRAMES * (1 - 1 / SUBFRAMES))
+            assert np.mean(times) == pytest.approx(pose)
+    others = {name: time for job in plan["jobs"] for name, time in job.get("elsewhen", {}).items()}
+    assert set(others) == {"person0", "person1", "person2"} and max(others.values()) < 8.0
+
+
+@pytest.mark.parametrize("size", ["quick", "medium", "delivery"])
+def test_every_change_is_over_before_the_next_instant(size):
+    instants = [index / SIZES[size].fps for index in SIZES[size].t_star_indices()]
+    for role, seed in itertools.product(ROLES, range(20)):
+        begin, end = change_times(SIZES[size], role, np.random.default_rng(seed))
+        before = max(t for t in instants if t < end)
+        assert begin - before > 0.35 and min(t for t in instants if t > begin) - end > 0.35
+
+
+def test_the_cast_has_every_role_and_no_head_turns_where_no_column_hides_it():
+    assert all(len(set(roles)) == 3 for roles in CAST) and set().union(*CAST) == set(ROLES)
+    assert set().union(*CAST[3:9]) == set(ROLES)  # the seeds that reports are accepted on
+    assert all(seed % 4 in (2, 3) for seed in range(10) if "turned" in CAST[seed])
