@@ -14,7 +14,6 @@ from ..views.source_views import Sightings
 from ..views.target_view import PosedFrame, displacements, parallax
 from ..views.visibility import Sighting
 from .config import DetailConfig
-from .reference_pixels import InstantPixels, instant_pixels
 
 WHOLE = 1.0 - 0.5 / 1024.0
 """Matte from which on the leading plate gives the whole pixel: it is rounded to 1024 steps, this one to 1."""
@@ -36,8 +35,6 @@ class Fillers:
     """[H, W, 3] float16 each, as `Sightings.residual`."""
     most: float
     """The largest number in any of them, or in a working frame if that is more."""
-    instant: InstantPixels | None = None
-    """Plate t*, where it stands in place of the splats."""
 
 
 @dataclass
@@ -70,8 +67,7 @@ def fillers_of(
     agreed = _agreed(sightings, config, posed, chosen, moved)
     residuals = [sightings.residual(frame) for frame in chosen]
     most = max(sightings.scene.display.most, *(sightings.most(frame) for frame in chosen))
-    instant = instant_pixels(sightings, config, posed, leading, usable)
-    return Fillers(chosen, moved, shown, agreed, residuals, most, instant)
+    return Fillers(chosen, moved, shown, agreed, residuals, most)
 
 
 def _shown(
@@ -133,10 +129,9 @@ def fill(
     larger = torch.tensor(
         [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
     )
-    doubt, elsewhere = look_up(posed.doubt, small), look_up(posed.held, small)
+    doubt = look_up(posed.doubt, small)
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
-    same_state = torch.zeros(count, device="cpu")
     untold = torch.ones(count, device="cpu")
     truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
     if truth is not None:  # the better plate t* shows it, the less another time is needed
@@ -151,10 +146,8 @@ def fill(
         sighting.visible = torch.lerp(sighting.visible, around, uneasy)
         agreed = look_up(fillers.agreed[n], small)
         unmoved = _unmoved(sightings, config, frame, points, sighting) * agreed
-        if frame != posed.t:
-            same_state = torch.maximum(same_state, unmoved * _near(sightings, config, posed, frame, sighting))
         sway = config.sway_trust * unmoved * untold
-        still = 1.0 - elsewhere * (1.0 - agreed)
+        still = 1.0 - doubt * (1.0 - agreed)
         weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, still))
         places.append(sighting.pixels * larger)
     believed = torch.stack(weights)
@@ -164,16 +157,6 @@ def fill(
     for n, residual in enumerate(fillers.residuals):
         carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n])
     filling.color += carried * filling.share[:, None]
-    if fillers.instant is not None:
-        # A plate near in pose that shows the same, a little swayed, has it at its place: plate t* may be a pixel off.
-        # What it adds is what the model missed of it, so it rids nothing of a ghost.
-        haunted = look_up(fillers.instant.haunted, small)
-        told = look_up(fillers.instant.where, small) * (1.0 - same_state * (1.0 - haunted))
-        on = told > 0.0
-        shown = fillers.instant.at(small[on], larger)
-        filling.color[on] = torch.lerp(filling.color[on], shown, told[on][:, None])
-        filling.share = torch.lerp(filling.share, torch.ones_like(told), told)
-        filling.source = torch.where(told > 0.5, float(posed.t), filling.source)
     filling.most = fillers.most
     return filling
 

@@ -10,14 +10,12 @@ from torch import Tensor
 from ...torch_types import norm
 from ..bands import bands
 from ..frozen import SUPPORT_SECONDS, OutputFrame
-from ..views.decisions import above, all_of, any_of, first_least
-from ..views.regions import closed, opened
-from ..views.reproject import blurred, look_up, pixel_centres, project, resized, unproject, widened
+from ..views.decisions import above, first_least
+from ..views.reproject import pixel_centres, project, resized, unproject
 from ..views.source_views import Sightings
-from ..views.target_view import PosedFrame, displacements, parallax
-from ..views.visibility import Sighting
+from ..views.target_view import PosedFrame, parallax
 from .config import DetailConfig
-from .foreground_change import BothPlates, held, with_holes
+from .state import evidence, let_go, log_odds
 from .warp import snap
 
 
@@ -50,7 +48,7 @@ def leading_matte(
 
     Also settles `posed.motion`: by the mattes of plate t* where that sees the point, else by the model's;
     `posed.doubt`: what the leading plate shows wrongly others may, too, though their mattes do not say so;
-    `posed.moved`, `posed.unseen` and `posed.held`.
+    `posed.moved` and `posed.unseen`.
     """
     rows, columns = posed.image.alpha.shape
     lead = sightings.seen(leading, posed.points)
@@ -72,17 +70,13 @@ def leading_matte(
             posed.moved = torch.maximum(posed.motion, 1.0 - free)
             within = within * resized(free, columns, rows)
         return within, st, own
-    wrong = above(torch.maximum(posed.motion, lead.moving), 0.5)
-    if own:
-        wrong, found = _let_go(sightings, config, posed, leading, wrong, truth)
-        posed.held = widened(found, round(config.margin * sightings.unit))
-    posed.doubt = widened(wrong, round(config.margin * sightings.unit))
-    let_go = blurred(posed.doubt, config.feather * sightings.unit)
-    matte = 1.0 - let_go
+    of = evidence(sightings, posed, leading, lead, truth, config.state)
+    posed.doubt = let_go(log_odds(of, config.state, sightings.unit), config.state)
+    matte = 1.0 - posed.doubt
     if own:
         if free is not None:
-            matte, let_go = matte * free, torch.maximum(let_go, 1.0 - free)
-        posed.moved = torch.maximum(posed.motion, let_go)
+            matte = matte * free
+        posed.moved = torch.maximum(posed.motion, 1.0 - matte)
     else:
         error = parallax(sightings, posed, leading, posed.depth, config.depth_error)
         matte = matte * lead.visible * torch.exp(-error.square())
@@ -119,74 +113,6 @@ def _free(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor | None:
     free = torch.ones_like(posed.depth)
     free[_middle(ignored, posed.depth)] = 1.0 - ignored[..., 0]
     return free
-
-
-def _let_go(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, moving: Tensor, truth: Sighting | None
-) -> tuple[Tensor, Tensor]:
-    """([h, w] in 0..1: where the frame's own plate shows another instant than t*, [h, w] in 0..1: what of it `held`
-    found).
-
-    Args:
-        moving: [h, w] in 0..1, by the mattes.
-        truth: how plate t* sees what is seen; None if it may not be used.
-    """
-    render = resized(posed.image.color, moving.shape[1], moving.shape[0])
-    off, gained = _off(sightings, posed, frame, render)
-    wrong = any_of(moving, _swayed(sightings, config, _travel(sightings, posed, frame), gained))
-    found = torch.zeros_like(wrong)
-    if truth is not None:
-        both = _both_plates(sightings, posed, frame, truth)
-        found = held(both, render, off, wrong, sightings.unit, config.held)
-    wrong = closed(any_of(wrong, found), round(config.gap * sightings.unit))
-    return with_holes(wrong, found, off, sightings.unit, config.held)
-
-
-def _off(sightings: Sightings, posed: PosedFrame, frame: int, render: Tensor) -> tuple[Tensor, Tensor]:
-    """([h, w] low-passed difference of the frozen `render` [h, w, 3] and its own plate, [h, w] by how much that is more
-    than the difference of the model at the plate's own time); 0 beyond the plate."""
-    h, w = posed.depth.shape
-    view = sightings.view(frame)
-    inside = _middle(view.missed, posed.depth)
-    off, gained = torch.zeros(h, w, device="cpu"), torch.zeros(h, w, device="cpu")
-    off[inside] = sightings.difference(view.picture.float(), render[inside])
-    gained[inside] = off[inside] - view.missed.float()
-    return off, gained
-
-
-def _both_plates(sightings: Sightings, posed: PosedFrame, frame: int, truth: Sighting) -> BothPlates:
-    """The frame's own plate, and plate t*, which sees what is seen as `truth` says."""
-    h, w = posed.depth.shape
-    picture = sightings.view(frame).picture.float()
-    inside = _middle(picture, posed.depth)
-    seen = truth.visible[inside][..., None]
-    own, instant = torch.zeros(h, w, 3, device="cpu"), torch.zeros(h, w, 3, device="cpu")
-    own[inside] = picture * seen
-    instant[inside] = look_up(sightings.view(posed.t).picture.float(), truth.pixels[inside]) * seen
-    return BothPlates(own, instant, truth.visible)
-
-
-def _swayed(sightings: Sightings, config: DetailConfig, travel: Tensor, gained: Tensor) -> Tensor:
-    """[h, w] in 0..1: the model moves what is seen from t* to its own plate (`travel`), and the plate bears it out.
-
-    That is, the render of t* differs from the plate by more than the render of the plate's own time does (`gained`,
-    as `_off`). A textureless shirt that the model lets drift is no evidence; flow at small sizes misses sways
-    that are.
-    """
-    out = all_of(above(gained, config.borne_out), above(travel, config.travel))
-    # Outlines are errors of depth; what moves is a region.
-    return opened(out, round(config.thin * sightings.unit))
-
-
-def _travel(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor:
-    """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
-    h, w = posed.depth.shape
-    size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: Gaussians of what moves are larger than its pixels
-    moved, points = displacements(sightings, posed, [frame], size)[0], posed.points[::2, ::2]
-    view = sightings.view(frame)
-    ends = project(points + moved, view.viewmat, view.K)[0]
-    travel = norm(ends - project(points, view.viewmat, view.K)[0], -1) / sightings.unit
-    return resized(travel, w, h)
 
 
 def _places(

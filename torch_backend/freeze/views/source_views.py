@@ -21,9 +21,7 @@ from ...solve.motion import MOVING, UNKNOWN, load_motion
 from ...torch_types import from_numpy
 from ...train import LoadedRun
 from ..frozen import FrozenGaussians, FrozenImage, render_frozen
-from .decisions import above
 from .ignored import ignore_mattes
-from .regions import grown
 from .reproject import blurred, look_up, pixel_centres, resized, widened
 from .scene_flow import Stage
 from .visibility import Sighting, sighted
@@ -103,12 +101,6 @@ class SightingConfig:
     """Low-passed difference, display-referred, at which a plate is believed 1/e."""
     region: int = 4
     """A difference speaks for so many pixels around it: half-rejected movers leave their outlines."""
-    contradicted: float = 0.2
-    """Low-passed difference, display-referred, from which on a pixel beside what moves belongs to it."""
-    reach: int = 16
-    """How far from what the matte calls moving such a region may go: a model that is wrong all over has no end."""
-    thin: int = 2
-    """Half the width below which such a difference is an edge, not a region."""
 
 
 class Sightings:
@@ -207,21 +199,6 @@ class Sightings:
         """Where plate `frame` shows world points [..., 3]."""
         view = self.view(frame)
         return sighted(points, view.viewmat, view.K, view.surface, view.ignored, self.config.depth_tolerance)
-
-    def whole(self, moving: Tensor, differs: Tensor) -> Tensor:
-        """[h, w] in 0..1: `moving`, and the regions that touch it in which plate and model differ (`differs`).
-
-        Flow ends some pixels before what moves does, or says nothing within it. What was missed would stand where it
-        is as specks and outlines.
-        """
-        if not bool(moving.any()):
-            return moving
-        reach, thin = (round(length * self.unit) for length in (self.config.reach, self.config.thin))
-        return grown(moving, differs, reach, thin)
-
-    def contradicted(self, off: Tensor) -> Tensor:
-        """[h, w] in 0..1: where plate and model differ enough, by `off` [h, w], to be of what moves beside it."""
-        return above(off, self.config.contradicted)
 
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height

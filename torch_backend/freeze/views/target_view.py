@@ -50,9 +50,6 @@ class PosedFrame:
     """[h, w] in 0..1: what moves in the clip, at t* or in the frame's own plate; else `motion`."""
     unseen: Tensor
     """[h, w] in 0..1: what moves, and is in no plate near t*: how it looked then nobody knows."""
-    held: Tensor
-    """[h, w] in 0..1: what is held in the frame's own plate where it was not at t*, by these two plates alone: no other
-    fills it that contradicts plate t*, whatever its matte says."""
 
     def settings(self, width: int, height: int) -> RasterSettings:
         """How its camera renders the picture, overscan included, at another size."""
@@ -96,7 +93,7 @@ def posed_frame(
     nothing = torch.zeros_like(motion)
     return PosedFrame(
         output.viewmat, K, image, sightings.scene.time_of_frame(output.exposed_like), own, t, frozen, points, depth,
-        motion, w / columns, beyond, nothing, motion, nothing, nothing,
+        motion, w / columns, beyond, nothing, motion, nothing,
     )  # fmt: skip
 
 

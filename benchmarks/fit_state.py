@@ -1,0 +1,180 @@
+"""Fits the weights of `torch_backend/freeze/composite/state.py` on synthetic scenes with truth.
+
+    python -m benchmarks.fit_state SCENE ... --results DIR [--seeds 0 1] [--every K] [--cross]
+
+SCENE is a folder of benchmarks/synthetic; seeds 0 to 9 are for tuning. Its shot and an `auto` run for every training seed
+are made in DIR if they are not there. For every instant and pose with a truth the evidence is computed as a frozen frame
+computes it. Two losses are added: the mean squared error of a mix of the plate and of what fills it (the frame with that
+plate withheld), by the posterior, in units of the plate's own mean squared error; and the cross-entropy of the posterior
+with whether plate and truth differ. Prints the weights, and PSNR of frames mixed by them. `--cross` also fits without
+each scene in turn and judges on that scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from benchmarks.detail_clip import DetailClip
+from benchmarks.detail_truth import trained
+from benchmarks.sources import load_source
+from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go
+from torch_backend.freeze.frozen import OutputFrame
+from torch_backend.freeze.views.reproject import blurred, resized
+from torch_backend.freeze.views.target_view import posed_frame
+from torch_backend.native import default_threads
+from torch_backend.report.truth import TruthScene
+from torch_backend.train import load_run
+
+NAMES = [f.name for f in fields(StateWeights) if f.name != "bias"]
+"""Names of the evidence, in the order of `Case.evidence`."""
+LABEL_WEIGHT = 0.2
+"""Weight of the cross-entropy beside the squared error."""
+DIFFERS = 0.03, 0.09
+"""Difference of plate and truth, display-referred, at which they begin to differ and surely do."""
+STEPS, RATE, DECAY = 300, 0.1, 1e-4
+"""Of Adam; and the weight of the squared weights, which are in standard deviations of the evidence."""
+
+
+@dataclass
+class Case:
+    """All frames of one run, pictures [N, h, w, 3] display-referred, at the size of decisions."""
+
+    name: str
+    """Scene and training seed."""
+    evidence: Tensor
+    """[N, h, w, E] in the order of NAMES."""
+    plate: Tensor
+    """The plate of each pose."""
+    filled: Tensor
+    """The frozen frame with that plate withheld."""
+    truth: Tensor
+    """The scene at t*."""
+    moving: Tensor
+    """[N, h, w] bool: pixels that move."""
+    unit: float
+    """Pixels of decisions to one of 640."""
+
+    def saving(self) -> Tensor:
+        """[N, h, w] squared error that letting go of the plate saves, over the plate's mean squared error."""
+        kept, gone = ((picture - self.truth).square().mean(-1) for picture in (self.plate, self.filled))
+        return torch.stack([blurred(each, 1.0) for each in kept - gone]) / kept.mean()
+
+    def differs(self) -> Tensor:
+        """[N, h, w] in 0..1: whether plate and truth differ."""
+        off = torch.stack([blurred(each, 1.0).abs().amax(-1) for each in self.plate - self.truth])
+        low, high = DIFFERS
+        return ((off - low) / (high - low)).clamp(0.0, 1.0)
+
+
+def collect(truth: TruthScene, run: str, name: str, every: int) -> Case:
+    """All instants and every `every`-th pose of a scene, by one run."""
+    clip = DetailClip(truth.shot, run, load_run(truth.shot, run, torch.device("cpu")).width)
+    rows: list[tuple[Tensor, ...]] = []
+    for t_star in truth.t_stars:
+        for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
+            rows.append(_row(clip, truth, pose, t_star))
+    stacked = [torch.stack(column) for column in zip(*rows, strict=True)]
+    return Case(name, *stacked, clip.detailer.seen.unit)
+
+
+@torch.no_grad()
+def _row(clip: DetailClip, truth: TruthScene, pose: int, t_star: int) -> tuple[Tensor, ...]:
+    image = clip.splats(pose, t_star)
+    filled = clip.view(pose, t_star, (pose,), image).picture
+    detailer, frozen = clip.detailer, clip.frozen(t_star)
+    output = OutputFrame(pose, *clip.camera(pose), float(t_star), float(pose))
+    posed = posed_frame(detailer.seen, output, frozen, image, clip.width, clip.height)
+    seen, instant = (detailer.seen.seen(frame, posed.points) for frame in (pose, t_star))
+    found = evidence(detailer.seen, posed, pose, seen, instant, detailer.config.state)
+    h, w = posed.depth.shape
+    pictures = (clip.plate(pose), filled, truth.truth(t_star, pose, clip.width, clip.height))
+    moving = truth.regions(t_star, pose, clip.width, clip.height)["moving"]
+    return (
+        torch.stack([found[name] for name in NAMES], dim=-1), *(resized(each, w, h) for each in pictures),
+        resized(moving.float(), w, h) > 0.5,
+    )  # fmt: skip
+
+
+def fit(cases: Sequence[Case]) -> StateWeights:
+    """The weights that fit all cases; each case weighs the same."""
+    flat = [case.evidence.reshape(-1, len(NAMES)) for case in cases]
+    every = torch.cat(flat)
+    mean, deviation = every.mean(0), every.std(0).clamp_min(1e-3)
+    told = [((x - mean) / deviation, case.saving().flatten(), case.differs().flatten()) for x, case in
+            zip(flat, cases, strict=True)]  # fmt: skip
+    weights, bias = torch.zeros(len(NAMES), requires_grad=True), torch.tensor(-2.0, requires_grad=True)
+    optimizer = torch.optim.Adam([weights, bias], lr=RATE)
+    for _ in range(STEPS):
+        loss = DECAY * weights.square().sum()
+        for x, saving, differs in told:
+            odds = x @ weights + bias
+            entropy = F.binary_cross_entropy_with_logits(odds, differs)
+            loss = loss + (LABEL_WEIGHT * entropy - (torch.sigmoid(odds) * saving).mean()) / len(told)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    weights = weights.detach() / deviation
+    values = {name: round(float(value), 2) for name, value in zip(NAMES, weights, strict=True)}
+    return StateWeights(bias=round(float(bias.detach() - (weights * mean).sum()), 2), **values)
+
+
+def judged(case: Case, weights: StateWeights) -> dict[str, float]:
+    """dB of frames mixed by weights, whole and moving; and of the plate and the fill alone."""
+    config = StateConfig(weights=weights)
+    values = torch.tensor([getattr(weights, name) for name in NAMES])
+    odds = case.evidence @ values + weights.bias
+    share = torch.stack([let_go(blurred(each, config.smoothing * case.unit), config) for each in odds])[..., None]
+    mixed = torch.lerp(case.plate, case.filled, share)
+    found = {"let go": float(share.mean())}
+    for name, picture in {"mixed": mixed, "plate": case.plate, "fill": case.filled}.items():
+        error = (picture - case.truth).square().mean(-1)
+        found[f"{name} whole"] = _db([float(each.mean()) for each in error])
+        found[f"{name} moving"] = _db([float(e[m].mean()) for e, m in zip(error, case.moving, strict=True) if m.any()])
+    return found
+
+
+def _db(errors: Sequence[float]) -> float:
+    return float(np.mean([-10.0 * np.log10(max(error, 1e-10)) for error in errors]))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
+    parser.add_argument("--results", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the training")
+    parser.add_argument("--every", type=int, default=2, metavar="K", help="only every K-th pose")
+    parser.add_argument("--iterations", type=int, default=1500)
+    parser.add_argument("--gaussians", type=int, default=10_000)
+    parser.add_argument("--cross", action="store_true", help="judge each scene by weights fitted on the others")
+    args = parser.parse_args(argv)
+    torch.set_num_threads(default_threads())
+    cases: list[Case] = []
+    for folder in args.scenes:
+        source = f"exact:{folder.absolute()}"
+        truth = load_source(source, args.results.absolute())
+        for seed in args.seeds:
+            run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
+            cases.append(collect(truth, run, f"{truth.name} s{seed}", args.every))
+    print(fit(cases))
+    for case in cases:
+        others = [other for other in cases if other.name.split(" s")[0] != case.name.split(" s")[0]]
+        figures = judged(case, fit(others if args.cross and others else cases))
+        print(f"{case.name}: " + ", ".join(f"{name} {value:.2f}" for name, value in figures.items()), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

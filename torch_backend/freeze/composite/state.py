@@ -1,0 +1,140 @@
+"""Which pixels of a plate show another state of the scene than the instant t*.
+
+Every pixel has a posterior probability. Its log-odds are a weighted sum of evidence (logistic regression): motion
+mattes, the model's scene flow, and differences between the plate, the frozen render and plate t*, in units of noise.
+The weights are fitted on synthetic scenes with truth by `python -m benchmarks.fit_state`, to two things: the squared
+error that the plate's pixel costs against what would fill it, and whether the plate differs from the truth at all. No
+weight is set by eye.
+
+Related: Granados et al. 2012, "Background Inpainting for Videos with Dynamic Objects and a Free-moving Camera", also
+choose between plates by an expected error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...torch_types import from_numpy, norm
+from ..views.reproject import blurred, look_up, project, resized
+from ..views.source_views import Sightings
+from ..views.target_view import PosedFrame, displacements
+from ..views.visibility import Sighting
+
+
+@dataclass(frozen=True)
+class StateWeights:
+    """Weight of each piece of evidence in the log-odds that a plate shows another state; see `evidence` for units."""
+
+    bias: float = -4.0
+    """Log-odds where no evidence says anything."""
+    plate_matte: float = 1.0
+    """Weight of the plate's own motion matte."""
+    instant_matte: float = 1.0
+    """Weight of the motion matte of plate t*."""
+    model_motion: float = 1.0
+    """Weight of the share of what is seen that the model moves."""
+    scene_flow: float = 1.0
+    """Weight of how far the model moves the surface from t* to the plate."""
+    change: float = 1.0
+    """Weight of the difference between the plate and the frozen render."""
+    misfit: float = -1.0
+    """Weight of the difference between the plate and the model's render at the plate's own time."""
+    gain: float = 1.0
+    """Weight of the difference that the plate's own time explains better than t*."""
+    contradiction: float = 1.0
+    """Weight of the difference between the plate and plate t* carried to it."""
+    gradient: float = 0.0
+    """Weight of the picture's gradient, which a wrong depth turns into a difference."""
+    visible: float = 0.0
+    """Weight of how surely plate t* sees the surface."""
+
+
+@dataclass(frozen=True)
+class StateConfig:
+    """How evidence is scaled, and how log-odds become a matte."""
+
+    noise: float = 0.02
+    """Standard deviation of a low-passed difference between two renders or plates of one surface, display-referred."""
+    travel: float = 0.5
+    """Scene flow in pixels of 640 at which its evidence is log(2): below it flow is mostly the field's noise."""
+    lowpass: float = 2.0
+    """Sigma of the low-pass of differences between two plates, in pixels of 640: plates of one surface are a pixel or
+    two apart by depth."""
+    smoothing: float = 2.0
+    """Sigma of the low-pass of the log-odds, in pixels of 640: states belong to surfaces, not to pixels."""
+    softness: float = 1.0
+    """Log-odds on either side of even odds between which a pixel is mixed; beyond them it is wholly one source."""
+    weights: StateWeights = field(default_factory=StateWeights)
+    """The fitted weights."""
+
+
+Evidence = dict[str, Tensor]
+"""Name of a field of `StateWeights` -> [h, w] float32, no unit."""
+
+
+def evidence(
+    sightings: Sightings, posed: PosedFrame, frame: int, seen: Sighting, instant: Sighting | None, config: StateConfig
+) -> Evidence:
+    """What speaks for another state in plate `frame`, at the pixels of the target view's size of decisions.
+
+    Args:
+        seen: how the plate sees the target view's points.
+        instant: how plate t* sees them; None if it may not be used.
+    """
+    h, w = posed.depth.shape
+    view, unit = sightings.view(frame), sightings.unit
+    render = resized(posed.image.color, w, h)
+    inside = (seen.depth > 0.0).float()
+    plate = torch.lerp(render, look_up(view.picture.float(), seen.pixels), inside[..., None])
+    change = sightings.difference(plate, render)
+    misfit = look_up(view.missed.float()[..., None], seen.pixels)[..., 0] * inside
+    nothing = torch.zeros_like(change)
+    visible, instant_matte, contradiction = nothing, nothing, nothing
+    if instant is not None:
+        visible, instant_matte = instant.visible, instant.visible * instant.moving
+        carried = look_up(sightings.view(posed.t).picture.float(), instant.pixels)
+        apart = (plate - carried) * visible[..., None]
+        contradiction = blurred(apart, config.lowpass * unit).abs().amax(-1)
+    gain = change - misfit
+    return {
+        "plate_matte": seen.moving, "instant_matte": instant_matte, "model_motion": resized(posed.image.motion, w, h),
+        "scene_flow": torch.log1p(_travel(sightings, posed, frame) / config.travel),
+        "change": torch.log1p(change / config.noise), "misfit": torch.log1p(misfit / config.noise),
+        "gain": gain.sign() * torch.log1p(2.0 * gain.abs() / config.noise),
+        "contradiction": torch.log1p(contradiction / config.noise),
+        "gradient": torch.log1p(_gradient(render, unit) / config.noise), "visible": visible,
+    }  # fmt: skip
+
+
+def log_odds(of: Evidence, config: StateConfig, unit: float) -> Tensor:
+    """[h, w] log-odds that a plate shows another state. `unit`: pixels of decisions to one of 640."""
+    weights = {f.name: float(getattr(config.weights, f.name)) for f in fields(StateWeights)}
+    total = sum((weights[name] * value for name, value in of.items()), torch.tensor(weights["bias"], device="cpu"))
+    return blurred(total, config.smoothing * unit)
+
+
+def let_go(odds: Tensor, config: StateConfig) -> Tensor:
+    """[h, w] in 0..1: the share of each pixel that the plate does not give, of log-odds [h, w]."""
+    return (0.5 + 0.5 * odds / config.softness).clamp(0.0, 1.0)
+
+
+def _gradient(picture: Tensor, unit: float) -> Tensor:
+    """[h, w] gradient of a picture [h, w, 3] per pixel of 640, display-referred."""
+    grey = blurred(picture, unit).mean(-1).numpy()
+    down, right = np.gradient(grey)
+    return from_numpy(np.hypot(down, right).astype(np.float32)) * unit
+
+
+def _travel(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor:
+    """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
+    h, w = posed.depth.shape
+    size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: Gaussians of what moves are larger than its pixels
+    moved, points = displacements(sightings, posed, [frame], size)[0], posed.points[::2, ::2]
+    view = sightings.view(frame)
+    ends = project(points + moved, view.viewmat, view.K)[0]
+    travel = norm(ends - project(points, view.viewmat, view.K)[0], -1) / sightings.unit
+    return resized(travel, w, h)
