@@ -2,12 +2,12 @@
 
     python -m benchmarks.fit_state SCENE ... --results DIR [--seeds 0 1] [--every K] [--cross]
 
-SCENE is a folder of benchmarks/synthetic; seeds 0 to 9 are for tuning. Its shot and an `auto` run for every training seed
-are made in DIR if they are not there. For every instant and pose with a truth the evidence is computed as a frozen frame
-computes it. Two losses are added: the mean squared error of a mix of the plate and of what fills it (the frame with that
-plate withheld), by the posterior, in units of the plate's own mean squared error; and the cross-entropy of the posterior
-with whether plate and truth differ. Prints the weights, and PSNR of frames mixed by them. `--cross` also fits without
-each scene in turn and judges on that scene.
+SCENE is a folder of benchmarks/synthetic; seeds 0 to 9 are for tuning. Its shot and an `auto` run for every training
+seed are made in DIR if they are not there. For every instant and pose with a truth the evidence is computed as a frozen
+frame computes it. Two losses are added. One is the mean squared error of a mix of the plate and of what fills it (the
+frame with that plate withheld) by the posterior, in units of the plate's own mean squared error. The other is the
+cross-entropy of the posterior with whether plate and truth differ. Prints the weights, and PSNR of frames mixed by
+them. `--cross` judges each scene by weights that were fitted on the others.
 """
 
 from __future__ import annotations
@@ -83,10 +83,11 @@ def collect(truth: TruthScene, run: str, name: str, every: int) -> Case:
     clip = DetailClip(truth.shot, run, load_run(truth.shot, run, torch.device("cpu")).width)
     rows: list[tuple[Tensor, ...]] = []
     for t_star in truth.t_stars:
+        clip.frozen(t_star)  # developed here: rows are made without gradients
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             rows.append(_row(clip, truth, pose, t_star))
-    stacked = [torch.stack(column) for column in zip(*rows, strict=True)]
-    return Case(name, *stacked, clip.detailer.seen.unit)
+    found, plate, filled, target, moving = (torch.stack(column) for column in zip(*rows, strict=True))
+    return Case(name, found, plate, filled, target, moving, clip.detailer.seen.unit)
 
 
 @torch.no_grad()

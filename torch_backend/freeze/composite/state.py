@@ -29,27 +29,27 @@ from ..views.visibility import Sighting
 class StateWeights:
     """Weight of each piece of evidence in the log-odds that a plate shows another state; see `evidence` for units."""
 
-    bias: float = -4.0
+    bias: float = -7.24
     """Log-odds where no evidence says anything."""
-    plate_matte: float = 1.0
+    plate_matte: float = 2.21
     """Weight of the plate's own motion matte."""
-    instant_matte: float = 1.0
+    instant_matte: float = -1.2
     """Weight of the motion matte of plate t*."""
-    model_motion: float = 1.0
+    model_motion: float = -2.19
     """Weight of the share of what is seen that the model moves."""
-    scene_flow: float = 1.0
+    scene_flow: float = 5.77
     """Weight of how far the model moves the surface from t* to the plate."""
-    change: float = 1.0
+    change: float = 0.04
     """Weight of the difference between the plate and the frozen render."""
-    misfit: float = -1.0
+    misfit: float = 0.74
     """Weight of the difference between the plate and the model's render at the plate's own time."""
-    gain: float = 1.0
+    gain: float = 2.54
     """Weight of the difference that the plate's own time explains better than t*."""
-    contradiction: float = 1.0
+    contradiction: float = 1.05
     """Weight of the difference between the plate and plate t* carried to it."""
-    gradient: float = 0.0
+    gradient: float = 0.45
     """Weight of the picture's gradient, which a wrong depth turns into a difference."""
-    visible: float = 0.0
+    visible: float = 0.98
     """Weight of how surely plate t* sees the surface."""
 
 
