@@ -22,13 +22,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.ablate.switches import detail_config, replaced, switched_off
+from benchmarks.ablate.instants import Instants
+from benchmarks.ablate.measures import FrameMaker, shown
+from benchmarks.ablate.switches import replaced
 from benchmarks.detail_clip import DetailClip, over
 from benchmarks.detail_truth import trained
 from benchmarks.sources import Log, load_source
 from benchmarks.synthetic.folder import SyntheticScene
 from torch_backend.contract import JobError
-from torch_backend.freeze.frozen import FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
+from torch_backend.freeze.frozen import FrozenImage, freeze_at, render_frozen, span_of
 from torch_backend.freeze.views.reproject import inside, look_up, pixel_centres, project, unproject
 from torch_backend.native import default_threads
 from torch_backend.report.evaluate import freeze_run, plate_detail
@@ -102,14 +104,17 @@ def judge(rendered: SyntheticScene, truth: TruthScene, run: LoadedRun, every: in
     return rows
 
 
-def judge_labels(truth: TruthScene, run: LoadedRun, every: int) -> list[dict[str, dict[str, float | None]]]:
-    """One row per pose and instant: {picture or choice: {region: dB}}."""
+def judge_labels(
+    truth: TruthScene, run: LoadedRun, every: int, kept: Path
+) -> list[dict[str, dict[str, float | None]]]:  # fmt: skip
+    """One row per pose and instant: {picture or choice: {region: dB}}. Developed instants are kept in a folder."""
     clip, rows = DetailClip(truth.shot, run.folder.name, run.width), list[dict[str, dict[str, float | None]]]()
     size = clip.width, clip.height
     for t_star in truth.t_stars:
-        for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
+        maker = FrameMaker(clip, t_star, Instants(clip, t_star, kept).make(frozenset()))
+        for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][every // 2 :: every]:
             target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
-            sources, delivered = _sources(clip, pose, t_star)
+            sources, delivered = _sources(maker, pose)
             pictures = {**sources, "delivered": delivered}
             for name, labels in CHOICES.items():
                 of = torch.stack([sources[label] for label in labels])
@@ -129,18 +134,14 @@ def chosen(sources: Tensor, truth: Tensor, block: int) -> Tensor:
     return sources.gather(0, label[None, ..., None].expand(1, height, width, 3))[0]
 
 
-def _sources(clip: DetailClip, pose: int, t_star: int) -> tuple[dict[str, Tensor], Tensor]:
+def _sources(maker: FrameMaker, pose: int) -> tuple[dict[str, Tensor], Tensor]:
     """(each of `SOURCES`, what is delivered), [H, W, 3] in 0..1."""
-    frozen, image = clip.frozen(t_star), clip.splats(pose, t_star)
-    delivered = clip.view(pose, t_star, image=image).picture
+    clip, image = maker.clip, maker.image(pose)
+    delivered = shown(maker.make(pose, frozenset())[0])
+    with replaced("detail", "leading_matte", lambda made: lambda *args: _given_up(made(*args))):
+        residuals = shown(maker.make(pose, frozenset({"plate t*'s pixels"}))[0])
+    carried, seen = _carried(clip, pose, maker.t_star, image)
     splats = over(image.color, image.alpha)
-    output = OutputFrame(pose, *clip.camera(pose), float(t_star), float(pose))
-    clip.detailer.config = detail_config(frozenset())
-    own = replaced("detail", "leading_matte", lambda made: lambda *args: _given_up(made(*args)))
-    with own, switched_off(frozenset({"plate t*'s pixels"})):
-        filled = clip.detailer.frame(output, frozen, image, clip.width, clip.height)
-    carried, seen = _carried(clip, pose, t_star, image)
-    residuals = over(filled.color, filled.alpha)
     pictures = clip.plate(pose), torch.where(seen[..., None], carried, residuals), residuals, splats
     return dict(zip(SOURCES, pictures, strict=True)), delivered
 
@@ -176,6 +177,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--t-star", type=int, nargs="+", metavar="N", help="only these")
     parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th pose")
     parser.add_argument("--iterations", type=int, default=1500)
     parser.add_argument("--gaussians", type=int, default=10_000)
@@ -187,9 +189,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             source = f"exact:{folder.absolute()}"
             truth = load_source(source, args.results.absolute())
+            truth.t_stars = args.t_star or truth.t_stars
             run = load_run(truth.shot, trained(truth, source, args), torch.device("cpu"))
             if args.labels:
-                found = judge_labels(truth, run, args.every)
+                found = judge_labels(truth, run, args.every, args.results / "ablate" / "instants")
                 print("\n".join(["", f"{truth.name}, {len(found)} poses", "", *labels_table(found)]), flush=True)
                 continue
             rows = judge(SyntheticScene.load(folder), truth, run, args.every)

@@ -26,6 +26,7 @@ import torch
 
 from benchmarks.ablate.cases import Case, clip_case, pairs_of, scene_case
 from benchmarks.ablate.instants import Instants
+from benchmarks.ablate.masks import judge_masks
 from benchmarks.ablate.measures import FrameMaker, Row, judge, poses_of
 from benchmarks.ablate.switches import of_frames, variants
 from benchmarks.ablate.table import CLIPS, MASKS, TRUTH, Store, case_table, code_version, table
@@ -131,6 +132,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--pairs", type=int, default=2, metavar="N", help="neighbouring frames of a clip's instant")
     parser.add_argument("--instants", type=int, default=0, metavar="N", help="of each case at most (default: all)")
     parser.add_argument("--seconds", type=float, default=0.0, metavar="S", help="start nothing after so many")
+    parser.add_argument("--masks", action="store_true", help="judge clips by masks painted by hand, and nothing else")
     parser.add_argument("--table", action="store_true", help="only print what is there")
     return parser
 
@@ -146,7 +148,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             results = args.results.absolute()
             cases = [scene_case(folder, seed, results, args.lent) for seed in args.seeds for folder in args.scenes]
             cases += [clip_case(path, args.run, args.draw) for path in args.clip]
-            if cases:
+            for case in cases if args.masks else ():
+                judge_masks(case, store)
+            if cases and not args.masks:
                 Ablation(store, args.results / "ablate" / "instants", args).run(cases)
     except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)

@@ -205,7 +205,7 @@ def _number(name: str, off: str, **numbers: Any) -> Rule:
     return Rule(name, off, numbers=numbers)
 
 
-_OWN_PLATE = (
+OWN_PLATE = (
     _term("travel", "the model's travel lets go of nothing", "leading_plate", "_swayed", _nowhere(2)),
     _term("beside", "neighbouring plates' mattes are not asked", "leading_plate", "_beside", _nowhere(2)),
     _term("of its time", "no own-time evidence", "leading_plate", "_of_its_time", _nowhere(3)),
@@ -222,6 +222,7 @@ _OWN_PLATE = (
     _number("margin", "no margin around what is let go of", margin=0),
     _number("feather", "hard borders", feather=0.0),
 )
+"""Rules that decide where the frame's own plate is let go of."""
 _FILL = (
     _term("plate t*'s pixels", "plate t* gives residuals alone", "fill", "instant_pixels", _none),
     _term("ghosts", "plate t* does not cover ghosts", "instant_pixels", "ghosts", _none),
@@ -261,7 +262,7 @@ def _found(switch: Switch) -> Any:
     return found
 
 
-RULES = {rule.name: rule for rule in (*_SCENE, *_OWN_PLATE, *_FILL) if _is_there(rule)}
+RULES = {rule.name: rule for rule in (*_SCENE, *OWN_PLATE, *_FILL) if _is_there(rule)}
 """Name -> rule."""
 
 _BARE_SCENE = ("turned", "specks", "adrift", "layer", "unseen")

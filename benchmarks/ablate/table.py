@@ -26,7 +26,7 @@ CLIPS = {
     "instant_s": "instant, CPU s",
 }  # fmt: skip
 """The same, of clips."""
-MASKS = {"iou": "IoU of masks"}
+MASKS = {"iou": "IoU of masks", "extra_share": "share of the unchanged that is let go"}
 """The same, of hand-painted masks."""
 
 
@@ -71,7 +71,7 @@ def figures(record: dict[str, Any]) -> dict[str, float | None]:
     moving, splats = found["delivered moving"], found["developed moving"]
     found["over splats"] = None if moving is None or splats is None else moving - splats
     found["instant_s"] = sum(record.get("seconds", {}).values())
-    found["iou"] = record.get("iou")
+    found["iou"], found["extra_share"] = record.get("iou"), record.get("extra_share")
     return found
 
 

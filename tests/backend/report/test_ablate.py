@@ -4,9 +4,11 @@ import argparse
 import importlib
 from collections import Counter
 
+import numpy as np
 import pytest
 import torch
 
+from benchmarks.ablate import masks
 from benchmarks.ablate.__main__ import Ablation, tables
 from benchmarks.ablate.cases import TUNED_AT, Case, drawn, pairs_of
 from benchmarks.ablate.instants import Instants, digest
@@ -15,6 +17,7 @@ from benchmarks.ablate.switches import COMBINATIONS, FRAME, RULES, detail_config
 from benchmarks.ablate.table import TRUTH, Store, table
 from benchmarks.detail_ceiling import chosen
 from benchmarks.detail_clip import open_clip
+from benchmarks.other_state import OTHER, Painted, Pair, Polygon
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +141,29 @@ def test_the_best_label_of_each_block():
     assert torch.equal(chosen(sources, truth, 4), sources[0])
     best = chosen(sources, truth, 1)
     assert bool((best[0, 0] == 0.0).all()) and torch.equal(best[1:], sources[0, 1:])
+
+
+def test_what_is_let_go_is_held_against_what_was_painted(clip, tmp_path, monkeypatch):
+    """The whole plate is painted as another state: a frame's share that is let go of is its IoU."""
+    t_star, frame = clip.run.train_frames[6], clip.run.train_frames[2]
+    whole = Polygon(np.array([(0, 0), (clip.width, 0), (clip.width, clip.height), (0, clip.height)], float), "", OTHER)
+    painted = Painted("tiny", "", clip.width, clip.height, (Pair(t_star, frame, 0, (whole,)),))
+    case, store = Case("tiny", clip, [], None), Store(tmp_path)
+    masks.judge_masks(case, store)
+    assert not store.records()  # nobody painted it
+    monkeypatch.setattr(masks, "CLIPS", (clip.shot.info().source.rpartition("/")[2].partition(".")[0],))
+    monkeypatch.setattr(masks, "load_masks", lambda _: painted)
+    monkeypatch.setattr(masks, "load_plate_lenses", lambda _: {frame: AsItIs()})
+    masks.judge_masks(case, store)
+    found = {record["variant"]: record for record in store.records()}
+    assert {"today", "no travel", "null's decisions"} <= set(found) and "null" not in found
+    today = found["today"]["frames"][0]
+    assert today["iou"] == pytest.approx(today["both"] / (clip.width * clip.height)) and 0.0 < today["iou"] < 1.0
+
+
+class AsItIs:
+    """A lens that bends nothing."""
+
+    def where(self, width: int, height: int) -> np.ndarray:
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        return np.stack([x, y], axis=-1).astype(np.float32)

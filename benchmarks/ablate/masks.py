@@ -1,0 +1,67 @@
+"""What a variant lets go of the frame's own plate, against masks painted by hand (`benchmarks.other_state`)."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.ablate.cases import Case
+from benchmarks.ablate.instants import Instant
+from benchmarks.ablate.measures import FrameMaker, Row
+from benchmarks.ablate.switches import COMBINATIONS, OWN_PLATE, RULES, of_frames, replaced
+from benchmarks.ablate.table import Store
+from benchmarks.other_state.masks import CLIPS, Painted, Pair, load_masks, plate_labels
+from benchmarks.other_state.scores import LET_GO, count
+from torch_backend.solve.plate_lens import load_plate_lenses
+
+
+def variants() -> dict[str, frozenset[str]]:
+    """Name -> rules of frames that are off: combinations, and each rule that decides about the own plate."""
+    named = {name: off for name, off in COMBINATIONS.items() if off == of_frames(off)}
+    return named | {f"no {rule.name}": frozenset({rule.name}) for rule in OWN_PLATE if rule.name in RULES}
+
+
+def judge_masks(case: Case, store: Store) -> None:
+    """Measures every variant at the painted pairs of a clip, on today's scene. Nothing if nobody painted it."""
+    name = Path(case.clip.shot.info().source).stem
+    if name not in CLIPS:
+        return
+    masks, told = load_masks(name), f"{case.name} masks"
+    for t_star in sorted({pair.t_star for pair in masks.pairs}):
+        todo = {name: off for name, off in variants().items() if not store.has(told, t_star, name)}
+        if todo:
+            maker = FrameMaker(case.clip, t_star, Instant(case.clip.frozen(t_star), "", {}))
+            pairs = [pair for pair in masks.pairs if pair.t_star == t_star]
+            with replaced("detail", "fillers_of", lambda _: lambda *_: None):  # the fill is not judged
+                for name, row in _judged(maker, masks, pairs, todo).items():
+                    store.save(told, t_star, name, row)
+
+
+def _judged(
+    maker: FrameMaker, masks: Painted, pairs: list[Pair], todo: Mapping[str, frozenset[str]]
+) -> dict[str, Row]:  # fmt: skip
+    """{variant: figures} of an instant."""
+    clip, rows = maker.clip, {name: list[Row]() for name in todo}
+    lenses = load_plate_lenses(clip.shot)
+    scale = np.array([masks.width / clip.width, masks.height / clip.height], np.float32)
+    for pair in pairs:
+        where = lenses[pair.frame].where(clip.width, clip.height) * scale
+        labels = plate_labels(masks.labels(pair), where)
+        for name, off in todo.items():
+            made, decided, _ = maker.make(pair.frame, off)
+            let_go = (made.matte < LET_GO) | (made.leading != pair.frame)
+            counts = count(let_go.numpy(), labels)
+            ratios = {"iou": counts.iou, "extra_share": counts.extra_share}
+            rows[name].append({"frame": pair.frame, "decision_s": decided, **ratios, **asdict(counts)})
+    means = {name: {ratio: _mean(found, ratio) for ratio in ("iou", "extra_share")} for name, found in rows.items()}
+    return {name: {"frames": found, "seconds": {}, **means[name]} for name, found in rows.items()}
+
+
+def _mean(frames: list[Row], ratio: str) -> float | None:
+    """Mean of a ratio over the frames that have it."""
+    known = [frame[ratio] for frame in frames if frame[ratio] is not None]
+    return statistics.fmean(known) if known else None
