@@ -39,11 +39,11 @@ from torch_backend.train import load_run
 
 NAMES = [f.name for f in fields(StateWeights) if f.name != "bias"]
 """Names of the evidence, in the order of `Case.evidence`."""
-LABEL_WEIGHT = 0.2
+LABEL_WEIGHT = 0.1
 """Weight of the cross-entropy beside the squared error."""
 DIFFERS = 0.03, 0.09
 """Difference of plate and truth, display-referred, at which they begin to differ and surely do."""
-STEPS, RATE, DECAY = 300, 0.1, 1e-4
+STEPS, RATE, DECAY = 150, 0.15, 1e-4
 """Of Adam; and the weight of the squared weights, which are in standard deviations of the evidence."""
 
 
