@@ -51,7 +51,7 @@ def test_the_frame_inside_is_the_take_without_overscan(trained, lens, plain, qui
                 aside = np.abs(whole.rgba[6:-6, 9:-7] - frame.rgba).mean()
                 assert off.mean() < 0.02 * aside, "not a fraction of a pixel aside"
         off = np.abs(whole.depth[6:-6, 8:-8] / frame.depth - 1.0)
-        assert np.quantile(off, 0.99) < 1e-3  # the median jumps from one Gaussian to another here and there
+        assert np.quantile(off, 0.99) < 5e-3, "surfaces at the border are measured with what is beyond it"
         assert whole.rgba[:6, :, 3].mean() > 0.5, "there is picture beyond the frame: the wall goes on"
         np.testing.assert_array_equal(
             read_png(folder / "preview" / f"{n:06d}.png").shape, read_png(plain / "preview" / f"{n:06d}.png").shape
