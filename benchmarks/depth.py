@@ -11,7 +11,7 @@ left out. Figures pool the pixels of all frames of a scene:
 - Median of |depth - truth| / truth, and the share of pixels beyond 1 %, inside surfaces: at least `INSIDE` pixels from
   every occlusion boundary and from the border of the region.
 - F-score of occlusion boundaries at a tolerance of one pixel: see `occlusion_edges`.
-- If frames have a standard deviation of depth: the share of pixels inside surfaces whose error is below two of it.
+- The share of pixels inside surfaces whose error is below two of the standard deviations that the frame gives.
 
 DIR gets depth-NAME.json.
 """
@@ -156,16 +156,13 @@ def judge(
     metres = truth.metres_per_unit / clip.scene.scale
     for t_star in t_stars:
         for pose in truth.poses(t_star, [])[::every]:
-            frame = clip.view(pose, t_star).detailed
+            depth, sigma = clip.depth(pose, clip.view(pose, t_star))
             regions = truth.regions(t_star, pose, *size)
             left_out = torch.zeros_like(regions["moving"])
             for pane in PANES:
                 left_out |= regions.get(pane, left_out)
-            sigma = getattr(frame, "depth_sigma", None)
-            add_frame(
-                pooled, frame.depth * metres, truth.depth(t_star, pose, *size), regions["moving"], left_out,
-                None if sigma is None else sigma * metres,
-            )  # fmt: skip
+            true = truth.depth(t_star, pose, *size)
+            add_frame(pooled, depth * metres, true, regions["moving"], left_out, sigma * metres)
         print(f"{truth.name}, t* {t_star}: {_text(pooled['still'].figures())} still so far", flush=True)
     return {region: of.figures() for region, of in pooled.items()}
 

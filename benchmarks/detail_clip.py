@@ -16,6 +16,7 @@ from benchmarks.sources import Log
 from torch_backend.contract import FreezeParams
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze.composite.compositor import DetailedFrame, Detailer
+from torch_backend.freeze.composite.surface_depth import FrameDepths
 from torch_backend.freeze.frozen import (
     FrozenGaussians,
     FrozenImage,
@@ -69,6 +70,7 @@ class DetailClip:
         self.width, self.height = self.plates.width, self.plates.height
         self.Ks = self.scene.camera_at(self.width, self.height)
         self.detailer = Detailer(self.run, self.scene, self.plates)
+        self.depths = FrameDepths(self.run, self.scene)
         self._frozen: dict[int, FrozenGaussians] = {}
 
     @property
@@ -131,6 +133,11 @@ class DetailClip:
         """The frozen frame of plates as a take makes it, from its render by `splats`."""
         output = OutputFrame(frame, *self.camera(frame), float(t_star), float(frame))
         return self.detailer.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
+
+    def depth(self, frame: int, view: View) -> tuple[Tensor, Tensor]:
+        """(depth, its standard deviation) of a frozen frame as a take writes it, [H, W] each in scene units."""
+        detailed = view.detailed
+        return self.depths.of(*self.camera(frame), detailed.depth, view.image.motion, view.picture)
 
     def plate(self, frame: int) -> Tensor:
         """The plate of a frame, [H, W, 3] in [0, 1]."""

@@ -48,7 +48,8 @@ def fill(
         layers["Combined"] = _warped(group, enter, layers["Combined"], warp, take)
     if "Plate" in layers:
         layers["Combined"] = _looked_at(group, enter, layers)
-    layers.pop("Splat", None)
+    for name in ("Splat", "DepthSigma"):  # nothing behind this reads them
+        layers.pop(name, None)
     fitted = fitting.fitted(scene, group, take.size, take.margin, layers)
     share = _share(group, enter, fitted)
     nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,15 @@ import pytest
 if importlib.util.find_spec("anny") is None:
     pytest.skip("anny is not installed (requirements/bench.txt)", allow_module_level=True)
 
+from benchmarks.synthetic import make
 from benchmarks.synthetic.cameras import intrinsics
 from benchmarks.synthetic.generate import SHUTTER_FRAMES, SUBFRAMES, write_geometry
 from benchmarks.synthetic.held import CAST, ROLES, change_times
 from benchmarks.synthetic.people import Bodies
 from benchmarks.synthetic.regions import Geometry, View, held_elsewhere, region_maps, views_of
 from benchmarks.synthetic.sizes import HELD, SIZES, THING
+from torch_backend.footage.images import read_png
+from torch_backend.shot import write_json
 
 TINY, SEED, FINER = SIZES["tiny"], 0, 4
 
@@ -107,3 +111,22 @@ def test_the_cast_has_every_role_and_no_head_turns_where_no_column_hides_it():
     assert all(len(set(roles)) == 3 for roles in CAST) and set().union(*CAST) == set(ROLES)
     assert set().union(*CAST[3:9]) == set(ROLES)  # the seeds that reports are accepted on
     assert all(seed % 4 in (2, 3) for seed in range(10) if "turned" in CAST[seed])
+
+
+def test_behind_the_truth_everything_is_in_its_other_state(held, tmp_path):
+    """The rendered pictures: at t* 8 one person has left; the other picture shows her where she stood."""
+    folder = tmp_path / "rendered"
+    shutil.copytree(held, folder)
+    plan = json.loads((folder / "plan.json").read_text())
+    wanted = ("truth/000009/000009.png", "truth/000009/behind/000009.png", "frames/000009.png")
+    jobs = [next(job for job in plan["jobs"] if job["out"] == out) for out in wanted]
+    write_json(folder / "plan.json", {**plan, "jobs": jobs, "oversize": 1})
+    write_json(folder / "meter.json", {"stops": 0.0, "bpy": "", "threads": 0})
+    make._render(folder, make.find_bpy(None), lambda text: None)
+    truth, behind, frame = (read_png(folder / out).astype(float) for out in wanted)
+    geometry, view = Geometry.load(held), views_of(SEED, TINY, HELD)[8]
+    left = region_maps(geometry, geometry.at(0), 0, view, view)[THING + "leaving"]
+    left[:, :] &= behind.sum(axis=2) > 0  # inside the box
+    assert left.sum() > 20
+    assert np.abs(truth - behind).mean(axis=2)[left].mean() > 20
+    assert np.abs(truth - frame).mean() < 1.0  # nothing changes at t*: only what sways differs

@@ -54,6 +54,14 @@ FRAME_LAYERS = (
         tip="Distance along the camera's axis in scene units; 1e10 where there is nothing",
     ),
     FrameLayer(
+        "DepthSigma",
+        ("DepthSigma.V",),
+        "half",
+        "DepthSigma.V",
+        "standard deviation of depth, in its units; large where nothing tells how far something is",
+        part="sigma",
+    ),
+    FrameLayer(
         "Support",
         ("Support.V",),
         "half",

@@ -56,10 +56,12 @@ class FrozenImage:
     """[H, W] in 0..1: how much of what is seen was seen at the instant."""
     motion: Tensor
     """[H, W] in 0..1: how much of what is seen moves in the clip."""
+    depth_sigma: Tensor | None = None
+    """[H, W] standard deviation of `depth` in scene units; None: not known, `depth` is the splats' own."""
 
     def cpu(self) -> FrozenImage:
         """The same on the CPU, where files are written."""
-        return FrozenImage(*(value.cpu() for value in vars(self).values()))
+        return replace(self, **{name: value.cpu() for name, value in vars(self).items() if value is not None})
 
 
 @dataclass

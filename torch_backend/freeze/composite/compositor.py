@@ -79,6 +79,8 @@ class DetailedFrame:
     """[H, W, 3] scene-linear, premultiplied by 1 - matte: the rest of the pixel."""
     display: Display = PLAIN
     """What `splat` and `color` are shown on."""
+    depth_sigma: Tensor | None = None
+    """As in `FrozenImage`."""
 
     @property
     def color(self) -> Tensor:

@@ -87,7 +87,10 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
     K = output.K.clone()
     K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
     image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
-    return image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+    made = image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+    picture = _display(made, slice(None)) + (1.0 - made.alpha[..., None]) * 0.5
+    made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture)
+    return made
 
 
 def _write(
@@ -123,6 +126,7 @@ def _write_frame(
         splat, covered = image.splat.numpy(), image.splat_alpha.numpy()
         shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows], scene.display))
         layers = DetailLayers(shown, image.plate, image.source)
+    sigma = None if image.depth_sigma is None else (image.depth_sigma / scene.scale).numpy()
     write_frozen_exr(
         folder.frame(output.frame),
         Made((*size, 4), rgba),
@@ -141,6 +145,7 @@ def _write_frame(
         spec.beyond,
         None if spec.grain is None else _grain(spec.grain, output.frame, image, spec, scene.display),
         layers,
+        None if sigma is None else {"DepthSigma": sigma},
     )
 
 

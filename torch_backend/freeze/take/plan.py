@@ -33,14 +33,15 @@ from ...torch_types import floats
 from ...train import LoadedRun, choose_device, load_run, static_views
 from ..composite.compositor import Detailer
 from ..composite.grain import Grain, measure_plate
+from ..composite.surface_depth import FrameDepths
 from ..frozen import CandidateInstant, OutputFrame, best_instants, rank_instants
 from ..instant.instants import Instants
 from .cameras import intrinsics, output_size, plan
 from .footage_facts import footage_light
 
-TAKE_VERSION = 2
+TAKE_VERSION = 3
 """Rises when frames rendered before must not stand beside new ones."""
-DETAIL_VERSION = 20
+DETAIL_VERSION = 21
 """The same, of frames made of plates."""
 
 
@@ -62,6 +63,8 @@ class FrameSpec:
     """The plate's, None if it is not wanted."""
     grain_size: tuple[int, int]
     """Width and height in pixels at which a frame's grain is drawn, without overscan."""
+    depths: FrameDepths
+    """Makes the frames' depth."""
     detail: Detailer | None = None
     """Makes the frames of plates; None: splats alone."""
     detail_key: str = ""
@@ -150,8 +153,8 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
     spec = FrameSpec(
-        run, instants, params.query, (width, height), beyond, grain, plate, detail, detail_key(shot, detail),
-        footage_light(shot),
+        run, instants, params.query, (width, height), beyond, grain, plate, FrameDepths(run, scene), detail,
+        detail_key(shot, detail), footage_light(shot),
         _start(shot),
     )  # fmt: skip
     keys = {f.frame: spec.key(f) for f in whole}

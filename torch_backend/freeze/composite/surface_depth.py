@@ -1,0 +1,508 @@
+"""Depth of frozen frames that a compositor can use: smooth on surfaces, with the edges of the frame's own picture.
+
+The median depth of splats is that of single Gaussians: a plane looks like shingles, and where Gaussians are translucent
+the depth behind them is taken. What stands still is measured instead, once for all frames of a run:
+
+1. Key views, spread over the clip, start from the splats' inverse depth of what stands still.
+2. Each plate is compared with the plates of the key views around it. Inverse depth takes Gauss-Newton steps that make
+   them agree (Lucas and Kanade 1981, along epipolar lines). What mattes call moving takes no part.
+3. After each step inverse depth is fitted by planes in windows, weighted by how much the plates tell. Inverse depth of
+   a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows around it that fit
+   best: a window that reaches over an edge does not (Kuwahara et al. 1976).
+
+A frame takes that depth from the key views nearest to it, and the splats' for what moves or what they do not show.
+Planes are fitted once more in small windows, and each pixel takes those of its neighbours that are about as deep as the
+splats there and have its own colour in the frame's picture: a joint bilateral filter of planes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...contract import NO_DEPTH
+from ...scene import Scene, evenly_spaced, read_image, resize_intrinsics
+from ...shot import Shot
+from ...solve.motion import load_motion
+from ...torch_types import from_numpy
+from ...train import LoadedRun
+from ..bands import bands
+from ..frozen import FrozenGaussians, fade, freeze_at, render_frozen, span_of
+
+Array = NDArray[Any]
+"""float32 unless it says otherwise."""
+
+_LEAST = 1e-4
+"""Least inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so what is farther than
+10,000 of them has no parallax."""
+
+
+@dataclass(frozen=True)
+class SurfaceDepthConfig:
+    """How the depth of surfaces is found. Pixels are those of pictures `width` wide."""
+
+    width: int = 320
+    """Width in pixels at which surfaces are measured; less for smaller plates."""
+    keys: int = 12
+    """Number of key views, spread evenly over the clip."""
+    reach: int = 6
+    """Each key view is compared with this many before and after it."""
+    steps: int = 4
+    """Number of Gauss-Newton steps."""
+    radius: int = 6
+    """Radius in pixels of the windows in which planes are fitted to what the plates tell."""
+    detail: float = 1.5
+    """Standard deviation in pixels of the blur that is subtracted from plates, so that light and exposure cancel."""
+    contrast: float = 0.1
+    """Difference of two plates, display-referred, at which they no longer count as showing the same point."""
+    prior: float = 1.0
+    """Standard deviation of the splats' inverse depth, as a share of it, where plates tell more: large, so that splats
+    count only where plates tell nothing."""
+    noise: float = 0.03
+    """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.7 % on the
+    tuning scenes arm-000 and arm-001. What is farther off is another surface."""
+    flat: float = 0.01
+    """Deviation from its plane, as a share of the median inverse depth, from which on a window counts less."""
+    occluded: float = 1.15
+    """Ratio of inverse depths from which on a key view shows something in front of a point."""
+    nearest: int = 4
+    """Number of key views from which a frame takes its depth."""
+    taps: tuple[int, ...] = (-3, 0, 3)
+    """Offsets, along rows and columns, of the windows from which a pixel of a frame chooses."""
+    frame_radius: int = 2
+    """Radius in pixels of the windows in which planes are fitted in a frame."""
+    outlier: float = 1e-6
+    """Chance that a pixel's splats belong to another surface than the pixel: where the picture's colour is that surely
+    another one, edges are the picture's."""
+    color: float = 0.1
+    """Difference of colours in the frame's picture, display-referred, between a pixel and the window it takes."""
+
+
+@dataclass
+class KeyView:
+    """A clip's frame at which still surfaces are measured, at the size of measuring."""
+
+    viewmat: NDArray[np.float64]
+    """[4, 4] world-to-camera, scene units."""
+    K: NDArray[np.float64]
+    """[3, 3] pixels."""
+    picture: Array
+    """[h, w] brightness of its plate without what is smooth."""
+    still: Array
+    """[h, w] 1 where its plate shows what stands still, else 0."""
+    inverse: Array
+    """[h, w] inverse depth of what stands still, in 1 / scene units."""
+    sigma: Array
+    """[h, w] its standard deviation."""
+
+
+class StillSurfaces:
+    """Inverse depth of what stands still at the key views of a clip. Making it takes seconds."""
+
+    def __init__(self, keys: list[KeyView], config: SurfaceDepthConfig | None = None) -> None:
+        """`keys` in the clip's order, with the splats' inverse depth; they are refined here, in place."""
+        self.config, self.keys = config or SurfaceDepthConfig(), keys
+        found: list[tuple[Array, Array]] = []
+        for i, key in enumerate(keys):
+            reach = range(max(0, i - self.config.reach), min(len(keys), i + self.config.reach + 1))
+            found.append(refined(key, [keys[j] for j in reach if j != i], self.config))
+        for key, (inverse, sigma) in zip(keys, found, strict=True):
+            key.inverse, key.sigma = inverse, sigma
+
+    def near(self, viewmat: NDArray[np.float64]) -> list[KeyView]:
+        """The key views whose cameras are nearest to a world-to-camera [4, 4], nearest first."""
+        centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
+
+        def away(key: KeyView) -> float:
+            off = float(np.linalg.norm(-key.viewmat[:3, :3].T @ key.viewmat[:3, 3] - centre))
+            return off + float(np.linalg.norm(key.viewmat[2, :3] - viewmat[2, :3]))
+
+        return sorted(self.keys, key=away)[: self.config.nearest]
+
+
+def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
+    """[h, w] brightness of a plate [h, w, 3] without what is smooth."""
+    import cv2
+
+    grey = plate.mean(2, dtype=np.float32)
+    return np.asarray(grey - cv2.GaussianBlur(grey, (0, 0), config.detail), np.float32)
+
+
+def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig) -> tuple[Array, Array]:
+    """Inverse depth [h, w] of a key view at which plates agree, and its standard deviation [h, w]."""
+    start, inverse = key.inverse, key.inverse.copy()
+    flat = config.flat * float(np.median(start))
+    sigma = config.prior * start
+    for _ in range(config.steps if others else 1):
+        told, pull = gauss_newton(key, others, inverse, config)
+        prior = 1.0 / np.square(config.prior * start)
+        weight = told + prior
+        wanted = (told * inverse + pull + prior * start) / weight
+        wanted = np.clip(wanted, 0.9 * inverse, 1.1 * inverse)  # a linear step is not believed beyond that
+        planes = fit_planes(wanted, weight / np.median(weight), config.radius)
+        inverse, spread = planes.around(flat, config.radius)
+        inverse = np.maximum(inverse, _LEAST).astype(np.float32)
+        known = key.still * _means([told], config.radius)[0] * (2 * config.radius + 1)
+        sigma = np.sqrt(spread + 1.0 / np.maximum(known, 1e-6))
+    return inverse, sigma.astype(np.float32)
+
+
+def gauss_newton(
+    key: KeyView, others: Sequence[KeyView], inverse: Array, config: SurfaceDepthConfig
+) -> tuple[Array, Array]:
+    """What the plates of `others` tell of a key view's inverse depth, [h, w] each: how much (1 / variance), and that
+    times the step by which they would agree."""
+    told, pull = np.zeros_like(inverse), np.zeros_like(inverse)
+    rays = rays_of(key.K, inverse.shape)
+    for other in others:
+        place = Place.of(key, other, rays, inverse)
+        shift = place.look(other.picture) - key.picture
+        slope = place.look(_slope(other.picture, 1)) * place.dx + place.look(_slope(other.picture, 0)) * place.dy
+        seen = place.look(other.still) * key.still
+        clear = place.look(other.inverse) < config.occluded * place.inverse
+        weight = seen * clear / np.square(1.0 + np.square(shift / config.contrast))
+        told += weight * slope * slope
+        pull -= weight * slope * shift
+    return told / config.contrast**2, pull / config.contrast**2
+
+
+@dataclass
+class Place:
+    """Where the points of one view are in another."""
+
+    x: Array
+    """[h, w] pixel of the other view, centres at whole numbers."""
+    y: Array
+    """[h, w]."""
+    dx: Array
+    """[h, w] pixels by which x changes with inverse depth."""
+    dy: Array
+    """[h, w]."""
+    inverse: Array
+    """[h, w] inverse depth in the other view; 0 behind it."""
+
+    @classmethod
+    def of(cls, view: KeyView, other: KeyView, rays: Array, inverse: Array) -> Place:
+        """Of the points of `view` at `inverse` [h, w] along `rays` [h, w, 3]."""
+        turn, shift = between(view.viewmat, other.viewmat)
+        points = rays @ turn.T + inverse[..., None] * shift
+        ahead = points[..., 2] > 1e-3
+        depth = np.where(ahead, points[..., 2], 1.0)
+        fx, fy, cx, cy = (float(other.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        x, y = points[..., 0] / depth, points[..., 1] / depth
+        dx, dy = (f * (shift[i] - at * shift[2]) / depth for i, f, at in ((0, fx, x), (1, fy, y)))
+        outside = np.where(ahead, 0.0, -1e6).astype(np.float32)
+        places = fx * x + (cx - 0.5) + outside, fy * y + (cy - 0.5), dx, dy, ahead * inverse / depth
+        return cls(*(a.astype(np.float32) for a in places))
+
+    def look(self, picture: Array) -> Array:
+        """[h, w] a picture of the other view at these places, 0 outside of it."""
+        import cv2
+
+        return cv2.remap(picture, self.x, self.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def between(view: NDArray[np.float64], other: NDArray[np.float64]) -> tuple[Array, Array]:
+    """(rotation [3, 3], translation [3]) from one world-to-camera [4, 4] to another."""
+    turn = other[:3, :3] @ view[:3, :3].T
+    return turn.astype(np.float32), (other[:3, 3] - turn @ view[:3, 3]).astype(np.float32)
+
+
+def rays_of(K: NDArray[np.float64], size: tuple[int, ...]) -> Array:
+    """[h, w, 3] rays of unit depth through the pixel centres."""
+    x, y = np.meshgrid(np.arange(size[1]) + 0.5, np.arange(size[0]) + 0.5)
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
+    return rays.astype(np.float32)
+
+
+def _slope(picture: Array, axis: int) -> Array:
+    import cv2
+
+    return cv2.Sobel(picture, cv2.CV_32F, axis, 1 - axis, ksize=3, scale=0.125)
+
+
+@dataclass
+class Planes:
+    """Inverse depth around each pixel as a plane: value + along * (x - its column) + down * (y - its row)."""
+
+    value: Array
+    """[h, w] at the window's middle."""
+    along: Array
+    """[h, w] change per pixel to the right."""
+    down: Array
+    """[h, w] change per pixel downwards."""
+    variance: Array
+    """[h, w] mean square of what the window's values are off the plane."""
+
+    def where(self, mask: Array, other: Planes) -> Planes:
+        """Those of `other` in `mask`, bool [h, w]."""
+        return Planes(
+            np.where(mask, other.value, self.value),
+            np.where(mask, other.along, self.along),
+            np.where(mask, other.down, self.down),
+            np.where(mask, other.variance, self.variance),
+        )
+
+    def fits(self, flat: float) -> Array:
+        """[h, w] in 0..1: how well a window is a plane; `flat` is a deviation that is no fault."""
+        return np.square(np.square(flat * flat / (flat * flat + self.variance)))
+
+    def around(self, flat: float, radius: int) -> tuple[Array, Array]:
+        """(inverse depth [h, w], variance [h, w]) of the planes of all windows that hold a pixel, those that fit."""
+        rows, columns = _grid(self.value.shape)
+        fit = np.maximum(self.fits(flat), 1e-20)
+        level = self.value - self.along * columns - self.down * rows
+        total, level, along, down, variance = _means(
+            [fit, fit * level, fit * self.along, fit * self.down, fit * self.variance], radius
+        )
+        return (level + along * columns + down * rows) / total, variance / total
+
+
+def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
+    """The planes that fit `values` [h, w], each weighted by `weight` [h, w], in the windows around all pixels."""
+    rows, columns = _grid(values.shape)
+    near = weight.astype(np.float64)
+    terms = [near * f for f in (1.0, columns, rows, columns**2, columns * rows, rows**2)]
+    terms += [near * values * f for f in (1.0, columns, rows, values)]
+    total, *moments = _means(terms, radius)
+    total = np.maximum(total, 1e-12)
+    x, y, xx, xy, yy, v, vx, vy, vv = (moment / total for moment in moments)
+    # A third of a pixel squared keeps slopes finite where all the weight lies in one pixel.
+    xx, xy, yy = xx - x * x + 0.1, xy - x * y, yy - y * y + 0.1
+    vx, vy, vv = vx - v * x, vy - v * y, vv - v * v
+    determinant = xx * yy - xy * xy
+    along, down = (yy * vx - xy * vy) / determinant, (xx * vy - xy * vx) / determinant
+    variance = np.maximum(vv - along * vx - down * vy, 0.0)
+    value = v + along * (columns - x) + down * (rows - y)
+    return Planes(*(a.astype(np.float32) for a in (value, along, down, variance)))
+
+
+def _grid(size: tuple[int, ...]) -> tuple[Array, Array]:
+    """([h, 1] rows, [1, w] columns), counted from the middle."""
+    height, width = size
+    return np.arange(height)[:, None] - 0.5 * height, np.arange(width)[None] - 0.5 * width
+
+
+def _means(terms: Sequence[Array], radius: int) -> list[Array]:
+    """Each [h, w] averaged over windows; what is beyond the picture counts as 0."""
+    import cv2
+
+    side = 2 * radius + 1, 2 * radius + 1
+    return [cv2.blur(np.ascontiguousarray(term, np.float64), side, borderType=cv2.BORDER_CONSTANT) for term in terms]
+
+
+@dataclass
+class Splats:
+    """What the splats show of a frame, at its full size."""
+
+    viewmat: NDArray[np.float64]
+    """[4, 4] world-to-camera, scene units."""
+    K: NDArray[np.float64]
+    """[3, 3] pixels of the picture, overscan included."""
+    inverse: Array
+    """[H, W] inverse of the median depth, 0 where nothing is."""
+    moving: Array
+    """[H, W] in 0..1: how much of what is seen moves in the clip."""
+
+
+def frame_depth(surfaces: StillSurfaces, splats: Splats, picture: Array) -> tuple[Array, Array]:
+    """Inverse depth [H, W] of a frame, and its standard deviation [H, W], in 1 / scene units; 0 where nothing is.
+
+    `picture` [H, W, 3] is the finished frame, display-referred.
+    """
+    import cv2
+
+    config = surfaces.config
+    height, width = splats.inverse.shape
+    # Pixels of the key views' size, whatever of the scene the frame shows around its middle: overscan changes nothing.
+    focal = float(surfaces.keys[0].K[0, 0]) if surfaces.keys else splats.K[0, 0] * config.width / width
+    w = max(min(64, width), min(width, round(width * float(focal / splats.K[0, 0]))))
+    h = max(8, round(height * w / width))
+    inverse = cv2.resize(splats.inverse, (w, h), interpolation=cv2.INTER_NEAREST)
+    moving = cv2.resize(splats.moving, (w, h), interpolation=cv2.INTER_AREA)
+    K = splats.K.copy()
+    K[0] *= w / width
+    K[1] *= h / height
+    still = np.clip(1.0 - 2.0 * moving, 0.0, 1.0)
+    values, sigma, weight = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, inverse))
+    # What moves and what stands still are surfaces of their own, however near they are.
+    weight, mover = weight / float(np.median(weight)), moving > 0.5
+    still, moved = (fit_planes(values, weight * of + 1e-9, config.frame_radius) for of in (~mover, mover))
+    planes = still.where(mover, moved)
+    guide = np.concatenate([picture, (4.0 * config.color * (splats.moving > 0.5))[..., None]], axis=2, dtype=np.float32)
+    small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
+    small = np.concatenate([small, (4.0 * config.color * mover)[..., None]], axis=2, dtype=np.float32)
+    return selected(planes, sigma, small, splats.inverse, guide, config)
+
+
+def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array, Array]:
+    """(inverse depth, its standard deviation, weight), [h, w] each: the key views' where they agree with the splats."""
+    config, radius = surfaces.config, surfaces.config.frame_radius
+    rough = fit_planes(view.inverse, np.ones_like(view.inverse), radius)
+    smooth = rough.around(config.noise * float(np.median(view.inverse)), radius)[0]
+    smooth = np.maximum(smooth, _LEAST).astype(np.float32)
+    rays = rays_of(view.K, view.inverse.shape)
+    total, mean, square = np.zeros_like(smooth), np.zeros_like(smooth), np.zeros_like(smooth)
+    for key in surfaces.near(view.viewmat):
+        found, sigma = seen_in(key, view, rays, smooth)
+        off = (found - smooth) / (config.noise * smooth)
+        weight = view.still * np.exp(-0.5 * np.square(off)) * (sigma > 0) / np.maximum(np.square(sigma), 1e-12)
+        total += weight
+        mean += weight * (found - smooth)
+        square += weight * np.square(found - smooth)
+    known = np.maximum(total, 1e-12)
+    spread = np.maximum(square / known - np.square(mean / known), 0.0)
+    # Key views that disagree know little, however sure each of them is.
+    told = total / (1.0 + total * spread)
+    splats = 1.0 / np.square(config.prior * smooth)
+    share = told / (told + splats)
+    variance = share * share / np.maximum(told, 1e-12) + np.square((1.0 - share) * config.noise * smooth)
+    value = smooth + share * mean / known + (1.0 - share) * (view.inverse - smooth)
+    return value, np.sqrt(variance), told + splats
+
+
+def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[Array, Array]:
+    """Inverse depth [h, w] of a view's points as a key view has them, and its standard deviation, 0 where it has none.
+
+    `inverse` [h, w] is where to begin. A point's place in the key view hangs on its depth; two rounds settle it.
+    """
+    turn, shift = between(view.viewmat, key.viewmat)
+    ahead = (rays @ turn.T)[..., 2]
+
+    def once(inverse: Array) -> tuple[Array, Array]:
+        place = Place.of(view, key, rays, inverse)
+        depth = place.look(key.inverse)
+        better = depth * ahead / np.maximum(1.0 - depth * shift[2], 1e-3)
+        better = np.maximum(np.where(depth > 0, better, inverse), _LEAST).astype(np.float32)
+        return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, _LEAST), 0.0)
+
+    return once(once(inverse)[0])
+
+
+def selected(
+    planes: Planes, sigma: Array, small: Array, splats: Array, picture: Array, config: SurfaceDepthConfig
+) -> tuple[Array, Array]:
+    """Inverse depth [H, W] of a picture and its standard deviation: each pixel's from the planes around it.
+
+    Args:
+        planes: [h, w], fitted to a smaller picture `small` [h, w, C] of the frame; `sigma` [h, w] that of their values.
+        splats: [H, W] the splats' inverse depth, 0 where nothing is.
+        picture: [H, W, C] the frame.
+    """
+    import cv2
+
+    height, width = splats.shape
+    rows, columns = (axis.astype(np.float32) for axis in _grid(planes.value.shape))
+    level = planes.value - planes.along * columns - planes.down * rows
+    fit = planes.fits(config.flat * float(np.median(planes.value)))
+    maps = [level, planes.along, planes.down, fit, np.square(sigma), *np.moveaxis(small, -1, 0)]
+    windows = [np.pad(m.astype(np.float32), max(config.taps), mode="edge") for m in maps]
+    rough = np.asarray(cv2.medianBlur(splats, 3), np.float32)
+    out, deviation = np.zeros_like(splats), np.zeros_like(splats)
+    for part in bands(height, width):
+        colors = [np.ascontiguousarray(picture[part, :, i]) for i in range(picture.shape[2])]
+        size = *planes.value.shape, height
+        out[part], deviation[part] = _from_windows(windows, rough[part], colors, part.start, size, config)
+    return np.where(splats > 0, out, 0.0), np.where(splats > 0, deviation, 0.0)
+
+
+def _from_windows(
+    windows: list[Array], rough: Array, colors: list[Array], top: int, size: tuple[int, int, int],
+    config: SurfaceDepthConfig,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Some rows of `selected`, from row `top` on: `rough` and `colors` [b, W] of the picture's channels.
+
+    `windows` are level, slopes, fit, variance and the channels of the smaller picture, [h, w] with a border of the
+    farthest tap; `size` is (h, w) without it, and the picture's height.
+    """
+    import cv2
+
+    (h, w, height), (rows, width), border = size, rough.shape, max(config.taps)
+    down = (np.arange(top, top + rows, dtype=np.float32) + 0.5) * (h / height)
+    at = border + down.astype(np.int64)
+    y = (down - 0.5 - 0.5 * h)[:, None]
+    x = ((np.arange(width, dtype=np.float32) + 0.5) * (w / width) - 0.5 - 0.5 * w)[None]
+    near = 1.0 / np.maximum(config.noise * rough, config.noise * _LEAST)
+    total = np.full_like(rough, 1e-20)
+    mean, square, spread = np.zeros_like(rough), np.zeros_like(rough), np.zeros_like(rough)
+    for dy in config.taps:
+        lines = [m[at + dy] for m in windows]
+        for dx in config.taps:
+            columns = slice(border + dx, border + dx + w)
+            level, along, below, fit, variance, *there = (
+                cv2.resize(m[:, columns], (width, rows), interpolation=cv2.INTER_NEAREST) for m in lines
+            )
+            guess = level + along * x + below * y - rough
+            off = np.zeros_like(rough)
+            for one, other in zip(there, colors, strict=True):
+                off += np.square((one - other) * np.float32(1.0 / config.color))
+            # Splats have the last word among windows of one colour, and none where the picture's colour denies them.
+            weight = fit * np.exp(-0.5 * off) * (np.exp(-0.5 * np.square(guess * near)) + config.outlier)
+            total += weight
+            mean += weight * guess
+            square += weight * np.square(guess)
+            spread += weight * variance
+    known = total > 1e-12
+    variance = np.maximum(square / total - np.square(mean / total), 0.0) + spread / total
+    deviation = np.where(known, np.sqrt(variance), config.noise * rough)
+    return np.where(known, rough + mean / total, rough), deviation
+
+
+class FrameDepths:
+    """Makes depth of a run's frozen frames that a compositor can use. Still surfaces are measured for the first."""
+
+    def __init__(self, run: LoadedRun, scene: Scene, config: SurfaceDepthConfig | None = None) -> None:
+        self.run, self.scene, self.config = run, scene, config or SurfaceDepthConfig()
+        self._surfaces: StillSurfaces | None = None
+
+    @property
+    def surfaces(self) -> StillSurfaces:
+        """Those of the run. They hang on no instant, so that a frame is the same whichever was made before it."""
+        if self._surfaces is None:
+            frozen = freeze_at(self.run.model, 0.5, span_of(self.scene, self.run))
+            still = fade(frozen, (frozen.motion < 0.5).float())
+            shot = Shot(self.scene.folder.parent)
+            frames = [f for f in self.run.train_frames if shot.plate(f).is_file()]
+            chosen = [frames[i] for i in evenly_spaced(len(frames), min(self.config.keys, len(frames)))]
+            self._surfaces = StillSurfaces([self._key(shot, frame, still) for frame in chosen], self.config)
+        return self._surfaces
+
+    @torch.no_grad()
+    def of(self, viewmat: Tensor, K: Tensor, depth: Tensor, motion: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """(depth, its standard deviation) of a frozen frame, [H, W] each in scene units; 1e10 and 0 where nothing is.
+
+        Args:
+            viewmat: [4, 4] world-to-camera, scene units. `K`: [3, 3] pixels of the picture, overscan included.
+            depth: [H, W] the splats' median depth. `motion`: [H, W] in 0..1, how much of it moves in the clip.
+            picture: [H, W, 3] the finished frame, display-referred.
+        """
+        there = depth < NO_DEPTH
+        inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / _LEAST), 0.0)
+        splats = Splats(viewmat.double().numpy(), K.double().numpy(), inverse.numpy(), motion.numpy())
+        found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, picture.clamp(0.0, 1.0).numpy()))
+        refined = torch.where(there, 1.0 / found.clamp_min(_LEAST), NO_DEPTH)
+        return refined, torch.where(there, sigma * refined.square(), 0.0)
+
+    def _key(self, shot: Shot, frame: int, still: FrozenGaussians) -> KeyView:
+        import cv2
+
+        i, scene = self.scene.frames.index(frame), self.scene
+        width = min(self.config.width, scene.width)
+        height = max(8, round(scene.height * width / scene.width))
+        K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
+        image = render_frozen(still, scene.viewmats[i], K, width, height)
+        inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / _LEAST)).numpy()
+        plate = read_image(shot.plate(frame), width, height, scene.display).numpy()
+        moving = load_motion(shot, frame)
+        clear = np.ones((height, width), np.float32)
+        if moving is not None:
+            moving = cv2.resize(moving, (width, height), interpolation=cv2.INTER_NEAREST)
+            clear[cv2.dilate(moving, np.ones((5, 5), np.uint8)) > 160] = 0.0
+        pose = scene.viewmats[i].double().numpy(), K.double().numpy()
+        return KeyView(*pose, key_picture(plate, self.config), clear, inverse, self.config.noise * inverse)
