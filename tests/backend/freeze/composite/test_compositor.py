@@ -16,10 +16,10 @@ from torch_backend.deformation import Deformation, Deltas
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
+from torch_backend.freeze import bands
 from torch_backend.freeze.composite.compositor import DetailConfig, Detailer
 from torch_backend.freeze.composite.warp import sample, snap
 from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen
-from torch_backend.freeze.views import bands
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
 from torch_backend.scene import Scene
