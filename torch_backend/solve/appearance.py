@@ -62,7 +62,9 @@ class Appearance:
         self.sight = sight
         self.colors = _smoothed(sight.colors)
         """[h, w, 3] low-passed."""
-        self.residual: Map = self.colors - _smoothed(cv2.resize(static.colors, size, interpolation=how))
+        self.residual: Map = self.colors - _smoothed(
+            np.asarray(cv2.resize(static.colors, size, interpolation=how), np.uint8)
+        )
         """[h, w, 3] the frame less the static model's render."""
         self.depth = np.asarray(cv2.resize(static.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
         """[h, w] of the static model, solve units."""
@@ -109,7 +111,8 @@ class Appearance:
         sparse = apart[::_SPARSE, ::_SPARSE][visible[::_SPARSE, ::_SPARSE]]
         if len(sparse) >= FEW:
             apart -= np.median(sparse, axis=0)  # exposure drifts in a clip
-        return cv2.blur(np.mean(apart * apart, axis=-1), (3, 3)) / noise, visible
+        square = np.asarray(np.mean(apart * apart, axis=-1), np.float32)
+        return np.asarray(cv2.blur(square, (3, 3)), np.float32) / noise, np.asarray(visible, np.bool_)
 
 
 def _smoothed(colors: NDArray[np.uint8]) -> Map:
