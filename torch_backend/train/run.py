@@ -273,7 +273,7 @@ def warm_up(config: TrainConfig, device: torch.device) -> None:
 
 def _likely(shot: Shot) -> Mattes:
     """The motion mattes as a training wants them: its field is offered what is likely to move, too."""
-    return functools.partial(load_motion, shot, likely=True)
+    return functools.partial(load_motion, shot)
 
 
 def planned(
