@@ -43,8 +43,8 @@ Check = Callable[[int, int], None]
 class DevelopConfig:
     """How an instant is developed. Rates are in scene units."""
 
-    steps: int = 300
-    """Training steps, of one frame each."""
+    steps: int = 120
+    """Training steps, of one frame each. Of 75 to 300 the delivered frames differ by 0.06 dB at most on three clips."""
     width: int = 640
     """Pixels of the pictures that are trained on, at most; never above the working frames'."""
     frames: int = 160
@@ -63,8 +63,9 @@ class DevelopConfig:
     squared errors),"""
     ways: int = 4
     """in so many parts."""
-    instant_share: float = 0.1
-    """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training."""
+    instant_share: float = 0.25
+    """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training: 30
+    steps, as plate t* alone shows what moves."""
     afar: float = 2.0
     """Plate t* teaches nothing of what it sees from more than so many times as far as some trained frame does."""
     looks: int = 12
