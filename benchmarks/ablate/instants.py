@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.ablate.switches import STAGES, of_stage, replaced, switched_off
+from benchmarks.ablate.switches import MAKER, STAGES, of_stage, replaced, switched_off
 from benchmarks.detail_clip import DetailClip
 from torch_backend.freeze.frozen import FrozenGaussians
 from torch_backend.freeze.instant import instants as developed_instants
@@ -57,7 +57,7 @@ class Instants:
         with contextlib.ExitStack() as stack:
             for stage in filter(partial(hasattr, developed_instants), STAGES):
                 # A step that is off as a whole is replaced over this, and costs nothing.
-                stack.enter_context(replaced("developed_instants", stage, self._shared(stage, off, seconds)))
+                stack.enter_context(replaced(MAKER, stage, self._shared(stage, off, seconds)))
             yield
 
     def _shared(
@@ -114,7 +114,7 @@ def _feed(found: Any, value: Any) -> None:
         found.update(f"[{len(value)}".encode())
         for each in value:
             _feed(found, each)
-    elif isinstance(value, FrozenGaussians) or type(value).__name__ in ("Turned", "DevelopConfig"):
+    elif isinstance(value, FrozenGaussians) or type(value).__name__ == "DevelopConfig":
         assert is_dataclass(value)
         _feed(found, [getattr(value, f.name) for f in fields(value)])
     elif value is None or isinstance(value, str | int | float | bool):

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.ablate.cases import Case
 from benchmarks.ablate.instants import Instant
 from benchmarks.ablate.measures import FrameMaker, Row
-from benchmarks.ablate.switches import COMBINATIONS, OWN_PLATE, RULES, of_frames, replaced
+from benchmarks.ablate.switches import COMBINATIONS, RULES, STATE, of_frames, replaced
 from benchmarks.ablate.table import Store
 from benchmarks.other_state.masks import CLIPS, Painted, Pair, load_masks, plate_labels
 from benchmarks.other_state.scores import LET_GO, count
@@ -22,7 +22,7 @@ from torch_backend.solve.plate_lens import load_plate_lenses
 def variants() -> dict[str, frozenset[str]]:
     """Name -> rules of frames that are off: combinations, and each rule that decides about the own plate."""
     named = {name: off for name, off in COMBINATIONS.items() if off == of_frames(off)}
-    return named | {f"no {rule.name}": frozenset({rule.name}) for rule in OWN_PLATE if rule.name in RULES}
+    return named | {f"no {rule.name}": frozenset({rule.name}) for rule in STATE if rule.name in RULES}
 
 
 def judge_masks(case: Case, store: Store) -> None:
@@ -36,7 +36,7 @@ def judge_masks(case: Case, store: Store) -> None:
         if todo:
             maker = FrameMaker(case.clip, t_star, Instant(case.clip.frozen(t_star), "", {}))
             pairs = [pair for pair in masks.pairs if pair.t_star == t_star]
-            with replaced("detail", "fillers_of", lambda _: lambda *_: None):  # the fill is not judged
+            with replaced("composite.compositor", "fillers_of", lambda _: lambda *_: None):  # the fill is not judged
                 for name, row in _judged(maker, masks, pairs, todo).items():
                     store.save(told, t_star, name, row)
 

@@ -22,7 +22,7 @@ from torch_backend.report.metrics import psnr_by_region, psnr_of
 from torch_backend.report.things import recall_of
 from torch_backend.report.truth import TruthScene
 
-DECISIONS = (("detail", "leading_matte"), ("fill", "instant_pixels"))
+DECISIONS = (("composite.compositor", "leading_matte"),)
 """Functions that decide from which plate a pixel comes: their CPU seconds are those of the decision."""
 Row = dict[str, Any]
 

@@ -9,6 +9,7 @@ import pytest
 
 from torch_backend.contract import FrameLayer
 from torch_backend.footage.color import PRIMARIES, InputSpace
+from torch_backend.freeze import exr
 from torch_backend.freeze.exr import (
     CHANNELS,
     DETAIL_CHANNELS,
@@ -21,7 +22,6 @@ from torch_backend.freeze.exr import (
     read_key,
     write_frozen_exr,
 )
-from torch_backend.freeze.take import exr
 
 VIEWMAT = np.array([[0, -1, 0, 0.25], [1, 0, 0, -2], [0, 0, 1, 3.5], [0, 0, 0, 1]], dtype=np.float32)
 K = np.array([[1000.5, 0, 31.5], [0, 999.25, 24.5], [0, 0, 1]], dtype=np.float32)

@@ -24,9 +24,10 @@ from torch_backend.footage.color import linear_to_srgb
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.freeze.take import frames as take_frames
+from torch_backend.freeze.take import write_beside
 from torch_backend.freeze.take.cameras import plan
-from torch_backend.freeze.take.job import frames as take_frames
-from torch_backend.freeze.take.job import missable, write_beside
+from torch_backend.freeze.take.job import missable
 from torch_backend.freeze.take.video import write_video
 from torch_backend.gaussians.ply import read_ply
 from torch_backend.scene import load_scene
