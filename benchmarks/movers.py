@@ -1,7 +1,8 @@
 """Motion mattes against rendered truth: `python -m benchmarks.movers SCENE ... --results DIR`.
 
 SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot with exact (or
-solved) cameras and its mattes are made in DIR if they are not there. Printed are, over all frames of the clip:
+solved) cameras and its mattes are made in DIR if they are not there. Printed are, over all frames of the clip, for what
+is moving (as a freeze reads the mattes) and for that with what is likely to move (as a training does):
 
 precision     share of the marked pixels that move, or lie within `--margin` pixels of one that does
 moving, ...   recall: share of the truth's pixels that are marked, of all that moves and of the thing of a hard scene
@@ -32,44 +33,52 @@ from torch_backend.solve.stored import load_cameras
 
 MOVERS = ("moving", *(name for name in THINGS if name not in ("glass", "mirror", "wall")))
 """Regions of truth that mattes should mark."""
+LABELS = ("moving", "likely")
+"""What mattes call moving, and that with what is likely to move."""
 LEAST = 50
 """Pixels of a thing below which a frame says nothing about its recall."""
 
 
-def frame_row(matte: NDArray[np.uint8], regions: Mapping[str, NDArray[np.bool_]], margin: int) -> dict[str, Any]:
-    """Pixel counts of one frame: `marked`, `right` of them, and `found`: [marked, all] of each mover.
+def frame_row(
+    mattes: Mapping[str, NDArray[np.uint8]], regions: Mapping[str, NDArray[np.bool_]], margin: int
+) -> dict[str, Any]:
+    """Pixel counts of one frame by label: `marked`, `right` of them, and `found`: [marked, all] of each mover.
 
     Args:
-        matte: [H, W] as `load_motion` returns it.
+        mattes: of each of `LABELS`, [H, W] as `load_motion` returns it.
         regions: name -> [H, W]; `moving` has to be there.
         margin: pixels around what moves that may be marked, too.
     """
     block = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
     near = cv2.dilate(regions["moving"].astype(np.uint8), block) > 0
-    marked = matte == MOVING
-    found = {name: [int((marked & of).sum()), int(of.sum())] for name, of in regions.items() if name in MOVERS}
-    return {"marked": int(marked.sum()), "right": int((marked & near).sum()), "found": found}
+    row: dict[str, Any] = {}
+    for label, matte in mattes.items():
+        marked = matte == MOVING
+        found = {name: [int((marked & of).sum()), int(of.sum())] for name, of in regions.items() if name in MOVERS}
+        row[label] = {"marked": int(marked.sum()), "right": int((marked & near).sum()), "found": found}
+    return row
 
 
 def judge(truth: TruthScene, frames: Sequence[int], margin: int) -> list[dict[str, Any]]:
     """One row per frame that has a matte, see `frame_row`."""
     rows: list[dict[str, Any]] = []
     for frame in frames:
-        matte = load_motion(truth.shot, frame)
-        if matte is None:
+        matte, likely = load_motion(truth.shot, frame), load_motion(truth.shot, frame, likely=True)
+        if matte is None or likely is None:
             continue
         height, width = matte.shape
         regions = {name: mask.numpy() for name, mask in truth.frame_regions(frame, width, height).items()}
-        rows.append({"frame": frame, **frame_row(matte, regions, margin)})
+        rows.append({"frame": frame, **frame_row({"moving": matte, "likely": likely}, regions, margin)})
     return rows
 
 
-def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+def summary(rows: Sequence[Mapping[str, Any]], label: str) -> dict[str, float | None]:
     """Precision, recall of each mover, and that of the thing in its worst frames; None where nothing is marked."""
-    marked, right = (sum(row[name] for row in rows) for name in ("marked", "right"))
+    of = [row[label] for row in rows]
+    marked, right = (sum(each[name] for each in of) for name in ("marked", "right"))
     found: dict[str, float | None] = {"precision": right / marked if marked else None}
     for name in MOVERS:
-        pairs = [row["found"][name] for row in rows if name in row["found"]]
+        pairs = [each["found"][name] for each in of if name in each["found"]]
         whole = sum(pair[1] for pair in pairs)
         if not whole:
             continue
@@ -99,7 +108,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             rows = judge(truth, [camera.frame for camera in load_cameras(truth.shot).frames], args.margin)
             name = truth.name.replace(" ", "-")
             write_json(args.results / f"movers-{name}.json", {"version": 1, "margin": args.margin, "frames": rows})
-            print(f"{truth.name}: {text(summary(rows))}", flush=True)
+            for label in LABELS:
+                print(f"{truth.name}, {label}: {text(summary(rows, label))}", flush=True)
     except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return 1

@@ -87,31 +87,34 @@ class FlowConfig:
     """So many of these units are nothing yet,"""
     clear: float = 0.8
     """and so many are motion for certain."""
-    references: int = 12
-    """Frames in which the surfaces of a frame are looked up, at most: the nearest ones."""
-    spacing: int = 4
-    """Key frames from one of those to the next, at most; fewer in a clip that would have fewer references."""
-    sensor: float = 3.0
-    """Standard deviation of a low-passed colour that is noise: sensor, compression, a static model's errors."""
-    misplaced: float = 0.5
-    """Points of the grid by which a lookup is off: times the picture's gradient it is the noise beside edges."""
-    hides: float = 0.9
-    """What a static model has before a point, nearer than this share of its depth, hides it."""
+    unlike: float = 12.0
+    """A colour this far out of the range that another picture shows there is another thing's."""
+    fleeting: tuple[float, float] = (0.5, 0.65)
+    """What is unlike so many of the key frames around belongs to what moves, and is it for certain."""
+    explained: float = 0.6
+    """A depth at which so many of them show the same explains it by a thing that stands still."""
+    need: int = 2
+    """In fewer of them a point says nothing."""
+    depths: int = 64
+    """So many depths are tried."""
+    speck: float = 4.0
+    """What is fleeting and smaller than this squared is noise."""
+    unexplained: tuple[float, float] = (16.0, 32.0)
+    """An area so far from all that a static model of the clip shows there, and somewhere so far, is likely to move,"""
+    borne_out: float = 0.6
+    """unless so many of the key frames around show the same at the still point's depth: the model is poor there."""
+    asked: int = 3
+    """So many of them have to have that point in their picture, hidden or not."""
     reach: int = 2
     """Over so many of the longest baselines a surface's scores are gathered along it."""
     radius: int = 4
     """Scores are spread over so many points of the grid, stopping at edges of the picture."""
     edge: float = 8.0
     """Smaller differences are no edges."""
-    by_flow: float = 3.6
-    """Weight of the square root of flow's score in the log odds that a point moves. This weight and the next two are
-    fitted by logistic regression on truth (tuning scenes 0 to 2 of the kind `arm`)."""
-    by_appearance: float = 3.2
-    """Weight of the score of the lookups in the log odds."""
-    prior: float = -3.8
-    """Log odds that a point moves if both scores are 0."""
-    flow_alone: tuple[float, float] = (4.8, -2.9)
-    """Weight of the square root of flow's score and log odds without it where a clip has no static model: same fit."""
+    seed: float = 0.4
+    """An area moves if a point in it has this score,"""
+    grow: float = 0.2
+    """and reaches as far as points have this one."""
     blob: float = 10.0
     """Areas of less than this squared are noise, and holes of less are filled."""
 

@@ -17,7 +17,7 @@ from ..contract import Reporter
 from ..footage import load_frames
 from ..footage.images import read_frame
 from ..shot import Shot
-from .appearance import Appearance, Sight, StaticView
+from .fleeting import Fleeting, Other, Shades, Sight, seeded
 from .flow import FlowConfig, Map, Mask, Matches, neighbours, sample
 from .leftover import Leftover
 from .masks import IGNORE, load_mask, painted_over
@@ -30,15 +30,17 @@ _KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
 _LEFT_EVERY = 2
 """In every so manieth key frame what is left of motion is looked for: sways are slow."""
-_APART = 2
-"""Key frames between a frame and one in which its surfaces are looked up, at least: what moves slowly is still there
-in nearer ones."""
+_PART = 0.25
+"""A pixel is fleeting if so much of what is around it is."""
+LIKELY = 48
+"""In the files: a static model of the clip cannot show it, but no flow sees it move. Nearest to still, which it is for
+whoever does not know it, and where it is copied into a painted matte."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 
 
-StaticViews = Callable[[int], StaticView | None]
-"""Frame number -> what a static model of the clip shows from its camera; None: nothing."""
+StaticViews = Callable[[int], NDArray[np.uint8] | None]
+"""Frame number -> what a static model of the clip shows from its camera, [h, w, 3] as the frames are; None: nothing."""
 
 
 class Clip:
@@ -102,17 +104,16 @@ class Clip:
             pixels = painted_over(pixels, ignored)
         grey = _sized(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8), self.flow_size)
         colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))
-        return grey, Sight(colors, self._cameras[0][index], self._cameras[1][index])
+        return grey, Sight(Shades(colors), self._cameras[0][index], self._cameras[1][index])
 
-    @property
-    def has_static(self) -> bool:
-        """True if there is a static model of the clip."""
-        return self._static is not None
+    def static(self, index: int) -> Shades | None:
+        """What a static model of the clip shows in a frame, on the grid; None if there is none."""
+        shown = None if self._static is None else self._static(self.frames[index])
+        return None if shown is None else Shades(_sized(shown, (self.flow_size[0] // 2, self.flow_size[1] // 2)))
 
-    def appearance(self, index: int, sight: Sight) -> Appearance | None:
-        """A frame prepared for lookups; None if its pose was not solved or there is no static model."""
-        static = None if self._static is None or self._guessed[index] else self._static(self.frames[index])
-        return None if static is None else Appearance(sight, static)
+    def is_guessed(self, index: int) -> bool:
+        """True if the pose of a frame was not solved."""
+        return self._guessed[index]
 
     def forget(self, before: int) -> None:
         """Drops the pictures of keys below `before`."""
@@ -148,7 +149,8 @@ def mattes(
     clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter,
     tell: Callable[[int, tuple[Map, Map], Evidence], None] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:  # fmt: skip
-    """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order.
+    """(index, labels [H, W] uint8: 0 still, 48 likely to move, 128 unknown, 255 moving) of all frames but the `written`
+    ones, in order.
 
     `tell` hears each key's evidence and the grid it is on, before the key's matte comes.
     """
@@ -159,7 +161,7 @@ def mattes(
         return
     first, last = wanted.index(True), len(wanted) - 1 - wanted[::-1].index(True)
     matches = Matches(clip.picture, config, clip.unit)
-    lookups = Lookups(clip, matches.grid, config)
+    fleeting = Fleeting(matches.grid, clip.unit, config)
     own: dict[int, tuple[Map, Map, Map]] = {}
     final: dict[int, tuple[Map, Map]] = {}
     start = max(0, first - 1 - reach)
@@ -177,12 +179,13 @@ def mattes(
         final[key] = _followed(matches, key, own, len(keys), reach, config)
         for n in groups[key] if wanted[key] else ():
             if n not in written:
-                picture, sight = clip.frame(n)
+                picture, sight = (clip.picture(key), clip.sight(key)) if n == keys[key] else clip.frame(n)
                 if n == keys[key]:
                     score, inverse = final[key], own[key][2]
                 else:
                     score, inverse = _between(clip, matches, picture, key, final, own)
-                yield n, _labels(clip, picture, *score, lookups.changed(n, key, sight, inverse), config)
+                gone = _fleeting(clip, fleeting, n, key, sight, inverse, own, config)
+                yield n, _labels(clip, picture, *score, *gone, config)
         for store in (own, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
@@ -245,71 +248,46 @@ def _between(
     return (total / np.maximum(weight, 1e-6), weight), inverse / count
 
 
-class Lookups:
-    """Looks the surfaces of frames up in reference frames, which are prepared once and kept while they are near."""
-
-    def __init__(self, clip: Clip, grid: tuple[Map, Map], config: FlowConfig) -> None:
-        self._clip, self._grid, self._config = clip, grid, config
-        stride = max(1, min(config.spacing, -(-len(clip.keys) // config.references)))
-        self._keys = range(0, len(clip.keys), stride)
-        self._ready: dict[int, Appearance | None] = {}
-
-    def changed(self, n: int, key: int, sight: Sight, inverse: Map) -> Map:
-        """`Appearance.changed` of frame `n`, which is key `key` or lies between it and the one before.
-
-        0 where its pose was not solved, or without a static model.
-        """
-        clip = self._clip
-        frame = self._prepared(n, sight)
-        if frame is None:
-            return np.zeros_like(inverse)
-        apart = sorted((k for k in self._keys if abs(k - key) >= _APART), key=lambda k: abs(k - key))
-        nearest = [clip.keys[k] for k in apart[: self._config.references]]
-        others = [self._prepared(index) for index in nearest]
-        for index in [index for index in self._ready if index < min(nearest, default=0)]:
-            del self._ready[index]
-        known = [other for other in others if other is not None]
-        return frame.changed(self._grid, known, inverse, self._config)
-
-    def _prepared(self, index: int, sight: Sight | None = None) -> Appearance | None:
-        """A frame, kept if it is a reference."""
-        if index in self._ready:
-            return self._ready[index]
-        found = self._clip.appearance(index, sight or self._clip.frame(index)[1])
-        if index in (self._clip.keys[k] for k in self._keys):
-            self._ready[index] = found
-        return found
+def _fleeting(
+    clip: Clip, fleeting: Fleeting, n: int, key: int, sight: Sight | None, inverse: Map,
+    own: dict[int, tuple[Map, Map, Map]], config: FlowConfig,
+) -> tuple[Mask, Mask]:  # fmt: skip
+    """`Fleeting.masks` of frame `n`, which is key `key` or lies between it and the one before."""
+    if sight is None or clip.is_guessed(n):
+        return np.zeros(inverse.shape, bool), np.zeros(inverse.shape, bool)
+    nearest = {-1: key - 1, 1: key + (n == clip.keys[key])}
+    around: list[Other] = []
+    for side, first in nearest.items():
+        for step in config.baselines:
+            other = first + side * (step - 1)
+            found = clip.sight(other) if 0 <= other < len(clip.keys) else None
+            if found is not None:
+                around.append(Other(side, step, found, own[other][2]))
+    return fleeting.masks(sight, around, inverse, clip.depths[key], clip.static(n))
 
 
 def _labels(
-    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, changed: Map, config: FlowConfig
+    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, fleeting: Mask, likely: Mask, config: FlowConfig
 ) -> NDArray[np.uint8]:
-    """The labels [H, W] of a frame's score and weight by flow and of its lookups, on the grid."""
+    """The labels [H, W] of a frame's score and weight on the grid, of what is fleeting there and likely to move."""
     grey = cv2.resize(picture, score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
     spread = _Spread(grey, config.radius, config.edge)
     weight = np.minimum(weight, _ENOUGH)
     known = np.maximum(spread(weight), 0.0)
-    score = np.sqrt(np.clip(spread(score * weight) / np.maximum(known, 1e-3), 0.0, 1.0))
-    if clip.has_static:
-        # Half as far: a lookup errs by a point or two, flow by the width of its patches.
-        changed = _Spread(grey, config.radius // 2, config.edge)(changed)
-        odds = config.by_flow * score + config.by_appearance * changed + config.prior
-    else:
-        odds = config.flow_alone[0] * score + config.flow_alone[1]
+    score = spread(score * weight) / np.maximum(known, 1e-3)
     size = clip.width, clip.height
-    odds, known = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (odds, known))
+    score, known = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (score, known))
     least = round((config.blob * clip.width / 640) ** 2)
-    moving = ~_areas(~_areas(odds > 0.0, least), least)  # without holes
-    unknown = _areas(known < _UNKNOWN, least)
-    return np.where(moving, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
-
-
-def _areas(mask: Mask, least: int) -> Mask:
-    """The connected areas of a mask that have at least so many points."""
-    _, numbers, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
-    keep = about[:, cv2.CC_STAT_AREA] >= least
-    keep[0] = False
-    return keep[np.asarray(numbers, np.int32)]
+    moving = seeded(score > config.grow, score > config.seed, least, connectivity=4)
+    gone, perhaps = (
+        cv2.resize(p.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > _PART for p in (fleeting, likely)
+    )
+    # Holes are filled in either.
+    perhaps, moving = (~seeded(~p, ~p, least, connectivity=4) for p in (moving | gone | perhaps, moving | gone))
+    unknown = known < _UNKNOWN
+    unknown = seeded(unknown, unknown, least, connectivity=4)
+    labels = np.where(unknown, np.uint8(128), np.uint8(0))
+    return np.where(moving, np.uint8(255), np.where(perhaps, np.uint8(LIKELY), labels))
 
 
 class _Spread:

@@ -126,7 +126,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     plan = planned(config, (width, height), len(train), images, device, report)
     images = place_images(images, device, plan)
     identity = {"key": key, "solve": solve_key(shot), "motion": motion, "pictures": pictures_key(shot)}
-    movers = load_movers(functools.partial(load_motion, shot), scene, train, width, height) if motion else None
+    movers = load_movers(_likely(shot), scene, train, width, height) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, width, height)
     limits = () if plan is None else (plan.gaussians, plan.pieces)
     trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored, *limits)
@@ -192,7 +192,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     held_out = images[len(train) :]
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     identity = {**{name: facts[name] for name in ("key", "solve")}, "motion": motion, "pictures": pictures_key(shot)}
-    movers = load_movers(functools.partial(load_motion, shot), scene, train, *size) if motion else None
+    movers = load_movers(_likely(shot), scene, train, *size) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, *size)
     limits = () if plan is None else (plan.gaussians, plan.pieces)
     trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored, *limits)
@@ -269,6 +269,11 @@ def warm_up(config: TrainConfig, device: torch.device) -> None:
             module.warm_up()
         if config.method != "static":
             host(config.host).warm_up(config.field)
+
+
+def _likely(shot: Shot) -> Mattes:
+    """The motion mattes as a training wants them: its field is offered what is likely to move, too."""
+    return functools.partial(load_motion, shot, likely=True)
 
 
 def planned(

@@ -1,6 +1,8 @@
 """What a static model of a clip shows: the clip learnt in a few hundred steps as a world in which nothing moves.
 
-The search for what moves looks the surfaces of a frame up at other times through it (`solve/appearance.py`).
+What a frame shows and such a model cannot, moves, or is hard to learn (`solve/fleeting.py` tells them apart). It is as
+the first part of every run, whose residual opened the gate once and was a poor judge of Gaussians; of pixels, held
+against the key frames around, it is a good one (docs/benchmarks.md, "What mattes miss").
 """
 
 from __future__ import annotations
@@ -10,12 +12,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..contract import Reporter, TrainParams
 from ..scene import evenly_spaced, load_images, load_scene
 from ..shot import Shot
-from ..solve.appearance import StaticView
 from ..solve.masks import IGNORE, load_mask
 from ..solve.moving import StaticViews
 from .config import config_from_params
@@ -38,7 +41,7 @@ FRAMES = 600
 def static_views(shot: Shot, report: Reporter) -> StaticViews:
     """Learns a solved shot as a static world, on the processor; nothing is written.
 
-    Returns what it shows at any delivered frame, of a preview's size: colours with that frame's exposure, and depth.
+    Returns what it shows at any delivered frame, [h, w, 3] uint8 of a preview's size, with that frame's exposure.
     JobError if the shot cannot be learnt, Cancelled.
     """
     scene = load_scene(shot)
@@ -54,10 +57,8 @@ def static_views(shot: Shot, report: Reporter) -> StaticViews:
     index = {frame: n for n, frame in enumerate(scene.frames)}
 
     @torch.no_grad()
-    def shown(frame: int) -> StaticView:
-        colors, depth = trainer.render_with_depth(index[frame])
-        colors = (colors.clamp(0.0, 1.0) * 255.0).round().byte()
-        return StaticView(colors.numpy(), (depth / scene.scale).numpy())
+    def shown(frame: int) -> NDArray[np.uint8]:
+        return (trainer.render_frame(index[frame]).clamp(0.0, 1.0) * 255.0).round().byte().numpy()
 
     return shown
 

@@ -661,16 +661,6 @@ class Trainer:
         )  # fmt: skip
         return model.exposure.apply(out.colors[0], time) if exposure else out.colors[0]
 
-    def render_with_depth(self, index: int) -> tuple[Tensor, Tensor]:
-        """As `render_frame`, and median depth [H, W] along the camera's axis, scene units."""
-        model, time = self.model, float(self.scene.times[index])
-        out = render(
-            model.state_at(time), model.sh_degree, self._viewmat(index), self.Ks[index], self.width, self.height,
-            background=self.background, with_depth=True, with_contributions=False,
-        )  # fmt: skip
-        assert out.depth_median is not None
-        return model.exposure.apply(out.colors[0], time), out.depth_median[0]
-
     def frame_psnrs(self, indices: list[int], images: Tensor | list[Tensor], **options: Any) -> list[float]:
         """PSNR in dB of each frame `indices` of the scene at its own time against images [I, H, W, 3].
 
