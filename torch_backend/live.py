@@ -7,7 +7,7 @@ when that process ends, so does this one. Messages are those of `contract.write_
 |---|---|---|
 | `ready` | backend | the run is loaded: its frames, frames good as instants, size; `note`: a warning or empty |
 | a `LiveView` | Blender | draw this; a newer one for the same view replaces one that waits or is being made of plates |
-| `frame` | backend | a view: float32 premultiplied display-referred RGBA, then float32 depth in solve units |
+| `frame` | backend | a view: float32 premultiplied display-referred RGBA, then float32 depth of splats in solve units |
 | `error` | backend | message and hint; after one without `seq` the session ends |
 """
 

@@ -149,9 +149,9 @@ RULES = {rule.name: rule for rule in (*_SCENE, *STATE, *_FILL)}
 COMBINATIONS = {
     "today": frozenset[str](),
     "mattes alone": frozenset(("scene flow", "change", "gain", "contradiction")),
-    "no pictures": frozenset(("change", "gain", "contradiction")),
+    "motion alone": frozenset(("change", "gain", "contradiction")),
 }
-"""Name -> rules that are off. `no pictures`: mattes and the model's travel tell the state."""
+"""Name -> rules that are off. `motion alone`: mattes and the model's travel tell the state."""
 
 
 def variants(groups: tuple[str, ...]) -> dict[str, frozenset[str]]:

@@ -122,7 +122,8 @@ def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
     seen = want.rgba[..., 3] > 0.99
     assert seen.mean() > 0.9
     assert np.abs(rgba[..., :3] - linear_to_srgb(want.rgba[..., :3]))[seen].max() < 4e-3
-    assert np.abs(depth[seen] / want.depth[seen] - 1).max() < 1e-3
+    # A view has the splats' own depth; a take's is measured (`surface_depth.py`).
+    assert np.median(np.abs(depth[seen] / want.depth[seen] - 1)) < 0.02
     assert bool((depth[rgba[..., 3] == 0] == np.float32(NO_DEPTH)).all())
     tinted, _ = picture(ask(session[0], view_of(world, 105, 112, show="guesses", exposed_like=105.0, develop=False)))
     guess = _TINTED * (1.0 - want.support)[..., None]
@@ -146,7 +147,8 @@ def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, traine
     assert difference.max() < 0.05  # where it is filled: fewer plates are looked at
     assert np.abs(made[0][..., 3] - want.rgba[..., 3]).max() < 1 / 255
     seen = want.rgba[..., 3] > 0.99
-    assert np.abs(made[1][seen] / want.depth[seen] - 1).max() < 1e-3
+    np.testing.assert_array_equal(made[1], splats[1])
+    assert np.median(np.abs(made[1][seen] / want.depth[seen] - 1)) < 0.02
     assert np.abs(splats[0][..., :3] - shown).mean() > 3.0 * difference.mean()
     for show in ("guesses", "support", "motion"):
         plain, same = (picture(ask(session[0], {**asked, "show": show, "detail": d}))[0] for d in (False, True))

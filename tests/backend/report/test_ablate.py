@@ -51,7 +51,7 @@ def test_a_rule_is_off_and_on_again(rule):
 
 
 def test_groups_of_variants():
-    assert COMBINATIONS["no pictures"] < variants(("combinations",))["mattes alone"]
+    assert COMBINATIONS["motion alone"] < variants(("combinations",))["mattes alone"]
     frame, scene = variants((FRAME,)), variants(("scene",))
     assert not frame.keys() & scene.keys() - {"today"} and len(frame) + len(scene) == len(RULES) + 2
     with pytest.raises(ValueError, match="no group or variant 'bent'"):

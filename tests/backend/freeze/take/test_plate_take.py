@@ -103,7 +103,7 @@ sys.path.insert(0, sys.argv[3])
 from tests.backend.conftest import Quiet
 from torch_backend.contract import FreezeParams
 from torch_backend.freeze import freeze_shot
-from torch_backend.freeze.take.job import frames as take_frames
+from torch_backend.freeze.take import frames as take_frames
 from torch_backend.shot import Shot
 
 def dies(folder, output, *rest):
