@@ -1,0 +1,89 @@
+"""The posterior of a plate's state: what counts as evidence, and how log-odds become a matte."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from benchmarks.fit_state import NAMES, Case, fit, judged
+from tests.backend.freeze.composite.test_compositor import H, W, build, widened
+from torch_backend.freeze.composite.compositor import Detailer
+from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go, log_odds
+from torch_backend.freeze.frozen import freeze_at, render_frozen
+from torch_backend.freeze.views.ignored import ignore_mattes
+from torch_backend.freeze.views.source_views import Sightings
+from torch_backend.freeze.views.target_view import posed_frame
+
+FRAME, T_STAR = 3, 11
+"""The board stands wholly apart in these two."""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory, quiet):
+    return build(tmp_path_factory.mktemp("state"), quiet())
+
+
+@pytest.fixture(scope="module")
+def found(world):
+    """(evidence of plate FRAME against t*, where its board is [H, W], where the board of t* is [H, W])."""
+    output = world.output(FRAME, T_STAR)
+    frozen = freeze_at(world.run.model, world.scene.time_of_frame(T_STAR), 1.0)
+    image = render_frozen(frozen, output.viewmat, output.K, W, H)
+    views: Sightings = Detailer(world.run, world.scene, world.plates()).seen
+    posed = posed_frame(views, output, frozen, image, W, H)
+    seen, instant = (views.seen(frame, posed.points) for frame in (FRAME, T_STAR))
+    told = evidence(views, posed, FRAME, seen, instant, StateConfig())
+    alone = evidence(views, posed, FRAME, seen, None, StateConfig())
+    return told, alone, world.seen_at(FRAME)[1], world.truth(output)[1]
+
+
+def test_each_piece_of_evidence_is_large_where_it_should_be(found):
+    told, alone, own, there = found
+    still = ~widened(own | there, 24)
+    gone = own & ~widened(there, 8)
+    assert set(told) == {f.name for f in fields(StateWeights)} - {"bias"}
+    for name in ("change", "contradiction", "gain"):
+        value = told[name].numpy()
+        assert value[gone].mean() > value[still].mean() + 1.0, name
+    moved = told["scene_flow"].numpy()
+    assert moved[there].mean() > 2.0 and moved[still].max() < 0.1
+    assert not alone["contradiction"].any(), "plate t* may not be used"
+    assert torch.equal(alone["change"], told["change"])
+
+
+def test_odds_are_a_weighted_sum_and_a_still_world_keeps_its_plate_to_the_bit(found):
+    told, _, own, there = found
+    config = StateConfig(smoothing=0.0)
+    weights = config.weights
+    want = weights.bias + sum(getattr(weights, name) * told[name].double() for name in told)
+    torch.testing.assert_close(log_odds(told, config, 1.0).double(), want, rtol=1e-5, atol=1e-5)
+    share = let_go(log_odds(told, StateConfig(), W / 640), StateConfig()).numpy()
+    assert (share[~widened(own | there, 40)] == 0.0).all()
+    assert (share[own & ~widened(there, 8)] > 0.99).mean() > 0.95
+
+
+def test_log_odds_become_a_soft_border():
+    odds = torch.tensor([-9.0, -2.0, -1.0, 0.0, 1.0, 2.0, 9.0])
+    share = let_go(odds, StateConfig(softness=2.0))
+    torch.testing.assert_close(share, torch.tensor([0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0]))
+
+
+def test_fitting_finds_the_evidence_that_tells_and_leaves_the_rest():
+    """One piece of evidence tells where the plate is wrong, the others are noise; there the fill is right."""
+    torch.manual_seed(0)
+    wrong = torch.zeros(2, 32, 40)
+    wrong[:, 8:24, 10:30] = 1.0
+    truth = torch.full((2, 32, 40, 3), 0.5)
+    told = torch.randn(2, 32, 40, len(NAMES)) * 0.3
+    told[..., NAMES.index("change")] += 2.0 * wrong
+    plate, filled = truth + 0.3 * wrong[..., None], truth + 0.1 * (1.0 - wrong[..., None])
+    case = Case("made", told, plate, filled, truth, wrong > 0.5, 1.0)
+    weights = fit([case])
+    assert weights.change > 3.0 * max(abs(getattr(weights, name)) for name in NAMES if name != "change")
+    figures = judged(case, weights)
+    assert figures["mixed whole"] > max(figures["plate whole"], figures["fill whole"]) + 5.0
+    assert figures["mixed whole"] > judged(case, replace(weights, change=0.0))["mixed whole"] + 5.0
+
+
+def test_a_shot_without_masks_ignores_nothing(world):
+    assert [ignore_mattes(world.shot)(frame) for frame in (FRAME, T_STAR)] == [None, None]
