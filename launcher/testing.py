@@ -39,12 +39,9 @@ OTHER_INSTRUCTIONS = {
 """Environment variables with which torch, our kernels, numpy and OpenCV compute as on an older processor: floats come
 out some 1e-7 otherwise. For processors of x86; on others torch's alone means something."""
 SENSITIVE = (
-    "tests/backend/freeze/views/test_decisions.py", "tests/backend/freeze/composite/test_overscan.py",
-    "tests/backend/freeze/views/test_regions.py", "tests/backend/freeze/composite/test_foreground_change.py",
-    "tests/backend/freeze/composite/test_ghosting.py", "tests/backend/freeze/composite/test_reference_pixels.py",
-    "tests/backend/freeze/composite/test_compositor.py", "tests/backend/freeze/composite/test_honest.py",
-    "tests/backend/freeze/views/test_visibility.py",
-    "tests/backend/raster",
+    "tests/backend/freeze/views", "tests/backend/freeze/composite/test_compositor.py",
+    "tests/backend/freeze/composite/test_honest.py", "tests/backend/freeze/composite/test_overscan.py",
+    "tests/backend/freeze/composite/test_state.py", "tests/backend/raster",
 )  # fmt: skip
 """Tests of what decides by floats, and of the kernels: those that `test --instructions` runs."""
 ADDON_TESTS = ("tests/addon", "tests/addon_free")

@@ -36,6 +36,9 @@ class DetailConfig:
     agreement: float = 0.03
     """Low-passed difference, display-referred, between a plate of another time and plate t* at which the first is
     believed 1/e in what moves: it may show another state."""
+    beside: tuple[float, float] = (10.0, 20.0)
+    """Angle in degrees between the frame's and plate t*'s view of a surface: up to the first that plate's own pixels
+    are believed of what moves, from the second on not."""
     state: StateConfig = field(default_factory=StateConfig)
     """How it is told whether a plate shows the instant."""
     sightings: SightingConfig = field(default_factory=SightingConfig)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...torch_types import norm
-from ..views.decisions import first_best
+from ..views.decisions import above, first_best
 from ..views.reproject import blurred, look_up, look_up_near, narrowed, project, resized, unproject, widened
 from ..views.source_views import Sightings
 from ..views.target_view import PosedFrame, displacements, parallax
@@ -132,7 +132,7 @@ def fill(
     doubt = look_up(posed.doubt, small)
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
-    untold = torch.ones(count, device="cpu")
+    same_state, untold = torch.zeros(count, device="cpu"), torch.ones(count, device="cpu")
     truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
     if truth is not None:  # the better plate t* shows it, the less another time is needed
         untold = 1.0 - _near(sightings, config, posed, posed.t, truth)
@@ -148,6 +148,8 @@ def fill(
         unmoved = _unmoved(sightings, config, frame, points, sighting) * agreed
         sway = config.sway_trust * unmoved * untold
         still = 1.0 - doubt * (1.0 - agreed)
+        if frame != posed.t:
+            same_state = torch.maximum(same_state, unmoved * _near(sightings, config, posed, frame, sighting))
         weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, still))
         places.append(sighting.pixels * larger)
     believed = torch.stack(weights)
@@ -157,8 +159,57 @@ def fill(
     for n, residual in enumerate(fillers.residuals):
         carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n])
     filling.color += carried * filling.share[:, None]
+    if truth is not None:
+        at = fillers.chosen.index(posed.t)
+        # A plate near in pose that shows the same, a little swayed, has it at its place; plate t* may be a pixel off.
+        around = truth.visible * look_up(fillers.shown[at], small) * (1.0 - same_state)
+        _take_instant(sightings, config, posed, filling, points, small, around, places[at])
     filling.most = fillers.most
     return filling
+
+
+def _take_instant(
+    sightings: Sightings, config: DetailConfig, posed: PosedFrame, filling: Filling, points: Tensor, small: Tensor,
+    visible: Tensor, places: Tensor,
+) -> None:  # fmt: skip
+    """Puts plate t*'s own pixels into a filling where it shows what moves, from nearly the same side.
+
+    What moves is learnt from plate t* alone. Its splats are right from that camera; from elsewhere a face may fall
+    apart while its depth still holds, and a residual cannot mend that.
+
+    Args:
+        points: [P, 3] that are seen, in scene units.
+        small: [P, 2] where the frame shows them, in pixels of decisions.
+        visible: [P] in 0..1 how surely plate t* shows each and what is around it.
+        places: [P, 2] where it shows them, in pixels of the plate.
+    """
+    h, w = posed.depth.shape
+    moves = above(look_up(resized(posed.image.motion, w, h), small), 0.5)
+    told = visible * _turned_to(sightings, config, posed, points) * moves
+    on = told > 0.0
+    gain, offset = _exposed(sightings, posed, posed.t)
+    shown = look_up_near(sightings.displayed(posed.t), places[on]) * gain + offset
+    filling.color[on] = torch.lerp(filling.color[on], shown, told[on][:, None])
+    filling.share = torch.lerp(filling.share, torch.ones_like(told), told)
+    filling.source = torch.where(told > 0.5, float(posed.t), filling.source)
+
+
+def _turned_to(sightings: Sightings, config: DetailConfig, posed: PosedFrame, points: Tensor) -> Tensor:
+    """[...] in 0..1: plate t* sees points [..., 3] from nearly the same side as the frame does."""
+    a, b = points - sightings.centres[sightings.index[posed.t]], points - posed.centre
+    cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
+    first, last = config.beside
+    return ((last - torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))) / (last - first)).clamp(0.0, 1.0)
+
+
+def _exposed(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:
+    """(gain [3], offset [3]) from the exposure of a plate to that of the frame that is made."""
+    exposure = sightings.run.model.exposure
+    if not exposure.config.on:
+        return torch.ones(3, device="cpu"), torch.zeros(3, device="cpu")
+    theirs, ours = sightings.scene.time_of_frame(frame), posed.exposed_at
+    (gain, offset), (our_gain, our_offset) = ([part.detach().cpu() for part in exposure.at(t)] for t in (theirs, ours))
+    return our_gain / gain, our_offset - offset * our_gain / gain
 
 
 def _doubted(sighting: Sighting, doubt: Tensor) -> Sighting:

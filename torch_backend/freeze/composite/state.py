@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ...torch_types import norm
-from ..views.reproject import blurred, look_up, project, resized
+from ..views.reproject import blurred, look_up, narrowed, project, resized, widened
 from ..views.source_views import Sightings
 from ..views.target_view import PosedFrame, displacements
 from ..views.visibility import Sighting
@@ -28,18 +28,18 @@ from ..views.visibility import Sighting
 class StateWeights:
     """Weight of each piece of evidence in the log-odds that a plate shows another state; see `evidence` for units."""
 
-    bias: float = -8.66
+    bias: float = -6.39
     """Log-odds where no evidence says anything."""
-    plate_matte: float = 4.39
+    plate_matte: float = 4.3
     """Weight of the plate's own motion matte."""
-    scene_flow: float = 4.89
+    scene_flow: float = 5.05
     """Weight of how far the model moves the surface from t* to the plate."""
-    change: float = 1.98
+    change: float = 1.82
     """Weight of the difference between the plate and the frozen render."""
-    gain: float = 2.06
+    gain: float = 2.26
     """Weight of how much better the model explains the plate at its own time than the frozen render does."""
-    contradiction: float = 1.82
-    """Weight of the difference between the plate and plate t* carried to it."""
+    contradiction: float = 1.73
+    """Weight of the difference between the plate and all that plate t*, carried to it, shows nearby."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,9 @@ class StateConfig:
     """Standard deviation of a low-passed difference between two renders or plates of one surface, display-referred."""
     travel: float = 0.5
     """Scene flow in pixels of 640 at which its evidence is log(2): below it flow is mostly the field's noise."""
-    lowpass: float = 2.0
-    """Sigma of the low-pass of differences between two plates, in pixels of 640: plates of one surface are a pixel or
-    two apart by depth."""
-    smoothing: float = 4.0
+    misplaced: float = 2.0
+    """Distance in pixels of 640 by which depth may misplace plate t*: what it shows within it contradicts nothing."""
+    smoothing: float = 8.0
     """Sigma of the low-pass of the log-odds, in pixels of 640: states belong to surfaces. Of 1, 2, 4 and 8 it was
     the best on tuning scenes, each judged by weights that were fitted on the others."""
     softness: float = 2.0
@@ -85,8 +84,9 @@ def evidence(
     contradiction = torch.zeros_like(change)
     if instant is not None:
         carried = look_up(sightings.view(posed.t).picture.float(), instant.pixels)
-        apart = (plate - carried) * instant.visible[..., None]
-        contradiction = blurred(apart, config.lowpass * unit).abs().amax(-1)
+        ours, theirs = (blurred(each * instant.visible[..., None], unit) for each in (plate, carried))
+        reach = max(1, round(config.misplaced * unit))
+        contradiction = torch.maximum(_beyond(ours, theirs, reach), _beyond(theirs, ours, reach))
     gain = change - misfit
     return {
         "plate_matte": seen.moving,
@@ -107,6 +107,12 @@ def log_odds(of: Evidence, config: StateConfig, unit: float) -> Tensor:
 def let_go(odds: Tensor, config: StateConfig) -> Tensor:
     """[h, w] in 0..1: the share of each pixel that the plate does not give, of log-odds [h, w]."""
     return (0.5 + 0.5 * odds / config.softness).clamp(0.0, 1.0)
+
+
+def _beyond(picture: Tensor, other: Tensor, reach: int) -> Tensor:
+    """[h, w] by how much a picture [h, w, 3] leaves the range of what another shows within `reach` pixels."""
+    least, most = (torch.stack([of(each, reach) for each in other.unbind(-1)], -1) for of in (narrowed, widened))
+    return torch.maximum(least - picture, picture - most).clamp_min(0.0).amax(-1)
 
 
 def _travel(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor:

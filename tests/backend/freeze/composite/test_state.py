@@ -2,6 +2,7 @@
 
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -39,8 +40,7 @@ def found(world):
 
 def test_each_piece_of_evidence_is_large_where_it_should_be(found):
     told, alone, own, there = found
-    still = ~widened(own | there, 24)
-    gone = own & ~widened(there, 8)
+    still, gone = np.logical_not(widened(own | there, 24)), own & np.logical_not(widened(there, 8))
     assert set(told) == {f.name for f in fields(StateWeights)} - {"bias"}
     for name in ("change", "contradiction", "gain"):
         value = told[name].numpy()
@@ -58,8 +58,8 @@ def test_odds_are_a_weighted_sum_and_a_still_world_keeps_its_plate_to_the_bit(fo
     want = weights.bias + sum(getattr(weights, name) * told[name].double() for name in told)
     torch.testing.assert_close(log_odds(told, config, 1.0).double(), want, rtol=1e-5, atol=1e-5)
     share = let_go(log_odds(told, StateConfig(), W / 640), StateConfig()).numpy()
-    assert (share[~widened(own | there, 40)] == 0.0).all()
-    assert (share[own & ~widened(there, 8)] > 0.99).mean() > 0.95
+    assert (share[np.logical_not(widened(own | there, 40))] == 0.0).all()
+    assert (share[own & np.logical_not(widened(there, 8))] > 0.99).mean() > 0.95
 
 
 def test_log_odds_become_a_soft_border():
