@@ -18,6 +18,7 @@ from torch_backend.farm.work import (
     PER_WORKING,
     steps_of,
 )
+from torch_backend.freeze.instant.develop import DevelopConfig
 
 ONE = {kind: Rate(1.0, 0.0, 2.0, 1000) for kind in rates.MEASURED}
 """Every task takes a second, on two cores."""
@@ -56,7 +57,7 @@ def test_a_training_costs_its_steps_and_pixels_and_an_instant_too(shot, requests
     (one,) = shots_of(shot, requests)
     amounts = {step.kind: step.amounts[0] for step in steps_of(one, 10, False) if 0 in step.amounts}
     assert amounts["train"] == pytest.approx(2000 * (320 * 180 / 1e6 + PER_STEP))
-    assert amounts["open"] == pytest.approx(300 * 640 * 360 / 1e6)
+    assert amounts["open"] == pytest.approx(DevelopConfig().steps * 640 * 360 / 1e6)
     assert amounts["solve"] == pytest.approx(20 * (640 * 360 / 1e6 + PER_SOLVED))
     one.requests["train"].update(iterations=100, width=64)
     one.requests["freeze"]["develop"] = "off"
