@@ -48,7 +48,7 @@ SHIFTS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Added to the fitted bias, of which that is kept with which smoothed, mixed frames have the highest PSNR. The
 regression knows neither smoothing nor ramp, and its cross-entropy counts a missed pixel no more than a needless one."""
 ALIKE = 0.02
-"""dB of PSNR by which two biases are equally good. The one that lets go of more is taken: leftovers of movers move."""
+"""dB of PSNR by which two biases are equally good: the one that lets go of less is taken."""
 STEPS, RATE, DECAY = 150, 0.15, 1e-4
 """Of Adam; and the weight of the squared weights, which are in standard deviations of the evidence."""
 
@@ -137,7 +137,7 @@ def fit(cases: Sequence[Case]) -> StateWeights:
     found = StateWeights(bias=round(float(bias.detach() - (weights * mean).sum()), 2), **values)
     shifted = [replace(found, bias=round(found.bias + shift, 2)) for shift in SHIFTS]
     reached = [float(np.mean([judged(case, each)["mixed whole"] for case in cases])) for each in shifted]
-    return [each for each, psnr in zip(shifted, reached, strict=True) if psnr >= max(reached) - ALIKE][-1]
+    return next(each for each, psnr in zip(shifted, reached, strict=True) if psnr >= max(reached) - ALIKE)
 
 
 def judged(case: Case, weights: StateWeights) -> dict[str, float]:

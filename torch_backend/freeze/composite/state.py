@@ -28,7 +28,7 @@ from ..views.visibility import Sighting
 class StateWeights:
     """Weight of each piece of evidence in the log-odds that a plate shows another state; see `evidence` for units."""
 
-    bias: float = -5.39
+    bias: float = -6.39
     """Log-odds where no evidence says anything."""
     plate_matte: float = 4.3
     """Weight of the plate's own motion matte."""
