@@ -24,7 +24,6 @@ import statistics
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -35,7 +34,7 @@ from torch.nn import functional as F
 
 from benchmarks.detail_clip import DetailClip
 from benchmarks.detail_figures import widened
-from benchmarks.detail_truth import trained
+from benchmarks.detail_truth import scene_arguments, trained
 from benchmarks.sources import SyntheticTruth, load_source
 from torch_backend.contract import SWITCH, JobError
 from torch_backend.native import default_threads
@@ -197,13 +196,7 @@ def mean_of(found: Sequence[dict[str, dict[str, float | None]]]) -> dict[str, di
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; returns an exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
-    parser.add_argument("--results", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
-    parser.add_argument("--t-star", type=int, nargs="+", metavar="N", help="only these")
-    parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th pose")
-    parser.add_argument("--iterations", type=int, default=1500)
-    parser.add_argument("--gaussians", type=int, default=10_000)
+    scene_arguments(parser)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of the trainings")
     parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
     args = parser.parse_args(argv)

@@ -178,9 +178,8 @@ def shortfalls(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
     return sentences
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of every benchmark that trains on synthetic scenes and judges their frozen frames."""
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
     parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
@@ -188,6 +187,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=1, metavar="K", help="only every K-th pose")
     parser.add_argument("--iterations", type=int, default=1500)
     parser.add_argument("--gaussians", type=int, default=10_000)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    scene_arguments(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the training")
     parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
     parser.add_argument("--delivered", action="store_true", help="judge at the size of the plates")

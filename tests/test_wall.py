@@ -462,7 +462,9 @@ def test_the_scan_counts_levels():
 
 def test_nothing_runs_what_a_file_says():
     files = [ROOT / "splannequin.py", ROOT / "__init__.py"]
-    files += [path for folder in ("launcher", "torch_backend", "splannequin_addon") for path in sources(folder)]
+    files += [
+        path for folder in ("launcher", "torch_backend", "splannequin_addon", "benchmarks") for path in sources(folder)
+    ]
     wrong = [f"{path}:{line}: {what}" for path in files for line, what in dangers(read(path))]
     assert not wrong
 

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from benchmarks.ablate.switches import MAKER, STAGES, of_stage, replaced, switched_off
 from benchmarks.detail_clip import DetailClip
 from torch_backend.freeze.frozen import FrozenGaussians
 from torch_backend.freeze.instant import instants as developed_instants
+from torch_backend.gaussians.model import PARAM_NAMES
+from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 
 
 @dataclass
@@ -80,16 +81,38 @@ class Instants:
 
     def _made(self, stage: str, key: str, make: Callable[[], Any]) -> tuple[Any, float]:
         """(what a step makes, its CPU seconds): from the folder if it lies there."""
-        path = None if self.folder is None or stage != "develop" else self.folder / f"{key}.pt"
+        path = None if self.folder is None or stage != "develop" else self.folder / f"{key}.safetensors"
         if path is not None and path.is_file():
-            return torch.load(path, weights_only=False)
+            return _load(path)
         since = time.process_time()
         made = make(), time.process_time() - since
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            torch.save(made, path.with_suffix(".part"))
-            path.with_suffix(".part").replace(path)
+            _save(path, *made)
         return made
+
+
+def _save(path: Path, frozen: FrozenGaussians, seconds: float) -> None:
+    """Keeps a developed scene, what it descends from, and the CPU seconds it took."""
+    assert frozen.descent is not None
+    scenes = {"now": frozen, "before": frozen.descent}
+    tensors = {f"{name}.{key}": value.clone() for name, scene in scenes.items() for key, value in scene.state.items()}
+    for name, scene in scenes.items():
+        tensors |= {f"{name}:support": scene.support.clone(), f"{name}:motion": scene.motion.clone()}
+    save_checkpoint(path, tensors, {"sh_degree": frozen.sh_degree, "seconds": seconds})
+
+
+def _load(path: Path) -> tuple[FrozenGaussians, float]:
+    """Inverse of `_save`."""
+    tensors, meta = load_checkpoint(path)
+
+    def scene(name: str, descent: FrozenGaussians | None) -> FrozenGaussians:
+        state = {key: tensors[f"{name}.{key}"] for key in PARAM_NAMES}
+        return FrozenGaussians(
+            state, int(meta["sh_degree"]), tensors[f"{name}:support"], tensors[f"{name}:motion"], descent
+        )
+
+    return scene("now", scene("before", None)), float(meta["seconds"])
 
 
 def digest(value: Any) -> str:

@@ -79,6 +79,12 @@ def test_steps_that_variants_share_are_made_once(instants, clip):
     assert set(plain.seconds) == set(today.seconds) - {"develop"} and all(s >= 0.0 for s in today.seconds.values())
 
 
+def test_a_developed_scene_is_kept_whole_and_read_again(clip, tmp_path):
+    ways = [Instants(clip, clip.run.train_frames[6], tmp_path).make(frozenset()) for _ in range(2)]
+    assert len(list(tmp_path.iterdir())) == 1 and ways[0].key == ways[1].key
+    assert ways[0].seconds["develop"] == ways[1].seconds["develop"] > 0.0, "the second was read"
+
+
 def test_a_rule_of_frames_changes_the_frame_and_not_for_long(instants, clip):
     maker = FrameMaker(clip, instants.t_star, instants.make(frozenset()))
     frame = clip.frames[1]
@@ -99,7 +105,7 @@ def test_what_was_measured_is_not_measured_again(clip, tmp_path):
     Ablation(store, tmp_path / "kept", args).run([case])
     first = {path: path.stat().st_mtime_ns for path in store.folder.rglob("*.json")}
     assert {path.stem for path in first} == {"today", "no-residuals", "no-develop"}
-    assert list((tmp_path / "kept").glob("develop-*.pt"))
+    assert list((tmp_path / "kept").glob("develop-*.safetensors"))
     told = "\n".join(tables(store))
     assert "| no residuals | " in told and "| no develop | 1 of 1 | " in told and told.endswith("tiny 107.")
     Ablation(store, tmp_path / "kept", args).run([case])

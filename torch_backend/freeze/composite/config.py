@@ -40,6 +40,6 @@ class DetailConfig:
     """Angle in degrees between the frame's and plate t*'s view of a surface: up to the first that plate's own pixels
     are believed of what moves, from the second on not."""
     state: StateConfig = field(default_factory=StateConfig)
-    """How it is told whether a plate shows the instant."""
+    """How the posterior of a plate's state is computed."""
     sightings: SightingConfig = field(default_factory=SightingConfig)
     """How plates are compared with the model."""

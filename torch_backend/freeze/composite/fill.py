@@ -185,17 +185,17 @@ def _take_instant(
     """
     h, w = posed.depth.shape
     moves = above(look_up(resized(posed.image.motion, w, h), small), 0.5)
-    told = visible * _turned_to(sightings, config, posed, points) * moves
-    on = told > 0.0
+    weight = visible * _facing(sightings, config, posed, points) * moves
+    used = weight > 0.0
     gain, offset = _exposed(sightings, posed, posed.t)
-    shown = look_up_near(sightings.displayed(posed.t), places[on]) * gain + offset
-    filling.color[on] = torch.lerp(filling.color[on], shown, told[on][:, None])
-    filling.share = torch.lerp(filling.share, torch.ones_like(told), told)
-    filling.source = torch.where(told > 0.5, float(posed.t), filling.source)
+    shown = look_up_near(sightings.displayed(posed.t), places[used]) * gain + offset
+    filling.color[used] = torch.lerp(filling.color[used], shown, weight[used][:, None])
+    filling.share = torch.lerp(filling.share, torch.ones_like(weight), weight)
+    filling.source = torch.where(weight > 0.5, float(posed.t), filling.source)
 
 
-def _turned_to(sightings: Sightings, config: DetailConfig, posed: PosedFrame, points: Tensor) -> Tensor:
-    """[...] in 0..1: plate t* sees points [..., 3] from nearly the same side as the frame does."""
+def _facing(sightings: Sightings, config: DetailConfig, posed: PosedFrame, points: Tensor) -> Tensor:
+    """[...] in 0..1: how nearly plate t* sees points [..., 3] from the frame's side."""
     a, b = points - sightings.centres[sightings.index[posed.t]], points - posed.centre
     cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
     first, last = config.beside

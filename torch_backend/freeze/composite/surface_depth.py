@@ -140,15 +140,15 @@ def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig)
     flat = config.flat * float(np.median(start))
     sigma = config.prior * start
     for _ in range(config.steps if others else 1):
-        told, pull = gauss_newton(key, others, inverse, config)
+        information, pull = gauss_newton(key, others, inverse, config)
         prior = 1.0 / np.square(config.prior * start)
-        weight = told + prior
-        wanted = (told * inverse + pull + prior * start) / weight
+        weight = information + prior
+        wanted = (information * inverse + pull + prior * start) / weight
         wanted = np.clip(wanted, 0.9 * inverse, 1.1 * inverse)  # a linear step is not believed beyond that
         planes = fit_planes(wanted, weight / np.median(weight), config.radius)
         inverse, spread = planes.around(flat, config.radius)
         inverse = np.maximum(inverse, _LEAST).astype(np.float32)
-        known = key.still * _means([told], config.radius)[0] * (2 * config.radius + 1)
+        known = key.still * _means([information], config.radius)[0] * (2 * config.radius + 1)
         sigma = np.sqrt(spread + 1.0 / np.maximum(known, 1e-6))
     return inverse, sigma.astype(np.float32)
 
@@ -158,7 +158,7 @@ def gauss_newton(
 ) -> tuple[Array, Array]:
     """What the plates of `others` tell of a key view's inverse depth, [h, w] each: how much (1 / variance), and that
     times the step by which they would agree."""
-    told, pull = np.zeros_like(inverse), np.zeros_like(inverse)
+    information, pull = np.zeros_like(inverse), np.zeros_like(inverse)
     rays = rays_of(key.K, inverse.shape)
     for other in others:
         place = Place.of(key, other, rays, inverse)
@@ -167,9 +167,9 @@ def gauss_newton(
         seen = place.look(other.still) * key.still
         clear = place.look(other.inverse) < config.occluded * place.inverse
         weight = seen * clear / np.square(1.0 + np.square(shift / config.contrast))
-        told += weight * slope * slope
+        information += weight * slope * slope
         pull -= weight * slope * shift
-    return told / config.contrast**2, pull / config.contrast**2
+    return information / config.contrast**2, pull / config.contrast**2
 
 
 @dataclass
@@ -359,12 +359,12 @@ def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array, Arra
     known = np.maximum(total, 1e-12)
     spread = np.maximum(square / known - np.square(mean / known), 0.0)
     # Key views that disagree know little, however sure each of them is.
-    told = total / (1.0 + total * spread)
+    information = total / (1.0 + total * spread)
     splats = 1.0 / np.square(config.prior * smooth)
-    share = told / (told + splats)
-    variance = share * share / np.maximum(told, 1e-12) + np.square((1.0 - share) * config.noise * smooth)
+    share = information / (information + splats)
+    variance = share * share / np.maximum(information, 1e-12) + np.square((1.0 - share) * config.noise * smooth)
     value = smooth + share * mean / known + (1.0 - share) * (view.inverse - smooth)
-    return value, np.sqrt(variance), told + splats
+    return value, np.sqrt(variance), information + splats
 
 
 def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[Array, Array]:
