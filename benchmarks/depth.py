@@ -33,7 +33,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from benchmarks.detail_clip import DetailClip
-from benchmarks.detail_figures import widened
+from benchmarks.detail_figures import dilate
 from benchmarks.detail_truth import scene_arguments, trained
 from benchmarks.sources import SyntheticTruth, load_source
 from torch_backend.contract import SWITCH, JobError
@@ -101,16 +101,16 @@ class Pooled:
     def add_boundary(self, depth: Tensor, truth: Tensor, region: Tensor) -> None:
         """Boundary pixels of one frame that lie in `region`."""
         true_edges, edges = occlusion_edges(truth), occlusion_edges(depth)
-        self.found += int((edges & region & widened(true_edges, TOLERANCE)).sum())
+        self.found += int((edges & region & dilate(true_edges, TOLERANCE)).sum())
         self.shown += int((edges & region).sum())
-        self.recalled += int((true_edges & region & widened(edges, TOLERANCE)).sum())
+        self.recalled += int((true_edges & region & dilate(edges, TOLERANCE)).sum())
         self.true += int((true_edges & region).sum())
 
     def add_surface(self, depth: Tensor, truth: Tensor, region: Tensor, sigma: Tensor | None) -> None:
         """Pixels of one frame that lie inside surfaces of `region`."""
         sky = ~torch.isfinite(truth)
         outside = occlusion_edges(truth) | sky | ~region
-        inside = ~widened(outside, INSIDE)
+        inside = ~dilate(outside, INSIDE)
         off = (depth[inside] - truth[inside]).abs()
         self.errors.append(off / truth[inside])
         if sigma is not None:
@@ -139,7 +139,7 @@ def add_frame(
     pooled: dict[str, Pooled], depth: Tensor, truth: Tensor, moving: Tensor, left_out: Tensor, sigma: Tensor | None
 ) -> None:
     """Adds one frame to both of `REGIONS`: depth, truth and sigma [H, W] in metres, masks bool [H, W]."""
-    near = widened(moving, NEAR_MOVER)
+    near = dilate(moving, NEAR_MOVER)
     pooled["still"].add_surface(depth, truth, ~moving & ~left_out, sigma)
     pooled["moving"].add_surface(depth, truth, moving & ~left_out, sigma)
     pooled["still"].add_boundary(depth, truth, ~near & ~left_out)

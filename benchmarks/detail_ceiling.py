@@ -138,7 +138,7 @@ def _sources(maker: FrameMaker, pose: int) -> tuple[dict[str, Tensor], Tensor]:
     """(each of `SOURCES`, what is delivered), [H, W, 3] in 0..1."""
     clip, image = maker.clip, maker.image(pose)
     delivered = shown(maker.make(pose, frozenset())[0])
-    with replaced("detail", "leading_matte", lambda made: lambda *args: _given_up(made(*args))):
+    with replaced("detail", "primary_matte", lambda made: lambda *args: _given_up(made(*args))):
         residuals = shown(maker.make(pose, frozenset({"plate t*'s pixels"}))[0])
     carried, seen = _carried(clip, pose, maker.t_star, image)
     splats = over(image.color, image.alpha)
@@ -147,7 +147,7 @@ def _sources(maker: FrameMaker, pose: int) -> tuple[dict[str, Tensor], Tensor]:
 
 
 def _given_up(made: tuple[Tensor, Tensor, bool]) -> tuple[Tensor, Tensor, bool]:
-    """The leading plate's matte with nothing in it."""
+    """The primary plate's matte with nothing in it."""
     matte, st, own = made
     return torch.zeros_like(matte), st, own
 

@@ -15,7 +15,7 @@ from benchmarks.detail_figures import STILL_MATTE, induced_places, inside, sampl
 from benchmarks.sources import Log
 from torch_backend.contract import FreezeParams
 from torch_backend.footage.plates import Plates
-from torch_backend.freeze.composite.compositor import DetailedFrame, Detailer
+from torch_backend.freeze.composite.compositor import CompositeFrame, Compositor
 from torch_backend.freeze.composite.surface_depth import FrameDepths
 from torch_backend.freeze.frozen import (
     FrozenGaussians,
@@ -45,7 +45,7 @@ class View:
 
     image: FrozenImage
     """Splats alone, of the instant as it is delivered."""
-    detailed: DetailedFrame
+    detailed: CompositeFrame
     """With plate detail."""
     splats: Tensor
     """[H, W, 3] splats alone before grey, in [0, 1]."""
@@ -69,7 +69,7 @@ class DetailClip:
         self.plates = Plates(shot, size) if size else own
         self.width, self.height = self.plates.width, self.plates.height
         self.Ks = self.scene.camera_at(self.width, self.height)
-        self.detailer = Detailer(self.run, self.scene, self.plates)
+        self.compositor = Compositor(self.run, self.scene, self.plates)
         self.depths = FrameDepths(self.run, self.scene)
         self._frozen: dict[int, FrozenGaussians] = {}
 
@@ -129,10 +129,10 @@ class DetailClip:
         detailed = self.detailed(frame, t_star, image, withheld)
         return View(image, detailed, over(image.color, image.alpha), over(detailed.color, detailed.alpha))
 
-    def detailed(self, frame: int, t_star: int, image: FrozenImage, withheld: Collection[int] = ()) -> DetailedFrame:
+    def detailed(self, frame: int, t_star: int, image: FrozenImage, withheld: Collection[int] = ()) -> CompositeFrame:
         """The frozen frame of plates as a take makes it, from its render by `splats`."""
         output = OutputFrame(frame, *self.camera(frame), float(t_star), float(frame))
-        return self.detailer.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
+        return self.compositor.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
 
     def depth(self, frame: int, view: View) -> tuple[Tensor, Tensor]:
         """(depth, its standard deviation) of a frozen frame as a take writes it, [H, W] each in scene units."""

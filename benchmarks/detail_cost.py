@@ -129,7 +129,7 @@ def measure(shot: Path, run: str, width: int, poses: Sequence[int], develop: boo
         "height": clip.height,
         "plates": [clip.plates.width, clip.plates.height],
         "frames": rows,
-        "sources": clip.detailer.config.sources,
+        "sources": clip.compositor.config.sources,
         "plates_used": sorted(sources),
         "before_mb": _mb(before),
         "peak_mb": _mb(peak),

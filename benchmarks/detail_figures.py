@@ -35,7 +35,7 @@ TEXTURE_WINDOW, TEXTURE = 9, 4 / 255
 """Pixels over which structure is looked for, and the least of it: grain of 1 or 2 / 255 is none."""
 
 
-def widened(mask: Tensor, by: int) -> Tensor:
+def dilate(mask: Tensor, by: int) -> Tensor:
     """A mask with a margin of `by` pixels."""
     return F.max_pool2d(mask.float()[None, None], 2 * by + 1, 1, by)[0, 0] > 0.5
 
@@ -47,7 +47,7 @@ def still_pixels(matte: Tensor, mover: Tensor | None = None, margin: int = STILL
     """
     movers = matte > MOVER_MATTE
     movers = movers if mover is None else movers | mover
-    return (matte < STILL_MATTE) & ~widened(movers, margin)
+    return (matte < STILL_MATTE) & ~dilate(movers, margin)
 
 
 def picture_figures(image: Tensor, plate: Tensor, still: Tensor) -> dict[str, float | None]:

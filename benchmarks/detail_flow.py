@@ -37,6 +37,7 @@ from benchmarks.detail_figures import (
     MOVER_MATTE,
     Flow,
     Histogram,
+    dilate,
     induced_places,
     inside,
     sampled,
@@ -45,7 +46,6 @@ from benchmarks.detail_figures import (
     textured,
     unexplained_flow,
     unsteadiness,
-    widened,
 )
 from torch_backend.contract import JobError
 from torch_backend.native import default_threads
@@ -135,7 +135,7 @@ def lay_over(clip: DetailClip, a: Shown, b: Shown, what: str) -> Pair:
     own_b, matte_t_star_b = (sampled(matte, places, nearest=True) for matte in (b.own, b.matte_t_star))
     matte = torch.stack([a.own, own_b]).amax(0)
     mover = torch.stack([a.matte_t_star, matte_t_star_b]).amax(0) > MOVER_MATTE
-    inner = ~widened(~both, HIDDEN_MARGIN)
+    inner = ~dilate(~both, HIDDEN_MARGIN)
     return Pair(places, both, inner & ((matte > MOVER_MATTE) | mover), inner & still_pixels(matte, mover))
 
 

@@ -33,7 +33,7 @@ from benchmarks.sources import load_source
 from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go
 from torch_backend.freeze.frozen import OutputFrame
 from torch_backend.freeze.views.reproject import blurred, resized
-from torch_backend.freeze.views.target_view import posed_frame
+from torch_backend.freeze.views.target_view import target_view
 from torch_backend.native import default_threads
 from torch_backend.report.truth import TruthScene
 from torch_backend.train import load_run
@@ -93,19 +93,19 @@ def collect(truth: TruthScene, run: str, name: str, every: int) -> Case:
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             rows.append(_row(clip, truth, pose, t_star))
     found, plate, filled, target, moving = (torch.stack(column) for column in zip(*rows, strict=True))
-    return Case(name, found, plate, filled, target, moving, clip.detailer.seen.unit)
+    return Case(name, found, plate, filled, target, moving, clip.compositor.seen.unit)
 
 
 @torch.no_grad()
 def _row(clip: DetailClip, truth: TruthScene, pose: int, t_star: int) -> tuple[Tensor, ...]:
     image = clip.splats(pose, t_star)
     filled = clip.view(pose, t_star, (pose,), image).picture
-    detailer, frozen = clip.detailer, clip.frozen(t_star)
+    compositor, frozen = clip.compositor, clip.frozen(t_star)
     output = OutputFrame(pose, *clip.camera(pose), float(t_star), float(pose))
-    posed = posed_frame(detailer.seen, output, frozen, image, clip.width, clip.height)
-    seen, instant = (detailer.seen.seen(frame, posed.points) for frame in (pose, t_star))
-    found = evidence(detailer.seen, posed, pose, seen, instant, detailer.config.state)
-    h, w = posed.depth.shape
+    target = target_view(compositor.seen, output, frozen, image, clip.width, clip.height)
+    seen, instant = (compositor.seen.seen(frame, target.points) for frame in (pose, t_star))
+    found = evidence(compositor.seen, target, pose, seen, instant, compositor.config.state)
+    h, w = target.depth.shape
     pictures = (clip.plate(pose), filled, truth.truth(t_star, pose, clip.width, clip.height))
     moving = truth.regions(t_star, pose, clip.width, clip.height)["moving"]
     return (

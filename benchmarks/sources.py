@@ -24,9 +24,9 @@ from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, similarity_to_exact, solved_shot
 from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
-from torch_backend.contract import read_json
+from torch_backend.contract import JobError, read_json
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
-from torch_backend.shot import SHOT_SUFFIX, Shot, content_key
+from torch_backend.shot import SHOT_SUFFIX, Shot, content_key, locked
 from torch_backend.solve.motion import find_motion
 from torch_backend.train import static_views
 
@@ -41,7 +41,12 @@ def load_source(source: str, results: Path) -> TruthScene:
     """
     kind, _, folder = source.partition(":")
     if kind == "truth":
-        return TruthFolder(folder)
+        scene = TruthFolder(folder)
+        # All runs of a scene train with its motion mattes: otherwise it depends on which of them was judged first.
+        # Without readable footage there are none, and plate detail is not judged either (`evaluate_run`).
+        with locked(scene.shot.root / "bench" / "motion.lock"), contextlib.suppress(JobError):
+            find_motion(scene.shot, Log(), static_model=static_views)
+        return scene
     if kind == "shot":
         return RealScene(Shot.open(folder))
     if kind in ("exact", "solved"):

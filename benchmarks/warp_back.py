@@ -72,7 +72,7 @@ def _prepare(folder: Path, take: str, frame_list: str, work: Path) -> list[int]:
     )
     for frame in frames:
         warp = read_warp(place / "warp" / f"{frame:06d}.exr")
-        linear = torch.as_tensor(plates.linear(warp.metadata.leading)).float()
+        linear = torch.as_tensor(plates.linear(warp.metadata.primary)).float()
         graded = _graded(linear)
         _write(work / "delivered" / f"{frame:06d}.exr", linear.numpy())
         _write(work / "graded" / f"{frame:06d}.exr", graded.numpy())

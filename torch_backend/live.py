@@ -31,7 +31,7 @@ from torch import Tensor
 from . import contract
 from .contract import NO_DEPTH, JobError, LiveView, from_dict, own_input, path_error, read_message, write_message
 from .footage.plates import Plates
-from .freeze.composite.compositor import DetailConfig, DetailedFrame, Detailer
+from .freeze.composite.compositor import CompositeConfig, CompositeFrame, Compositor
 from .freeze.frozen import (
     FrozenGaussians,
     FrozenImage,
@@ -42,7 +42,7 @@ from .freeze.frozen import (
 )
 from .freeze.instant.instants import developed_path, load_developed
 from .freeze.take.plan import suggested_instants
-from .freeze.views.source_views import SightingConfig, motion_mattes
+from .freeze.views.source_views import VisibilityConfig, motion_mattes
 from .scene import Scene, load_scene
 from .shot import Shot
 from .train import LoadedRun, load_run
@@ -52,7 +52,7 @@ _INSTANTS_KEPT = 8
 """Frozen scenes that are kept: going back and forth between keys costs no evaluation of the field."""
 _COARSER = 1.25
 """Plates may be so many times as coarse as a view that is made of them."""
-_DETAIL = DetailConfig(sources=4, reach=(1, 3, 9), sightings=SightingConfig(width=320))
+_DETAIL = CompositeConfig(sources=4, reach=(1, 3, 9), source_views=VisibilityConfig(width=320))
 """A take looks at more plates, more finely: there a plate serves a frame and its neighbours, here perhaps one view."""
 _TINT, _TINTED = (1.0, 0.15, 0.55), 0.75
 """Display-referred colour of what is a guess, and how much of it covers what nobody saw at all."""
@@ -63,7 +63,7 @@ class Superseded(Exception):
 
 
 class _LivePlates:
-    """Plates as `Detailer` reads them, between whose reads a view can be given up."""
+    """Plates as `Compositor` reads them, between whose reads a view can be given up."""
 
     def __init__(self, shot: Shot, size: tuple[int, int]) -> None:
         self._plates, self._moving = Plates(shot, size), motion_mattes(shot)
@@ -80,7 +80,7 @@ class _LivePlates:
         return self._plates.linear(frame, rows)
 
     def moving(self, frame: int) -> Tensor | None:
-        """As `sightings.MovingOf`."""
+        """As `source_views.MovingOf`."""
         self._go_on()
         return self._moving(frame)
 
@@ -94,22 +94,22 @@ class _Details:
 
     def __init__(self, shot: Shot, run: LoadedRun, scene: Scene) -> None:
         self._shot, self._run, self._scene = shot, run, scene
-        self._made: tuple[tuple[int, int], _LivePlates, Detailer] | None = None
+        self._made: tuple[tuple[int, int], _LivePlates, Compositor] | None = None
         self._whole: tuple[int, int] | None = None
 
     def frame(
         self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, stop: Callable[[], bool]
-    ) -> DetailedFrame:
+    ) -> CompositeFrame:
         """A view of plates at its own scale. JobError if a plate cannot be read; Superseded once `stop` is true."""
         height, width = image.alpha.shape
         size = self._size(output)
         if self._made is None or self._made[0] != size:
             self._made = None  # before the next takes its room
             plates = _LivePlates(self._shot, size)
-            self._made = size, plates, Detailer(self._run, self._scene, plates, _DETAIL, plates.moving)
-        _, plates, detailer = self._made
+            self._made = size, plates, Compositor(self._run, self._scene, plates, _DETAIL, plates.moving)
+        _, plates, compositor = self._made
         plates.stop = stop
-        return detailer.frame(output, frozen, image, width, height)
+        return compositor.frame(output, frozen, image, width, height)
 
     def _size(self, output: OutputFrame) -> tuple[int, int]:
         """Width and height of plates that are about as fine as a view: the source's own, halved as often as it can."""

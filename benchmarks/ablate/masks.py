@@ -53,7 +53,7 @@ def _judged(
         labels = plate_labels(masks.labels(pair), where)
         for name, off in todo.items():
             made, decided, _ = maker.make(pair.frame, off)
-            let_go = (made.matte < LET_GO) | (made.leading != pair.frame)
+            let_go = (made.matte < LET_GO) | (made.primary != pair.frame)
             counts = count(let_go.numpy(), labels)
             ratios = {"iou": counts.iou, "extra_share": counts.extra_share}
             rows[name].append({"frame": pair.frame, "decision_s": decided, **ratios, **asdict(counts)})

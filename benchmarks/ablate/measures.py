@@ -16,13 +16,13 @@ from benchmarks.ablate.switches import detail_config, replaced, switched_off
 from benchmarks.detail_clip import DetailClip, View, over
 from benchmarks.detail_figures import Flow, textured, unexplained_flow, unsteadiness
 from benchmarks.detail_flow import LEAST, Pair, Shown, lay_over
-from torch_backend.freeze.composite.compositor import DetailedFrame, Detailer
+from torch_backend.freeze.composite.compositor import CompositeFrame, Compositor
 from torch_backend.freeze.frozen import FrozenImage, OutputFrame
 from torch_backend.report.metrics import psnr_by_region, psnr_of
 from torch_backend.report.things import recall_of
 from torch_backend.report.truth import TruthScene
 
-DECISIONS = (("composite.compositor", "leading_matte"),)
+DECISIONS = (("composite.compositor", "primary_matte"),)
 """Functions that decide from which plate a pixel comes: their CPU seconds are those of the decision."""
 Row = dict[str, Any]
 
@@ -32,7 +32,7 @@ class FrameMaker:
 
     def __init__(self, clip: DetailClip, t_star: int, instant: Instant) -> None:
         self.clip, self.t_star, self.instant = clip, t_star, instant
-        self.detailer = Detailer(clip.run, clip.scene, clip.plates)
+        self.compositor = Compositor(clip.run, clip.scene, clip.plates)
         self._images: dict[int, FrozenImage] = {}
 
     def image(self, frame: int) -> FrozenImage:
@@ -42,15 +42,15 @@ class FrameMaker:
             self.make(frame, frozenset())  # what it computes of plates is no variant's cost
         return self._images[frame]
 
-    def make(self, frame: int, off: frozenset[str]) -> tuple[DetailedFrame, float, float]:
+    def make(self, frame: int, off: frozenset[str]) -> tuple[CompositeFrame, float, float]:
         """(the frame with rules `off`, CPU seconds of its decisions, CPU seconds of all of it but the splats)."""
         clip, image = self.clip, self.image(frame)
         output = OutputFrame(frame, *clip.camera(frame), float(self.t_star), float(frame))
-        self.detailer.config = detail_config(off)
+        self.compositor.config = detail_config(off)
         spent = [0.0]
         with switched_off(off), timed(spent):
             since = time.process_time()
-            made = self.detailer.frame(output, self.instant.frozen, image, clip.width, clip.height)
+            made = self.compositor.frame(output, self.instant.frozen, image, clip.width, clip.height)
             return made, spent[0], time.process_time() - since
 
 
@@ -74,7 +74,7 @@ def timed(spent: list[float]) -> Iterator[None]:
         yield
 
 
-def shown(made: DetailedFrame) -> Tensor:
+def shown(made: CompositeFrame) -> Tensor:
     """[H, W, 3] a delivered frame over grey, in 0..1."""
     return over(made.color, made.alpha)
 
@@ -136,7 +136,9 @@ def _judge_clip(
     return {name: {"frames": found} for name, found in rows.items()}
 
 
-def _laid(maker: FrameMaker, frames: tuple[int, int], made: tuple[DetailedFrame, DetailedFrame]) -> tuple[Pair, Tensor]:
+def _laid(
+    maker: FrameMaker, frames: tuple[int, int], made: tuple[CompositeFrame, CompositeFrame]
+) -> tuple[Pair, Tensor]:
     """(two neighbouring frames laid over one another, bool [H, W] still pixels of the first)."""
     clip, t_star, both = maker.clip, maker.t_star, list[Shown]()
     still: Tensor | None = None

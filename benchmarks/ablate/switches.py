@@ -1,7 +1,7 @@
 """The freeze's steps and terms, each with what stands in its place when it is off.
 
 A step is switched off in this process alone: a name of a module gets a neutral replacement. A term of a frame is a
-number of `DetailConfig`, a dot apart for a number within (`state.weights.change`), and gets a neutral value. This is
+number of `CompositeConfig`, a dot apart for a number within (`state.weights.change`), and gets a neutral value. This is
 the only file of the bench that knows the freeze's insides.
 """
 
@@ -18,12 +18,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_backend.freeze.composite.config import DetailConfig
+from torch_backend.freeze.composite.config import CompositeConfig
 from torch_backend.freeze.frozen import FrozenGaussians
 
 FRAME = "frame"
 """Stage of the rules that decide each frame; all other stages make the instant."""
-STAGES = ("settled", "develop")
+STAGES = ("apply_static_baseline", "develop")
 """Names in `torch_backend.freeze.instant.instants` of the steps that make an instant, in their order."""
 MAKER = "instant.instants"
 
@@ -55,7 +55,7 @@ class Rule:
     switches: tuple[Switch, ...] = ()
     """Names that are replaced."""
     numbers: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """Fields of `DetailConfig`, with dots for fields within, and their neutral values."""
+    """Fields of `CompositeConfig`, with dots for fields within, and their neutral values."""
 
 
 # ---------------------------------------------------------------------------------------------- neutral replacements
@@ -76,7 +76,7 @@ def _developed_as_is(*args: Any, **_: Any) -> FrozenGaussians:
 
 
 def _everywhere(*args: Any, **_: Any) -> list[Tensor]:
-    """Ones for every plate of `(sightings, config, posed, chosen, moved)`."""
+    """Ones for every plate of `(source_views, config, target, chosen, moved)`."""
     return [torch.ones_like(args[2].depth) for _ in args[3]]
 
 
@@ -85,7 +85,7 @@ def _freeze(module: str) -> Any:
 
 
 def _never_near(config: Any) -> Any:
-    """`TwinConfig` with which no plate sees anything from near."""
+    """`StaticBaselineConfig` with which no plate sees anything from near."""
     return partial(config, nearer=0.0)
 
 
@@ -106,19 +106,22 @@ def _number(name: str, off: str, **numbers: Any) -> Rule:
 
 
 _SCENE = (
-    Rule("static baseline", "nothing is closed", "settled", (Switch(MAKER, "settled", _third),)),
     Rule(
-        "baseline from near", "nothing counts as seen from near by the baseline", "settled",
-        (Switch("instant.static_baseline", "TwinConfig", _never_near, of_original=True),),
+        "static baseline", "nothing is closed", STAGES[0],
+        (Switch(MAKER, STAGES[0], _third),),
+    ),
+    Rule(
+        "baseline from near", "nothing counts as seen from near by the baseline", STAGES[0],
+        (Switch("instant.static_baseline", "StaticBaselineConfig", _never_near, of_original=True),),
     ),
     Rule("develop", "no training step", "develop", (Switch(MAKER, "develop", _developed_as_is),)),
     Rule(
         "undersampled", "plate t* teaches what it sees from afar", "develop",
-        (Switch("instant.develop", "seen_from_afar", _none_afar),),
+        (Switch("instant.develop", "undersampled", _none_afar),),
     ),
     Rule(
         "movers alone", "no second training of movers", "develop",
-        (Switch("instant.develop", "_Darkroom._movers_alone", _as_it_was),),
+        (Switch("instant.develop", "_FineTuning._movers_alone", _as_it_was),),
     ),
 )  # fmt: skip
 STATE = (
@@ -181,9 +184,9 @@ def of_stage(off: frozenset[str], stage: str) -> frozenset[str]:
     return frozenset(name for name in off if RULES[name].stage == stage)
 
 
-def detail_config(off: frozenset[str]) -> DetailConfig:
+def detail_config(off: frozenset[str]) -> CompositeConfig:
     """The configuration of plate detail with the numbers of rules neutral."""
-    config = DetailConfig()
+    config = CompositeConfig()
     for name in sorted(off):
         for path, value in RULES[name].numbers.items():
             config = _with(config, path.split("."), value)

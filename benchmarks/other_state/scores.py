@@ -139,6 +139,6 @@ def _let_go(clip: DetailClip, t_star: int, frame: int, view: View) -> tuple[Tens
     """Bool [H, W] by METHODS."""
     detailed = view.detailed
     # On the clip's own poses the frame's own plate leads. If another one did, nothing of the own plate would be kept.
-    delivered = (detailed.matte < LET_GO) | (detailed.leading != frame)
+    delivered = (detailed.matte < LET_GO) | (detailed.primary != frame)
     own, frozen = clip.mattes(frame, t_star, view)
     return delivered, torch.maximum(own, frozen) > MOVER_MATTE

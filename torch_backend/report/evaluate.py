@@ -16,7 +16,7 @@ from torch import Tensor
 from ..contract import CHECKPOINT_FILE, METRICS_FILE, SUMMARY_FILE, JobError, Reporter, read_json
 from ..footage.images import write_png
 from ..footage.plates import Plates
-from ..freeze.composite.compositor import Detailer
+from ..freeze.composite.compositor import Compositor
 from ..freeze.frozen import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
 from ..freeze.instant.instants import Instants
 from ..scene import Scene, evenly_spaced, load_scene, read_image, split_frames
@@ -45,7 +45,7 @@ class Frozen:
     scene: Scene
     t_star: int
     gaussians: FrozenGaussians
-    detailer: Detailer | None = None
+    compositor: Compositor | None = None
     """What makes plate detail; None: splats are all there is."""
     developed: FrozenGaussians | None = None
     """The instant developed; None: what is made of plates is made on `gaussians`, as splats alone are."""
@@ -56,10 +56,10 @@ class Frozen:
         gaussians = self.gaussians if shown == SPLATS or self.developed is None else self.developed
         image = self._splats(pose, gaussians)
         color, alpha = image.color, image.alpha
-        if shown in (WITHHELD, DELIVERED) and self.detailer is not None:
+        if shown in (WITHHELD, DELIVERED) and self.compositor is not None:
             output = OutputFrame(pose, viewmat, K, float(self.t_star), float(pose))
             withheld = (pose,) if shown == WITHHELD else ()
-            made = self.detailer.frame(output, gaussians, image, self.run.width, self.run.height, withheld)
+            made = self.compositor.frame(output, gaussians, image, self.run.width, self.run.height, withheld)
             color, alpha = made.color, made.alpha
         return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0)
 
@@ -77,13 +77,13 @@ class Frozen:
         return render_frozen(gaussians, *where, run.width, run.height, run.model.exposure, exposed_at)
 
 
-def plate_detail(shot: Shot, run: LoadedRun, scene: Scene, report: Reporter) -> Detailer:
+def plate_detail(shot: Shot, run: LoadedRun, scene: Scene, report: Reporter) -> Compositor:
     """What makes plate detail at the run's size. Motion mattes are found in the shot if it has none.
 
     JobError if the footage cannot be read.
     """
     find_motion(shot, report, static_model=static_views)
-    return Detailer(run, scene, Plates(shot, (run.width, run.height)))
+    return Compositor(run, scene, Plates(shot, (run.width, run.height)))
 
 
 def evaluate_run(
@@ -103,18 +103,18 @@ def evaluate_run(
     """
     run, scene = load_run(truth.shot, run_name, device), load_scene(truth.shot)
     held_out = held_out_frames(run, scene)
-    missing, detailer, kinds = missing_metrics(), None, [SPLATS, DEVELOPED]
+    missing, compositor, kinds = missing_metrics(), None, [SPLATS, DEVELOPED]
     try:
-        detailer = plate_detail(truth.shot, run, scene, report)
+        compositor = plate_detail(truth.shot, run, scene, report)
         kinds += [WITHHELD, DELIVERED]
     except JobError as error:
         missing["detail"] = f"Plate detail of {truth.name} was not judged: {error.message}"
     matte = {}
-    if detailer is not None and truth.kind == "synthetic":
+    if compositor is not None and truth.kind == "synthetic":
         matte = matte_on_panes(truth, [scene.frames[i] for i in scene.solved], run.width, run.height)
     frozen = {
         t_star: freeze_run(
-            run, scene, t_star, query, detailer, develop_run(truth.shot, run, scene, t_star, query, report)
+            run, scene, t_star, query, compositor, develop_run(truth.shot, run, scene, t_star, query, report)
         )
         for t_star in truth.t_stars
     }
@@ -174,13 +174,13 @@ def held_out_frames(run: LoadedRun, scene: Scene) -> list[int]:
 
 
 def freeze_run(
-    run: LoadedRun, scene: Scene, t_star: int, query: str, detailer: Detailer | None = None,
+    run: LoadedRun, scene: Scene, t_star: int, query: str, compositor: Compositor | None = None,
     developed: FrozenGaussians | None = None,
 ) -> Frozen:  # fmt: skip
-    """The run frozen at frame `t_star`; `detailer` as `plate_detail` gives it, None for splats alone; `developed` as
+    """The run frozen at frame `t_star`; `compositor` as `plate_detail` gives it, None for splats alone; `developed` as
     `develop_run` does, None: as the run has it."""
     frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), query)
-    return Frozen(run, scene, t_star, frozen, detailer, developed)
+    return Frozen(run, scene, t_star, frozen, compositor, developed)
 
 
 def develop_run(shot: Shot, run: LoadedRun, scene: Scene, t_star: int, query: str, report: Reporter) -> FrozenGaussians:

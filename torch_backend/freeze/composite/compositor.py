@@ -5,7 +5,7 @@ camera, its time, its exposure), a pixel x is
 
     out(x) = A(x) I_n(p_n(x)) + (1 - A(x)) (C(x) + b(x) sum_m w_m(x) (I_m - R_m)(p_m(x)) / sum_m w_m(x))
 
-n is the leading plate: the frame's own on the clip's poses, the nearest in pose on others. A, its matte, is 1 wherever
+n is the primary plate: the frame's own on the clip's poses, the nearest in pose on others. A, its matte, is 1 wherever
 nothing that moves is seen, at t* or in the plate; so a still world is the plate itself, bit for bit. The rest is
 filled: what the model missed in other plates (texture, edges, light) is carried along the surface point that x shows
 to where plate m shows the same point, moved from t* to m as the model moves it. Plate t* is believed even where the
@@ -34,11 +34,11 @@ from ...train import LoadedRun
 from ..bands import bands, hand_back
 from ..frozen import FrozenGaussians, FrozenImage, OutputFrame
 from ..views.reproject import resized
-from ..views.source_views import MovingOf, PlateReader, Sightings
-from ..views.target_view import PosedFrame, posed_frame
-from .config import DetailConfig
+from ..views.source_views import MovingOf, PlateReader, SourceViews
+from ..views.target_view import TargetView, target_view
+from .config import CompositeConfig
 from .fill import Fillers, Filling, fill, fillers_of
-from .primary_source import leading_matte, leading_plate
+from .primary_source import primary_matte, primary_plate
 from .transfer import to_display, to_linear
 from .warp import sample
 
@@ -47,7 +47,7 @@ _NOTHING = 0.5 / 1024.0
 
 
 @dataclass
-class DetailedFrame:
+class CompositeFrame:
     """One frozen frame made of plates, on the CPU, with overscan if the render had it."""
 
     linear: Tensor
@@ -69,12 +69,12 @@ class DetailedFrame:
     motion: Tensor
     """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell. On the clip's own
     poses 1 also where the frame's own plate shows what moves and is let go of: where it is 0 that plate may stand."""
-    leading: int
+    primary: int
     """Frame number of the plate that `st` looks into."""
     st: Tensor
-    """[H, W, 2] s to the right, t up, 0..1 over the undistorted plate `leading`, pixel centres at (i + 0.5) / size."""
+    """[H, W, 2] s to the right, t up, 0..1 over the undistorted plate `primary`, pixel centres at (i + 0.5) / size."""
     matte: Tensor
-    """[H, W] in 0..1: how much of the pixel the leading plate gives."""
+    """[H, W] in 0..1: how much of the pixel the primary plate gives."""
     fill: Tensor
     """[H, W, 3] scene-linear, premultiplied by 1 - matte: the rest of the pixel."""
     display: Display = PLAIN
@@ -95,7 +95,7 @@ BarsOf = Callable[[int], "NDArray[np.bool_] | None"]
 """Frame number -> [H, W], what of its plate is a bar beside the picture and no part of the scene; None: nothing."""
 
 
-class Detailer:
+class Compositor:
     """Makes frozen frames of one run out of plates. What it computes of a plate serves all frames that use it."""
 
     def __init__(
@@ -103,15 +103,15 @@ class Detailer:
         run: LoadedRun,
         scene: Scene,
         plates: PlateReader,
-        config: DetailConfig | None = None,
+        config: CompositeConfig | None = None,
         moving: MovingOf | None = None,
         bars: BarsOf | None = None,
     ) -> None:
-        """`moving`: see `Sightings`. `bars`: see `BarsOf`; None: the footage has none."""
+        """`moving`: see `SourceViews`. `bars`: see `BarsOf`; None: the footage has none."""
         self.run, self.scene, self.plates = run, scene, plates
-        self.config = config or DetailConfig()
+        self.config = config or CompositeConfig()
         self._moving, self._bars = moving, bars
-        self.seen = Sightings(run, scene, plates, moving, self.config.sightings)
+        self.seen = SourceViews(run, scene, plates, moving, self.config.source_views)
         """The plates as the scene at hand has them: the run's, or that of a developed instant."""
 
     @torch.no_grad()
@@ -123,7 +123,7 @@ class Detailer:
         width: int,
         height: int,
         withheld: Collection[int] = (),
-    ) -> DetailedFrame:
+    ) -> CompositeFrame:
         """One frozen frame.
 
         Args:
@@ -134,13 +134,13 @@ class Detailer:
             withheld: frames whose plates are not to be used.
         """
         self._turn_to(frozen, output.t_star)
-        posed = posed_frame(self.seen, output, frozen, image, width, height)
+        target = target_view(self.seen, output, frozen, image, width, height)
         usable = [frame for frame in self.seen.frames if frame not in withheld]
-        leading = leading_plate(self.seen, output, posed, usable)
-        matte, st, own = leading_matte(self.seen, self.config, output, posed, leading, usable, (width, height))
-        bars = self._keep_bars(matte, leading) if own and leading == output.frame else None
-        fillers = fillers_of(self.seen, self.config, posed, matte, leading, usable)
-        made = self._mix_frame(posed, leading, matte, st, own, fillers)
+        primary = primary_plate(self.seen, output, target, usable)
+        matte, st, own = primary_matte(self.seen, self.config, output, target, primary, usable, (width, height))
+        bars = self._keep_bars(matte, primary) if own and primary == output.frame else None
+        fillers = fillers_of(self.seen, self.config, target, matte, primary, usable)
+        made = self._mix_frame(target, primary, matte, st, own, fillers)
         if bars is not None:  # they are shown as they are, at every instant
             made.support[bars], made.motion[bars] = 1.0, 0.0
         return made
@@ -163,40 +163,40 @@ class Detailer:
         """Looks at the plates as a scene has them; frames of one instant come one after another."""
         developed = frozen if frozen.descent is not None else None
         if developed is not self.seen.stage.developed:
-            config = self.config.sightings
-            self.seen = Sightings(self.run, self.scene, self.plates, self._moving, config, developed, round(t_star))
+            config = self.config.source_views
+            self.seen = SourceViews(self.run, self.scene, self.plates, self._moving, config, developed, round(t_star))
 
     # ------------------------------------------------------------------------------------------------- the mix
 
     def _mix_frame(
         self,
-        posed: PosedFrame,
-        leading: int,
+        target: TargetView,
+        primary: int,
         matte: Tensor,
         st: Tensor,
         own: bool,
         fillers: Fillers | None,
-    ) -> DetailedFrame:
-        image = posed.image
+    ) -> CompositeFrame:
+        image = target.image
         rows, columns = image.alpha.shape
         parts = bands(rows, columns)
         if len(parts) > 1:
             hand_back()
         gives = bool((matte > _NOTHING).any())
-        plate = self.plates.linear(leading) if gives and not own else None
-        made = DetailedFrame(
+        plate = self.plates.linear(primary) if gives and not own else None
+        made = CompositeFrame(
             torch.empty(rows, columns, 3, device="cpu"), image.alpha.clone(), image.color, image.alpha,
             torch.empty(rows, columns, device="cpu"), torch.empty(rows, columns, device="cpu"), image.depth,
-            torch.minimum(image.support, 1.0 - resized(posed.unseen, columns, rows)),
-            resized(posed.moved, columns, rows), leading, st, matte, torch.zeros(rows, columns, 3, device="cpu"),
+            torch.minimum(image.support, 1.0 - resized(target.unseen, columns, rows)),
+            resized(target.moved, columns, rows), primary, st, matte, torch.zeros(rows, columns, 3, device="cpu"),
             self.scene.display,
         )  # fmt: skip
         for band in parts:
-            filling = None if fillers is None else fill(self.seen, self.config, posed, fillers, matte, band)
+            filling = None if fillers is None else fill(self.seen, self.config, target, fillers, matte, band)
             matte[band] = (matte[band] * 1024.0).round() / 1024.0
             lead = sample(plate, st[band]) if plate is not None else None
             if gives and own:
-                lead = self._placed(leading, rows, columns, band)
+                lead = self._placed(primary, rows, columns, band)
             self._mix_rows(made, filling, lead, band)
         return made
 
@@ -213,14 +213,14 @@ class Detailer:
             out[first - band.start : last - band.start, left : left + width] = part
         return out
 
-    def _mix_rows(self, made: DetailedFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
+    def _mix_rows(self, made: CompositeFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
         """Fills some rows of a frame whose `matte` is settled and whose `alpha` is the splats'.
 
-        `lead` [h, W, 3] are the leading plate's pixels there, scene-linear; None where it gives nothing.
+        `lead` [h, W, 3] are the primary plate's pixels there, scene-linear; None where it gives nothing.
         """
         matte, alpha, fill = made.matte[rows], made.alpha[rows], made.fill[rows]
         share = matte.clone()
-        source = torch.full_like(share, float(made.leading))
+        source = torch.full_like(share, float(made.primary))
         if filling is not None:
             at = filling.y, filling.x
             left = 1.0 - matte[at]
@@ -232,7 +232,7 @@ class Detailer:
                 color = color.clamp_max(filling.most)
             fill[at] = left[:, None] * covered * to_linear(color, made.display)
             share[at] += left * filling.share
-            source[at] = torch.where(left > 0.5, filling.source, float(made.leading))
+            source[at] = torch.where(left > 0.5, filling.source, float(made.primary))
         torch.maximum(alpha, matte, out=alpha)
         source[share <= 0.0] = 0.0
         made.plate[rows], made.source[rows] = share, source

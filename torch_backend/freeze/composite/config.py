@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ..views.source_views import SightingConfig
+from ..views.source_views import VisibilityConfig
 from .state import StateConfig
 
 
 @dataclass(frozen=True)
-class DetailConfig:
+class CompositeConfig:
     """How plates are chosen, weighed and mixed. Lengths are in pixels of pictures 640 wide."""
 
     sources: int = 5
@@ -41,5 +41,5 @@ class DetailConfig:
     are believed of what moves, from the second on not."""
     state: StateConfig = field(default_factory=StateConfig)
     """How the posterior of a plate's state is computed."""
-    sightings: SightingConfig = field(default_factory=SightingConfig)
+    source_views: VisibilityConfig = field(default_factory=VisibilityConfig)
     """How plates are compared with the model."""

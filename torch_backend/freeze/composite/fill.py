@@ -1,4 +1,4 @@
-"""What fills a frozen frame where its leading plate is not believed: splats, and what they missed of other plates."""
+"""What fills a frozen frame where its primary plate is not believed: splats, and what they missed of other plates."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from torch import Tensor
 
 from ...torch_types import norm
 from ..views.decisions import above, first_best
-from ..views.reproject import blurred, look_up, look_up_near, narrowed, project, resized, unproject, widened
-from ..views.source_views import Sightings
-from ..views.target_view import PosedFrame, displacements, parallax
-from ..views.visibility import Sighting
-from .config import DetailConfig
+from ..views.reproject import blurred, dilate, erode, look_up, look_up_near, project, resized, unproject
+from ..views.source_views import SourceViews
+from ..views.target_view import TargetView, displacements, parallax
+from ..views.visibility import Visibility
+from .config import CompositeConfig
 
 WHOLE = 1.0 - 0.5 / 1024.0
-"""Matte from which on the leading plate gives the whole pixel: it is rounded to 1024 steps, this one to 1."""
+"""Matte from which on the primary plate gives the whole pixel: it is rounded to 1024 steps, this one to 1."""
 
 
 @dataclass
 class Fillers:
-    """The plates that fill what the leading one does not give."""
+    """The plates that fill what the primary one does not give."""
 
     chosen: list[int]
     """Their frame numbers."""
@@ -32,14 +32,14 @@ class Fillers:
     agreed: list[Tensor]
     """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
     residuals: list[Tensor]
-    """[H, W, 3] float16 each, as `Sightings.residual`."""
+    """[H, W, 3] float16 each, as `SourceViews.residual`."""
     most: float
     """The largest number in any of them, or in a working frame if that is more."""
 
 
 @dataclass
 class Filling:
-    """Pixels of some rows that the leading plate does not give, P of them."""
+    """Pixels of some rows that the primary plate does not give, P of them."""
 
     y: Tensor
     """[P] int64 row, from the first of these rows."""
@@ -56,30 +56,35 @@ class Filling:
 
 
 def fillers_of(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, matte: Tensor, leading: int, usable: list[int]
+    source_views: SourceViews,
+    config: CompositeConfig,
+    target: TargetView,
+    matte: Tensor,
+    primary: int,
+    usable: list[int],
 ) -> Fillers | None:
-    """The plates for what the leading one does not give; None if it gives everything."""
+    """The plates for what the primary one does not give; None if it gives everything."""
     if not bool((matte < WHOLE).any()):
         return None
-    chosen = _chosen(sightings, config, posed, matte, leading, usable)
-    moved = displacements(sightings, posed, chosen)
-    shown = _shown(sightings, config, posed, chosen, moved)
-    agreed = _agreed(sightings, config, posed, chosen, moved)
-    residuals = [sightings.residual(frame) for frame in chosen]
-    most = max(sightings.scene.display.most, *(sightings.most(frame) for frame in chosen))
+    chosen = _chosen(source_views, config, target, matte, primary, usable)
+    moved = displacements(source_views, target, chosen)
+    shown = _shown(source_views, config, target, chosen, moved)
+    agreed = _agreed(source_views, config, target, chosen, moved)
+    residuals = [source_views.residual(frame) for frame in chosen]
+    most = max(source_views.scene.display.most, *(source_views.most(frame) for frame in chosen))
     return Fillers(chosen, moved, shown, agreed, residuals, most)
 
 
 def _shown(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], moved: list[Tensor]
+    source_views: SourceViews, config: CompositeConfig, target: TargetView, chosen: list[int], moved: list[Tensor]
 ) -> list[Tensor]:
     """[h, w] in 0..1 for each plate: it shows what is seen and what is around that; of use where something moves."""
-    near = widened(_uneasy(posed.motion, posed.doubt) > 0.0, 4 * config.rough + 1)  # elsewhere it is not asked for
-    points, out = posed.points[near], list[Tensor]()
+    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 4 * config.rough + 1)  # elsewhere it is not asked for
+    points, out = target.points[near], list[Tensor]()
     for frame, way in zip(chosen, moved, strict=True):
-        visible = torch.ones_like(posed.depth)
-        visible[near] = sightings.seen(frame, points if frame == posed.t else points + way[near]).visible
-        out.append(blurred(narrowed(visible, config.rough), float(config.rough)))
+        visible = torch.ones_like(target.depth)
+        visible[near] = source_views.seen(frame, points if frame == target.t else points + way[near]).visible
+        out.append(blurred(erode(visible, config.rough), float(config.rough)))
     return out
 
 
@@ -89,69 +94,70 @@ def _uneasy(motion: Tensor, doubt: Tensor) -> Tensor:
 
 
 def _agreed(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, chosen: list[int], moved: list[Tensor]
+    source_views: SourceViews, config: CompositeConfig, target: TargetView, chosen: list[int], moved: list[Tensor]
 ) -> list[Tensor]:
     """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
-    h, w = posed.depth.shape
-    if posed.t not in chosen:
-        return [torch.ones_like(posed.depth) for _ in chosen]
-    points = posed.points[::2, ::2]  # a quarter of the work: it is low-passed
-    truth = sightings.seen(posed.t, points)
-    shown_at_t = look_up(sightings.view(posed.t).picture.float(), truth.pixels)
+    h, w = target.depth.shape
+    if target.t not in chosen:
+        return [torch.ones_like(target.depth) for _ in chosen]
+    points = target.points[::2, ::2]  # a quarter of the work: it is low-passed
+    truth = source_views.seen(target.t, points)
+    shown_at_t = look_up(source_views.view(target.t).picture.float(), truth.pixels)
     out: list[Tensor] = []
     for frame, way in zip(chosen, moved, strict=True):
-        if frame == posed.t:
-            out.append(torch.ones_like(posed.depth))
+        if frame == target.t:
+            out.append(torch.ones_like(target.depth))
             continue
-        sighting = sightings.seen(frame, points + way[::2, ::2])
-        says = look_up(sightings.view(frame).picture.float(), sighting.pixels)
-        both = (truth.visible * sighting.visible)[..., None]
-        off = sightings.difference(says * both, shown_at_t * both, 0.5)
+        visibility = source_views.seen(frame, points + way[::2, ::2])
+        says = look_up(source_views.view(frame).picture.float(), visibility.pixels)
+        both = (truth.visible * visibility.visible)[..., None]
+        off = source_views.difference(says * both, shown_at_t * both, 0.5)
         out.append(resized(torch.exp(-(off / config.agreement).square()), w, h))
     return out
 
 
 def fill(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, fillers: Fillers, matte: Tensor, rows: slice
+    source_views: SourceViews, config: CompositeConfig, target: TargetView, fillers: Fillers, matte: Tensor, rows: slice
 ) -> Filling:
-    """What the leading plate does not give of some rows: the splats, with what they missed from other plates."""
+    """What the primary plate does not give of some rows: the splats, with what they missed from other plates."""
     at = (matte[rows] < WHOLE).nonzero()
     y, x = at[:, 0], at[:, 1]
     count = len(at)
     share, source = (torch.zeros(count, device="cpu") for _ in range(2))
-    filling = Filling(y, x, posed.image.color[rows][y, x], share, source)
+    filling = Filling(y, x, target.image.color[rows][y, x], share, source)
     if not count:
         return filling
     pixels = torch.stack([x + 0.5, (y + rows.start) + 0.5], dim=-1)
-    small = pixels * posed.per_pixel
-    points = unproject(pixels, posed.image.depth[rows][y, x], posed.viewmat, posed.K)
-    motion = look_up(posed.motion, small)
+    small = pixels * target.per_pixel
+    points = unproject(pixels, target.image.depth[rows][y, x], target.viewmat, target.K)
+    motion = look_up(target.motion, small)
     larger = torch.tensor(
-        [sightings.plates.width / sightings.size[0], sightings.plates.height / sightings.size[1]], device="cpu"
+        [source_views.plates.width / source_views.size[0], source_views.plates.height / source_views.size[1]],
+        device="cpu",
     )
-    doubt = look_up(posed.doubt, small)
+    doubt = look_up(target.doubt, small)
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
     same_state, untold = torch.zeros(count, device="cpu"), torch.ones(count, device="cpu")
-    truth = sightings.seen(posed.t, points) if posed.t in fillers.chosen else None
+    truth = source_views.seen(target.t, points) if target.t in fillers.chosen else None
     if truth is not None:  # the better plate t* shows it, the less another time is needed
-        untold = 1.0 - _near(sightings, config, posed, posed.t, truth)
+        untold = 1.0 - _near(source_views, config, target, target.t, truth)
     for n, frame in enumerate(fillers.chosen):
-        if truth is not None and frame == posed.t:
-            sighting = truth
+        if truth is not None and frame == target.t:
+            visibility = truth
         else:
-            sighting = sightings.seen(frame, points + look_up(fillers.moved[n], small))
-        sighting = _doubted(sighting, doubt)
-        around = torch.minimum(sighting.visible, look_up(fillers.shown[n], small))
-        sighting.visible = torch.lerp(sighting.visible, around, uneasy)
+            visibility = source_views.seen(frame, points + look_up(fillers.moved[n], small))
+        visibility = _doubted(visibility, doubt)
+        around = torch.minimum(visibility.visible, look_up(fillers.shown[n], small))
+        visibility.visible = torch.lerp(visibility.visible, around, uneasy)
         agreed = look_up(fillers.agreed[n], small)
-        unmoved = _unmoved(sightings, config, frame, points, sighting) * agreed
+        unmoved = _unmoved(source_views, config, frame, points, visibility) * agreed
         sway = config.sway_trust * unmoved * untold
         still = 1.0 - doubt * (1.0 - agreed)
-        if frame != posed.t:
-            same_state = torch.maximum(same_state, unmoved * _near(sightings, config, posed, frame, sighting))
-        weights.append(_weight(sightings, config, posed, frame, sighting, motion, sway, still))
-        places.append(sighting.pixels * larger)
+        if frame != target.t:
+            same_state = torch.maximum(same_state, unmoved * _near(source_views, config, target, frame, visibility))
+        weights.append(_weight(source_views, config, target, frame, visibility, motion, sway, still))
+        places.append(visibility.pixels * larger)
     believed = torch.stack(weights)
     filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[first_best(believed)]
     total, carried = believed.sum(dim=0).clamp_min(1e-6), torch.zeros(count, 3, device="cpu")
@@ -160,17 +166,17 @@ def fill(
         carried += (believed[n] / total)[:, None] * look_up_near(residual, places[n])
     filling.color += carried * filling.share[:, None]
     if truth is not None:
-        at = fillers.chosen.index(posed.t)
+        at = fillers.chosen.index(target.t)
         # A plate near in pose that shows the same, a little swayed, has it at its place; plate t* may be a pixel off.
         around = truth.visible * look_up(fillers.shown[at], small) * (1.0 - same_state)
-        _take_instant(sightings, config, posed, filling, points, small, around, places[at])
+        _take_instant(source_views, config, target, filling, points, small, around, places[at])
     filling.most = fillers.most
     return filling
 
 
 def _take_instant(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, filling: Filling, points: Tensor, small: Tensor,
-    visible: Tensor, places: Tensor,
+    source_views: SourceViews, config: CompositeConfig, target: TargetView, filling: Filling, points: Tensor,
+    small: Tensor, visible: Tensor, places: Tensor,
 ) -> None:  # fmt: skip
     """Puts plate t*'s own pixels into a filling where it shows what moves, from nearly the same side.
 
@@ -183,90 +189,99 @@ def _take_instant(
         visible: [P] in 0..1 how surely plate t* shows each and what is around it.
         places: [P, 2] where it shows them, in pixels of the plate.
     """
-    h, w = posed.depth.shape
-    moves = above(look_up(resized(posed.image.motion, w, h), small), 0.5)
-    weight = visible * _facing(sightings, config, posed, points) * moves
+    h, w = target.depth.shape
+    moves = above(look_up(resized(target.image.motion, w, h), small), 0.5)
+    weight = visible * _facing(source_views, config, target, points) * moves
     used = weight > 0.0
-    gain, offset = _exposed(sightings, posed, posed.t)
-    shown = look_up_near(sightings.displayed(posed.t), places[used]) * gain + offset
+    gain, offset = _exposed(source_views, target, target.t)
+    shown = look_up_near(source_views.displayed(target.t), places[used]) * gain + offset
     filling.color[used] = torch.lerp(filling.color[used], shown, weight[used][:, None])
     filling.share = torch.lerp(filling.share, torch.ones_like(weight), weight)
-    filling.source = torch.where(weight > 0.5, float(posed.t), filling.source)
+    filling.source = torch.where(weight > 0.5, float(target.t), filling.source)
 
 
-def _facing(sightings: Sightings, config: DetailConfig, posed: PosedFrame, points: Tensor) -> Tensor:
+def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetView, points: Tensor) -> Tensor:
     """[...] in 0..1: how nearly plate t* sees points [..., 3] from the frame's side."""
-    a, b = points - sightings.centres[sightings.index[posed.t]], points - posed.centre
+    a, b = points - source_views.centres[source_views.index[target.t]], points - target.centre
     cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
     first, last = config.beside
     return ((last - torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))) / (last - first)).clamp(0.0, 1.0)
 
 
-def _exposed(sightings: Sightings, posed: PosedFrame, frame: int) -> tuple[Tensor, Tensor]:
+def _exposed(source_views: SourceViews, target: TargetView, frame: int) -> tuple[Tensor, Tensor]:
     """(gain [3], offset [3]) from the exposure of a plate to that of the frame that is made."""
-    exposure = sightings.run.model.exposure
+    exposure = source_views.run.model.exposure
     if not exposure.config.on:
         return torch.ones(3, device="cpu"), torch.zeros(3, device="cpu")
-    theirs, ours = sightings.scene.time_of_frame(frame), posed.exposed_at
+    theirs, ours = source_views.scene.time_of_frame(frame), target.exposed_at
     (gain, offset), (our_gain, our_offset) = ([part.detach().cpu() for part in exposure.at(t)] for t in (theirs, ours))
     return our_gain / gain, our_offset - offset * our_gain / gain
 
 
-def _doubted(sighting: Sighting, doubt: Tensor) -> Sighting:
-    """The sighting, with what it shows of points in doubt [...] taken for moving where the model says otherwise."""
-    return replace(sighting, moving=torch.maximum(sighting.moving, doubt * (1.0 - sighting.explained)))
+def _doubted(visibility: Visibility, doubt: Tensor) -> Visibility:
+    """The visibility, with what it shows of points in doubt [...] taken for moving where the model says otherwise."""
+    return replace(visibility, moving=torch.maximum(visibility.moving, doubt * (1.0 - visibility.explained)))
 
 
-def _unmoved(sightings: Sightings, config: DetailConfig, frame: int, points: Tensor, sighting: Sighting) -> Tensor:
+def _unmoved(
+    source_views: SourceViews, config: CompositeConfig, frame: int, points: Tensor, visibility: Visibility
+) -> Tensor:
     """[...] in 0..1: what moves is in plate `frame` nearly as at t*: the model agrees, and moved it little."""
-    view = sightings.view(frame)
-    travel = norm(project(points, view.viewmat, view.K)[0] - sighting.pixels, -1)
-    trust = torch.exp(-travel / (config.sway * sightings.unit))
-    return sighting.explained * trust
+    view = source_views.view(frame)
+    travel = norm(project(points, view.viewmat, view.K)[0] - visibility.pixels, -1)
+    trust = torch.exp(-travel / (config.sway * source_views.unit))
+    return visibility.explained * trust
 
 
-def _near(sightings: Sightings, config: DetailConfig, posed: PosedFrame, frame: int, sighting: Sighting) -> Tensor:
+def _near(
+    source_views: SourceViews, config: CompositeConfig, target: TargetView, frame: int, visibility: Visibility
+) -> Tensor:
     """[...] in 0..1: how surely a plate shows points where the depth says."""
-    return sighting.visible / (1.0 + parallax(sightings, posed, frame, sighting.depth, config.depth_error))
+    return visibility.visible / (1.0 + parallax(source_views, target, frame, visibility.depth, config.depth_error))
 
 
 def _weight(
-    sightings: Sightings,
-    config: DetailConfig,
-    posed: PosedFrame,
+    source_views: SourceViews,
+    config: CompositeConfig,
+    target: TargetView,
     frame: int,
-    sighting: Sighting,
+    visibility: Visibility,
     motion: Tensor,
     sway: Tensor,
     still: Tensor | float = 1.0,
 ) -> Tensor:
     """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*; what stands still in
     it by `still` at most."""
-    near = _near(sightings, config, posed, frame, sighting)
-    if frame == posed.t:
+    near = _near(source_views, config, target, frame, visibility)
+    if frame == target.t:
         return near
-    still = still * (1.0 - motion) * (1.0 - sighting.moving)
+    still = still * (1.0 - motion) * (1.0 - visibility.moving)
     return near * (still + (1.0 - still) * sway)
 
 
 def _chosen(
-    sightings: Sightings, config: DetailConfig, posed: PosedFrame, matte: Tensor, leading: int, usable: list[int]
+    source_views: SourceViews,
+    config: CompositeConfig,
+    target: TargetView,
+    matte: Tensor,
+    primary: int,
+    usable: list[int],
 ) -> list[int]:
     """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
-    h, w = posed.depth.shape
+    h, w = target.depth.shape
     need = 1.0 - resized(matte, w, h)[::4, ::4]
-    points, motion, doubt = (of[::4, ::4] for of in (posed.points, posed.motion, posed.doubt))
-    k = sightings.frames.index(leading)
+    points, motion, doubt = (of[::4, ::4] for of in (target.points, target.motion, target.doubt))
+    k = source_views.frames.index(primary)
     around = {k + side * step for step in config.reach for side in (-1, 1)} | {k}
-    reach = {sightings.frames[i] for i in around if 0 <= i < len(sightings.frames)} | {posed.t}
+    reach = {source_views.frames[i] for i in around if 0 <= i < len(source_views.frames)} | {target.t}
     zero = torch.zeros_like(motion)
     gains = {
         frame: need
-        * _weight(sightings, config, posed, frame, _doubted(sightings.seen(frame, points), doubt), motion, zero)
+        * _weight(source_views, config, target, frame, _doubted(source_views.seen(frame, points), doubt), motion, zero)
         for frame in sorted(reach)
         if frame in usable
     }
-    first = [frame for frame in (posed.t, leading) if frame in gains]
+    first = [frame for frame in (target.t, primary) if frame in gains]
     chosen, have = list(dict.fromkeys(first)), torch.zeros_like(need)
     for frame in chosen:
         have = have + gains[frame]
@@ -277,7 +292,7 @@ def _chosen(
             for frame, gain in gains.items()
             if frame not in chosen
         }
-        candidates = sorted(worth, key=lambda candidate: abs(candidate - leading))
+        candidates = sorted(worth, key=lambda candidate: abs(candidate - primary))
         frame = candidates[int(first_best(torch.tensor([worth[each] for each in candidates], device="cpu")))]
         if worth[frame] < 1e-3 * float(need.sum()):
             break

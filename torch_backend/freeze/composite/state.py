@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from ...torch_types import norm
-from ..views.reproject import blurred, look_up, narrowed, project, resized, widened
-from ..views.source_views import Sightings
-from ..views.target_view import PosedFrame, displacements
-from ..views.visibility import Sighting
+from ..views.reproject import blurred, dilate, erode, look_up, project, resized
+from ..views.source_views import SourceViews
+from ..views.target_view import TargetView, displacements
+from ..views.visibility import Visibility
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,12 @@ Evidence = dict[str, Tensor]
 
 
 def evidence(
-    sightings: Sightings, posed: PosedFrame, frame: int, seen: Sighting, instant: Sighting | None, config: StateConfig
+    source_views: SourceViews,
+    target: TargetView,
+    frame: int,
+    seen: Visibility,
+    instant: Visibility | None,
+    config: StateConfig,
 ) -> Evidence:
     """What speaks for another state in plate `frame`, at the pixels of the target view's size of decisions.
 
@@ -74,23 +79,23 @@ def evidence(
         seen: how the plate sees the target view's points.
         instant: how plate t* sees them; None if it may not be used.
     """
-    h, w = posed.depth.shape
-    view, unit = sightings.view(frame), sightings.unit
-    render = resized(posed.image.color, w, h)
+    h, w = target.depth.shape
+    view, unit = source_views.view(frame), source_views.unit
+    render = resized(target.image.color, w, h)
     inside = (seen.depth > 0.0).float()
     plate = torch.lerp(render, look_up(view.picture.float(), seen.pixels), inside[..., None])
-    change = sightings.difference(plate, render)
+    change = source_views.difference(plate, render)
     misfit = look_up(view.missed.float()[..., None], seen.pixels)[..., 0] * inside
     contradiction = torch.zeros_like(change)
     if instant is not None:
-        carried = look_up(sightings.view(posed.t).picture.float(), instant.pixels)
+        carried = look_up(source_views.view(target.t).picture.float(), instant.pixels)
         ours, theirs = (blurred(each * instant.visible[..., None], unit) for each in (plate, carried))
         reach = max(1, round(config.misplaced * unit))
         contradiction = torch.maximum(_beyond(ours, theirs, reach), _beyond(theirs, ours, reach))
     gain = change - misfit
     return {
         "plate_matte": seen.moving,
-        "scene_flow": torch.log1p(_travel(sightings, posed, frame) / config.travel),
+        "scene_flow": torch.log1p(_travel(source_views, target, frame) / config.travel),
         "change": torch.log1p(change / config.noise),
         "gain": gain.sign() * torch.log1p(2.0 * gain.abs() / config.noise),
         "contradiction": torch.log1p(contradiction / config.noise),
@@ -111,16 +116,16 @@ def let_go(odds: Tensor, config: StateConfig) -> Tensor:
 
 def _beyond(picture: Tensor, other: Tensor, reach: int) -> Tensor:
     """[h, w] by how much a picture [h, w, 3] leaves the range of what another shows within `reach` pixels."""
-    least, most = (torch.stack([of(each, reach) for each in other.unbind(-1)], -1) for of in (narrowed, widened))
+    least, most = (torch.stack([of(each, reach) for each in other.unbind(-1)], -1) for of in (erode, dilate))
     return torch.maximum(least - picture, picture - most).clamp_min(0.0).amax(-1)
 
 
-def _travel(sightings: Sightings, posed: PosedFrame, frame: int) -> Tensor:
+def _travel(source_views: SourceViews, target: TargetView, frame: int) -> Tensor:
     """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
-    h, w = posed.depth.shape
+    h, w = target.depth.shape
     size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: Gaussians of what moves are larger than its pixels
-    moved, points = displacements(sightings, posed, [frame], size)[0], posed.points[::2, ::2]
-    view = sightings.view(frame)
+    moved, points = displacements(source_views, target, [frame], size)[0], target.points[::2, ::2]
+    view = source_views.view(frame)
     ends = project(points + moved, view.viewmat, view.K)[0]
-    travel = norm(ends - project(points, view.viewmat, view.K)[0], -1) / sightings.unit
+    travel = norm(ends - project(points, view.viewmat, view.K)[0], -1) / source_views.unit
     return resized(travel, w, h)

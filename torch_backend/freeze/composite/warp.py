@@ -52,7 +52,7 @@ class WarpMetadata:
 
     frame: int
     """Frame number in the clip's own numbering."""
-    leading: int
+    primary: int
     """Number of the plate that ST looks into: `frame` on the clip's poses, else the nearest in pose."""
     t_star_frame: float
     """Instant at which time stands still, as a (fractional) frame number of the clip."""
@@ -194,7 +194,7 @@ def _describe(spec: oiio.ImageSpec, metadata: WarpMetadata) -> None:
     if min(metadata.plate_width, metadata.plate_height) < 1:
         raise ValueError(f"metadata: a plate of {metadata.plate_width} x {metadata.plate_height} has no pixels")
     spec.attribute("splannequin:frame", int(metadata.frame))
-    spec.attribute("splannequin:leading", int(metadata.leading))
+    spec.attribute("splannequin:leading", int(metadata.primary))
     spec.attribute("splannequin:tStarFrame", float(metadata.t_star_frame))
     spec.attribute("splannequin:plateWidth", int(metadata.plate_width))
     spec.attribute("splannequin:plateHeight", int(metadata.plate_height))
@@ -213,7 +213,7 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> WarpMetadata:
         raise UserError(f"{path}: written by a newer version ({values['version']}, this one reads {WARP_VERSION})")
     return WarpMetadata(
         frame=int(values["frame"]),
-        leading=int(values["leading"]),
+        primary=int(values["leading"]),
         t_star_frame=float(values["tStarFrame"]),
         plate_width=int(values["plateWidth"]),
         plate_height=int(values["plateHeight"]),

@@ -30,10 +30,10 @@ from ...train.average import ParameterMean
 from ...train.losses import photometric
 from ...train.model import render
 from ..frozen import FrozenGaussians
-from ..views.scene_flow import Travel
+from ..views.scene_flow import SceneFlow
 from ..views.source_views import MovingOf
 from ..views.working_plates import WorkingPlates, showing, spread
-from .undersampled import seen_from_afar
+from .undersampled import undersampled
 
 Check = Callable[[int, int], None]
 """Called with (steps done, steps in all); raises to cancel."""
@@ -120,10 +120,10 @@ def develop(
         moving: what moves in the clip's frames.
         check: reports progress, and cancels.
     """
-    return _Darkroom(run, scene, frozen, t_star, moving, config or DevelopConfig()).run(check)
+    return _FineTuning(run, scene, frozen, t_star, moving, config or DevelopConfig()).run(check)
 
 
-class _Darkroom:
+class _FineTuning:
     """One development."""
 
     def __init__(
@@ -137,12 +137,12 @@ class _Darkroom:
         frames = [frame for frame in spread(run.train_frames, config.frames) if frame not in self.instants]
         self.probes = spread(frames[1:-1], min(config.probes, len(frames) // 4))
         self.frames = sorted({*frames, *self.instants} - {*self.probes})
-        self.travel = Travel(run, scene, frozen, t_star)
+        self.travel = SceneFlow(run, scene, frozen, t_star)
         self.generator = torch.Generator(device="cpu").manual_seed(config.seed)
         self.params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in frozen.state.items()}
         self.optimizer = self._optimizer()
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
-        self.afar = seen_from_afar(run, scene, frozen.state["means"], t_star, config.afar).float()
+        self.afar = undersampled(run, scene, frozen.state["means"], t_star, config.afar).float()
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in spread(self.frames, config.looks)])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
         self.held = ((self.afar > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]

@@ -21,7 +21,7 @@ from ...train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from ..frozen import FrozenGaussians, freeze_at, span_of
 from ..views.source_views import motion_mattes
 from .develop import DevelopConfig, develop
-from .static_baseline import settled
+from .static_baseline import apply_static_baseline
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
@@ -211,7 +211,7 @@ def _make(
     check: Callable[[int, int], None] | None = None,
 ) -> FrozenGaussians:  # fmt: skip
     moving = motion_mattes(shot)
-    return develop(run, scene, settled(run, scene, frozen, t_star, moving), t_star, moving, config, check)
+    return develop(run, scene, apply_static_baseline(run, scene, frozen, t_star, moving), t_star, moving, config, check)
 
 
 def _save(

@@ -39,7 +39,7 @@ _SEEN = 0.05
 
 
 @dataclass(frozen=True)
-class TwinConfig:
+class StaticBaselineConfig:
     """How a frozen scene is compared with its static twin."""
 
     width: int = 320
@@ -62,9 +62,9 @@ class TwinConfig:
     """Comparisons: what stays open is held against the twin again without what was closed."""
 
 
-def settled(
+def apply_static_baseline(
     run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int, moving: MovingOf,
-    config: TwinConfig | None = None,
+    config: StaticBaselineConfig | None = None,
 ) -> FrozenGaussians:  # fmt: skip
     """A run's scene at t*, in which what only does harm there stands still: `closed`.
 
@@ -73,7 +73,7 @@ def settled(
         t_star: frame number; one that the run was not trained on is judged by the trained plates beside it.
         moving: what moves in the clip's frames.
     """
-    config = config or TwinConfig()
+    config = config or StaticBaselineConfig()
     rows = run.model.open_rows()
     if not len(rows):
         return frozen
@@ -85,7 +85,7 @@ def settled(
         left = rows[frozen.motion[rows] > 0.5]
         if not len(left):
             break
-        twin = held_still(run, frozen, left)
+        twin = with_still_means(run, frozen, left)
         pair = _Pair(run, plates, frozen, twin, left, movers, t_star, config)
         near = _nearest(frozen.state["means"][left], config.neighbours)
         gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
@@ -93,12 +93,12 @@ def settled(
         stays = (harm <= 0.0) | (gain > least)
         if bool(stays.all()):
             break
-        frozen = held_still(run, frozen, left[~stays])
+        frozen = with_still_means(run, frozen, left[~stays])
     return frozen
 
 
 @torch.no_grad()
-def held_still(run: LoadedRun, frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
+def with_still_means(run: LoadedRun, frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
     """A frozen scene in which `rows` [M] int64 of the run's Gaussians are what they are on average, and do not move."""
     mean, state = mean_of(run.model, rows), dict(frozen.state)
     for name, value in state.items():
@@ -112,7 +112,7 @@ class _Pair:
 
     def __init__(
         self, run: LoadedRun, plates: WorkingPlates, frozen: FrozenGaussians, twin: FrozenGaussians, rows: Tensor,
-        movers: Tensor, t_star: int, config: TwinConfig,
+        movers: Tensor, t_star: int, config: StaticBaselineConfig,
     ) -> None:  # fmt: skip
         self.sways = config.sways * plates.width / 640
         """Pixels of the plates."""

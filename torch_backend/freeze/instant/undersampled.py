@@ -12,7 +12,7 @@ from ...train import LoadedRun
 
 
 @torch.no_grad()
-def seen_from_afar(run: LoadedRun, scene: Scene, means: Tensor, t_star: float, times: float) -> Tensor:
+def undersampled(run: LoadedRun, scene: Scene, means: Tensor, t_star: float, times: float) -> Tensor:
     """bool [M]: which of the run's first M Gaussians are more than `times` as far from t*'s camera as from the nearest
     one that a trained frame saw them with.
 

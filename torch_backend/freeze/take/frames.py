@@ -21,7 +21,7 @@ from ...scene import Scene
 from ...shot import disk_error, is_disk_full, need_disk
 from ...torch_types import from_numpy
 from ..bands import bands
-from ..composite.compositor import DetailedFrame
+from ..composite.compositor import CompositeFrame
 from ..composite.grain import Brush, Grain
 from ..composite.transfer import to_display
 from ..composite.warp import WarpMetadata, write_warp
@@ -69,7 +69,7 @@ def _render_all(
             if output.frame in done:
                 continue
             image = _render(output, scene, spec, report)
-            if isinstance(image, DetailedFrame):
+            if isinstance(image, CompositeFrame):
                 shares[output.frame] = small_share(image.plate, image.support)
             if before_each is not None:
                 before_each()
@@ -80,7 +80,7 @@ def _render_all(
     return shares
 
 
-def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter) -> FrozenImage | DetailedFrame:
+def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter) -> FrozenImage | CompositeFrame:
     """A frame of the take, of splats or of plates."""
     frozen = spec.instants.at(output.t_star, report)
     exposed_at = scene.time_of_frame(output.exposed_like)
@@ -94,17 +94,27 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
 
 
 def _write(
-    folder: TakeFolder, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
+    folder: TakeFolder,
+    output: OutputFrame,
+    image: FrozenImage | CompositeFrame,
+    scene: Scene,
+    spec: FrameSpec,
+    key: str,
 ) -> None:
     """All files of a frame. Each carries the frame's key, by which `take_folder.stored_key` tells a whole frame from
     files of two; the EXR comes last, so that readers who look for it alone find the others."""
-    if isinstance(image, DetailedFrame):
+    if isinstance(image, CompositeFrame):
         _write_warp(folder, output, image, spec, key)
     _write_frame(folder, output, image, scene, spec, key)
 
 
 def _write_frame(
-    folder: TakeFolder, output: OutputFrame, image: FrozenImage | DetailedFrame, scene: Scene, spec: FrameSpec, key: str
+    folder: TakeFolder,
+    output: OutputFrame,
+    image: FrozenImage | CompositeFrame,
+    scene: Scene,
+    spec: FrameSpec,
+    key: str,
 ) -> None:
     """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
     write_png(folder.preview(output.frame), _preview(image, spec), key)
@@ -117,12 +127,12 @@ def _write_frame(
         return torch.where(image.depth[rows] < NO_DEPTH, image.depth[rows] / scene.scale, NO_DEPTH).numpy()
 
     def rgba(rows: slice) -> np.ndarray:
-        if isinstance(image, DetailedFrame):
+        if isinstance(image, CompositeFrame):
             return np.concatenate([image.linear[rows].numpy(), alpha[rows][..., None]], axis=2)
         return scene_linear(image.color[rows].numpy(), alpha[rows], scene.display)
 
     layers = None
-    if isinstance(image, DetailedFrame):
+    if isinstance(image, CompositeFrame):
         splat, covered = image.splat.numpy(), image.splat_alpha.numpy()
         shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows], scene.display))
         layers = DetailLayers(shown, image.plate, image.source)
@@ -150,31 +160,31 @@ def _write_frame(
 
 
 def _grain(
-    grain: Grain, frame: int, image: FrozenImage | DetailedFrame, spec: FrameSpec, display: Display
+    grain: Grain, frame: int, image: FrozenImage | CompositeFrame, spec: FrameSpec, display: Display
 ) -> Made:  # fmt: skip
     """The layer of a frame's grain, [H, W, 3] scene-linear, premultiplied. It was measured on sRGB, whatever `display`
     the frame's splats are shown on."""
     brush = Brush(grain, frame, image.alpha.shape, spec.whole_grain_size)
 
     def drawn(rows: slice) -> np.ndarray:
-        colour = to_display(image.linear[rows], PLAIN) if isinstance(image, DetailedFrame) else image.color[rows]
+        colour = to_display(image.linear[rows], PLAIN) if isinstance(image, CompositeFrame) else image.color[rows]
         shown = torch.cat([colour, image.alpha[rows][..., None]], dim=2).numpy()
-        if display.bends and not isinstance(image, DetailedFrame):
+        if display.bends and not isinstance(image, CompositeFrame):
             shown = on_straight_colour(shown, lambda x: display.straightened(np.asarray(x, np.float32)))
         made = brush.rows(rows, shown)
-        if isinstance(image, DetailedFrame):  # plates have theirs
+        if isinstance(image, CompositeFrame):  # plates have theirs
             made = made * (1.0 - image.plate[rows].numpy()[..., None])
         return made
 
     return Made((*image.alpha.shape, 3), drawn)
 
 
-def _display(image: FrozenImage | DetailedFrame, rows: slice) -> Tensor:
+def _display(image: FrozenImage | CompositeFrame, rows: slice) -> Tensor:
     """[h, W, 3] some rows of a frame, premultiplied, on the scene's display."""
-    return to_display(image.linear[rows], image.display) if isinstance(image, DetailedFrame) else image.color[rows]
+    return to_display(image.linear[rows], image.display) if isinstance(image, CompositeFrame) else image.color[rows]
 
 
-def _preview(image: FrozenImage | DetailedFrame, spec: FrameSpec) -> np.ndarray:
+def _preview(image: FrozenImage | CompositeFrame, spec: FrameSpec) -> np.ndarray:
     """[H, W, 3] uint8 the frame without overscan as it stands over the plate; so contact sheet and video show it."""
     (width, height), (left, top) = spec.size, spec.beyond
     out = np.empty((height, width, 3), np.uint8)
@@ -186,7 +196,7 @@ def _preview(image: FrozenImage | DetailedFrame, spec: FrameSpec) -> np.ndarray:
     return out
 
 
-def _write_warp(folder: TakeFolder, output: OutputFrame, made: DetailedFrame, spec: FrameSpec, key: str) -> None:
+def _write_warp(folder: TakeFolder, output: OutputFrame, made: CompositeFrame, spec: FrameSpec, key: str) -> None:
     assert spec.detail is not None
     plates = spec.detail.plates
     write_warp(
@@ -195,7 +205,7 @@ def _write_warp(folder: TakeFolder, output: OutputFrame, made: DetailedFrame, sp
         made.matte,
         made.fill,
         made.alpha,
-        WarpMetadata(output.frame, made.leading, output.t_star, plates.width, plates.height, key, light=spec.light),
+        WarpMetadata(output.frame, made.primary, output.t_star, plates.width, plates.height, key, light=spec.light),
         spec.beyond,
     )
 

@@ -31,7 +31,7 @@ from ...solve.motion import find_motion, motion_key
 from ...solve.stmap import margin
 from ...torch_types import floats
 from ...train import LoadedRun, choose_device, load_run, static_views
-from ..composite.compositor import Detailer
+from ..composite.compositor import Compositor
 from ..composite.grain import Grain, measure_plate
 from ..composite.surface_depth import FrameDepths
 from ..frozen import CandidateInstant, OutputFrame, best_instants, rank_instants
@@ -41,7 +41,7 @@ from .footage_facts import footage_light
 
 TAKE_VERSION = 3
 """Rises when frames rendered before must not stand beside new ones."""
-DETAIL_VERSION = 21
+COMPOSITE_VERSION = 21
 """The same, of frames made of plates."""
 
 
@@ -65,7 +65,7 @@ class FrameSpec:
     """Width and height in pixels at which a frame's grain is drawn, without overscan."""
     depths: FrameDepths
     """Makes the frames' depth."""
-    detail: Detailer | None = None
+    detail: Compositor | None = None
     """Makes the frames of plates; None: splats alone."""
     detail_key: str = ""
     """Identifies the plates and mattes that it uses; empty without it."""
@@ -165,7 +165,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
 def plate_detail(
     shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, first: OutputFrame, size: tuple[int, int],
     report: Reporter,
-) -> Detailer | None:  # fmt: skip
+) -> Compositor | None:  # fmt: skip
     """What makes a take's frames of plates; None where `params` wants splats alone. `first` is any frame of the take.
     The shot's motion mattes must have been found.
 
@@ -181,14 +181,14 @@ def plate_detail(
         plates = Plates(shot, (max(16, round(plates.width * scale)), max(16, round(plates.height * scale))))
     if plates.note:
         report.warning(plates.note)
-    return Detailer(run, scene, plates, bars=plates.bars)
+    return Compositor(run, scene, plates, bars=plates.bars)
 
 
-def detail_key(shot: Shot, detail: Detailer | None) -> str:
+def detail_key(shot: Shot, detail: Compositor | None) -> str:
     """Identifies what plate detail is made of, beside the run; empty without it."""
     if detail is None or not isinstance(detail.plates, Plates):
         return ""
-    return content_key(DETAIL_VERSION, detail.plates.key, motion_key(shot), dataclasses.asdict(detail.config))
+    return content_key(COMPOSITE_VERSION, detail.plates.key, motion_key(shot), dataclasses.asdict(detail.config))
 
 
 def plate_grain(shot: Shot, scene: Scene) -> Grain:

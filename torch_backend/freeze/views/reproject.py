@@ -99,7 +99,7 @@ def blurred(picture: Tensor, sigma: float) -> Tensor:
     return out[..., 0] if picture.ndim == 2 else out
 
 
-def widened(matte: Tensor, by: int) -> Tensor:
+def dilate(matte: Tensor, by: int) -> Tensor:
     """[H, W] float or bool, every value spread `by` pixels to all sides: the greatest one around; beyond the border
     nothing counts."""
     if by <= 0:
@@ -115,9 +115,9 @@ def widened(matte: Tensor, by: int) -> Tensor:
     return from_numpy(np.asarray(cv2.dilate(values, window), values.dtype)).to(matte.dtype)
 
 
-def narrowed(matte: Tensor, by: int) -> Tensor:
+def erode(matte: Tensor, by: int) -> Tensor:
     """[H, W] float or bool, the least value within `by` pixels; beyond the border nothing counts."""
-    return ~widened(~matte, by) if matte.dtype == torch.bool else -widened(-matte, by)
+    return ~dilate(~matte, by) if matte.dtype == torch.bool else -dilate(-matte, by)
 
 
 def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ _KEPT = 90
 """Frames whose changes are kept: of 25,000 open Gaussians about 3 MB each."""
 
 
-class Travel:
+class SceneFlow:
     """From a scene frozen at t* to the clip's frames.
 
     What was closed at t* (`static_twin.py`) is not moved.
@@ -55,7 +55,7 @@ class Travel:
         return {name: state[name][self.rows] for name in PARAM_NAMES}
 
 
-class Stage:
+class MovingScene:
     """The scene as it stood in every frame of the clip: the run's own, or that which an instant was developed to."""
 
     def __init__(
@@ -68,7 +68,7 @@ class Stage:
         self._travel = None
         if frozen is not None and frozen.descent is not None:
             assert t_star is not None
-            self.developed, self._travel = frozen, Travel(run, scene, frozen.descent, t_star)
+            self.developed, self._travel = frozen, SceneFlow(run, scene, frozen.descent, t_star)
             self.rows = self._travel.rows
 
     def at(self, frame: int) -> FrozenGaussians:

@@ -22,9 +22,9 @@ from ...torch_types import from_numpy
 from ...train import LoadedRun
 from ..frozen import FrozenGaussians, FrozenImage, render_frozen
 from .ignored import ignore_mattes
-from .reproject import blurred, look_up, pixel_centres, resized, widened
-from .scene_flow import Stage
-from .visibility import Sighting, sighted
+from .reproject import blurred, dilate, look_up, pixel_centres, resized
+from .scene_flow import MovingScene
+from .visibility import Visibility, visible_pixels
 
 MovingOf = Callable[[int], "Tensor | None"]
 """Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
@@ -86,7 +86,7 @@ class PlateView:
 
 
 @dataclass(frozen=True)
-class SightingConfig:
+class VisibilityConfig:
     """At what size plates are looked at for decisions, and how finely. Lengths are in pixels of pictures 640 wide."""
 
     width: int = 640
@@ -94,7 +94,7 @@ class SightingConfig:
     depth_tolerance: float = 0.03
     """Share of the depth by which a point may lie off the surface that a plate shows and still be it."""
     margin: int = 2
-    """What moves is widened by this: the flow's own error, motion blur."""
+    """What moves is dilate by this: the flow's own error, motion blur."""
     lowpass: float = 4.0
     """Sigma under which plate and render are compared: splats are soft, that alone contradicts nothing."""
     unexplained: float = 0.1
@@ -103,7 +103,7 @@ class SightingConfig:
     """A difference speaks for so many pixels around it: half-rejected movers leave their outlines."""
 
 
-class Sightings:
+class SourceViews:
     """The plates of a clip as one run sees them."""
 
     def __init__(
@@ -112,7 +112,7 @@ class Sightings:
         scene: Scene,
         plates: PlateReader,
         moving: MovingOf | None = None,
-        config: SightingConfig | None = None,
+        config: VisibilityConfig | None = None,
         frozen: FrozenGaussians | None = None,
         t_star: int | None = None,
     ) -> None:
@@ -123,7 +123,7 @@ class Sightings:
         self.run, self.scene, self.plates = run, scene, plates
         self.moving = moving or motion_mattes(Shot(scene.folder.parent))
         self.ignored = ignore_mattes(Shot(scene.folder.parent))
-        self.config = config or SightingConfig()
+        self.config = config or VisibilityConfig()
         self.index = {frame: i for i, frame in enumerate(scene.frames)}
         have = set(plates.frames)
         self.frames = [frame for frame in scene.frames if frame in have]
@@ -132,7 +132,7 @@ class Sightings:
         self.size = width, max(8, round(plates.height * width / plates.width))
         self.unit = width / _LENGTHS_OF
         """Pixels of decisions to a pixel in which lengths are configured."""
-        self.stage = Stage(run, scene, frozen, t_star)
+        self.stage = MovingScene(run, scene, frozen, t_star)
         """The model in every frame."""
         self.rows = self.stage.rows.cpu()
         views = scene.viewmats
@@ -195,10 +195,10 @@ class Sightings:
         half = resized(a - b, (w + 1) // 2, (h + 1) // 2)  # what is left needs no more pixels
         return resized(blurred(half, 0.5 * sigma).abs().amax(dim=-1), w, h)
 
-    def seen(self, frame: int, points: Tensor) -> Sighting:
+    def seen(self, frame: int, points: Tensor) -> Visibility:
         """Where plate `frame` shows world points [..., 3]."""
         view = self.view(frame)
-        return sighted(points, view.viewmat, view.K, view.surface, view.ignored, self.config.depth_tolerance)
+        return visible_pixels(points, view.viewmat, view.K, view.surface, view.ignored, self.config.depth_tolerance)
 
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height
@@ -241,11 +241,11 @@ class Sightings:
         missed = self.difference(plate, image.color)
         off = self.difference(plate, image.color, 1.0)
         region = round(self.config.region * self.unit)
-        off = blurred(widened(off, region), 0.5 * region)
+        off = blurred(dilate(off, region), 0.5 * region)
         explained = torch.exp(-(off / self.config.unexplained).square()).half().float()
         return PlateView(
             *self.camera(frame, width, height),
-            torch.stack([image.depth, widened(moving, round(self.config.margin * self.unit)), explained], dim=-1),
+            torch.stack([image.depth, dilate(moving, round(self.config.margin * self.unit)), explained], dim=-1),
             plate.half(),
             missed.half(),
             frozen.state["means"].cpu()[self.rows],
@@ -254,12 +254,12 @@ class Sightings:
         )
 
     def _ignored(self, frame: int) -> Tensor | None:
-        """As in `PlateView`: widened as mattes are, with a soft edge."""
+        """As in `PlateView`: dilate as mattes are, with a soft edge."""
         mask = self.ignored(frame)
         if mask is None or not bool((mask > 0).any()):
             return None
         margin = max(1, round(self.config.margin * self.unit))
-        return blurred(widened(resized(mask, *self.size), 2 * margin), 0.5 * margin).clamp(0.0, 1.0)[..., None]
+        return blurred(dilate(resized(mask, *self.size), 2 * margin), 0.5 * margin).clamp(0.0, 1.0)[..., None]
 
 
 def motion_mattes(shot: Shot) -> MovingOf:

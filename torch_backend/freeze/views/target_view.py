@@ -13,11 +13,11 @@ from ...torch_types import norm_of_all
 from ...train.model import render
 from ..frozen import FrozenGaussians, FrozenImage, OutputFrame
 from .reproject import pixel_centres, resized, unproject
-from .source_views import Sightings
+from .source_views import SourceViews
 
 
 @dataclass
-class PosedFrame:
+class TargetView:
     """A frame that is being made: its camera at both sizes, and what it shows."""
 
     viewmat: Tensor
@@ -62,14 +62,14 @@ class PosedFrame:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
-def posed_frame(
-    sightings: Sightings,
+def target_view(
+    source_views: SourceViews,
     output: OutputFrame,
     frozen: FrozenGaussians,
     image: FrozenImage,
     width: int,
     height: int,
-) -> PosedFrame:
+) -> TargetView:
     """What a frame shows, before any plate has been asked.
 
     Args:
@@ -80,63 +80,63 @@ def posed_frame(
     """
     rows, columns = image.alpha.shape
     K, beyond = with_overscan(output.K, image, width, height)
-    per_pixel = min(1.0, sightings.config.width / width)
+    per_pixel = min(1.0, source_views.config.width / width)
     w, h = max(8, round(columns * per_pixel)), max(8, round(rows * per_pixel))
     small = pixel_centres(w, h)
     # The pixel at each centre, in whole numbers: a centre that lies between two pixels is always the second's.
     across, down = ((2 * torch.arange(n, device="cpu") + 1) * of // (2 * n) for n, of in ((w, columns), (h, rows)))
     depth = image.depth[down[:, None], across]
     points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
-    t = min(sightings.frames, key=lambda frame: abs(frame - output.t_star))
+    t = min(source_views.frames, key=lambda frame: abs(frame - output.t_star))
     motion = resized(image.motion, w, h)
-    own = _is_own(sightings, output, width, height)
+    own = _is_own(source_views, output, width, height)
     nothing = torch.zeros_like(motion)
-    return PosedFrame(
-        output.viewmat, K, image, sightings.scene.time_of_frame(output.exposed_like), own, t, frozen, points, depth,
+    return TargetView(
+        output.viewmat, K, image, source_views.scene.time_of_frame(output.exposed_like), own, t, frozen, points, depth,
         motion, w / columns, beyond, nothing, motion, nothing,
     )  # fmt: skip
 
 
-def _is_own(sightings: Sightings, output: OutputFrame, width: int, height: int) -> bool:
+def _is_own(source_views: SourceViews, output: OutputFrame, width: int, height: int) -> bool:
     """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
-    i = sightings.index.get(output.frame)
+    i = source_views.index.get(output.frame)
     return (
         i is not None
-        and (width, height) == (sightings.plates.width, sightings.plates.height)
-        and output.frame in sightings.frames
+        and (width, height) == (source_views.plates.width, source_views.plates.height)
+        and output.frame in source_views.frames
         and output.exposed_like == float(output.frame)
-        and torch.equal(output.viewmat, sightings.scene.viewmats[i])
-        and torch.allclose(output.K, sightings.scene.camera_at(width, height)[i], rtol=1e-4)
+        and torch.equal(output.viewmat, source_views.scene.viewmats[i])
+        and torch.allclose(output.K, source_views.scene.camera_at(width, height)[i], rtol=1e-4)
     )
 
 
-def parallax(sightings: Sightings, posed: PosedFrame, frame: int, depth: Tensor, depth_error: float) -> Tensor:
+def parallax(source_views: SourceViews, target: TargetView, frame: int, depth: Tensor, depth_error: float) -> Tensor:
     """Misplacement of points in a plate, in pixels of 640, by a depth that is wrong by the share `depth_error`."""
-    travel = norm_of_all(sightings.centres[sightings.index[frame]] - posed.centre)
-    focal = posed.K[0, 0] * posed.per_pixel
-    return focal * travel / depth.clamp_min(1e-6) * depth_error / sightings.unit
+    travel = norm_of_all(source_views.centres[source_views.index[frame]] - target.centre)
+    focal = target.K[0, 0] * target.per_pixel
+    return focal * travel / depth.clamp_min(1e-6) * depth_error / source_views.unit
 
 
 def displacements(
-    sightings: Sightings, posed: PosedFrame, chosen: list[int], size: tuple[int, int] | None = None
+    source_views: SourceViews, target: TargetView, chosen: list[int], size: tuple[int, int] | None = None
 ) -> list[Tensor]:
     """[h, w, 3] scene units from t* to each plate of what is seen.
 
     `size` (w, h) None: that of decisions.
     """
-    w, h = size or posed.depth.shape[::-1]
-    rows, state = sightings.rows, posed.frozen.state
+    w, h = size or target.depth.shape[::-1]
+    rows, state = source_views.rows, target.frozen.state
     if not len(rows):
         return [torch.zeros(h, w, 3, device="cpu") for _ in chosen]
     extra = torch.zeros(len(state["means"]), 3 * len(chosen), device=state["means"].device)
     now = state["means"][rows].cpu()
     for n, frame in enumerate(chosen):
-        extra[rows, 3 * n : 3 * n + 3] = (sightings.view(frame).offsets - now).to(extra.device)
-    rows_full, columns = posed.image.alpha.shape
-    K = resize_intrinsics(posed.K[None], columns, rows_full, w, h)[0]
+        extra[rows, 3 * n : 3 * n + 3] = (source_views.view(frame).offsets - now).to(extra.device)
+    rows_full, columns = target.image.alpha.shape
+    K = resize_intrinsics(target.K[None], columns, rows_full, w, h)[0]
     out = render(
-        state, 0, posed.viewmat.to(extra.device), K.to(extra.device), w, h, colors=extra, with_contributions=False,
-        settings=posed.settings(w, h),
+        state, 0, target.viewmat.to(extra.device), K.to(extra.device), w, h, colors=extra, with_contributions=False,
+        settings=target.settings(w, h),
     )  # fmt: skip
     shown = (out.colors[0, ..., 3:] / out.alphas[0].clamp_min(1e-3)[..., None]).cpu()
     return [shown[..., 3 * n : 3 * n + 3] for n in range(len(chosen))]

@@ -25,7 +25,7 @@ _KERNEL = Path(__file__).with_name("kernels") / "visibility.cpp"
 
 
 @dataclass
-class Sighting:
+class Visibility:
     """Where and how points are seen in one plate; leading dimensions are those of the points."""
 
     pixels: Tensor
@@ -46,7 +46,7 @@ def _snippet() -> Snippet:
         "points", "camera", "surface", "ignored", "settings", "pixels", "depth", "visible", "moving", "explained",
     )  # fmt: skip
     fields = {**dict.fromkeys(pointers, POINTER), **dict.fromkeys(("count", "width", "height"), INTEGER)}
-    return Snippet("sighting", fields, kernel_text(_KERNEL).replace("@POINTS@", str(_POINTS)))
+    return Snippet("visibility", fields, kernel_text(_KERNEL).replace("@POINTS@", str(_POINTS)))
 
 
 def warm_up() -> None:
@@ -54,9 +54,9 @@ def warm_up() -> None:
     _snippet().warm_up()
 
 
-def sighted(
+def visible_pixels(
     points: Tensor, viewmat: Tensor, K: Tensor, surface: Tensor, ignored: Tensor | None, tolerance: float
-) -> Sighting:
+) -> Visibility:
     """How a plate shows world points [..., 3]. All on the CPU, float32; no gradient. ValueError for others.
 
     Args:
@@ -82,4 +82,4 @@ def sighted(
         pixels=pixels.data_ptr(), depth=depth.data_ptr(), visible=visible.data_ptr(), moving=moving.data_ptr(),
         explained=explained.data_ptr(), count=count, width=width, height=height,
     )  # fmt: skip
-    return Sighting(pixels, depth, visible, moving, explained)
+    return Visibility(pixels, depth, visible, moving, explained)

@@ -10,7 +10,7 @@ from ...shot import Shot
 from ...train.model import gathered
 from ..frozen import FrozenGaussians
 from .ignored import ignore_mattes
-from .reproject import resized, widened
+from .reproject import dilate, resized
 from .source_views import MovingOf
 
 _SEEN = 0.05
@@ -56,7 +56,7 @@ class WorkingPlates:
             found = self.moving(frame)
             found = torch.zeros(self.height, self.width, device="cpu") if found is None else found
             found = resized(found.float(), self.width, self.height)
-            self._mattes[frame] = widened(found, self.margin).half()
+            self._mattes[frame] = dilate(found, self.margin).half()
         return self._mattes[frame].to(self.device).float()
 
     def ignored(self, frame: int) -> Tensor | None:
@@ -64,7 +64,7 @@ class WorkingPlates:
         mask = self._ignored(frame)
         if mask is None:
             return None
-        return (widened(resized(mask, self.width, self.height), max(1, self.margin)) > 0.0).to(self.device)
+        return (dilate(resized(mask, self.width, self.height), max(1, self.margin)) > 0.0).to(self.device)
 
     def moving_share(self, frozen: FrozenGaussians, frame: int) -> Tensor:
         """[N] in 0..1: of what a frame's camera sees of each Gaussian, the share that lies in what moves there."""

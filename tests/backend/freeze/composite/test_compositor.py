@@ -17,7 +17,7 @@ from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze import bands
-from torch_backend.freeze.composite.compositor import DetailConfig, Detailer
+from torch_backend.freeze.composite.compositor import CompositeConfig, Compositor
 from torch_backend.freeze.composite.warp import sample, snap
 from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen
 from torch_backend.gaussians import Gaussians
@@ -107,22 +107,22 @@ class World:
     def plates(self):
         return Plates(self.shot)
 
-    def detailer(self):
+    def compositor(self):
         # Surfaces are where they are: a real model's are not, which the default minds.
-        return Detailer(self.run, self.scene, self.plates(), DetailConfig(depth_error=0.01))
+        return Compositor(self.run, self.scene, self.plates(), CompositeConfig(depth_error=0.01))
 
     def output(self, frame, t_star):
         """A frame of a take at the clip's own pose."""
         K = self.scene.camera_at(W, H)[frame - 1]
         return OutputFrame(frame, self.scene.viewmats[frame - 1], K, float(t_star), float(frame))
 
-    def make(self, output, detailer=None, beyond=(0, 0), withheld=()):
+    def make(self, output, compositor=None, beyond=(0, 0), withheld=()):
         frozen = freeze_at(self.run.model, self.scene.time_of_frame(output.t_star), 1.0)
         K = output.K.clone()
         K[:2, 2] += torch.tensor(beyond)
         size, at = (W + 2 * beyond[0], H + 2 * beyond[1]), self.scene.time_of_frame(output.exposed_like)
         image = render_frozen(frozen, output.viewmat, K, *size, self.run.model.exposure, at)
-        return (detailer or self.detailer()).frame(output, frozen, image, W, H, withheld)
+        return (compositor or self.compositor()).frame(output, frozen, image, W, H, withheld)
 
     def truth(self, output):
         """(picture [H, W, 3] of the frozen instant, where the board is)."""
@@ -219,17 +219,17 @@ def still_world(tmp_path_factory, quiet):
 @pytest.fixture(scope="module")
 def made(world):
     """(pose, t*) -> frame, each made once."""
-    detailer, frames = world.detailer(), {}
+    compositor, frames = world.compositor(), {}
 
     def get(frame, t_star):
         if (frame, t_star) not in frames:
-            frames[frame, t_star] = world.make(world.output(frame, t_star), detailer)
+            frames[frame, t_star] = world.make(world.output(frame, t_star), compositor)
         return frames[frame, t_star]
 
     return get
 
 
-def widened(mask, by):
+def dilate(mask, by):
     return binary_dilation(mask, np.ones((2 * by + 1,) * 2))
 
 
@@ -247,7 +247,7 @@ def assert_is_plate(frame, plate, where):
     assert (frame.matte.numpy()[where] == 1.0).all()
     assert (frame.plate.numpy()[where] == 1.0).all() and (frame.alpha.numpy()[where] == 1.0).all()
     assert (frame.fill.numpy()[where] == 0.0).all()
-    assert (frame.source.numpy()[where] == frame.leading).all()
+    assert (frame.source.numpy()[where] == frame.primary).all()
     assert (frame.st.numpy()[where] == snap(identity(), (W, H)).numpy()[where]).all()
     np.testing.assert_allclose(frame.linear.numpy()[where], plate.numpy()[where], rtol=1e-6, atol=1e-9)
 
@@ -257,7 +257,7 @@ def test_a_still_world_is_the_plate(still_world):
     assert (plates.width, plates.height) == (W, H)
     for frame, t_star in ((3, 11), (7, 7)):
         made = still_world.make(still_world.output(frame, t_star))
-        assert made.leading == frame
+        assert made.primary == frame
         assert_is_plate(made, plates.linear(frame), everywhere)
         np.testing.assert_allclose(made.color, plates.display(frame), atol=2e-6)
         picture, _ = still_world.seen_at(frame)
@@ -266,7 +266,7 @@ def test_a_still_world_is_the_plate(still_world):
 
 @pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (9, 4)])
 def test_away_from_what_moves_a_frame_is_the_plate(world, made, frame, t_star):
-    where = ~widened(world.seen_at(frame)[1] | world.truth(world.output(frame, t_star))[1], 24)
+    where = ~dilate(world.seen_at(frame)[1] | world.truth(world.output(frame, t_star))[1], 24)
     assert where.mean() > 0.5
     assert_is_plate(made(frame, t_star), world.plates().linear(frame), where)
 
@@ -275,8 +275,8 @@ def test_away_from_what_moves_a_frame_is_the_plate(world, made, frame, t_star):
 def test_the_board_is_where_it_was_at_t_star_and_has_its_stripes(world, made, frame, t_star):
     output, result = world.output(frame, t_star), made(frame, t_star)
     truth, on = world.truth(output)
-    gone = world.seen_at(frame)[1] & ~widened(on, 4)
-    inner, hole = ~widened(~on, 4), ~widened(~gone, 3)
+    gone = world.seen_at(frame)[1] & ~dilate(on, 4)
+    inner, hole = ~dilate(~on, 4), ~dilate(~gone, 3)
     assert inner.sum() > 1000 and hole.sum() > 400
     for where in (inner, hole):
         assert off(result.color, truth, where) < 0.4 * off(result.splat, truth, where)
@@ -288,7 +288,7 @@ def test_the_board_is_where_it_was_at_t_star_and_has_its_stripes(world, made, fr
 def test_what_still_is_in_one_plate_only_differs_between_two_instants(world, made):
     early, late = made(6, 2), made(6, 11)
     truths = [world.truth(world.output(6, t)) for t in (2, 11)]
-    touched = widened(truths[0][1] | truths[1][1] | world.seen_at(6)[1], 16)
+    touched = dilate(truths[0][1] | truths[1][1] | world.seen_at(6)[1], 16)
     moved = np.abs(truths[0][0] - truths[1][0]).max(-1) > 0.15
     difference = (early.linear - late.linear).abs().numpy().max(-1)
     assert (difference[~touched] == 0).all() and (~touched).sum() > 20_000
@@ -298,7 +298,7 @@ def test_what_still_is_in_one_plate_only_differs_between_two_instants(world, mad
 def test_warp_matte_and_fill_are_the_frame(world, made):
     turned = replace_pose(world.output(5, 7), [0.04, 0.02, 0.1])
     for result in (made(3, 11), made(9, 4), world.make(turned)):
-        plate = world.plates().linear(result.leading)
+        plate = world.plates().linear(result.primary)
         again = result.matte[..., None] * sample(plate, result.st) + result.fill
         np.testing.assert_allclose(result.linear, again, atol=2e-6)
         assert ((result.fill == 0).all(-1) | (result.matte < 1)).all()
@@ -314,7 +314,7 @@ def replace_pose(output, shift):
 def test_the_plate_of_the_instant_is_its_own_frame(world, made):
     for frame in (4, 11):
         assert_is_plate(made(frame, frame), world.plates().linear(frame), np.ones((H, W), bool))
-        assert made(frame, frame).motion.numpy()[~widened(~world.seen_at(frame)[1], 3)].min() > 0.9
+        assert made(frame, frame).motion.numpy()[~dilate(~world.seen_at(frame)[1], 3)].min() > 0.9
 
 
 @pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (10, 4)])
@@ -335,7 +335,7 @@ def test_stripes_of_what_sways_come_from_other_plates_moved_as_the_model_moves_i
     output = world.output(12, 13)
     result = world.make(output, withheld=[13])
     truth, on = world.truth(output)
-    inner = ~widened(~on, 6)
+    inner = ~dilate(~on, 6)
     assert off(result.color, truth, inner) < 0.6 * off(result.splat, truth, inner)
     assert set(np.unique(result.source.numpy()[inner])) <= {10.0, 11.0, 12.0}
 
@@ -349,10 +349,10 @@ def test_far_from_plate_t_star_a_wrong_depth_is_made_up_for_by_the_own_plate(tmp
         means[world.run.model.open_rows()] *= 1.03
     output = world.output(13, 1)
     truth, on = world.truth(output)
-    inner = ~widened(~on, 6)
+    inner = ~dilate(~on, 6)
     one, both = (
-        world.make(output, Detailer(world.run, world.scene, world.plates(), DetailConfig(sway_trust=trust)))
-        for trust in (0.0, DetailConfig().sway_trust)
+        world.make(output, Compositor(world.run, world.scene, world.plates(), CompositeConfig(sway_trust=trust)))
+        for trust in (0.0, CompositeConfig().sway_trust)
     )
     assert one.plate.numpy()[inner].min() > 0.5
     assert off(both.color, truth, inner) < 0.8 * off(one.color, truth, inner)
@@ -367,7 +367,7 @@ def test_a_masked_logo_is_in_no_frozen_frame_and_what_is_behind_it_comes_from_ot
     assert (frame.matte.numpy()[logo] == 0.0).all() and (frame.motion.numpy()[logo] > 0.999).all()
     assert off(frame.color, truth, logo) < 0.03 < off(frame.splat, truth, logo)
     assert (frame.plate.numpy()[logo] > 0.5).mean() > 0.9 and (frame.source.numpy()[logo] != 4).all()
-    away = ~widened(logo, 16)
+    away = ~dilate(logo, 16)
     assert (frame.matte.numpy()[away] == 1.0).all()
     plain.mkdir()
     unmasked = build(plain, quiet(), still=True, logo=logo)
@@ -378,21 +378,21 @@ def test_a_masked_logo_is_in_no_frozen_frame_and_what_is_behind_it_comes_from_ot
 def test_withheld_plates_are_not_used(tmp_path, quiet):
     world = build(tmp_path, quiet())
     assert 3 not in (1, FRAMES // 2 + 1, FRAMES), "those are looked at to know the footage"
-    detailer = world.detailer()
-    before = {(n, t): world.make(world.output(n, t), detailer, withheld=[3]) for n, t in ((3, 11), (5, 3))}
-    used = world.make(world.output(5, 3), detailer)
+    compositor = world.compositor()
+    before = {(n, t): world.make(world.output(n, t), compositor, withheld=[3]) for n, t in ((3, 11), (5, 3))}
+    used = world.make(world.output(5, 3), compositor)
     for path, pixels in (
         (tmp_path / "source" / "000003.png", np.zeros((H, W, 3), np.uint16)),
         (world.shot.frames / "000003.png", np.zeros((H // 2, W // 2, 3), np.uint8)),
     ):
         write_png(path, pixels)
-    detailer = world.detailer()
+    compositor = world.compositor()
     for (n, t), want in before.items():
-        found = world.make(world.output(n, t), detailer, withheld=[3])
+        found = world.make(world.output(n, t), compositor, withheld=[3])
         for name in ("linear", "plate", "source", "alpha", "motion", "st", "matte", "fill"):
             assert torch.equal(getattr(found, name), getattr(want, name)), (n, t, name)
         assert not (found.source == 3).any()
-    again = world.make(world.output(5, 3), detailer)
+    again = world.make(world.output(5, 3), compositor)
     assert not torch.equal(again.linear, used.linear), "else the test tests nothing"
 
 
@@ -411,10 +411,10 @@ def test_a_camera_of_ones_own_looks_into_the_nearest_plate(world, shift, nearest
     result = world.make(output)
     distances = (world.scene.viewmats[:, :3, 3] - output.viewmat[:3, 3]).norm(dim=1)
     assert abs(int(distances.argmin()) + 1 - nearest) <= 1, "the test's own arithmetic"
-    assert result.leading == int(distances.argmin()) + 1
+    assert result.primary == int(distances.argmin()) + 1
     truth, on = world.truth(output)
-    inner = ~widened(~on, 4)
-    wall = ~widened(on, 8)
+    inner = ~dilate(~on, 4)
+    wall = ~dilate(on, 8)
     for where in (inner, wall):
         assert off(result.color, truth, where) < 0.6 * off(result.splat, truth, where)
     assert bool(torch.isfinite(result.linear).all()) and result.plate.mean() > 0.8
@@ -423,7 +423,7 @@ def test_a_camera_of_ones_own_looks_into_the_nearest_plate(world, shift, nearest
 def test_a_camera_of_ones_own_at_a_pose_of_the_clip_is_that_plate(still_world):
     output = replace(still_world.output(9, 4), frame=1001, exposed_like=4.0)
     result = still_world.make(output)
-    assert result.leading == 9
+    assert result.primary == 9
     # A depth that is wrong moves nothing between two cameras in one place.
     assert (result.st - identity()).abs().max() < 0.02 / W
     assert off(result.color, still_world.seen_at(9)[0], np.ones((H, W), bool)) < 2e-3
@@ -458,7 +458,7 @@ def test_overscan_goes_on_around_the_same_frame(world, made):
     assert wide.linear.shape == (H + 2 * down, W + 2 * across, 3)
     middle = (slice(down, -down), slice(across, -across))
     around = [world.seen_at(frame + step)[1] for step in (-1, 0, 1)]  # plates beside it have a say
-    still = ~widened(np.any([*around, world.truth(world.output(frame, t_star))[1]], axis=0), 16)
+    still = ~dilate(np.any([*around, world.truth(world.output(frame, t_star))[1]], axis=0), 16)
     still[:4] = still[-4:] = still[:, :4] = still[:, -4:] = False  # mattes end softly at the plate's own border
     for name in ("linear", "st", "matte", "plate", "source"):
         np.testing.assert_array_equal(getattr(wide, name)[middle][still], getattr(inside, name)[still], err_msg=name)
@@ -506,9 +506,11 @@ def test_bars_beside_the_picture_are_the_frames_own_plate_s(world):
     """No part of the scene, so no splat and no other plate has anything to say there."""
     output, bars = world.output(4, 7), np.zeros((H, W), bool)
     bars[:, : W // 2] = True  # also over the board, whose pixels there are no frame's but t*'s
-    config = DetailConfig(depth_error=0.01)
-    detailer = Detailer(world.run, world.scene, world.plates(), config, bars=lambda frame: bars if frame == 4 else None)
-    made, plain = world.make(output, detailer, (3, 2)), world.make(output, None, (3, 2))
+    config = CompositeConfig(depth_error=0.01)
+    compositor = Compositor(
+        world.run, world.scene, world.plates(), config, bars=lambda frame: bars if frame == 4 else None
+    )
+    made, plain = world.make(output, compositor, (3, 2)), world.make(output, None, (3, 2))
     inner = (slice(2, -2), slice(3, -3))
     own = world.plates().linear(4)
     assert torch.equal(made.linear[inner][bars], own[bars]) and not torch.equal(plain.linear[inner][bars], own[bars])

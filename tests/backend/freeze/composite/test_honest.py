@@ -7,17 +7,17 @@ import pytest
 import torch
 from scipy import ndimage
 
-from tests.backend.freeze.composite.test_compositor import H, W, board_at, build, off, widened
+from tests.backend.freeze.composite.test_compositor import H, W, board_at, build, dilate, off
 from torch_backend.deformation import Deformation, Deltas
-from torch_backend.freeze.composite.compositor import DetailConfig, Detailer
+from torch_backend.freeze.composite.compositor import CompositeConfig, Compositor
 from torch_backend.freeze.composite.state import StateConfig, StateWeights
 from torch_backend.freeze.take.frames import small_share
-from torch_backend.freeze.views.source_views import SightingConfig
+from torch_backend.freeze.views.source_views import VisibilityConfig
 
 FRAME, T_STAR = 3, 11
 """The board stands wholly apart in these two."""
 BLIND = {"state": StateConfig(weights=StateWeights(-5.0, 10.0, 0.0, 0.0, 0.0, 0.0))}
-"""Of `DetailConfig`: motion mattes alone tell the state."""
+"""Of `CompositeConfig`: motion mattes alone tell the state."""
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +32,11 @@ class Stays(Deformation):
         return Deltas(torch.tensor([board_at(T_STAR), 0.0, 0.0]).expand(len(means), 3))
 
 
-def narrowed(mask, by):
+def erode(mask, by):
     return ndimage.binary_erosion(mask, np.ones((2 * by + 1,) * 2))
 
 
-def make(world, mattes, sightings=None, masked=None, **config):
+def make(world, mattes, source_views=None, masked=None, **config):
     """The frame at T_STAR; `mattes` frame -> bool [H, W], of those that are not as they should be.
 
     `masked`: bool [H, W], what plate t* is not to show; None: nothing.
@@ -46,18 +46,18 @@ def make(world, mattes, sightings=None, masked=None, **config):
         on = mattes.get(frame)
         return torch.from_numpy(world.seen_at(frame)[1] if on is None else on).float()
 
-    settings = DetailConfig(depth_error=0.01, sightings=sightings or SightingConfig(), **config)
-    detailer = Detailer(world.run, world.scene, world.plates(), settings, moving)
+    settings = CompositeConfig(depth_error=0.01, source_views=source_views or VisibilityConfig(), **config)
+    compositor = Compositor(world.run, world.scene, world.plates(), settings, moving)
     if masked is not None:
         at_t = torch.from_numpy(masked).float()
-        detailer.seen.ignored = lambda frame: at_t if frame == T_STAR else None
-    return world.make(world.output(FRAME, T_STAR), detailer)
+        compositor.seen.ignored = lambda frame: at_t if frame == T_STAR else None
+    return world.make(world.output(FRAME, T_STAR), compositor)
 
 
 def shows_its_own_board(world, made):
     """Share of the pixels where the frame's own plate has the board and t* has not, that look like that board."""
     (plate, on), (truth, there) = world.seen_at(FRAME), world.truth(world.output(FRAME, T_STAR))
-    gone = on & ~widened(there, 4)
+    gone = on & ~dilate(there, 4)
     assert gone.sum() > 3000
     near = [np.abs(np.asarray(made.color) - picture).mean(-1) for picture in (plate, truth)]
     return float((near[0] < near[1])[gone].mean())
@@ -65,7 +65,7 @@ def shows_its_own_board(world, made):
 
 def test_a_matte_that_ends_short_of_what_moves_leaves_nothing_of_it(world):
     """The flow misses 9 pixels of the board all around: in the frame's own plate and in those that fill."""
-    short = {frame: narrowed(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
+    short = {frame: erode(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
     assert shows_its_own_board(world, make(world, short)) < 0.01
     assert shows_its_own_board(world, make(world, short, **BLIND)) > 0.1, "else there is nothing to mend"
 
@@ -76,7 +76,7 @@ def test_what_is_held_still_and_was_elsewhere_at_t_star_is_not_shown(world):
     made = make(world, still)
     assert shows_its_own_board(world, made) < 0.01
     assert shows_its_own_board(world, make(world, still, **BLIND)) > 0.9, "else there is nothing to mend"
-    wall = ~widened(world.seen_at(FRAME)[1] | world.truth(world.output(FRAME, T_STAR))[1], 24)
+    wall = ~dilate(world.seen_at(FRAME)[1] | world.truth(world.output(FRAME, T_STAR))[1], 24)
     assert (made.matte.numpy()[wall] == 1.0).all(), "and nothing else is let go of"
 
 
@@ -97,7 +97,7 @@ def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
     """At the plate's own time the board stood before the wall: there the frozen render shows what never moves."""
     none = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
     made, alone = make(world, none), make(world, none, **BLIND)
-    gone = narrowed(world.seen_at(FRAME)[1], 6) & ~widened(world.truth(world.output(FRAME, T_STAR))[1], 6)
+    gone = erode(world.seen_at(FRAME)[1], 6) & ~dilate(world.truth(world.output(FRAME, T_STAR))[1], 6)
     assert gone.sum() > 1000 and made.matte.numpy()[gone].max() < 0.01
     assert alone.matte.numpy()[gone].min() > 0.99, "else something else says so"
 
@@ -113,8 +113,8 @@ def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(wo
             colors[wrong] += 1.5
         made = make(world, {})
         shown = np.abs((made.splat - torch.from_numpy(world.truth(world.output(FRAME, T_STAR))[0]).float()).numpy())
-        spoilt = (shown.max(-1) > 0.2) & ~widened(world.seen_at(FRAME)[1], 24)
-        spoilt &= ~widened(world.truth(world.output(FRAME, T_STAR))[1], 24)
+        spoilt = (shown.max(-1) > 0.2) & ~dilate(world.seen_at(FRAME)[1], 24)
+        spoilt &= ~dilate(world.truth(world.output(FRAME, T_STAR))[1], 24)
         assert spoilt.sum() > 500
         assert made.matte.numpy()[spoilt].mean() > 0.75
         error = off(made.color, world.truth(world.output(FRAME, T_STAR))[0], spoilt)
@@ -131,7 +131,7 @@ def test_plates_that_fill_show_nothing_of_it_either(world):
     try:
         mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14) if frame not in (FRAME, T_STAR)}
         made = make(world, mattes, None)
-        believed = make(world, mattes, SightingConfig(unexplained=1e6), agreement=1e6)
+        believed = make(world, mattes, VisibilityConfig(unexplained=1e6), agreement=1e6)
     finally:
         world.run.model = before
     assert shows_its_own_board(world, made) < 0.01
@@ -140,8 +140,8 @@ def test_plates_that_fill_show_nothing_of_it_either(world):
 
 def test_where_mattes_ended_short_the_wall_is_as_sharp_as_its_plates(world):
     truth, there = world.truth(world.output(FRAME, T_STAR))
-    gone = world.seen_at(FRAME)[1] & ~widened(there, 4)
-    short = {frame: narrowed(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
+    gone = world.seen_at(FRAME)[1] & ~dilate(there, 4)
+    short = {frame: erode(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
     made = make(world, short)
     assert off(made.color, truth, gone) < min(0.01, 0.2 * off(made.splat, truth, gone))
 
@@ -149,8 +149,8 @@ def test_where_mattes_ended_short_the_wall_is_as_sharp_as_its_plates(world):
 def test_what_moves_and_no_plate_near_t_star_shows_is_a_guess(world):
     """Its Gaussians are known at every time, as those that were never opened are: the plates have to say it."""
     output = world.output(FRAME, T_STAR)
-    board = narrowed(world.truth(output)[1], 6)
-    wall = ~widened(world.seen_at(FRAME)[1] | world.truth(output)[1], 24)
+    board = erode(world.truth(output)[1], 6)
+    wall = ~dilate(world.seen_at(FRAME)[1] | world.truth(output)[1], 24)
     seen, guessed = world.make(output), world.make(output, withheld=[n for n in range(1, 14) if n != FRAME])
     assert seen.support.numpy()[board].min() > 0.95
     assert guessed.support.numpy()[board].max() < 0.05

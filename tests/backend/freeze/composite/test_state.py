@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from benchmarks.fit_state import NAMES, Case, fit, judged
-from tests.backend.freeze.composite.test_compositor import H, W, build, widened
-from torch_backend.freeze.composite.compositor import Detailer
+from tests.backend.freeze.composite.test_compositor import H, W, build, dilate
+from torch_backend.freeze.composite.compositor import Compositor
 from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go, log_odds
 from torch_backend.freeze.frozen import freeze_at, render_frozen
 from torch_backend.freeze.views.ignored import ignore_mattes
-from torch_backend.freeze.views.source_views import Sightings
-from torch_backend.freeze.views.target_view import posed_frame
+from torch_backend.freeze.views.source_views import SourceViews
+from torch_backend.freeze.views.target_view import target_view
 
 FRAME, T_STAR = 3, 11
 """The board stands wholly apart in these two."""
@@ -30,17 +30,17 @@ def found(world):
     output = world.output(FRAME, T_STAR)
     frozen = freeze_at(world.run.model, world.scene.time_of_frame(T_STAR), 1.0)
     image = render_frozen(frozen, output.viewmat, output.K, W, H)
-    views: Sightings = Detailer(world.run, world.scene, world.plates()).seen
-    posed = posed_frame(views, output, frozen, image, W, H)
-    seen, instant = (views.seen(frame, posed.points) for frame in (FRAME, T_STAR))
-    told = evidence(views, posed, FRAME, seen, instant, StateConfig())
-    alone = evidence(views, posed, FRAME, seen, None, StateConfig())
+    views: SourceViews = Compositor(world.run, world.scene, world.plates()).seen
+    target = target_view(views, output, frozen, image, W, H)
+    seen, instant = (views.seen(frame, target.points) for frame in (FRAME, T_STAR))
+    told = evidence(views, target, FRAME, seen, instant, StateConfig())
+    alone = evidence(views, target, FRAME, seen, None, StateConfig())
     return told, alone, world.seen_at(FRAME)[1], world.truth(output)[1]
 
 
 def test_each_piece_of_evidence_is_large_where_it_should_be(found):
     told, alone, own, there = found
-    still, gone = np.logical_not(widened(own | there, 24)), own & np.logical_not(widened(there, 8))
+    still, gone = np.logical_not(dilate(own | there, 24)), own & np.logical_not(dilate(there, 8))
     assert set(told) == {f.name for f in fields(StateWeights)} - {"bias"}
     for name in ("change", "contradiction", "gain"):
         value = told[name].numpy()
@@ -58,8 +58,8 @@ def test_odds_are_a_weighted_sum_and_a_still_world_keeps_its_plate_to_the_bit(fo
     want = weights.bias + sum(getattr(weights, name) * told[name].double() for name in told)
     torch.testing.assert_close(log_odds(told, config, 1.0).double(), want, rtol=1e-5, atol=1e-5)
     share = let_go(log_odds(told, StateConfig(), W / 640), StateConfig()).numpy()
-    assert (share[np.logical_not(widened(own | there, 40))] == 0.0).all()
-    assert (share[own & np.logical_not(widened(there, 8))] > 0.99).mean() > 0.95
+    assert (share[np.logical_not(dilate(own | there, 40))] == 0.0).all()
+    assert (share[own & np.logical_not(dilate(there, 8))] > 0.99).mean() > 0.95
 
 
 def test_log_odds_become_a_soft_border():

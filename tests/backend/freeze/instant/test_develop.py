@@ -23,9 +23,9 @@ from torch_backend.freeze.instant.instants import (
     developed_path,
     load_developed,
 )
-from torch_backend.freeze.instant.static_baseline import TwinConfig, held_still, settled
-from torch_backend.freeze.instant.undersampled import seen_from_afar
-from torch_backend.freeze.views.scene_flow import Stage, Travel
+from torch_backend.freeze.instant.static_baseline import StaticBaselineConfig, apply_static_baseline, with_still_means
+from torch_backend.freeze.instant.undersampled import undersampled
+from torch_backend.freeze.views.scene_flow import MovingScene, SceneFlow
 from torch_backend.freeze.views.source_views import motion_mattes
 from torch_backend.freeze.views.working_plates import WorkingPlates
 from torch_backend.live import LiveSession
@@ -104,7 +104,7 @@ def same(one, other):
 
 def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, made):
     run, scene, frozen, _ = made
-    travel = Travel(run, scene, frozen, T_STAR)
+    travel = SceneFlow(run, scene, frozen, T_STAR)
     assert len(travel.rows) > 30
     for frame in (101, 109, 116):
         then = freeze_at(run.model, scene.time_of_frame(frame), 1.0).state
@@ -115,7 +115,7 @@ def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, mad
 
 def test_developed_gaussians_travel_with_those_they_descend_from(made):
     run, scene, frozen, now = made
-    stage = Stage(run, scene, now, T_STAR)
+    stage = MovingScene(run, scene, now, T_STAR)
     assert all(torch.equal(value, now.state[name]) for name, value in stage.at(T_STAR).state.items())
     then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state["means"] - frozen.state["means"]
     moved = stage.at(112).state["means"] - now.state["means"]
@@ -141,11 +141,11 @@ def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(tra
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, patch = field(run, scene), run.model.open_rows()
     torn, wall = in_tatters(run, frozen)
-    mended = settled(run, scene, torn, T_STAR, motion_mattes(world.shot))
+    mended = apply_static_baseline(run, scene, torn, T_STAR, motion_mattes(world.shot))
     shut = (torn.motion > 0.5) & (mended.motion < 0.5)
     assert float(shut[wall].float().mean()) > 0.8, "what is seen of it"
     stays = mended.motion[patch] > 0.5
-    ours, twins = (scores(world, run, scene, f) for f in (mended, held_still(run, torn, run.model.open_rows())))
+    ours, twins = (scores(world, run, scene, f) for f in (mended, with_still_means(run, torn, run.model.open_rows())))
     was_moving, was_still = scores(world, run, scene, torn)
     assert ours[1] > was_still + 2.0 and ours[1] > twins[1] - 0.05, "no worse than static where nothing moves"
     assert ours[0] > was_moving - 0.1 and ours[0] > twins[0] + 1.0 and bool(stays.any())
@@ -159,7 +159,7 @@ def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(train
     closed = []
     for nearer in (0.0, 1e9):  # no plate sees it from near, every one does
         moving = lambda frame: torch.ones(scene.height, scene.width)  # noqa: E731
-        mended = settled(run, scene, torn, T_STAR, moving, TwinConfig(nearer=nearer))
+        mended = apply_static_baseline(run, scene, torn, T_STAR, moving, StaticBaselineConfig(nearer=nearer))
         closed.append(float((mended.motion[wall] < 0.5).float().mean()))
     assert closed[0] == 0.0 and closed[1] > 0.8
 
@@ -172,7 +172,9 @@ def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
     left = {}
     for sways in (0.0, 1e9):  # all of it went far, none did
         for doubted in (1.0, 1e9):
-            mended = settled(run, scene, frozen, T_STAR, blind, TwinConfig(sways=sways, doubted=doubted))
+            mended = apply_static_baseline(
+                run, scene, frozen, T_STAR, blind, StaticBaselineConfig(sways=sways, doubted=doubted)
+            )
             left[sways, doubted] = int((mended.motion > 0.5).sum())
     assert left[0.0, 1.0] == left[0.0, 1e9] > 0
     assert left[1e9, 1.0] > 1.2 * left[1e9, 1e9]
@@ -189,10 +191,10 @@ def test_what_is_seen_from_afar(trained):
     support[0, -1] = support[2, 0] = support[3, 0] = support[3, -1] = True
     near_last = centres[last] + 0.1 * (centres[last] - centres[first])
     means = near_last.repeat(4, 1)
-    found = seen_from_afar(run, scene, means, scene.frames[first], 2.0)
+    found = undersampled(run, scene, means, scene.frames[first], 2.0)
     assert found.tolist() == [True, False, False, True]
-    assert not seen_from_afar(run, scene, means, scene.frames[last], 2.0).any()
-    assert seen_from_afar(run, scene, means, scene.frames[first], 20.0).tolist() == [False] * 4
+    assert not undersampled(run, scene, means, scene.frames[last], 2.0).any()
+    assert undersampled(run, scene, means, scene.frames[first], 20.0).tolist() == [False] * 4
 
 
 def test_of_what_t_star_sees_from_afar_nothing_is_learnt_where_it_moves(trained):
@@ -202,7 +204,7 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_where_it_moves(trained)
     config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005)
     made = develop(run, scene, frozen, T_STAR, mattes, config)
     changed = (made.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
-    afar = seen_from_afar(run, scene, frozen.state["means"], T_STAR, 1.005)
+    afar = undersampled(run, scene, frozen.state["means"], T_STAR, 1.005)
     far, near = rows[afar[rows]], rows[~afar[rows]]
     assert len(far) > 8 and len(near) > 8, "or the test says nothing"
     assert float(changed[near].float().mean()) > 0.9
@@ -224,7 +226,7 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(tr
     changed = (made.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
     plates = WorkingPlates(scene, config.width, moving, config.margin, frozen.support.device)
     moves = plates.moving_share(frozen, once) > 0.5
-    afar = seen_from_afar(run, scene, frozen.state["means"], T_STAR, 1.005)
+    afar = undersampled(run, scene, frozen.state["means"], T_STAR, 1.005)
     closed = frozen.motion < 0.5
     assert int((closed & afar & moves).sum()) > 8 and int((closed & ~afar & moves).sum()) > 8, (
         "or the test says nothing"
@@ -241,7 +243,7 @@ def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(tmp_path, quiet)
     train_shot(world.shot, TrainParams(iterations=900, holdout=8, max_gaussians=1500), quiet())
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, rows = field(run, scene), run.model.open_rows()
-    blind = settled(run, scene, frozen, T_STAR, lambda frame: torch.zeros(scene.height, scene.width))
+    blind = apply_static_baseline(run, scene, frozen, T_STAR, lambda frame: torch.zeros(scene.height, scene.width))
     was, now = (scores(world, run, scene, f)[0] for f in (frozen, blind))
     # By six trainings, three seeds each of two rates: 0.43 to 0.58, and at most 1.1 dB.
     assert float((blind.motion[rows] > 0.5).float().mean()) > 0.35 and now > was - 2.0
@@ -367,9 +369,9 @@ def test_an_instant_that_was_held_out_is_learnt_from_the_plates_beside_it(apart)
     held, config = 109, DevelopConfig(steps=100, gain=-99.0)
     assert held not in run.train_frames
     frozen, mattes = field(run, scene, held), motion_mattes(shot)
-    made = [develop(run, scene, settled(run, scene, frozen, held, mattes), held, mattes, config)]
+    made = [develop(run, scene, apply_static_baseline(run, scene, frozen, held, mattes), held, mattes, config)]
     scene.image_path(scene.frames.index(held)).write_bytes(b"nobody reads it")
-    made.append(develop(run, scene, settled(run, scene, frozen, held, mattes), held, mattes, config))
+    made.append(develop(run, scene, apply_static_baseline(run, scene, frozen, held, mattes), held, mattes, config))
     assert same(*made) and not torch.equal(made[0].state["sh0"], made[0].descent.state["sh0"])
 
 

@@ -61,7 +61,7 @@ def test_a_frame_is_its_warp_over_the_plate(trained, take):
     for n in range(103, 109):
         frame, warp = read_frozen_exr(folder / f"{n:06d}.exr"), read_warp(folder / "warp" / f"{n:06d}.exr")
         np.testing.assert_allclose(apply_warp(plates.linear(n), warp), frame.rgba[..., :3], atol=1e-3)
-        assert warp.metadata.key == frame.metadata.key and warp.metadata.leading == n
+        assert warp.metadata.key == frame.metadata.key and warp.metadata.primary == n
         still = frame.detail.plate == 1.0
         assert still.mean() > 0.5
     rows = facts["detail"]["per_frame"]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torch_backend.footage.plates import Plates
-from torch_backend.freeze.composite.compositor import Detailer
+from torch_backend.freeze.composite.compositor import Compositor
 from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen, span_of
 from torch_backend.freeze.views.decisions import above, first_best, first_least
 from torch_backend.scene import load_scene
@@ -29,7 +29,7 @@ def frame(trained):
     """frame(by): [H, W, 5] colour, support and motion at a pose aside, with Gaussians off by a share `by`."""
     world, _ = trained
     run, scene, plates = load_run(world.shot, "main", torch.device("cpu")), load_scene(world.shot), Plates(world.shot)
-    detailer, (pose, t_star) = Detailer(run, scene, plates), (113, 106)
+    compositor, (pose, t_star) = Compositor(run, scene, plates), (113, 106)
     size, i = (plates.width, plates.height), scene.frames.index(pose)
     output = OutputFrame(pose, scene.viewmats[i], scene.camera_at(*size)[i], float(t_star), float(pose))
 
@@ -40,7 +40,7 @@ def frame(trained):
             frozen.state[name] = value * (1.0 + by * (2.0 * torch.rand(value.shape, generator=noise) - 1.0))
         exposed_at = scene.time_of_frame(pose)
         image = render_frozen(frozen, output.viewmat, output.K, *size, run.model.exposure, exposed_at)
-        out = detailer.frame(output, frozen, image, *size)
+        out = compositor.frame(output, frozen, image, *size)
         return torch.cat([out.linear, out.support[..., None], out.motion[..., None]], dim=-1)
 
     return made

@@ -7,14 +7,14 @@ from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
 from torch_backend.freeze.views.reproject import (
     blurred,
+    dilate,
+    erode,
     inside,
     look_up,
-    narrowed,
     pixel_centres,
     project,
     resized,
     unproject,
-    widened,
 )
 
 W, H = 37, 29
@@ -100,9 +100,9 @@ def test_a_blur_is_a_gaussian_that_keeps_the_mean_and_the_border(picture):
 @pytest.mark.parametrize("by", [0, 1, 4])
 def test_a_matte_is_widened_to_all_sides(picture, by):
     matte = picture[..., 0]
-    np.testing.assert_array_equal(widened(float32(matte), by), float32(maximum_filter(matte, 2 * by + 1)))
+    np.testing.assert_array_equal(dilate(float32(matte), by), float32(maximum_filter(matte, 2 * by + 1)))
     if by:
-        least = torch.stack([narrowed(layer, by) for layer in float32(picture).permute(2, 0, 1)])
+        least = torch.stack([erode(layer, by) for layer in float32(picture).permute(2, 0, 1)])
         want = [-maximum_filter(-picture[..., c], 2 * by + 1) for c in range(3)]
         np.testing.assert_array_equal(least, float32(np.stack(want)))
 
