@@ -16,6 +16,7 @@ import argparse
 import statistics
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from benchmarks.detail_truth import trained
 from benchmarks.sources import Log, load_source
 from benchmarks.synthetic.folder import SyntheticScene
 from torch_backend.contract import JobError
+from torch_backend.freeze.composite.primary_source import PrimaryMatte
 from torch_backend.freeze.frozen import FrozenImage, freeze_at, render_frozen, span_of
 from torch_backend.freeze.views.reproject import inside, look_up, pixel_centres, project, unproject
 from torch_backend.native import default_threads
@@ -138,7 +140,7 @@ def _sources(maker: FrameMaker, pose: int) -> tuple[dict[str, Tensor], Tensor]:
     """(each of `SOURCES`, what is delivered), [H, W, 3] in 0..1."""
     clip, image = maker.clip, maker.image(pose)
     delivered = shown(maker.make(pose, frozenset())[0])
-    with replaced("detail", "primary_matte", lambda made: lambda *args: _given_up(made(*args))):
+    with replaced("composite.compositor", "primary_matte", lambda made: lambda *args: _given_up(made(*args))):
         residuals = shown(maker.make(pose, frozenset({"plate t*'s pixels"}))[0])
     carried, seen = _carried(clip, pose, maker.t_star, image)
     splats = over(image.color, image.alpha)
@@ -146,10 +148,9 @@ def _sources(maker: FrameMaker, pose: int) -> tuple[dict[str, Tensor], Tensor]:
     return dict(zip(SOURCES, pictures, strict=True)), delivered
 
 
-def _given_up(made: tuple[Tensor, Tensor, bool]) -> tuple[Tensor, Tensor, bool]:
+def _given_up(made: PrimaryMatte) -> PrimaryMatte:
     """The primary plate's matte with nothing in it."""
-    matte, st, own = made
-    return torch.zeros_like(matte), st, own
+    return replace(made, matte=torch.zeros_like(made.matte))
 
 
 def _carried(clip: DetailClip, pose: int, t_star: int, image: FrozenImage) -> tuple[Tensor, Tensor]:

@@ -38,9 +38,8 @@ from torch_backend.contract import JobError, TrainParams
 from torch_backend.deformation import planes
 from torch_backend.footage.images import write_png
 from torch_backend.freeze.frozen import FrozenGaussians, FrozenImage, freeze_at, render_frozen
-from torch_backend.freeze.instant.develop import develop
 from torch_backend.freeze.instant.instants import config_for, developed
-from torch_backend.freeze.instant.static_baseline import apply_static_baseline
+from torch_backend.freeze.instant.repairs import Moment, repaired, repairs
 from torch_backend.freeze.views.source_views import motion_mattes
 from torch_backend.raster import cpu as raster_cpu
 from torch_backend.raster import ssim
@@ -241,9 +240,8 @@ class Freezer:
         if frame in self.run.train_frames:
             made = developed(self.shot, self.run, scene, frame, frozen, self.config, keep=False)
         else:
-            mattes = motion_mattes(self.shot)
-            still = apply_static_baseline(self.run, scene, frozen, frame, mattes)
-            made = develop(self.run, scene, still, frame, mattes, self.config)
+            moment = Moment(self.run, scene, frame, motion_mattes(self.shot))
+            made = repaired(frozen, moment, repairs(self.config))
         self.seconds += time.process_time() - since
         return made
 

@@ -7,7 +7,6 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +55,7 @@ class Instants:
     def _sharing(self, off: frozenset[str], seconds: dict[str, float]) -> Iterator[None]:
         """While this lasts, steps that are asked again with the same input answer with what they made before."""
         with contextlib.ExitStack() as stack:
-            for stage in filter(partial(hasattr, developed_instants), STAGES):
+            for stage in STAGES:
                 # A step that is off as a whole is replaced over this, and costs nothing.
                 stack.enter_context(replaced(MAKER, stage, self._shared(stage, off, seconds)))
             yield

@@ -24,8 +24,8 @@ from torch_backend.freeze.frozen import FrozenGaussians
 FRAME = "frame"
 """Stage of the rules that decide each frame; all other stages make the instant."""
 STAGES = ("apply_static_baseline", "develop")
-"""Names in `torch_backend.freeze.instant.instants` of the steps that make an instant, in their order."""
-MAKER = "instant.instants"
+"""Names in `torch_backend.freeze.instant.repairs` of the steps that make an instant, in their order."""
+MAKER = "instant.repairs"
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,10 @@ _FILL = (
         switches=(Switch("composite.fill", "_agreed", _everywhere),),
     ),
     Rule("rough", "single pixels of a plate count", switches=(Switch("composite.fill", "_shown", _everywhere),)),
+    Rule(
+        "plate t*'s pixels", "plate t* gives residuals alone",
+        switches=(Switch("composite.fill", "_take_instant", _none),),
+    ),
     _number("sway", "no other time where something moves", sway_trust=0.0),
     _number("depth error", "plates are believed whatever the baseline", depth_error=0.0),
     _number("doubt", "what plates say is believed wholly", doubt=0.0),

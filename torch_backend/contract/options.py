@@ -588,6 +588,16 @@ class FreezeParams:
         True, flag="--no-grain", switch=True, help="leave the plate's grain out of the files: a third smaller"
     )
     """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
+    debug_terms: str = option(
+        "",
+        flag="--debug-terms",
+        metavar="DIR",
+        is_path=True,
+        words="not written",
+        help="for developers: write what decided where each pixel comes from into DIR, an EXR of named channels for "
+        "each frame; every frame is rendered anew",
+    )
+    """Folder for the terms behind each frame's decisions (`torch_backend/freeze/take/debug_terms.py`); empty: none."""
     device: str = option("auto", **DEVICE)
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 

@@ -40,6 +40,9 @@ class FrozenGaussians:
     descent: FrozenGaussians | None = None
     """A developed instant as it was before, row by row: the run's Gaussians at t*, which still move as the run moves
     them. None if it was not developed."""
+    origin: Tensor | None = None
+    """[N] uint8: 0 for a row that is the run's own, else the number of the repair that changed it last, counted from 1
+    in the order of `instant.repairs.repairs`. None: no repair was asked."""
 
 
 @dataclass

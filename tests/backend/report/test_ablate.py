@@ -69,7 +69,7 @@ def test_steps_that_variants_share_are_made_once(instants, clip):
 
         return count
 
-    with replaced("instant.instants", "develop", counted):
+    with replaced("instant.repairs", "develop", counted):
         today = instants.make(frozenset())
         assert instants.make(frozenset({next(n for n, r in RULES.items() if r.stage == FRAME)})).key == today.key
     assert made == {"develop": 1}

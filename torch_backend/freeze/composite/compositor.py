@@ -20,7 +20,7 @@ Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023,
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -38,7 +38,7 @@ from ..views.source_views import MovingOf, PlateReader, SourceViews
 from ..views.target_view import TargetView, target_view
 from .config import CompositeConfig
 from .fill import Fillers, Filling, fill, fillers_of
-from .primary_source import primary_matte, primary_plate
+from .primary_source import PrimaryMatte, primary_matte, primary_plate
 from .transfer import to_display, to_linear
 from .warp import sample
 
@@ -81,6 +81,8 @@ class CompositeFrame:
     """What `splat` and `color` are shown on."""
     depth_sigma: Tensor | None = None
     """As in `FrozenImage`."""
+    terms: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
+    """Name -> [h, w] at the size of decisions: what decided where each pixel comes from (`--debug-terms`)."""
 
     @property
     def color(self) -> Tensor:
@@ -137,10 +139,10 @@ class Compositor:
         target = target_view(self.seen, output, frozen, image, width, height)
         usable = [frame for frame in self.seen.frames if frame not in withheld]
         primary = primary_plate(self.seen, output, target, usable)
-        matte, st, own = primary_matte(self.seen, self.config, output, target, primary, usable, (width, height))
-        bars = self._keep_bars(matte, primary) if own and primary == output.frame else None
-        fillers = fillers_of(self.seen, self.config, target, matte, primary, usable)
-        made = self._mix_frame(target, primary, matte, st, own, fillers)
+        given = primary_matte(self.seen, self.config, output, target, primary, usable, (width, height))
+        bars = self._keep_bars(given.matte, primary) if given.is_identity and primary == output.frame else None
+        fillers = fillers_of(self.seen, self.config, target, given.matte, primary, usable)
+        made = self._mix_frame(target, primary, given, fillers)
         if bars is not None:  # they are shown as they are, at every instant
             made.support[bars], made.motion[bars] = 1.0, 0.0
         return made
@@ -172,12 +174,10 @@ class Compositor:
         self,
         target: TargetView,
         primary: int,
-        matte: Tensor,
-        st: Tensor,
-        own: bool,
+        given: PrimaryMatte,
         fillers: Fillers | None,
     ) -> CompositeFrame:
-        image = target.image
+        image, matte, st, own = target.image, given.matte, given.st, given.is_identity
         rows, columns = image.alpha.shape
         parts = bands(rows, columns)
         if len(parts) > 1:
@@ -190,6 +190,7 @@ class Compositor:
             torch.minimum(image.support, 1.0 - resized(target.unseen, columns, rows)),
             resized(target.moved, columns, rows), primary, st, matte, torch.zeros(rows, columns, 3, device="cpu"),
             self.scene.display,
+            terms={**given.terms, **_terms(target, fillers)},
         )  # fmt: skip
         for band in parts:
             filling = None if fillers is None else fill(self.seen, self.config, target, fillers, matte, band)
@@ -237,3 +238,12 @@ class Compositor:
         source[share <= 0.0] = 0.0
         made.plate[rows], made.source[rows] = share, source
         made.linear[rows] = fill if lead is None else torch.addcmul(fill, matte[..., None], lead)
+
+
+def _terms(target: TargetView, fillers: Fillers | None) -> dict[str, Tensor]:
+    """What a frame knows of its pixels, and which plates may fill them: see `CompositeFrame.terms`."""
+    terms = {name: getattr(target, name) for name in ("motion", "doubt", "moved", "unseen")}
+    if fillers is not None:
+        for n, frame in enumerate(fillers.chosen):
+            terms |= {f"shown.{frame}": fillers.shown[n], f"agreed.{frame}": fillers.agreed[n]}
+    return terms

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -15,8 +16,22 @@ from ..views.reproject import pixel_centres, project, resized, unproject
 from ..views.source_views import SourceViews
 from ..views.target_view import TargetView, parallax
 from .config import CompositeConfig
-from .state import evidence, let_go, log_odds
+from .state import Evidence, evidence, let_go, log_odds
 from .warp import snap
+
+
+@dataclass
+class PrimaryMatte:
+    """How much of each pixel the primary plate gives, and why."""
+
+    matte: Tensor
+    """[H, W] in 0..1."""
+    st: Tensor
+    """[H, W, 2] places in the primary plate, as `CompositeFrame.st`."""
+    is_identity: bool
+    """True if `st` is the identity: the frame is one of the clip's own."""
+    terms: Evidence = field(default_factory=dict[str, Tensor])
+    """What decided, [h, w] each: the evidence, its log-odds. Empty where the plate shows t* itself."""
 
 
 def primary_plate(source_views: SourceViews, output: OutputFrame, target: TargetView, usable: list[int]) -> int:
@@ -43,8 +58,8 @@ def primary_matte(
     primary: int,
     usable: list[int],
     size: tuple[int, int],
-) -> tuple[Tensor, Tensor, bool]:
-    """(matte [H, W] of the primary plate, its ST [H, W, 2], True if that is the identity).
+) -> PrimaryMatte:
+    """The primary plate's matte.
 
     Also settles `target.motion`: by the mattes of plate t* where that sees the point, else by the model's;
     `target.doubt`: what the primary plate shows wrongly others may, too, though their mattes do not say so;
@@ -65,15 +80,16 @@ def primary_matte(
     )
     st, within = _places(source_views, target, primary, own, size)
     if own and primary != output.frame:  # its own plate is withheld
-        return torch.zeros(rows, columns, device="cpu"), st, own
+        return PrimaryMatte(torch.zeros(rows, columns, device="cpu"), st, own)
     free = _free(source_views, target, primary) if own else None
     if own and primary == output.t_star:  # its own plate shows the instant itself
         if free is not None:
             target.moved = torch.maximum(target.motion, 1.0 - free)
             within = within * resized(free, columns, rows)
-        return within, st, own
+        return PrimaryMatte(within, st, own)
     of = evidence(source_views, target, primary, lead, truth, config.state)
-    target.doubt = let_go(log_odds(of, config.state, source_views.unit), config.state)
+    odds = log_odds(of, config.state, source_views.unit)
+    target.doubt = let_go(odds, config.state)
     matte = 1.0 - target.doubt
     if own:
         if free is not None:
@@ -82,7 +98,7 @@ def primary_matte(
     else:
         error = parallax(source_views, target, primary, target.depth, config.depth_error)
         matte = matte * lead.visible * torch.exp(-error.square())
-    return resized(matte, columns, rows) * within, st, own
+    return PrimaryMatte(resized(matte, columns, rows) * within, st, own, {**of, "log_odds": odds})
 
 
 def _unseen(

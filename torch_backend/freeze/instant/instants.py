@@ -20,12 +20,12 @@ from ...train import LoadedRun
 from ...train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from ..frozen import FrozenGaussians, freeze_at, span_of
 from ..views.source_views import motion_mattes
-from .develop import DevelopConfig, develop
-from .static_baseline import apply_static_baseline
+from .develop import DevelopConfig
+from .repairs import Moment, repaired, repairs
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 23
+VERSION = 24
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -169,16 +169,17 @@ def load_developed(
     support, motion = frozen.support.index_fill(0, closed, 1.0), frozen.motion.index_fill(0, closed, 0.0)
     before = FrozenGaussians(base, frozen.sh_degree, support, motion)
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
-    return FrozenGaussians(state, frozen.sh_degree, support, motion, before)
+    return FrozenGaussians(state, frozen.sh_degree, support, motion, before, tensors["origin"].to(device))
 
 
 def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
     """True if tensors of a file fit each other and the run: it may come from anywhere."""
     names = [f"{part}.{name}" for part in ("base", "state") for name in PARAM_NAMES]
-    closed = tensors.get("closed")
+    closed, origin, known = tensors.get("closed"), tensors.get("origin"), len(frozen.support)
     if closed is None or closed.dtype != torch.long or closed.dim() != 1 or not all(n in tensors for n in names):
         return False
-    known = len(frozen.support)
+    if origin is None or origin.dtype != torch.uint8 or origin.shape != (known,):
+        return False
     for name in names:
         like, value = frozen.state[name.partition(".")[2]], tensors[name]
         if value.dtype != like.dtype or value.shape != like.shape or not bool(value.isfinite().all()):
@@ -210,8 +211,7 @@ def _make(
     shot: Shot, run: LoadedRun, scene: Scene, t_star: int, frozen: FrozenGaussians, config: DevelopConfig,
     check: Callable[[int, int], None] | None = None,
 ) -> FrozenGaussians:  # fmt: skip
-    moving = motion_mattes(shot)
-    return develop(run, scene, apply_static_baseline(run, scene, frozen, t_star, moving), t_star, moving, config, check)
+    return repaired(frozen, Moment(run, scene, t_star, motion_mattes(shot), check), repairs(config))
 
 
 def _save(
@@ -221,10 +221,11 @@ def _save(
 
     OSError, or JobError where a link leads elsewhere.
     """
-    assert made.descent is not None
+    assert made.descent is not None and made.origin is not None
     path = developed_path(run, t_star)
     folder = shot.own(path.parent)
-    tensors = {"closed": torch.nonzero(made.descent.motion < field.motion).flatten()}
+    closed = torch.nonzero(made.descent.motion < field.motion).flatten()
+    tensors = {"closed": closed, "origin": made.origin}
     # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
     tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}

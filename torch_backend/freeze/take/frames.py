@@ -28,6 +28,7 @@ from ..composite.warp import WarpMetadata, write_warp
 from ..exr import DetailLayers, FrameMetadata, Made, write_frozen_exr
 from ..frozen import FrozenImage, OutputFrame, render_frozen
 from ..views.reproject import resized
+from .debug_terms import origin_terms, write_terms
 from .plan import FrameSpec, PlannedTake
 from .write_beside import WriteBeside
 
@@ -61,6 +62,7 @@ def _render_all(
     before_each: Callable[[], None] | None,
 ) -> dict[int, Tensor]:  # fmt: skip
     folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
+    done = done if spec.debug_terms is None else set()  # of frames that are there, nobody kept the terms
     shares: dict[int, Tensor] = {}
     with WriteBeside() as out:
         for n, output in enumerate(frames):
@@ -88,6 +90,9 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
     K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
     image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
     made = image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+    if spec.debug_terms is not None and isinstance(made, CompositeFrame):
+        h, w = made.terms["motion"].shape
+        made.terms |= origin_terms(frozen, output.viewmat, K, spec.whole, spec.beyond, (w, h))
     picture = _display(made, slice(None)) + (1.0 - made.alpha[..., None]) * 0.5
     made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture)
     return made
@@ -104,6 +109,8 @@ def _write(
     """All files of a frame. Each carries the frame's key, by which `take_folder.stored_key` tells a whole frame from
     files of two; the EXR comes last, so that readers who look for it alone find the others."""
     if isinstance(image, CompositeFrame):
+        if spec.debug_terms is not None:
+            write_terms(spec.debug_terms, output.frame, image.terms)
         _write_warp(folder, output, image, spec, key)
     _write_frame(folder, output, image, scene, spec, key)
 

@@ -71,6 +71,8 @@ class FrameSpec:
     """Identifies the plates and mattes that it uses; empty without it."""
     light: str = LIGHTS[0]
     """Primaries of the light in which frames leave, one of `LIGHTS`: the footage's own."""
+    debug_terms: Path | None = None
+    """Folder that gets the terms behind each frame's decisions; None: they are not written."""
     start: tuple[str, int, float] = ("", 0, 0.0)
     """Timecode of one of the clip's frames, that frame's number, and frames per second; no code: the clip has none."""
 
@@ -155,7 +157,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     spec = FrameSpec(
         run, instants, params.query, (width, height), beyond, grain, plate, FrameDepths(run, scene), detail,
         detail_key(shot, detail), footage_light(shot),
-        _start(shot),
+        Path(params.debug_terms) if params.debug_terms else None, _start(shot),
     )  # fmt: skip
     keys = {f.frame: spec.key(f) for f in whole}
     key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))

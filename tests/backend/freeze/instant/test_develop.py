@@ -23,6 +23,7 @@ from torch_backend.freeze.instant.instants import (
     developed_path,
     load_developed,
 )
+from torch_backend.freeze.instant.repairs import Moment, repaired, repairs
 from torch_backend.freeze.instant.static_baseline import StaticBaselineConfig, apply_static_baseline, with_still_means
 from torch_backend.freeze.instant.undersampled import undersampled
 from torch_backend.freeze.views.scene_flow import MovingScene, SceneFlow
@@ -30,6 +31,7 @@ from torch_backend.freeze.views.source_views import motion_mattes
 from torch_backend.freeze.views.working_plates import WorkingPlates
 from torch_backend.live import LiveSession
 from torch_backend.scene import load_scene, read_image
+from torch_backend.shot import Shot
 from torch_backend.solve.motion import load_motion
 from torch_backend.train import load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, read_meta, save_checkpoint
@@ -98,8 +100,22 @@ def same(one, other):
         and torch.equal(one.support, other.support)
         and torch.equal(one.motion, other.motion)
         and torch.equal(one.descent.motion, other.descent.motion)
+        and (one.origin is None if other.origin is None else torch.equal(one.origin, other.origin))
         and all(torch.equal(v, other.descent.state[n]) for n, v in one.descent.state.items())
     )
+
+
+def test_each_row_knows_what_repaired_it(made):
+    run, scene, frozen, now = made
+    steps = repairs(config_for(run))
+    changed = torch.zeros(len(frozen.support), dtype=torch.bool)
+    for name, value in frozen.state.items():
+        changed |= (now.state[name] != value).reshape(len(value), -1).any(1)
+    assert torch.equal(now.origin > 0, changed) and bool(changed.any())
+    moment = Moment(run, scene, T_STAR, motion_mattes(Shot(scene.folder.parent)))
+    assert same(repaired(frozen, moment, steps), now)
+    untouched = repaired(frozen, moment, [])
+    assert not bool(untouched.origin.any()) and untouched.state is frozen.state
 
 
 def test_a_scene_that_was_not_developed_travels_as_the_run_moves_it(trained, made):

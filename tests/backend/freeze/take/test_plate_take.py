@@ -21,6 +21,7 @@ from torch_backend.footage.display import ROLLED
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.composite.state import StateConfig, let_go
 from torch_backend.freeze.composite.warp import apply_warp, read_warp
 from torch_backend.freeze.exr import read_frozen_exr, read_key
 from torch_backend.raster import rasterize
@@ -51,6 +52,25 @@ def take(trained, quiet):
     world, _ = trained
     facts = freeze_shot(world.shot, FreezeParams(take="whole", **RANGE), quiet())
     return world.shot.take("whole"), facts
+
+
+def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
+    """`--debug-terms`: the same frames, rendered anew, and the log-odds give back the matte."""
+    world, _ = trained
+    before = files(take[0])
+    freeze_shot(world.shot, FreezeParams(take="whole", only_missing=True, debug_terms=str(tmp_path), **RANGE), quiet())
+    assert files(take[0]) == before
+    assert sorted(path.stem for path in tmp_path.iterdir()) == [f"{n:06d}" for n in range(103, 109)]
+    config = StateConfig()
+    for n in (103, 108):
+        image = oiio.ImageBuf(str(tmp_path / f"{n:06d}.exr"))
+        terms = dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), 2, 0), strict=True))
+        assert {"plate_matte", "change", "unseen", "agreed.105", "origin.develop"} <= terms.keys()
+        matte = read_warp(take[0] / "warp" / f"{n:06d}.exr").matte
+        kept = 1.0 - let_go(torch.from_numpy(terms["log_odds"]), config)
+        assert kept.shape == matte.shape and float(kept.min()) < 0.1 < float(kept.max())
+        np.testing.assert_allclose(np.asarray(matte), kept, atol=0.01)
+        assert 0.02 < terms["origin.develop"].mean() <= 1.0
 
 
 def test_a_frame_is_its_warp_over_the_plate(trained, take):
