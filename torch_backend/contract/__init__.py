@@ -320,6 +320,7 @@ from .verbs import (
     COMMANDS,
     INPUT,
     VERBS,
+    ExportWords,
     FarmWords,
     Verb,
 )
@@ -453,6 +454,7 @@ __all__ = [
     "Cancelled",
     "Event",
     "ExitCode",
+    "ExportWords",
     "FarmWords",
     "FrameLayer",
     "FreezeParams",
