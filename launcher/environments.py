@@ -136,7 +136,7 @@ def home() -> Path:
 
 def backend_environment(testing: bool = False) -> Environment:
     """The backend's environment, with the test tools on request."""
-    probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, safetensors, scipy"
+    probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, safetensors, scipy, pxr.Usd"
     names = ("backend", "test") if testing else ("backend",)
     return Environment("the backend", home() / ".venv", names, probe, BACKEND_DISK_GB, torch=True)
 

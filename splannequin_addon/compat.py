@@ -523,3 +523,18 @@ def remove_keys(datablock: _Animated, data_paths: Sequence[str]) -> None:
     if not any(len(curves) for curves in _curves(data)) and action.users == 1 + int(action.use_fake_user):
         data.action = None
         bpy.data.actions.remove(action)
+
+
+def usd_import_options() -> list[str]:
+    """Names of the switches of Blender's USD importer; none in a Blender without one."""
+    importers: Any = bpy.ops.wm
+    try:
+        return list(importers.usd_import.get_rna_type().properties.keys())
+    except (AttributeError, KeyError):  # built without USD
+        return []
+
+
+def splat_import_option() -> str:
+    """Name of the USD importer's switch for Gaussian splats, in a Blender that reads them; empty in any other."""
+    names = [name for name in usd_import_options() if name.startswith("import_")]
+    return next((name for name in names if "splat" in name or "particle_field" in name), "")

@@ -217,7 +217,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     import importlib.metadata
 
     facts: dict[str, Any] = {"python": sys.version.split()[0], "packages": {}}
-    for name in ("torch", "warp-lang", "pycolmap", "OpenImageIO", "av", "safetensors", "numpy", "scipy"):
+    for name in ("torch", "warp-lang", "pycolmap", "OpenImageIO", "av", "safetensors", "numpy", "scipy", "usd-core"):
         try:
             facts["packages"][name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -301,10 +301,16 @@ def status(args: argparse.Namespace, console: Console) -> int:
 
 
 def export(args: argparse.Namespace, console: Console) -> int:
-    """`export SHOT --output DIR`: cameras and points for other programs; prints what was written."""
-    from .solve.export import export_cameras
+    """`export SHOT --output DIR`: cameras, points and splats for other programs; prints what was written."""
+    words, shot, folder = contract.words_of(args), Shot.open(args.shot), Path(args.output).absolute()
+    if words.format in ("ply", "usd"):
+        from .freeze.take.splats import export_splats
 
-    written = export_cameras(Shot.open(args.shot), args.format, Path(args.output).absolute(), args.text)
+        written = export_splats(shot, words.format, folder, words.take, words.placement)
+    else:
+        from .solve.export import export_cameras
+
+        written = export_cameras(shot, words.format, folder, words.text, words.placement)
     for path in written:
         print(json.dumps({"written": str(path)}) if console.as_json else path, file=console.stream)
     return ExitCode.OK

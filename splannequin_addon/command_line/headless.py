@@ -135,9 +135,11 @@ def solve(args: argparse.Namespace, console: Console) -> int:
 
 
 def export(args: argparse.Namespace, console: Console) -> int:
-    """`export SHOT --output DIR`: cameras and points for other programs."""
+    """`export SHOT --output DIR`: cameras, points and splats for other programs."""
     output = Path(args.output).absolute()
-    asked = exchange.begin_export(Path(args.shot).absolute(), args.format, output, args.text)
+    words: contract.ExportWords = contract.words_of(args)
+    words.shot, words.output = str(Path(words.shot).absolute()), str(output)
+    asked = exchange.begin_export(words)
     console.say(exchange.exported(asked, output))
     return ExitCode.OK
 

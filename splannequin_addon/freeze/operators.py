@@ -11,7 +11,7 @@ from ..properties import IntProperty, StringProperty
 from ..shot import markers, selection
 from ..translations import tr
 from ..ui import pick_operators, step_operator
-from . import own_camera, takes, viewport
+from . import own_camera, splats, takes, viewport
 
 
 class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
@@ -167,8 +167,37 @@ class SPLANNEQUIN_OT_remove_take(pick_operators.Remove, bpy.types.Operator):
     name = StringProperty(name="Take", description="Name of the take to delete", options={"SKIP_SAVE"})
 
 
+class SPLANNEQUIN_OT_add_splats(bpy.types.Operator):
+    """Bring the frozen splats of the chosen take into the scene, under the shot's root, to place things among them.
+    They are not rendered unless you switch that on"""
+
+    bl_idname = "splannequin.add_splats"
+    bl_label = "Add Frozen Splats"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a take."""
+        folder = selection.shot_folder(scene_in(context))
+        state = job_timer.watch_of(folder).state if folder else None
+        if state is None or settings_of(scene_in(context)).take_name not in state.takes:
+            cls.poll_message_set(tr("Freeze first"))
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> Outcome:
+        """Adds them; in a window the timer reads the file, and the panel tells when they are there."""
+        scene = scene_in(context)
+        folder, take = selection.shot_folder(scene), settings_of(scene).take_name
+        if bpy.app.background or folder is None:
+            return step_operator.edit(self, context, "freeze", lambda scene, shot: splats.add(scene, shot, take))
+        job_timer.work(folder, "freeze", splats.added_in_turns(scene.session_uid, folder, take))
+        return {"FINISHED"}
+
+
 CLASSES = (
     SPLANNEQUIN_OT_freeze,
+    SPLANNEQUIN_OT_add_splats,
     SPLANNEQUIN_OT_t_star_here,
     SPLANNEQUIN_OT_t_star_marker,
     SPLANNEQUIN_OT_live,

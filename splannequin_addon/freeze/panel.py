@@ -8,7 +8,7 @@ from ..access import camera_of, layout_of, present, scene_in, settings_of
 from ..process import steps
 from ..shot import markers
 from ..translations import tr
-from ..ui import listing, step_panel
+from ..ui import icons, listing, step_panel
 from ..ui.sentences import wrap
 from . import viewport
 
@@ -79,6 +79,7 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
             listing.draw(body, "take", watch.state, settings_of(scene_in(context)).take_name)
             for told in watch.state.damaged["take"].values():
                 wrap(body, context, told, "ERROR")
+            body.operator("splannequin.add_splats", icon=icons.of("splannequin.add_splats"))
 
     def _live(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Scrubbing: on or off, what is shown, suggestions and why."""

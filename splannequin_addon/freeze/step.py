@@ -10,7 +10,7 @@ from ..access import settings_of
 from ..process import jobs
 from ..process.steps import Step, View
 from ..shot.shot_state import ShotState
-from . import hidden_points, operators, own_camera, panel, takes, viewport
+from . import hidden_points, operators, own_camera, panel, splats, takes, viewport
 
 if TYPE_CHECKING:
     import bpy
@@ -58,6 +58,10 @@ class Freeze(Step):
         if not settings_of(scene).choose_t_star:
             settings_of(scene).t_star = int(job.result["t_star_frame"])
         return []
+
+    def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
+        """Takes splats out of the file."""
+        return ["Splats were removed."] if splats.remove(scene, shot) else []
 
     def in_use(self, shot: Path, folder: Path) -> str:
         """A run that is scrubbed through."""

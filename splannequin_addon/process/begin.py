@@ -12,7 +12,7 @@ import bpy
 
 from ...torch_backend import contract
 from ..scene import scene_setup
-from ..shot import inventory, markers, selection
+from ..shot import inventory, markers, placement, selection
 from . import backend, jobs, steps
 
 
@@ -30,6 +30,7 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
         jobs.refuse_second_writer(folder)
         if steps.STEPS[step].makes_shot:
             inventory.create(folder)
+        placement.write(scene, folder)
         job = jobs.new_job(folder, steps.STEPS[step].kind, params)
         (job.folder / contract.STEP_FILE).write_text(step, encoding="utf-8")
         (job.folder / contract.SCENE_FILE).write_text(scene.name, encoding="utf-8")

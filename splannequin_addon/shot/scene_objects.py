@@ -13,13 +13,19 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import named, settings_of
-from ..properties import BoolProperty, FloatProperty, PointerProperty, StringProperty
+from ..properties import BoolProperty, CollectionProperty, FloatProperty, PointerProperty, StringProperty
 from ..scene import paths
 from ..scene.ownership import TAG
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""
 _KINDS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
+
+
+class SPLANNEQUIN_PG_splats(bpy.types.PropertyGroup):
+    """Splats of one take in the scene; its name is the take's."""
+
+    object = PointerProperty(name="Object", description="The splats of the take", type=bpy.types.Object)
 
 
 class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
@@ -38,6 +44,7 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
         description="Scene units per solve unit that the camera's height suggested; 0: none was guessed",
         options={"HIDDEN"},
     )
+    splats = CollectionProperty(name="Splats", description="Splats of takes", type=SPLANNEQUIN_PG_splats, options=set())
     collection = PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
     points_hidden_in = StringProperty(
         name="Points Hidden In",
@@ -115,6 +122,10 @@ def tidy(scene: bpy.types.Scene) -> None:
             item = getattr(entry, name)
             if item is not None and not _stands(item, [*own, scene.objects]):
                 setattr(entry, name, None)
+        for index in reversed(range(len(entry.splats))):
+            item = entry.splats[index].object
+            if item is None or not _stands(item, [*own, scene.objects]):
+                entry.splats.remove(index)
 
 
 def _stands(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:

@@ -141,23 +141,16 @@ def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------- out
 
 
-def begin_export(shot: Path, kind: str, folder: Path, text: bool = False) -> children.Question:
-    """Has the backend write a shot's cameras for other programs, without waiting.
-
-    Args:
-        shot: shot folder.
-        kind: colmap or nerfstudio.
-        folder: where to.
-        text: a COLMAP model as .txt.
+def begin_export(words: contract.ExportWords) -> children.Question:
+    """Has the backend write a shot's cameras or splats for other programs, without waiting.
 
     Raises:
         contract.JobError: there is no backend, or it cannot be started.
     """
-    words = ["export", str(shot.absolute()), "--format", kind, "--output", str(folder.absolute())]
-    return backend.ask(*words, *(["--text"] if text else []))
+    return backend.ask("export", *contract.said_of(words))
 
 
 def exported(asked: children.Question, folder: Path) -> str:
     """What an export has done, in words. JobError with the backend's own sentence if it failed."""
     asked.answer("{}")
-    return f"Cameras written to {folder}"
+    return f"Written to {folder}"

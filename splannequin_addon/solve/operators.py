@@ -9,10 +9,10 @@ from pathlib import Path
 import bpy
 
 from ...torch_backend import contract
-from ..access import Outcome, scene_in
+from ..access import Outcome, scene_in, settings_of
 from ..process import children, job_timer, steps
 from ..properties import BoolProperty, EnumProperty, IntProperty, StringProperty
-from ..shot import selection
+from ..shot import inventory, placement, selection
 from ..translations import tr
 from ..ui import step_operator
 from . import arrival, exchange, stmaps
@@ -21,11 +21,15 @@ FORMATS = [
     ("colmap", "COLMAP", "Cameras, images and points3D as .bin, of the plates in the shot's folder frames"),
     ("colmap_text", "COLMAP Text", "The same as .txt"),
     ("nerfstudio", "nerfstudio", "A transforms.json that points to the plates, and points.ply"),
+    ("chan", "Nuke Chan", "The animated camera as a table, in the scene's units and Nuke's axes: camera.chan"),
+    ("nk", "Nuke Script", "The animated camera with its lens as nodes to paste, in Nuke's axes: camera.nk"),
+    ("ply", "Splats", "The splats of the chosen take, where this scene has the shot: frozen.ply"),
+    ("usd", "USD", "The splats of the chosen take and the animated camera, where this scene has the shot: frozen.usdc"),
 ]
 
 
 class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
-    """Write the solved cameras and points of the undistorted frames for other programs"""
+    """Write the solved cameras and points of the undistorted frames, or the splats of a take, for other programs"""
 
     bl_idname = "splannequin.export_cameras"
     bl_label = "Export Cameras"
@@ -62,13 +66,20 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
             return {"CANCELLED"}
         folder = Path(os.path.abspath(bpy.path.abspath(self.directory)))
         kind, _, text = self.format.partition("_")
+        words = contract.ExportWords(shot=str(shot.absolute()), format=kind, text=bool(text), output=str(folder))
+        words.take = settings_of(scene_in(context)).take_name
         try:
-            asked = exchange.begin_export(shot, kind, folder, bool(text))
+            placement.write(scene_in(context), shot)
+            asked = exchange.begin_export(words)
             if bpy.app.background:
                 self.report({"INFO"}, exchange.exported(asked, folder))
                 return {"FINISHED"}
         except contract.JobError as error:
             self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
+            return {"CANCELLED"}
+        except OSError as error:
+            refusal = inventory.unwritable(shot, error, "Is the disk full, or the shot on a disk that is read only?")
+            self.report({"ERROR"}, f"{refusal.message} {refusal.hint}".strip())
             return {"CANCELLED"}
         job_timer.watch_of(shot).failures.pop("solve", None)
         job_timer.when_answered(asked, lambda: tell(shot, lambda: [exchange.exported(asked, folder)]))

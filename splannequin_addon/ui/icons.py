@@ -5,6 +5,7 @@ from __future__ import annotations
 from ..access import Icon
 
 OF: dict[str, Icon] = {
+    "splannequin.add_splats": "OUTLINER_OB_POINTCLOUD",
     "splannequin.align_floor": "GRID",
     "splannequin.align_origin": "OBJECT_ORIGIN",
     "splannequin.align_scale": "ARROW_LEFTRIGHT",

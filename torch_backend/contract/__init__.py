@@ -16,6 +16,8 @@
     picture_files   whether a picture or movie is whole
     writing         atomic files and folders
     camera_path     a pinhole camera over frames
+    placement       where a solve stands in Blender's scene
+    ply_header      the header of a file of splats
     live_messages   what Blender and a live session say to each other
     colour          a colour by which two programs know that they mean the same space, and the display of light
     frame_names     frame numbers in file names
@@ -212,6 +214,13 @@ from .path_rules import (
 from .picture_files import (
     is_whole_picture,
 )
+from .placement import (
+    Placement,
+    placement_of,
+)
+from .ply_header import (
+    read_ply_header,
+)
 from .processes import (
     GRACE_SECONDS,
     Process,
@@ -260,6 +269,7 @@ from .shot_folder import (
     NEXT_FOLDER,
     PAINTED_FOLDER,
     PICTURE,
+    PLY_FILE,
     POINTS_FILE,
     PREVIEWS_FOLDER,
     RAW_FOLDER,
@@ -274,6 +284,7 @@ from .shot_folder import (
     TAKE_UNDISTORT,
     TAKES_FOLDER,
     UNPUBLISHED_FILE,
+    USD_FILE,
     WRITER_FILE,
     RunFolder,
     ShotFolder,
@@ -309,6 +320,7 @@ from .verbs import (
     COMMANDS,
     INPUT,
     VERBS,
+    ExportWords,
     FarmWords,
     Verb,
 )
@@ -396,6 +408,7 @@ __all__ = [
     "PAINTED_FOLDER",
     "PARAMS",
     "PICTURE",
+    "PLY_FILE",
     "POINTS_FILE",
     "PRESET_STEPS",
     "PRESET_WIDTHS",
@@ -431,6 +444,7 @@ __all__ = [
     "TAKE_UNDISTORT",
     "TORCH_INDEX",
     "UNPUBLISHED_FILE",
+    "USD_FILE",
     "VERBS",
     "VERDICT_WORDS",
     "WORK",
@@ -440,6 +454,7 @@ __all__ = [
     "Cancelled",
     "Event",
     "ExitCode",
+    "ExportWords",
     "FarmWords",
     "FrameLayer",
     "FreezeParams",
@@ -451,6 +466,7 @@ __all__ = [
     "MissingError",
     "NumberedFiles",
     "Option",
+    "Placement",
     "Process",
     "Reporter",
     "RunFolder",
@@ -528,6 +544,7 @@ __all__ = [
     "parse_timecode",
     "path_digest",
     "path_error",
+    "placement_of",
     "png_size",
     "printable",
     "process",
@@ -538,6 +555,7 @@ __all__ = [
     "read_json",
     "read_lines",
     "read_message",
+    "read_ply_header",
     "read_writer",
     "readable_stem",
     "record_packages",

@@ -40,6 +40,14 @@ DEVICES = ("auto", "cpu", "cuda")
 
 _FRAMES = ((1 << 31) - 1) * 1.0
 _PRESET = {0: "the preset's"}
+PLACEMENT: dict[str, Any] = {
+    "flag": "--placement",
+    "metavar": "FILE",
+    "is_path": True,
+    "help": "JSON that says where the solve stands in the scene for which splats and cameras leave",
+    "words": "as Blender wrote it into the shot; without that upright, in solve units",
+}
+"""The option that freezing and exporting have."""
 DEVICE: dict[str, Any] = {
     "flag": "--device",
     "choices": DEVICES,
@@ -582,6 +590,8 @@ class FreezeParams:
     )
     """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
     lens needs. `width` is that of the frame without it."""
+    placement: str = option("", **PLACEMENT)
+    """JSON file of a `Placement`, by which frozen.ply and frozen.usdc leave; empty: the shot's own, else upright."""
     only_missing: bool = option(False, always=True)
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
     grain: bool = option(

@@ -10,6 +10,7 @@ solve/ignore/, solve/people/     masks that the solve was given, undistorted; ma
 runs/NAME/                       a run: `RunFolder`
 takes/NAME/                      frozen frames: `TakeFolder`
 jobs/ID/                         requests and what became of them: `jobs`
+placement.json                   where the solve stands in Blender's scene
 paths/, tracking/                cameras that Blender sent
 farm/                            what tasks of a render farm took
 trash/                           what was removed and is being deleted
@@ -28,6 +29,8 @@ from .files import checked_name, frame_file, is_link
 SHOT_SUFFIX = ".splannequin"
 """Of a shot folder's own name."""
 INFO_FILE, WRITER_FILE = "shot.json", "lock.json"
+PLACEMENT_FILE = "placement.json"
+"""Where the solve stands in Blender's scene, a `Placement`."""
 FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER = "frames", "solve", "runs", "takes", "jobs"
 FRAMES_FILE, RAW_FOLDER, BURNT_IN_FILE = "frames.json", "raw", "burnt_in.png"
 UNPUBLISHED_FILE = "unpublished.json"
@@ -49,6 +52,8 @@ PREVIEWS_FOLDER, NEXT_FOLDER, DEVELOPED_FOLDER = "previews", "next", "developed"
 TAKE_FILE, TAKE_STATE_FILE = "take.json", "state.json"
 TAKE_PREVIEW_FOLDER, WARP_FOLDER, TAKE_NEXT_FOLDER = "preview", "warp", ".next"
 CONTACT_SHEET_FILE, VIDEO_FILE, PLY_FILE = "contact_sheet.png", "video.mp4", "frozen.ply"
+USD_FILE = "frozen.usdc"
+"""Of a take: the splats and the animated camera."""
 TAKE_REDISTORT = Path("stmap") / "redistort.exr"
 """Of a take with overscan: the way back through the lens."""
 TAKE_UNDISTORT = Path("stmap") / "undistort.exr"
@@ -58,7 +63,7 @@ FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER = "farm", "trash", "tra
 REPLACED_FOLDER = "replaced"
 SHOT_NAMES = frozenset({
     INFO_FILE, WRITER_FILE, FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER, PAINTED_FOLDER,
-    DRAWN_FOLDER, FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER, REPLACED_FOLDER,
+    DRAWN_FOLDER, FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER, REPLACED_FOLDER, PLACEMENT_FILE,
 })  # fmt: skip
 """All that lies in a shot folder."""
 PICTURE, LAYERS, SURFACE = ".png", ".exr", ".npz"
@@ -175,6 +180,11 @@ class ShotFolder:
     def live_log(self) -> Path:
         """What the last live session complained of."""
         return self.jobs / LIVE_LOG
+
+    @property
+    def placement(self) -> Path:
+        """Where the solve stands in Blender's scene, as Blender wrote it last."""
+        return self.root / PLACEMENT_FILE
 
     @property
     def lock(self) -> Path:
@@ -332,6 +342,11 @@ class TakeFolder:
     def ply(self) -> Path:
         """The frozen Gaussians, for other programs."""
         return self.root / PLY_FILE
+
+    @property
+    def usd(self) -> Path:
+        """The frozen Gaussians and the camera, as one USD stage."""
+        return self.root / USD_FILE
 
     @property
     def redistort(self) -> Path:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from .option_table import option
-from .options import DEVICE, PARAMS, FreezeParams, ImportParams, SolveParams, TrainParams
+from .options import DEVICE, PARAMS, PLACEMENT, FreezeParams, ImportParams, SolveParams, TrainParams
 
 BACKEND, BLENDER = "backend", "Blender"
 """The sides that have a command line."""
@@ -115,12 +115,29 @@ class MapWords:
 
 @dataclass
 class ExportWords:
-    """A shot's cameras for other programs."""
+    """A shot's cameras and splats for other programs."""
 
     shot: str = option("", flag="shot", help="shot folder")
     """Shot folder."""
-    format: str = option("colmap", flag="--format", choices=("colmap", "nerfstudio"), help="what to write")
-    """colmap or nerfstudio."""
+    format: str = option(
+        "colmap",
+        flag="--format",
+        choices=("colmap", "nerfstudio", "chan", "nk", "ply", "usd"),
+        help="`colmap`, `nerfstudio`: the solve; `chan`, `nk`: the animated camera for Nuke; `ply`: the splats of a "
+        "take; `usd`: the splats and the animated camera",
+    )
+    """colmap, nerfstudio, chan or nk: cameras; ply: the splats of a take; usd: both."""
+    take: str = option(
+        "freeze",
+        flag="--take",
+        metavar="NAME",
+        help="take whose splats are written",
+        heeded_with=("format", ("ply", "usd")),
+    )
+    """Name of the take."""
+    placement: str = option("", **PLACEMENT)
+    """JSON file of a `Placement`; empty: the shot's own, else upright. colmap and nerfstudio are moved only if it is
+    named."""
     text: bool = option(
         False,
         flag="--text",
@@ -315,7 +332,7 @@ VERBS: dict[str, Verb] = {
     "take": Verb("`freeze SHOT`", ShotWords, {"freeze": FreezeParams}, (BACKEND,), now="freeze"),
     "bake": Verb("a take through the compositor: DIR/composited and DIR/shot.blend", BakeWords, sides=(BLENDER,)),
     "stmaps": Verb("ST maps of the lens, both ways, into the shot's solve folder", MapWords),
-    "export": Verb("cameras and points of a solved shot for other programs", ExportWords),
+    "export": Verb("cameras, points and splats of a shot for other programs", ExportWords),
     "status": Verb("jobs of a shot", ShotWords),
     "farm": Verb("a job for a render farm, as Open Job Description, and what it will cost", FarmWords, PARAMS),
     "farm-task": Verb("one task of such a job (what the farm starts)", TaskWords, sides=(BACKEND,), json=False),

@@ -14,18 +14,11 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..contract import LONGEST_CHECKPOINT, open_regular
+from ..contract import LONGEST_CHECKPOINT, open_regular, read_ply_header
 from ..shot import atomic_path
 
 SH_BASES = (1, 4, 9, 16)
 """K for SH degrees 0 to 3."""
-
-_PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
-    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
-    "double": "<f8", "float64": "<f8",
-}  # fmt: skip
-_MAX_HEADER_LINES = 1000
 
 
 class PlyGaussians(NamedTuple):
@@ -106,7 +99,7 @@ def read_ply(path: str | Path) -> PlyGaussians:
     """
     path = Path(path)
     with open_regular(path, LONGEST_CHECKPOINT) as handle:
-        count, layout = _read_header(handle, path)
+        count, layout = vertex_layout(handle, path)
         need, available = count * layout.itemsize, os.fstat(handle.fileno()).st_size - handle.tell()
         if available < need:
             raise ValueError(f"{path}: cut short, {count} Gaussians need {need} bytes and {available} are there")
@@ -152,31 +145,7 @@ def _check(gaussians: PlyGaussians, where: str = "") -> None:
             raise ValueError(f"{where}{name} of {bad} Gaussians is not finite")
 
 
-def _read_header(handle: BinaryIO, path: Path) -> tuple[int, np.dtype]:
-    """Number of vertices and the layout of one; leaves the handle at the first vertex."""
-    if handle.readline(16).strip() != b"ply":
-        raise ValueError(f"{path}: not a PLY file")
-    count: int | None = None
-    fields: list[tuple[str, str]] = []
-    element = ""
-    for _ in range(_MAX_HEADER_LINES):
-        words = handle.readline(1024).decode("ascii", errors="replace").split()
-        match words:
-            case ["format", "binary_little_endian", _] | ["comment", *_] | ["obj_info", *_]:
-                pass
-            case ["format", kind, *_]:
-                raise ValueError(f"{path}: format {kind}; only binary_little_endian is read")
-            case ["element", name, number] if number.isdecimal():
-                if count is None and name != "vertex":
-                    raise ValueError(f"{path}: element {name} comes before the vertices")
-                element, count = name, int(number) if name == "vertex" else count
-            case ["property", kind, name] if kind in _PLY_TYPES:
-                if element == "vertex":
-                    fields.append((name, _PLY_TYPES[kind]))
-            case ["property", "list", *_] if element != "vertex":
-                pass
-            case ["end_header"] if count is not None and len({name for name, _ in fields}) == len(fields) > 0:
-                return count, np.dtype(fields)
-            case _:
-                raise ValueError(f"{path}: bad line in the PLY header: {' '.join(words)[:80]!r}")
-    raise ValueError(f"{path}: the PLY header does not end within {_MAX_HEADER_LINES} lines")
+def vertex_layout(handle: BinaryIO, path: Path) -> tuple[int, np.dtype]:
+    """Number of vertices and the layout of one; leaves the handle at the first vertex. ValueError as `read_ply`."""
+    count, fields = read_ply_header(handle, path)
+    return count, np.dtype(fields)

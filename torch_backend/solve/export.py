@@ -1,11 +1,13 @@
-"""The solve for other programs: a COLMAP model or a nerfstudio transforms.json of the undistorted frames.
+"""The solve for other programs: a COLMAP model, a nerfstudio transforms.json, or a camera for Nuke.
 
 No pictures are copied: a COLMAP model names the plates as they are called in the shot's frames/, a transforms.json
-points there. World, axes and units are the solve's.
+points there. Both are the solve as it is, so that what goes out can come back in, unless a placement is named. The
+camera for Nuke is where the shot stands in Blender's scene.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any
@@ -16,31 +18,43 @@ from numpy.typing import NDArray
 from ..contract import PICTURE, CameraPath, ExitCode, JobError, UserError, frame_file
 from ..shot import Shot, write_atomic, write_json
 from .colmap_files import PARTS, ColmapCamera, ColmapImage, ColmapModel, ColmapPoints, write_model
+from .nuke import chan_text, nk_text
+from .placement import Similarity, path_viewmats, placement_for
 from .stored import load_cameras, load_points
 
-FORMATS = ("colmap", "nerfstudio")
+FORMATS = ("colmap", "nerfstudio", "chan", "nk")
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False) -> list[Path]:
+def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False, placement: str = "") -> list[Path]:
     """Writes the cameras and points of a solved shot for other programs.
 
     Args:
         shot: a solved shot.
         kind: of `FORMATS`. colmap: cameras, images and points3D, PINHOLE. nerfstudio: transforms.json and points.ply.
+            chan, nk: the animated camera in Nuke's axes, camera.chan or camera.nk.
         folder: where to; made if it is not there.
         text: a COLMAP model as .txt instead of .bin.
+        placement: see `placement_for`; of colmap and nerfstudio, empty leaves the solve's own axes and units.
 
     Returns:
         The files written.
 
     Raises:
-        ValueError: another format.
+        ValueError: another format, or `placement` holds none.
         JobError: the shot is not solved, or the folder holds a model that would be read instead of this one.
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
     path, points = load_cameras(shot), load_points(shot)
+    where = Similarity.of(placement_for(shot, placement))
+    if kind in ("chan", "nk"):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / f"camera.{kind}"
+        write_atomic(file, (chan_text if kind == "chan" else nk_text)(path, where, shot.info().name).encode())
+        return [file]
+    if placement:
+        path, points = moved(path, where), {**points, "xyz": where.points(points["xyz"])}
     if kind == "nerfstudio":
         return _write_transforms(shot, path, points, folder)
     other = [folder / (part + (".bin" if text else ".txt")) for part in PARTS]
@@ -50,6 +64,13 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False) -> l
             f"{folder} holds another COLMAP model already ({existing.name}).", "Choose another folder.", ExitCode.USAGE
         )
     return write_model(folder, _model(path, points), text)
+
+
+def moved(path: CameraPath, where: Similarity) -> CameraPath:
+    """A camera path of solve units, as its cameras stand in the scene."""
+    viewmats = where.viewmats(path_viewmats(path))
+    frames = [dataclasses.replace(f, viewmat=v.ravel().tolist()) for f, v in zip(path.frames, viewmats, strict=True)]
+    return dataclasses.replace(path, frames=frames)
 
 
 def _model(path: CameraPath, points: dict[str, NDArray[Any]]) -> ColmapModel:

@@ -23,24 +23,25 @@ from ...contract import (
 )
 from ...footage.images import read_png
 from ...gaussians.ply import write_ply
-from ...scene import Scene
 from ...shot import Shot, disk_error, is_disk_full, remove_file, write_json
+from ...solve.placement import Similarity, placement_for
 from ...solve.stmap import write_take_map
 from ...torch_types import from_numpy
 from ..exr import read_frozen_exr
-from ..frozen import FrozenGaussians, OutputFrame
+from ..frozen import OutputFrame
 from .cameras import in_range, intrinsics
 from .contact_sheet import write_contact_sheet
 from .folder import clear, made_before, place_of, take_over
 from .footage_facts import footage_facts
 from .frames import make_ready, render_frames, small_share
 from .plan import FrameSpec, PlannedTake, planned, run_verdict
+from .splats import camera_path_of, placed_splats, write_stage
 from .verdict import judge_take, unsure
 from .video import write_video
 
 
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
-    """Renders a take of a run and writes EXRs, previews, contact sheet, video and PLY into takes/<name>.
+    """Renders a take of a run and writes EXRs, previews, contact sheet, video and splats into takes/<name>.
 
     Returns the take's figures (also in take.json). JobError in words if it cannot be done.
     """
@@ -70,7 +71,7 @@ def finish(
     shot: Shot, params: FreezeParams, take: PlannedTake, frames: list[OutputFrame], shares: dict[int, Tensor],
     report: Reporter,
 ) -> dict[str, Any]:  # fmt: skip
-    """Contact sheet, video, PLY and take.json of all frames that the take has by now; they are on disk.
+    """Contact sheet, video, splats and take.json of all frames that the take has by now; they are on disk.
 
     Returns what take.json holds. `shares` as `render_frames` gives them. JobError if the disk is full.
     """
@@ -102,10 +103,13 @@ def _finish(
         note = write_video(folder.video, (read_png(p) for p in previews), info.fps or 24.0)
         if note:
             report.warning(note)
-    report.progress("finishing the take", 2, 3, "PLY")
-    frozen = spec.instants.at(float(t_star), report)
+    report.progress("finishing the take", 2, 3, "splats")
+    placement = placement_for(shot, params.placement)
+    splats = placed_splats(spec.instants.at(float(t_star), report), scene, Similarity.of(placement))
     with missable("PLY", report):
-        _write_ply(folder.ply, frozen, scene)
+        write_ply(folder.ply, *splats)
+    with missable("USD stage", report):
+        write_stage(folder.usd, splats, camera_path_of(shot, params.camera_path), placement, info.fps, report)
     redistort = _redistort(shot, folder, size, spec.beyond, intrinsics(frames), report)
     facts = {
         "version": 1,
@@ -136,6 +140,8 @@ def _finish(
         "contact_sheet": str(folder.contact_sheet),
         "video": str(folder.video),
         "ply": str(folder.ply),
+        "usd": str(folder.usd) if folder.usd.is_file() else "",
+        "placement": placement.to_json(),
         **made_of,
         **({} if verdict is None else {"verdict": vars(verdict)}),
     }
@@ -200,17 +206,6 @@ def _contact_sheet(
     write_contact_sheet(
         path, plates if own_poses else None, previews, numbers, title, mark=t_star, note=note, unsure=doubt
     )
-
-
-def _write_ply(path: Path, frozen: FrozenGaussians, scene: Scene) -> None:
-    """The frozen instant in solve units, as every splat viewer reads it."""
-    s = {name: value.cpu() for name, value in frozen.state.items()}
-    means = s["means"].double() / scene.scale + from_numpy(scene.centre)
-    sh = torch.cat([s["sh0"], s["shN"]], dim=1)
-    write_ply(
-        path, means.float().numpy(), s["quats"].numpy(), (s["log_scales"] - float(np.log(scene.scale))).numpy(),
-        s["opacity_logits"].numpy(), sh.numpy(),
-    )  # fmt: skip
 
 
 def detail_facts(shares: dict[int, Tensor]) -> dict[str, Any]:

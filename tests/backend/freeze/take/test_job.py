@@ -159,7 +159,7 @@ def test_what_a_take_leaves(trained, takes):
     ply = read_ply(folder / "frozen.ply")
     kept = load_checkpoint(world.shot.run("main") / "developed" / "000105.safetensors")[0]
     assert facts["developed"] == [105] and len(ply.means) == len(kept["state.means"]), "the developed instant"
-    assert np.median(ply.means[:, 2]) == pytest.approx(4.0, rel=0.1)
+    assert np.median(ply.means[:, 1]) == pytest.approx(4.0, rel=0.1), "upright: ahead is y"
 
 
 def test_query_nearest_is_the_plain_one_where_everything_is_supported(trained):

@@ -1,0 +1,302 @@
+"""The splats of a take in Blender's scene, under the shot's root: one object a take.
+
+Where Blender's USD importer knows splats it brings them in. Elsewhere they are a mesh of loose vertices with their
+colours, opacities, sizes and rotations as attributes, shown as coloured points by a modifier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...torch_backend import contract
+from .. import compat
+from ..access import mesh_of, named, present
+from ..process import job_timer
+from ..scene import session
+from ..scene.ownership import TAG
+from ..shot import inventory, placement, scene_objects
+
+SHOWN_AS = "Splannequin Splats"
+"""Name of the node group and of the material that show splats."""
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic: a colour is 0.5 + SH_C0 * f_dc, display sRGB."""
+CHUNK = 1 << 16
+"""Splats read in a turn of the timer: 16 MB of the largest, 10 ms from a warm disk."""
+_NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+           "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
+
+
+def add(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
+    """Brings the splats of a take into a scene at once; what was there of that take is replaced. Returns what was done.
+
+    JobError if the take has none, or the shot does not stand in the scene. Then the scene is as it was.
+    """
+    for _ in adding(scene.session_uid, shot, take):
+        pass
+    return [_done(take)]
+
+
+def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:
+    """The same for the timer: part of the file, or one attribute, a turn. Keeps nothing of bpy between two turns."""
+    scene = _scene(scene_uid)
+    facts = _facts(scene, shot, take)
+    del scene
+    folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
+    option = compat.splat_import_option()
+    if option and folder.usd.is_file() and import_natively(_scene(scene_uid), shot, take, option, facts):
+        return
+    columns = yield from reading(folder.ply)
+    name = f"{scene_objects.name_of(shot)} {take} splats"
+    mesh = bpy.data.meshes.new(name)
+    called = mesh.name
+    try:
+        mesh.vertices.add(len(columns["x"]))
+        for attribute in attributes(columns):
+            del mesh
+            yield None
+            mesh = present(named(bpy.data.meshes, called))  # an undo may have taken it away
+            _set(mesh, *attribute)
+        scene = _scene(scene_uid)
+        _facts(scene, shot, take)
+    except BaseException:
+        left = named(bpy.data.meshes, called)
+        if left is not None:
+            bpy.data.meshes.remove(left)
+        raise
+    _show(scene, shot, take, mesh, facts)
+
+
+def added_in_turns(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:
+    """`adding` in a window: an undo step of its own, and a note on the panel."""
+    yield from adding(scene_uid, shot, take)
+    job_timer.watch_of(shot).notes["freeze"] = [_done(take)]
+    job_timer.undo_step("freeze")
+    job_timer.redraw()
+
+
+def _done(take: str) -> str:
+    return f"The splats of take {take} are in the scene, under the shot's root."
+
+
+def _scene(scene_uid: int) -> bpy.types.Scene:
+    scene = session.scene_of(scene_uid)
+    if scene is None:
+        raise contract.JobError("The scene is not there any more.", "", contract.ExitCode.USAGE)
+    return scene
+
+
+def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
+    """take.json of a take whose splats can be added. JobError says what is missing."""
+    facts = inventory.read(shot).takes.get(take)
+    if facts is None or not contract.TakeFolder(contract.ShotFolder(shot).take(take)).ply.is_file():
+        raise contract.JobError(f"Take {take} has no splats.", "Freeze first.", contract.ExitCode.USAGE)
+    if scene_objects.part(scene, shot, "root") is None:
+        raise contract.JobError("The solve is not in this scene.", "Load the camera first.", contract.ExitCode.USAGE)
+    return facts
+
+
+# ------------------------------------------------------------------------------------------------- the file
+
+
+def reading(path: Path) -> Generator[job_timer.Progress, None, dict[str, np.ndarray]]:
+    """Reads a 3DGS PLY in chunks; returns property -> float32 values of all vertices.
+
+    ValueError if it is no such PLY or is cut short.
+    """
+    with contract.open_regular(path, contract.LONGEST_CHECKPOINT) as handle:
+        count, fields = contract.read_ply_header(handle, path)
+        layout = np.dtype(fields)
+        missing = [name for name in _NEEDED if name not in (layout.names or ())]
+        if missing:
+            raise contract.UserError(f"{path}: not a 3D Gaussian PLY, the vertices have no {', '.join(missing[:4])}")
+        parts: list[dict[str, np.ndarray]] = []
+        for first in range(0, max(count, 1), CHUNK):
+            wanted = min(CHUNK, count - first)
+            rows = np.frombuffer(handle.read(wanted * layout.itemsize), dtype=np.uint8)
+            if len(rows) < wanted * layout.itemsize:
+                raise contract.UserError(f"{path} is cut short: freeze again.")
+            vertices = rows.view(layout)
+            parts.append({name: vertices[name].astype(np.float32) for name in _NEEDED})
+            done = first + wanted
+            if done < count:
+                yield job_timer.Progress(f"Reading splats, {done} of {count}", done, count)
+    return {name: np.concatenate([part[name] for part in parts]) for name in _NEEDED}
+
+
+def attributes(columns: dict[str, np.ndarray]) -> Iterator[tuple[str, str, np.ndarray]]:
+    """(name, type, values) of what a splat's vertex carries, the place first.
+
+    Col: scene-linear colour from all sides alike, and opacity as its alpha. opacity: 0 to 1. scale: standard deviations
+    along its axes, in the object's units. rotation: unit quaternion wxyz. radius: of a ball of the same volume.
+    """
+
+    def stacked(*names: str) -> np.ndarray:
+        return np.stack([columns[name] for name in names], axis=1)
+
+    opacity = 1.0 / (1.0 + np.exp(-columns["opacity"].astype(np.float64)))
+    display = np.clip(0.5 + SH_C0 * stacked("f_dc_0", "f_dc_1", "f_dc_2").astype(np.float64), 0.0, 1.0)
+    light = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    logs = stacked("scale_0", "scale_1", "scale_2").astype(np.float64)
+    quats = stacked("rot_0", "rot_1", "rot_2", "rot_3").astype(np.float64)
+    yield "position", "FLOAT_VECTOR", stacked("x", "y", "z")
+    yield "Col", "FLOAT_COLOR", np.concatenate([light, opacity[:, None]], axis=1)
+    yield "opacity", "FLOAT", opacity
+    yield "scale", "FLOAT_VECTOR", np.exp(logs)
+    length = np.sqrt((quats**2).sum(axis=1, keepdims=True))
+    yield (
+        "rotation",
+        "QUATERNION",
+        np.where(length > 0, quats / np.where(length > 0, length, 1.0), [1.0, 0.0, 0.0, 0.0]),
+    )
+    yield "radius", "FLOAT", np.exp(logs.mean(axis=1))
+
+
+def _set(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None:
+    """Gives the vertices of a mesh an attribute."""
+    attribute: Any = named(mesh.attributes, name) or mesh.attributes.new(name, kind, "POINT")  # pyright: ignore[reportArgumentType]
+    field = {"FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color"}.get(kind, "value")
+    if len(values):
+        attribute.data.foreach_set(field, np.ascontiguousarray(values, dtype=np.float32).ravel())
+
+
+# ------------------------------------------------------------------------------------------------- the scene
+
+
+def _show(scene: bpy.types.Scene, shot: Path, take: str, mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:
+    """Puts a finished mesh into the scene, in the place of the object of before."""
+    mesh.update()
+    mesh.materials.append(_material())
+    item = bpy.data.objects.new(mesh.name, mesh)
+    modifier: Any = item.modifiers.new(SHOWN_AS, "NODES")
+    modifier.node_group = _node_group()
+    item.hide_render = True  # else a bake would have them before the plate
+    _keep(scene, shot, take, [item], facts)
+
+
+def _keep(scene: bpy.types.Scene, shot: Path, take: str, items: list[bpy.types.Object], facts: dict[str, Any]) -> None:
+    """Hangs objects that stand in the take's placement on the shot's root, and remembers the first."""
+    remove(scene, shot, take)
+    root, entry = present(scene_objects.part(scene, shot, "root")), scene_objects.new(scene, shot)
+    stands = placement.in_solve(contract.placement_of(facts))
+    for item in items:
+        for collection in item.users_collection:
+            collection.objects.unlink(item)
+        present(entry.collection).objects.link(item)
+        if item.parent is None:
+            item.parent, item.matrix_parent_inverse = root, Matrix()
+            item.matrix_basis = stands @ item.matrix_basis
+    kept = entry.splats.add()
+    kept.name, kept.object = take, items[0]
+
+
+def import_natively(
+    scene: bpy.types.Scene, shot: Path, take: str, option: str, facts: dict[str, Any]
+) -> bpy.types.Object | None:
+    """Brings in a take's USD stage by Blender's importer, cameras aside; None if no object came of it.
+
+    Args:
+        scene: the context's scene.
+        shot: shot folder.
+        take: name of the take; it has a USD stage.
+        option: the importer's switch for splats.
+        facts: its take.json.
+    """
+    known = {item.session_uid for item in bpy.data.objects}
+    file = contract.TakeFolder(contract.ShotFolder(shot).take(take)).usd
+    switches: dict[str, Any] = {option: True, "import_cameras": False, "set_frame_range": False}
+    switches |= {name: False for name in ("apply_unit_conversion_scale",) if name in compat.usd_import_options()}
+    bpy.ops.wm.usd_import(filepath=contract.regular_file(file, contract.LONGEST_CHECKPOINT), **switches)
+    fresh = [item for item in bpy.data.objects if item.session_uid not in known]
+    filled = [item for item in fresh if item.data is not None]
+    if not filled:
+        bpy.data.batch_remove(fresh)
+        return None
+    for item in fresh:
+        item.hide_render = True
+    _keep(scene, shot, take, [filled[0], *(item for item in fresh if item != filled[0])], facts)
+    return filled[0]
+
+
+def find(scene: bpy.types.Scene, shot: Path, take: str) -> bpy.types.Object | None:
+    """The object of a take's splats, if the scene still has it."""
+    entry = scene_objects.of(scene, shot)
+    kept = next((one for one in entry.splats if one.name == take), None) if entry is not None else None
+    item = kept.object if kept is not None else None
+    return item if item is not None and named(scene.objects, item.name) == item else None
+
+
+def remove(scene: bpy.types.Scene, shot: Path, take: str | None = None) -> bool:
+    """Takes the splats of a take, or of all takes of a shot, out of the file. True if there were some."""
+    entry, found = scene_objects.of(scene, shot), False
+    for index in reversed(range(len(entry.splats) if entry is not None else 0)):
+        kept = present(entry).splats[index]
+        if take is not None and kept.name != take:
+            continue
+        item = kept.object
+        present(entry).splats.remove(index)
+        if item is None or (item.users_scene and scene not in item.users_scene):
+            continue
+        found = True
+        data = mesh_of(item) if item.type == "MESH" else None
+        bpy.data.objects.remove(item)
+        if data is not None and data.users <= int(data.use_fake_user):
+            bpy.data.meshes.remove(data)
+    return found
+
+
+def _material() -> bpy.types.Material:
+    """The material of splats: they shine in their own colour, as clear as they are opaque. Made once a file."""
+    kept = next((m for m in bpy.data.materials if m.get(TAG) == SHOWN_AS), None)
+    if kept is not None:
+        return kept
+    material = bpy.data.materials.new(SHOWN_AS)
+    material[TAG] = SHOWN_AS
+    if material.node_tree is None:  # until 5.0
+        material.use_nodes = True
+    tree = present(material.node_tree)
+    tree.nodes.clear()
+    colour: Any = tree.nodes.new("ShaderNodeAttribute")
+    colour.attribute_name = "Col"
+    shine, clear, mix = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("Emission", "BsdfTransparent", "MixShader"))
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    for place, node in enumerate((colour, shine, clear, mix, output)):
+        node.location = (200.0 * place, 0.0 if node != clear else -150.0)
+    tree.links.new(shine.inputs["Color"], colour.outputs["Color"])
+    tree.links.new(mix.inputs[0], colour.outputs["Alpha"])
+    tree.links.new(mix.inputs[1], clear.outputs[0])
+    tree.links.new(mix.inputs[2], shine.outputs[0])
+    tree.links.new(output.inputs["Surface"], mix.outputs[0])
+    return material
+
+
+def _node_group() -> bpy.types.NodeTree:
+    """The modifier that makes points of the vertices, as large as the splats. Made once a file."""
+    kept = next((g for g in bpy.data.node_groups if g.get(TAG) == SHOWN_AS), None)
+    if kept is not None:
+        return kept
+    tree = bpy.data.node_groups.new(SHOWN_AS, "GeometryNodeTree")  # pyright: ignore[reportArgumentType]
+    tree[TAG] = SHOWN_AS
+    interface = present(tree.interface)
+    interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    kinds = ("NodeGroupInput", "GeometryNodeMeshToPoints", "GeometryNodeSetMaterial", "NodeGroupOutput")
+    start, points, material, end = nodes = [tree.nodes.new(kind) for kind in kinds]
+    for place, node in enumerate(nodes):
+        node.location = (200.0 * place, 0.0)
+    radius: Any = tree.nodes.new("GeometryNodeInputNamedAttribute")
+    radius.location = (0.0, -150.0)
+    radius.data_type = "FLOAT"
+    radius.inputs["Name"].default_value = "radius"
+    shown: Any = material.inputs["Material"]
+    shown.default_value = _material()
+    tree.links.new(points.inputs["Mesh"], start.outputs[0])
+    tree.links.new(points.inputs["Radius"], radius.outputs["Attribute"])
+    tree.links.new(material.inputs["Geometry"], points.outputs[0])
+    tree.links.new(end.inputs[0], material.outputs[0])
+    return tree

@@ -1,0 +1,97 @@
+"""Gaussians in the axes and units of a scene: means, rotations, sizes and spherical harmonics moved together."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..gaussians.ply import PlyGaussians
+from ..raster.reference import sh_basis
+from ..solve.placement import Similarity
+from ..solve.poses import rotation_to_quat
+from ..torch_types import from_numpy
+
+_DIRECTIONS = 64
+"""Directions in which a band's rotation is solved for: some times more than the 7 functions of the third."""
+_CHUNK = 1 << 16
+"""Gaussians whose harmonics are rotated at a time: float64 copies of them take 25 MB."""
+
+
+def placed(gaussians: PlyGaussians, where: Similarity) -> PlyGaussians:
+    """The same Gaussians after the world was turned, scaled and moved: they look the same from the moved camera.
+
+    Args:
+        gaussians: as stored, float32.
+        where: from their space to the new one.
+
+    Returns:
+        float32; quaternions wxyz of the lengths they had, harmonics of the degree they had.
+    """
+    turn = rotation_to_quat(where.rotation)
+    sh = gaussians.sh
+    if sh.shape[1] > 1 and not np.array_equal(where.rotation, np.eye(3)):
+        sh = rotated_harmonics(sh, where.rotation)
+    return PlyGaussians(
+        where.points(gaussians.means).astype(np.float32),
+        _product(turn, gaussians.quats.astype(np.float64)).astype(np.float32),
+        (gaussians.log_scales + math.log(where.scale)).astype(np.float32),
+        gaussians.opacity_logits,
+        sh,
+    )
+
+
+def rotated_harmonics(sh: NDArray[np.float32], rotation: NDArray[Any]) -> NDArray[np.float32]:
+    """Coefficients [N, K, 3] of the same radiance after the world was turned by a rotation [3, 3]; K as it was.
+
+    What had a colour c(d) in direction d has c(rotation^T d) now. Constants stay; each further band is mixed in itself.
+    """
+    result = sh.copy()
+    degree = math.isqrt(sh.shape[1]) - 1
+    matrices = band_rotations(rotation, degree)
+    for first in range(0, len(sh), _CHUNK):
+        part = sh[first : first + _CHUNK].astype(np.float64)
+        for band, matrix in enumerate(matrices, start=1):
+            rows = slice(band * band, (band + 1) * (band + 1))
+            result[first : first + _CHUNK, rows] = np.einsum("ij,njc->nic", matrix, part[:, rows])
+    return result
+
+
+def band_rotations(rotation: NDArray[Any], degree: int) -> list[NDArray[np.float64]]:
+    """Matrices [2l+1, 2l+1] of the bands l = 1 to `degree`: coefficients before to those after the world was turned.
+
+    Each is the least-squares solution of Y(D) M = Y(rotation^T D) over evenly spread directions D. A band is closed
+    under rotation, so the residual is rounding alone; and M has the signs and the order of the rasteriser's own basis,
+    whatever these are.
+    """
+    directions = _fibonacci_sphere(_DIRECTIONS)
+    before = _basis(directions @ np.asarray(rotation, np.float64), degree)  # rows d: (rotation^T d)^T = d^T rotation
+    after = _basis(directions, degree)
+    bands = [slice(band * band, (band + 1) * (band + 1)) for band in range(1, degree + 1)]
+    solved = (np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0] for band in bands)
+    return [np.asarray(matrix, np.float64) for matrix in solved]
+
+
+def _basis(directions: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Real spherical harmonics [D, (degree+1)^2] of unit directions [D, 3], float64."""
+    return sh_basis(from_numpy(directions), degree).to(torch.float64).numpy()
+
+
+def _fibonacci_sphere(count: int) -> NDArray[np.float64]:
+    """Unit vectors [count, 3], evenly spread: heights evenly, turned by the golden angle."""
+    heights = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    angles = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
+    radii = np.sqrt(1.0 - heights**2)
+    return np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1)
+
+
+def _product(turn: NDArray[np.float64], quats: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Hamilton products of one quaternion [4] and many [N, 4], wxyz: first `quats`, then `turn`."""
+    w, v = turn[0], turn[1:]
+    scalars, vectors = quats[:, :1], quats[:, 1:]
+    return np.concatenate(
+        [w * scalars - vectors @ v[:, None], w * vectors + scalars * v + np.cross(v, vectors)], axis=1
+    )

@@ -1,0 +1,104 @@
+"""The splats of a take for other programs, in the axes and units of Blender's scene: frozen.ply and frozen.usdc."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+
+from ...contract import (
+    PLY_FILE,
+    USD_FILE,
+    CameraPath,
+    ExitCode,
+    JobError,
+    Placement,
+    Reporter,
+    TakeFolder,
+    UserError,
+    placement_of,
+    read_json,
+)
+from ...gaussians.ply import PlyGaussians, read_ply, write_ply
+from ...scene import Scene
+from ...shot import Shot
+from ...solve.placement import Similarity, placement_for
+from ...solve.stored import load_cameras
+from ...torch_types import from_numpy
+from ..frozen import FrozenGaussians
+from ..placed import placed
+from ..usd import NoUsdError, write_usd
+
+FORMATS = ("ply", "usd")
+_NO_USD = (
+    "The backend has no usd-core, so the USD stage is not written.",
+    "Press Repair in the add-on's preferences, or run the setup of splannequin.py.",
+)
+PLAIN_FPS = 24.0
+"""Frames per second of a stage where the footage says none."""
+
+
+def placed_splats(frozen: FrozenGaussians, scene: Scene, where: Similarity) -> PlyGaussians:
+    """A frozen instant in the axes and units of the scene that `where` leads to from solve units."""
+    state = {name: value.cpu() for name, value in frozen.state.items()}
+    in_solve = PlyGaussians(
+        (state["means"].double() / scene.scale + from_numpy(scene.centre)).float().numpy(),
+        state["quats"].numpy(),
+        (state["log_scales"] - math.log(scene.scale)).numpy(),
+        state["opacity_logits"].numpy(),
+        torch.cat([state["sh0"], state["shN"]], dim=1).numpy(),
+    )
+    return placed(in_solve, where)
+
+
+def camera_path_of(shot: Shot, file: str) -> CameraPath:
+    """The camera that a take was seen through, solve units: a path of Blender's, or the clip's own. Errors as these."""
+    return CameraPath.load(file) if file and Path(file).is_file() else load_cameras(shot)
+
+
+def write_stage(
+    path: Path, splats: PlyGaussians, cameras: CameraPath, placement: Placement, fps: float, report: Reporter
+) -> None:
+    """Writes a take's USD stage, or warns that the environment cannot. OSError if the file cannot be written."""
+    where = Similarity.of(placement)
+    try:
+        write_usd(path, splats, cameras, where, placement.metres_per_unit, fps or PLAIN_FPS)
+    except NoUsdError:
+        report.warning(*_NO_USD)
+
+
+def export_splats(shot: Shot, kind: str, folder: Path, take: str, placement: str = "") -> list[Path]:
+    """Writes the splats of a finished take, placed anew: after Set Scale nothing has to be frozen again.
+
+    Args:
+        shot: a solved shot.
+        kind: of `FORMATS`. ply: frozen.ply. usd: frozen.usdc, with the animated camera.
+        folder: where to; made if it is not there.
+        take: name of the take.
+        placement: see `placement_for`.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ValueError: another format, or `placement` or the take's files are damaged.
+        JobError: there is no such take, or the environment cannot write USD.
+    """
+    if kind not in FORMATS:
+        raise UserError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
+    there = TakeFolder(shot.take(take))
+    if not there.facts.is_file() or not there.ply.is_file():
+        raise JobError(f"Take {take} of {shot.root.name} has no splats.", "Freeze it first.", ExitCode.USAGE)
+    facts = read_json(there.facts)
+    target = placement_for(shot, placement)
+    change = Similarity.of(target).after(Similarity.of(placement_of(facts)).inverse())
+    splats = placed(read_ply(there.ply), change)
+    if kind == "ply":
+        return [write_ply(folder / PLY_FILE, *splats)]
+    cameras = camera_path_of(shot, str(facts.get("camera_path", "")))
+    where, fps = Similarity.of(target), shot.info().fps or PLAIN_FPS
+    try:
+        return [write_usd(folder / USD_FILE, splats, cameras, where, target.metres_per_unit, fps)]
+    except NoUsdError as error:
+        raise JobError(*_NO_USD, ExitCode.ENVIRONMENT) from error
