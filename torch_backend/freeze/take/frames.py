@@ -89,7 +89,8 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
     image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
     made = image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
     picture = _display(made, slice(None)) + (1.0 - made.alpha[..., None]) * 0.5
-    made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture)
+    measured = spec.measured.at(output.t_star, frozen)
+    made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture, measured)
     return made
 
 
