@@ -155,7 +155,7 @@ def judge(
     metres = truth.metres_per_unit / clip.scene.scale
     for t_star in t_stars:
         for pose in truth.poses(t_star, [])[::every]:
-            depth, sigma = clip.depth(pose, clip.view(pose, t_star))
+            depth, sigma = clip.depth(pose, t_star, clip.view(pose, t_star))
             regions = truth.regions(t_star, pose, *size)
             left_out = torch.zeros_like(regions["moving"])
             for pane in PANES:

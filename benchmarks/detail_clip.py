@@ -16,6 +16,7 @@ from benchmarks.sources import Log
 from torch_backend.contract import FreezeParams
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze.composite.compositor import CompositeFrame, Compositor
+from torch_backend.freeze.composite.measured_depth import MeasuredDepths
 from torch_backend.freeze.composite.surface_depth import FrameDepths
 from torch_backend.freeze.frozen import (
     FrozenGaussians,
@@ -71,6 +72,7 @@ class DetailClip:
         self.Ks = self.scene.camera_at(self.width, self.height)
         self.compositor = Compositor(self.run, self.scene, self.plates)
         self.depths = FrameDepths(self.run, self.scene)
+        self.measured = MeasuredDepths(self.run, self.scene)
         self._frozen: dict[int, FrozenGaussians] = {}
 
     @property
@@ -134,10 +136,10 @@ class DetailClip:
         output = OutputFrame(frame, *self.camera(frame), float(t_star), float(frame))
         return self.compositor.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
 
-    def depth(self, frame: int, view: View) -> tuple[Tensor, Tensor]:
+    def depth(self, frame: int, t_star: int, view: View) -> tuple[Tensor, Tensor]:
         """(depth, its standard deviation) of a frozen frame as a take writes it, [H, W] each in scene units."""
-        detailed = view.detailed
-        return self.depths.of(*self.camera(frame), detailed.depth, view.image.motion, view.picture)
+        measured = self.measured.at(t_star, self.frozen(t_star))
+        return self.depths.of(*self.camera(frame), view.detailed.depth, view.image.motion, view.picture, measured)
 
     def plate(self, frame: int) -> Tensor:
         """The plate of a frame, [H, W, 3] in [0, 1]."""

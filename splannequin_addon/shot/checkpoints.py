@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ...torch_backend import contract
 from ...torch_backend.contract import RunFolder
@@ -36,7 +37,17 @@ def paused(run: Path) -> dict[str, Any] | None:
         done: _Count = contract.from_dict(_Count, {"steps": told["iteration"]})
     except (KeyError, TypeError, AttributeError, ValueError):
         return None
-    return {"iteration": done.steps, "end": asked.iterations, "preset": asked.preset, "config": config}
+    return {
+        "iteration": done.steps, "end": asked.iterations, "preset": asked.preset, "config": config,
+        "depth_source": depth_source(run),
+    }  # fmt: skip
+
+
+def depth_source(run: Path) -> str:
+    """Absolute path of the depth maps that a run was trained with; empty without."""
+    told: object = facts(RunFolder(run).checkpoint).get("depth")
+    source = cast("dict[str, Any]", told).get("source") if isinstance(told, dict) else None
+    return source if isinstance(source, str) and os.path.isabs(source) and source.isprintable() else ""
 
 
 @dataclass

@@ -49,6 +49,7 @@ def read(folder: Path) -> ShotState:
     state.runs = _named(_Run, there.runs, contract.SUMMARY_FILE, state.damaged["run"])
     for name, run in state.runs.items():
         run["extension"] = checkpoints.extension(there.runs / name)
+        run["depth_source"] = checkpoints.depth_source(there.runs / name)
     for name in _names(there.runs, contract.CHECKPOINT_FILE):
         known = name in state.runs or name in state.damaged["run"]
         told = None if known else checkpoints.paused(there.runs / name)

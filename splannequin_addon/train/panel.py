@@ -6,6 +6,7 @@ import bpy
 
 from ..access import layout_of, scene_in, settings_of
 from ..process import steps
+from ..scene import paths
 from ..shot.shot_state import ShotState
 from ..translations import tr
 from ..ui import listing, step_panel
@@ -30,6 +31,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         props = settings_of(scene_in(context))
         watch, plan = self._watch(context), self._plan(context)
         self._presets(context, layout, watch.state if watch is not None else None)
+        layout.prop(props, "depth")
         if watch is None or watch.running() is not None:
             return
         if plan.kind == "extend":
@@ -64,7 +66,8 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
 
     def _plan(self, context: bpy.types.Context) -> training.Plan:
         props, watch = settings_of(scene_in(context)), self._watch(context)
-        return training.plan(watch.state if watch else None, props.run_name, props.preset)
+        depth = paths.absolute(props.depth)
+        return training.plan(watch.state if watch else None, props.run_name, props.preset, depth)
 
     def _label(self, context: bpy.types.Context, view: steps.View) -> str:
         return self._plan(context).button

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ...torch_backend import contract
+from .. import compat
 from ..access import scene_holding
 from ..process import job_timer
 from ..properties import EnumProperty, IntProperty, StringProperty
@@ -51,6 +52,11 @@ class TrainSettings:
         min=10,
         soft_max=30_000,
         options=set(),
+    )
+    depth = StringProperty(
+        **contract.panel(contract.TrainParams, "depth"),
+        subtype="DIR_PATH",
+        options=compat.PATH_OPTIONS,
     )
     run_name = StringProperty(
         **contract.panel(contract.TrainParams, "run"),

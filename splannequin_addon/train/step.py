@@ -8,6 +8,7 @@ from ...torch_backend import contract
 from ..access import settings_of
 from ..process import backend, jobs
 from ..process.steps import Step, View
+from ..scene import paths
 from ..shot import inventory, selection
 from ..shot.shot_state import ShotState
 from . import operators, panel, pictures, training
@@ -32,7 +33,8 @@ class Train(Step):
         """The preset, or how a run that is there goes on."""
         props, folder = settings_of(scene), selection.shot_folder(scene)
         state = inventory.read(folder) if folder is not None else None
-        return training.params(state, props.run_name, props.preset, props.extend_steps, backend.device())
+        depth = paths.absolute(props.depth)
+        return training.params(state, props.run_name, props.preset, props.extend_steps, backend.device(), depth)
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Train: how good the run is."""
@@ -49,7 +51,8 @@ class Train(Step):
         verdict = contract.verdict_lines(run)
         if run.get("quality") == "Poor" and not verdict:  # trained by an older version
             verdict = ["It is poor: take a range in which nobody walks, or solve the camera again."]
-        lines = [f"Run {settings_of(scene).run_name}: {quality}", size, *verdict]
+        depth = [line] if (line := contract.depth_line(run)) else []
+        lines = [f"Run {settings_of(scene).run_name}: {quality}", size, *depth, *verdict]
         return View(True, True, lines, "Next: freeze an instant.")
 
     def began(self, job: jobs.Job) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,17 @@ class Plan:
     """What will happen, in a sentence; empty if that needs no saying."""
 
 
-def plan(state: ShotState | None, run: str, preset: str) -> Plan:
-    """What training the run of a name with a preset means, as the shot stands."""
+def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Plan:
+    """What training the run of a name with a preset means, as the shot stands.
+
+    `depth` is the absolute path of the depth maps that are chosen; empty: those of the run, if it has any.
+    """
     finished = state.runs.get(run) if state is not None else None
     paused = state.unfinished.get(run) if state is not None else None
     told = finished or paused
     if told is None:
         return Plan("train", "Train", "")
-    if _goes_on(told, preset):
+    if _goes_on(told, preset, depth):
         words = "Paused while the run was trained anew. The run is as it was until the new one is done."
         return Plan("resume", "Resume", words)
     if told.get("other_cameras"):
@@ -43,6 +47,11 @@ def plan(state: ShotState | None, run: str, preset: str) -> Plan:
             "anew", "Train Anew", "This run has another preset: training begins anew and replaces it when done. "
             "Give the run another name to keep it."
         )  # fmt: skip
+    if not _same_depth(told, depth):
+        return Plan(
+            "anew", "Train Anew", "This run has another depth sequence, or none: training begins anew and replaces "
+            "this run when done. Give the run another name to keep it."
+        )  # fmt: skip
     if finished is None:
         return Plan("resume", "Resume", "Paused. It goes on exactly where it stopped.")
     if finished.get("extension") is not None:
@@ -50,26 +59,37 @@ def plan(state: ShotState | None, run: str, preset: str) -> Plan:
     return Plan("extend", "Train On", "Adds these steps to the run. It stays as it is until all are done.")
 
 
-def _goes_on(told: dict[str, Any], preset: str) -> bool:
-    """True if a run is being trained anew with a preset, on the cameras that the shot has."""
+def _goes_on(told: dict[str, Any], preset: str, depth: str) -> bool:
+    """True if a run is being trained anew with a preset and these depth maps, on the cameras that the shot has."""
     anew = told.get("anew")
-    return anew is not None and anew["preset"] == preset and not anew["other_cameras"]
+    return (
+        anew is not None and anew["preset"] == preset and not anew["other_cameras"] and _same_depth(anew, depth)
+    )  # fmt: skip
 
 
-def params(state: ShotState | None, run: str, preset: str, steps: int, device: str) -> contract.TrainParams:
-    """What the backend is asked for; `steps` is how many are added if the run is finished."""
-    kind = plan(state, run, preset).kind
+def _same_depth(told: dict[str, Any], depth: str) -> bool:
+    """True if a run has these depth maps, or none are chosen."""
+    return not depth or os.path.normcase(told.get("depth_source", "")) == os.path.normcase(depth)
+
+
+def params(
+    state: ShotState | None, run: str, preset: str, steps: int, device: str, depth: str = ""
+) -> contract.TrainParams:
+    """What the backend is asked for; `steps` is how many are added if the run is finished, `depth` as in `plan`."""
+    kind = plan(state, run, preset, depth).kind
     if state is not None and kind == "resume":
         # Its own settings, not the panel's: a run that was begun on the command line goes on too.
         told = state.runs.get(run) or state.unfinished[run]
-        settings = checkpoints.params_of((told["anew"] if _goes_on(told, preset) else told)["config"])
-        return contract.TrainParams(run=run, device=device, **settings)
+        begun = told["anew"] if _goes_on(told, preset, depth) else told
+        settings = checkpoints.params_of(begun["config"])
+        return contract.TrainParams(run=run, device=device, depth=begun.get("depth_source", ""), **settings)
     extend = 0
     if state is not None and kind == "extension":
         extend = int(state.runs[run]["extension"]["steps"])
     elif kind == "extend":
         extend = steps
-    return contract.TrainParams(run=run, preset=preset, device=device, extend=extend)
+    chosen = "" if extend else depth
+    return contract.TrainParams(run=run, preset=preset, device=device, extend=extend, depth=chosen)
 
 
 def history(told: dict[str, Any], now: list[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -101,6 +101,48 @@ def test_what_is_asked_for_fits_what_the_button_says(addon, with_runs, shot):
     assert steps["train"].params(with_runs).extend == 0
 
 
+def test_depth_maps_are_asked_for_and_other_ones_train_anew(addon, with_runs, shot, tmp_path):
+    props, step = with_runs.splannequin, addon("process.steps").STEPS["train"]
+    props.run_name, props.depth = "new", f"{tmp_path / 'depth'}{os.sep}"
+    asked = step.params(with_runs)
+    assert (asked.depth, asked.extend) == (str(tmp_path / "depth"), 0)
+    props.run_name = "main"
+    training = addon("train.training")
+
+    def plan_now():
+        state = addon("shot.inventory").read(shot)
+        return training.plan(state, props.run_name, props.preset, str(tmp_path / "depth") if props.depth else "")
+
+    assert plan_now().kind == "anew" and "depth" in plan_now().words
+    assert step.params(with_runs).depth == str(tmp_path / "depth")
+    told = {"key": "d", "source": str(tmp_path / "depth")}
+    checkpoint(shot / "runs" / "main" / "checkpoint.safetensors", iteration=900, depth=told)
+    checkpoint(shot / "runs" / "better" / "checkpoint.safetensors", iteration=300, depth=told)
+    assert plan_now().kind == "extend" and step.params(with_runs).depth == "", "the run has its own copy"
+    props.depth = ""
+    assert plan_now().kind == "extend"
+    props.run_name = "better"
+    assert plan_now().kind == "resume" and step.params(with_runs).depth == str(tmp_path / "depth")
+    checkpoint(shot / "runs" / "better" / "checkpoint.safetensors", iteration=300, depth={"source": ["/etc"]})
+    assert step.params(with_runs).depth == ""
+
+
+def test_the_panel_says_how_depth_maps_fit(addon, with_runs, shot):
+    step, inventory = addon("process.steps").STEPS["train"], addon("shot.inventory")
+    file = shot / "runs" / "main" / "summary.json"
+    told = json.loads(file.read_text())
+    good = {"linear_in": "inverse depth", "residual": 0.0312, "frames": 38, "of_frames": 40}
+    for facts, shown in (
+        (good, True),
+        ({**good, "linear_in": "\n"}, False),
+        ({**good, "frames": "38"}, False),
+        (7, False),
+    ):
+        file.write_text(json.dumps({**told, "depth": facts}))
+        lines = step.view(with_runs, inventory.read(shot)).state
+        assert any("inverse depth" in line and "3.1 %" in line for line in lines) == shown
+
+
 def test_more_steps_are_a_third_of_the_presets_at_first(scene, contract):
     props = scene.splannequin
     assert props.extend_steps == round(contract.PRESET_STEPS["preview"] / 3)

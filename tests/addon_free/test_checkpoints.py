@@ -7,6 +7,7 @@ ASKED_ELSEWHERE = {
     "device": "Preferences, or wherever it goes on",
     "resume": "asked for by going on",
     "extend": "of finished runs",
+    "depth": "what the checkpoint says of its maps",
 }
 """Fields that no stored configuration holds -> where they come from."""
 

@@ -474,6 +474,20 @@ class TrainParams:
     """Every how many frames one is kept out for testing; 0: none, -1: the preset's choice."""
     seed: int = option(0, flag="--seed", metavar="N", help="random seed", limit=Limit("random seed", 0, (1 << 53) - 1))
     """Random seed."""
+    depth: str = option(
+        "",
+        flag="--depth",
+        metavar="FOLDER",
+        is_path=True,
+        help="depth maps of the clip's frames, of a phone's sensor or a network: a folder of EXR, 16-bit PNG or TIFF, "
+        "numbered as the frames; metric, inverse or relative. They tell how far away is what moves",
+        words="none",
+        label="Depth",
+        tip="Depth maps of the clip's frames, of a phone's sensor or a network: a folder of EXR, 16-bit PNG or TIFF, "
+        "numbered as the frames. Scale and shift are found. They tell how far away is what moves, in the training and "
+        "in frozen frames; empty: none",
+    )
+    """Depth maps of the frames: a folder, one of its files or a pattern; metric, inverse or relative. Empty: none."""
     resume: bool = option(True, flag="--restart", switch=True, help="do not go on from the run's checkpoint")
     """Go on from the run's checkpoint if there is one."""
     device: str = option("auto", **DEVICE)

@@ -27,6 +27,8 @@ def _plain_number(value: object) -> float | None:
 VERDICT_WORDS = {"good": "Good.", "fair": "Fair.", "poor": "Poor."}
 """Good: it holds. Fair: it holds but for what is named. Poor: it is not worth going on from. As they are shown."""
 _MOST_LINES = 12
+DEPTH_KINDS = ("depth", "inverse depth")
+"""What the maps of a depth sequence may be linear in."""
 
 
 @dataclass
@@ -71,6 +73,22 @@ def verdict_lines(*facts: Mapping[str, Any]) -> list[str]:
     found = (verdict_of(one) for one in facts)
     lines = (line for verdict in found if verdict is not None for line in verdict.lines())
     return list(dict.fromkeys(lines))  # a take repeats what its run's verdict found amiss
+
+
+def depth_line(facts: Mapping[str, Any]) -> str:
+    """How the depth sequence of a run fits its solve, from the run's summary.json, which may come from anywhere; empty
+    if there is none."""
+    found = facts.get("depth")
+    if not is_json_object(found):
+        return ""
+    residual, frames, of_frames = (_plain_number(found.get(key)) for key in ("residual", "frames", "of_frames"))
+    kind = found.get("linear_in")
+    if residual is None or frames is None or of_frames is None or kind not in DEPTH_KINDS:
+        return ""
+    return (
+        f"The depth sequence fits the solve: linear in {kind}, half of the points are off by less than "
+        f"{100 * residual:.1f} %; {frames:.0f} of {of_frames:.0f} frames have depth."
+    )
 
 
 def take_figures(facts: Mapping[str, Any], folder: TakeFolder) -> dict[str, Any]:

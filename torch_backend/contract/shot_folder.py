@@ -47,6 +47,8 @@ DRAWN_FOLDER = "masks"
 CHECKPOINT_FILE, EXTENSION_FILE = "checkpoint.safetensors", "extension.safetensors"
 """Of a run: itself, and steps that are added to it and are not done."""
 CONFIG_FILE, METRICS_FILE, SUMMARY_FILE = "config.json", "metrics.jsonl", "summary.json"
+DEPTH_FILE = "depth.safetensors"
+"""Of a run: the artist's depth sequence, fitted to the solve."""
 PREVIEWS_FOLDER, NEXT_FOLDER, DEVELOPED_FOLDER = "previews", "next", "developed"
 """In a run's folder: pictures of the training, trainings that will take the run's place, developed instants."""
 TAKE_FILE, TAKE_STATE_FILE = "take.json", "state.json"
@@ -262,6 +264,11 @@ class RunFolder:
     @property
     def config(self) -> Path:
         return self.root / CONFIG_FILE
+
+    @property
+    def depth(self) -> Path:
+        """The artist's depth sequence, fitted to the solve; there if the run was trained with one."""
+        return self.root / DEPTH_FILE
 
     @property
     def metrics(self) -> Path:

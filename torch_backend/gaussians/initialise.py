@@ -9,7 +9,7 @@ repaired: a man before a plain wall, lifted to the depth of somebody before him,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +56,7 @@ def initialise(
     generator: torch.Generator,
     budget: int,
     ignored: Mapping[int, Tensor] | None = None,
+    depth: Callable[[int], Tensor | None] | None = None,
 ) -> Gaussians:
     """Gaussians from points and seeds, on the CPU, where the scene is.
 
@@ -66,6 +67,7 @@ def initialise(
         bins: time bins of the support bitmap.
         budget: most Gaussians to start with; a random choice is kept.
         ignored: frame of the scene -> bool [H, W] which pixels of it are no part of the scene: none of them is lifted.
+        depth: frame number -> its inverse depth, 0 where unknown, and deviation, [2, h, w]; pixels are lifted there.
     """
     points, colors = _known(scene, indices, min(config.surface, budget // 3), generator)
     known = points, colors
@@ -74,7 +76,16 @@ def initialise(
         picked = evenly_spaced(len(indices), config.frames)
         each = min(config.seeds // len(picked), images.shape[1] * images.shape[2] // _PIXELS_PER_SEED)
         seeds = [
-            _lift_seeds(scene, known, images[n], indices[n], each, generator, (ignored or {}).get(indices[n]))
+            _lift_seeds(
+                scene,
+                known,
+                images[n],
+                indices[n],
+                each,
+                generator,
+                (ignored or {}).get(indices[n]),
+                None if depth is None else depth(scene.frames[indices[n]]),
+            )
             for n in picked
         ]
         points = torch.cat([points, *(s[0] for s in seeds)])
@@ -138,9 +149,10 @@ def _known(scene: Scene, indices: list[int], most: int, generator: torch.Generat
 
 def _lift_seeds(
     scene: Scene, known: tuple[Tensor, Tensor], image: Tensor, index: int, count: int, generator: torch.Generator,
-    ignored: Tensor | None,
+    ignored: Tensor | None, measured: Tensor | None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """`count` pixels of one frame, preferably far from `known` points, at a depth between their neighbours' in it.
+    """`count` pixels of one frame, preferably far from `known` points, at a depth between their neighbours' in it, or
+    at that of `measured`, inverse depth and its deviation [2, h, w], where it has one.
 
     Fewer if some of them are `ignored`, bool [H, W].
     """
@@ -162,6 +174,10 @@ def _lift_seeds(
     weights = 1.0 / (distance[keep] + 1.0)
     depth = (weights * camera[seen][:, 2][neighbours[keep]]).sum(1) / weights.sum(1)
     chosen = candidates[keep]
+    if measured is not None:
+        at = (chosen / limits * torch.tensor(measured[0].T.shape, device="cpu")).long()
+        inverse = measured[0, at[:, 1], at[:, 0]]
+        depth = torch.where(inverse > 0, 1.0 / inverse.clamp_min(1e-6), depth)
     rays = torch.cat([(chosen - K[:2, 2]) / K[[0, 1], [0, 1]], chosen.new_ones(len(chosen), 1)], dim=1)
     local = rays * depth.float()[:, None]
     world = (local - viewmat[:3, 3]) @ viewmat[:3, :3]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from ..contract import CONFIG_FILE, METRICS_FILE, NEXT_FOLDER, PREVIEWS_FOLDER, is_link, remove_link
+from ..contract import CONFIG_FILE, DEPTH_FILE, METRICS_FILE, NEXT_FOLDER, PREVIEWS_FOLDER, is_link, remove_link
 from ..contract import SUMMARY_FILE as SUMMARY_FILE
 from ..shot import remove_file, replace_file
 from .checkpoint import CHECKPOINT_FILE, read_meta
@@ -40,7 +40,9 @@ def replace_run(run: Path, done: Path) -> None:
     Every file is replaced at once, the checkpoint first: whoever freezes has the one or the other. `finish_replacing`
     goes on where a killed process stopped.
     """
-    for name in (CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE):
+    if not (done / DEPTH_FILE).is_file() and (done / CHECKPOINT_FILE).is_file():  # else a killed process has moved it
+        remove_file(run / DEPTH_FILE)
+    for name in (CHECKPOINT_FILE, DEPTH_FILE, CONFIG_FILE, METRICS_FILE):
         if (done / name).is_file():
             replace_file(done / name, run / name)
     if (done / PREVIEWS_FOLDER).is_dir():

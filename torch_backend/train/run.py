@@ -31,6 +31,7 @@ from ..contract import (
 )
 from ..deformation import host
 from ..footage import load_frames
+from ..footage.depth_maps import DepthSequence, find_depth
 from ..footage.images import write_png
 from ..native import default_threads
 from ..raster import cpu as raster_cpu
@@ -43,6 +44,7 @@ from . import adam
 from .anew import SUMMARY_FILE, begun, drop_begun, finish_replacing, folder_for, replace_run
 from .checkpoint import CHECKPOINT_FILE, MISFITS, load_checkpoint, misfit, read_meta
 from .config import TrainConfig, config_from_json, config_from_params, config_to_json
+from .depth import FittedDepth, depth_key, fitted_depth, load_fitted
 from .device import choose_device
 from .evidence import gather_evidence
 from .extend import EXTENSION_FILE, pending
@@ -82,6 +84,12 @@ class LoadedRun:
     """`contract.file_digest` of the checkpoint that the model is from: what is made of it is known by it."""
     former_stamp: list[Any] = dataclasses.field(default_factory=list[Any])
     """The checkpoint's name, size and modification time (ns), by which earlier versions knew it."""
+    depth_key: str = ""
+    """Identifies the artist's depth maps that it was trained with; empty without."""
+
+    def depth(self) -> FittedDepth | None:
+        """Those maps, read from the run's folder; None without. JobError (TRAIN) if they are not there any more."""
+        return load_fitted(self.folder, self.depth_key) if self.depth_key else None
 
     @property
     def stale(self) -> bool:
@@ -103,10 +111,13 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     shot.own(run / PREVIEWS_FOLDER)
     finish_replacing(run)
     scene = load_scene(shot)
-    config, key, motion = _asked(shot, scene, run, params, device, report)
+    sequence = find_depth(shot, params.depth, report) if params.depth else None
+    config, key, motion = _asked(shot, scene, run, params, device, report, _depth_identity(shot, sequence))
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     done = finished(run, key)
     if done is not None and params.resume:
+        if sequence is not None:
+            fitted_depth(sequence, scene, depth_key(sequence, solve_key(shot)), run, report)  # it may have been removed
         drop_begun(run, key)
         report.progress("training", 1, 1, "already trained")
         return done
@@ -119,17 +130,29 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
             "The run's settings, cameras or motion mattes changed: it is trained anew.",
             "The run that is there stays until the new one is done.",
         )
+    depth = None
+    if sequence is not None:
+        depth = fitted_depth(sequence, scene, depth_key(sequence, solve_key(shot)), folder, report)
     warm_up(config, device)
     pictures = pictures_of(shot, scene, config, report)
     width, height = pictures.size
     images = pictures.load(train + test, report, folder)
     plan = planned(config, (width, height), len(train), images, device, report)
     images = place_images(images, device, plan)
-    identity = {"key": key, "solve": solve_key(shot), "motion": motion, "pictures": pictures_key(shot)}
+    identity: dict[str, Any] = {"key": key, "solve": solve_key(shot), "motion": motion, "pictures": pictures_key(shot)}
+    if depth is not None:
+        identity["depth"] = {name: depth.facts[name] for name in ("key", "source")}
     movers = load_movers(_likely(shot), scene, train, width, height) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, width, height)
     limits = () if plan is None else (plan.gaussians, plan.pieces)
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored, *limits)
+    trainer = Trainer(
+        scene, images[: len(train)], train, config, report, identity, device, movers, ignored, *limits, depth=depth
+    )
+    if depth is not None and trainer.targets is None:
+        report.warning(
+            "This run heeds no motion mattes: its depth maps are used where the training begins and in frozen frames, "
+            "and pull nothing in between."
+        )
     checkpoint = folder / CHECKPOINT_FILE
     resumed = _resume(trainer, checkpoint, params.resume, report)
     for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
@@ -192,10 +215,15 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     held_out = images[len(train) :]
     need_disk(folder, checkpoint_bytes(config), "a training's checkpoint")
     identity = {**{name: facts[name] for name in ("key", "solve")}, "motion": motion, "pictures": pictures_key(shot)}
+    depth = None
+    if facts.get("depth"):
+        identity["depth"], depth = facts["depth"], load_fitted(folder, str(facts["depth"]["key"]))
     movers = load_movers(_likely(shot), scene, train, *size) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, *size)
     limits = () if plan is None else (plan.gaussians, plan.pieces)
-    trainer = Trainer(scene, images[: len(train)], train, config, report, identity, device, movers, ignored, *limits)
+    trainer = Trainer(
+        scene, images[: len(train)], train, config, report, identity, device, movers, ignored, *limits, depth=depth
+    )
     begun = pending(folder, facts) if params.resume else None
     if before["iterations"] != facts["iteration"]:  # it was killed between its last two files: only figures are missing
         trainer.restore(checkpoint)
@@ -221,19 +249,20 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
 
 
 def _asked(
-    shot: Shot, scene: Scene, run: Path, params: TrainParams, device: torch.device, report: Reporter
+    shot: Shot, scene: Scene, run: Path, params: TrainParams, device: torch.device, report: Reporter, depth: list[str]
 ) -> tuple[TrainConfig, str, str | None]:
-    """(numbers, key, motion) of the run that is asked for; motion is the key of its mattes, None without.
+    """(numbers, key, motion) of the run that is asked for; motion is the key of its mattes, None without. `depth` is
+    `_depth_identity` of its depth maps.
 
     A preset has other numbers on a card. What was begun or finished with those of the other device stays that run, and
     goes on: a driver that fails for a day makes no training begin anew.
     """
     on_card = device.type == "cuda"
     config, elsewhere = config_from_params(params, on_card), config_from_params(params, not on_card)
-    key, motion = _identity(shot, scene, run, config)
+    key, motion = _identity(shot, scene, run, config, depth)
     if elsewhere == config or not params.resume or begun(run, key) is not None:
         return config, key, motion
-    its_key, its_motion = _identity(shot, scene, run, elsewhere)
+    its_key, its_motion = _identity(shot, scene, run, elsewhere, depth)
     if begun(run, its_key) is None:
         return config, key, motion
     if finished(run, its_key) is None:
@@ -245,11 +274,16 @@ def _asked(
     return elsewhere, its_key, its_motion
 
 
-def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig) -> tuple[str, str | None]:
+def _depth_identity(shot: Shot, sequence: DepthSequence | None) -> list[str]:
+    """What a run's key has of its depth maps; empty without."""
+    return [] if sequence is None else [f"depth {depth_key(sequence, solve_key(shot))}"]
+
+
+def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig, depth: list[str]) -> tuple[str, str | None]:
     """(key, motion) of a run of these numbers, see `_asked`."""
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     motion = motion_of(shot, config)
-    key = content_key(config_to_json(config), solve_key(shot), train, test, *masks_key(shot, IGNORE))
+    key = content_key(config_to_json(config), solve_key(shot), train, test, *masks_key(shot, IGNORE), *depth)
     if motion and not trained_without(shot, run, key):
         key = content_key(key, motion)
     else:
@@ -458,6 +492,7 @@ def summarise(
         "sh_degree": model.sh_degree,
         "train_seconds": round(trainer.trained_seconds, 2),
         "modelled": modelled(trainer),
+        **({} if trainer.depth is None else {"depth": trainer.depth.facts}),
     }
 
 
@@ -486,7 +521,10 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
         config = config_from_json(meta["config"])
         model = restore_model(tensors, meta, config, device)
         size = int(meta["width"]), int(meta["height"])
-        return LoadedRun(folder, config, model, *size, list(meta["train_frames"]), stamp, _former_stamp(checkpoint))
+        depth = str(meta["depth"]["key"]) if meta.get("depth") else ""
+        return LoadedRun(
+            folder, config, model, *size, list(meta["train_frames"]), stamp, _former_stamp(checkpoint), depth
+        )
     except MISFITS as error:  # whole, but not as `save` wrote it
         raise misfit(checkpoint, error, ExitCode.FREEZE) from None
 

@@ -36,6 +36,8 @@ class StepKind:
     """Is what moves learnt from a softened picture?"""
     ignored: bool
     """Are there pixels that teach nothing?"""
+    depth: bool
+    """Is what moves pulled to a depth map?"""
     recordable: bool
     """Does it ask a GPU nothing, and do its frame's own numbers all come in as `StepFacts`?"""
 
@@ -61,6 +63,8 @@ class StepFacts:
     """bool [H, W] what moves in the frame, where that is softened."""
     draws: Draws | None
     """What pairs to anchor are drawn by."""
+    depth: Tensor | None = None
+    """[2, H, W] inverse depth that pixels should have, 0 where nothing is asked, and its standard deviation."""
 
     @property
     def asked(self) -> Tensor:
@@ -108,7 +112,7 @@ class StepFacts:
     def _tensors(self) -> list[Tensor]:
         """All that there are, in one order."""
         found = [self.numbers, self.places, self.viewmat, self.K, self.image]
-        found += [t for t in (self.ignored, self.movers) if t is not None]
+        found += [t for t in (self.ignored, self.movers, self.depth) if t is not None]
         return [*found, *(() if self.draws is None else self.draws.tensors())]
 
     def _made(self, make: Callable[[Tensor], Tensor]) -> StepFacts:
@@ -117,4 +121,4 @@ class StepFacts:
 
         draws = None if self.draws is None else Draws(*map(make, self.draws.tensors()))
         parts = make(self.numbers), make(self.places), make(self.viewmat), make(self.K), make(self.image).float()
-        return StepFacts(*parts, of(self.ignored), of(self.movers), draws)
+        return StepFacts(*parts, of(self.ignored), of(self.movers), draws, of(self.depth))

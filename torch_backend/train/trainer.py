@@ -38,6 +38,7 @@ from . import memory
 from .average import ParameterMean
 from .checkpoint import MISFITS, load_checkpoint, misfit, optimizer_state, restore_optimizer, save_checkpoint
 from .config import TrainConfig, config_to_json
+from .depth import DepthTargets, FittedDepth, depth_pull
 from .exposure import Exposure
 from .extend import Extension
 from .forecast import Outlook, Stopwatch, smaller_presets, step_work, warning_of
@@ -73,6 +74,7 @@ class Trainer:
         ignored: index of a frame of the scene -> bool [H, W] which of its pixels teach nothing, and are not measured.
         most: Gaussians that fit the device's memory, where they are fewer than the configuration's.
         pieces: Gaussians that the field works on at a time; None: all.
+        depth: depth maps of an artist's; what moves by `movers` is pulled to them, and seeds start there.
     """
 
     def __init__(
@@ -88,11 +90,15 @@ class Trainer:
         ignored: dict[int, Tensor] | None = None,
         most: int | None = None,
         pieces: int | None = None,
+        depth: FittedDepth | None = None,
     ) -> None:
         self.identity, self.device = identity or {}, torch.device(device)
         self.scene, self.images, self.train_ids, self.config, self.report = scene, images, train, config, report
         self.movers = movers if config.decides else None
         self.ignored = ignored or {}
+        self.depth, self.targets = depth, None
+        if depth is not None and self.movers is not None and config.method != "static":
+            self.targets = DepthTargets(depth, [scene.frames[i] for i in train], self.movers)
         self.height, self.width = images.shape[1:3]
         opens = config.gate.start
         self.softened = SoftenedMovers(self.movers, self.width, (opens, opens + config.soft_movers), config.soft_block)
@@ -107,7 +113,8 @@ class Trainer:
         self.most, self.pieces = most, pieces
         budget = self._densify_config().budget
         count = len(self.centres)
-        gaussians = initialise(scene, images, train, count, config.init, self.generator, budget, self.ignored)
+        known = None if depth is None else depth.at
+        gaussians = initialise(scene, images, train, count, config.init, self.generator, budget, self.ignored, known)
         gaussians = gaussians.to(self.device)
         self.model = DynamicModel(gaussians, None, self.centres, 0, Exposure(self.centres, config.exposure), pieces)
         self.initial = len(gaussians)
@@ -329,6 +336,7 @@ class Trainer:
         # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         background = torch.rand(3, generator=self.generator, device="cpu")
         left, right, share = model.exposure.place(time)
+        depth = None if self.targets is None else self.targets.at(frame)
         numbers = from_numpy(np.array([asked, 1.0 - share, share, still_weight(self.progress, s)], np.float32))
         ignored = self.ignored.get(index)
         movers = self.softened.movers_at(frame, self.progress)
@@ -336,7 +344,7 @@ class Trainer:
             numbers=torch.cat([numbers, background]),
             places=from_numpy(np.array([self._bins[frame], left, right], np.int64)),
             viewmat=self.viewmats[index], K=self.Ks[index], image=self.images[frame], ignored=ignored,
-            movers=movers, draws=draws,
+            movers=movers, draws=draws, depth=depth,
         )  # fmt: skip
         asks = self._refines_poses() or (field is not None and s.paper_due(self.iteration, self.progress))
         kind = StepKind(
@@ -348,6 +356,7 @@ class Trainer:
             penalised=self.iteration % c.field_every == 0,
             soft=movers is not None,
             ignored=ignored is not None,
+            depth=depth is not None,
             recordable=not asks and (field is None or field.recordable),
         )
         return kind, facts
@@ -370,7 +379,7 @@ class Trainer:
         viewmat = corrected(facts.viewmat, self.poses.values[frame]) if self._refines_poses() else facts.viewmat
         out = render(
             state, model.sh_degree, viewmat, facts.K, self.width, self.height, background=facts.background,
-            with_depth=kind.hidden, with_contributions=True,
+            with_depth=kind.hidden or kind.depth, with_contributions=True,
         )  # fmt: skip
         paper = kind.moves and supervision.paper_due(self.iteration, self.progress)
         if paper:
@@ -381,6 +390,9 @@ class Trainer:
         if deltas is not None and supervision.preset == "support":
             price = stillness(deltas, len(model.gaussians), loss, facts.motion_price, supervision)
             total = total + self.config.field.still * price
+        if facts.depth is not None and self.targets is not None and out.depth_expected is not None:
+            pull = depth_pull(out.depth_expected[0], facts.depth)
+            total = total + self.targets.weight * pull
         if self._refines_poses():
             total = total + self.poses.regularisation()
         if pairs is not None and anchored is not None:
@@ -398,12 +410,13 @@ class Trainer:
             self.soundness.skipped(self, frame)
             return loss.detach()
         self.soundness.count(applied)
-        self._observe(facts, rows, state, out, applied)
+        self._observe(kind, facts, rows, state, out, applied)
         return loss.detach()
 
     def _observe(
-        self, facts: StepFacts, rows: Tensor, state: dict[str, Tensor], out: RasterOutput, applied: Tensor
-    ) -> None:
+        self, kind: StepKind, facts: StepFacts, rows: Tensor, state: dict[str, Tensor], out: RasterOutput,
+        applied: Tensor,
+    ) -> None:  # fmt: skip
         """After a step, applied or not (0-dim bool): what it tells the densifier and the support bitmap."""
         if out.weight_sum is None:
             raise RuntimeError("the frame was rendered without contributions")
@@ -412,7 +425,7 @@ class Trainer:
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
         mark_seen(self.model.gaussians, facts.time_bin, weight)
-        if out.depth_median is not None:  # at steps that mark who was hidden
+        if kind.hidden and out.depth_median is not None:
             view = facts.viewmat, facts.K, out.depth_median[0]
             mark_hidden(self.model.gaussians, rows, facts.time_bin, state, *view)
 

@@ -47,10 +47,11 @@ def trained(world, quiet):
     scene = load_scene(world.shot)
     images = load_images(scene, scene.solved, 32, 24)
 
-    def run(recording, steps=24, break_at=-1, method="hexplane"):
+    def run(recording, steps=24, break_at=-1, method="hexplane", targets=None):
         config = config_from_params(TrainParams(iterations=40, max_gaussians=330, method=method, width=32))
         config.densify.every, config.init.seeds, config.field.start, config.densify.start = 10, 0, 0.1, 0.2
         trainer = Trainer(scene, images, scene.solved, config, quiet(), {}, "cpu")
+        trainer.targets = targets
         if recording is not None:
             trainer.recorder = Recorder(trainer, torch.device("cpu"), recording)
         for _ in range(steps):
@@ -66,6 +67,22 @@ def trained(world, quiet):
 
 def equal(one, two):
     return all(torch.equal(p, q) for p, q in zip(one._named().values(), two._named().values(), strict=True))
+
+
+class EveryOther:
+    """Depth maps of every second trained frame: another depth in each."""
+
+    weight = 0.02
+
+    def at(self, frame):
+        wanted = torch.full((24, 32), 0.1 + 0.01 * frame)
+        return None if frame % 2 else torch.stack([wanted, torch.full_like(wanted, 0.01)])
+
+
+def test_depth_maps_reach_a_replayed_step_with_its_facts(trained):
+    plain, recorded = trained(None, targets=EveryOther()), trained(Again(), targets=EveryOther())
+    assert equal(plain, recorded) and not equal(plain, trained(None))
+    assert {kind.depth for kind, _ in recorded.recorder._seen} == {True, False}
 
 
 def test_a_kind_is_launched_once_and_then_replayed_until_growth(trained):

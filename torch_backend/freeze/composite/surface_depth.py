@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -311,10 +311,20 @@ class Splats:
     """[H, W] in 0..1: how much of what is seen moves in the clip."""
 
 
-def frame_depth(surfaces: StillSurfaces, splats: Splats, picture: Array) -> tuple[Array, Array]:
+class Correction(Protocol):
+    """Another measurement of what moves (`measured_depth.InstantDepth`)."""
+
+    def correction(self, view: KeyView, moving: Array) -> tuple[Array, Array]:
+        """(factor of the splats' inverse depth in a view, their relative standard deviation after it), [h, w] each."""
+        ...
+
+
+def frame_depth(
+    surfaces: StillSurfaces, splats: Splats, picture: Array, measured: Correction | None = None
+) -> tuple[Array, Array]:
     """Inverse depth [H, W] of a frame, and its standard deviation [H, W], in 1 / scene units; 0 where nothing is.
 
-    `picture` [H, W, 3] is the finished frame, display-referred.
+    `picture` [H, W, 3] is the finished frame, display-referred. `measured` corrects the splats of what moves.
     """
     import cv2
 
@@ -329,20 +339,27 @@ def frame_depth(surfaces: StillSurfaces, splats: Splats, picture: Array) -> tupl
     K = splats.K.copy()
     K[0] *= w / width
     K[1] *= h / height
-    still = np.clip(1.0 - 2.0 * moving, 0.0, 1.0)
-    values, sigma, weight = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, inverse))
+    still, mover = np.clip(1.0 - 2.0 * moving, 0.0, 1.0), moving > 0.5
+    whole, noise = splats.inverse, np.full_like(inverse, config.noise)
+    if measured is not None:
+        factor, noise = measured.correction(KeyView(splats.viewmat, K, inverse, still, inverse, inverse), mover)
+        inverse = np.asarray(inverse * factor, np.float32)
+        factor = np.asarray(cv2.resize(factor, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+        whole = np.where(splats.moving > 0.5, whole * factor, whole)
+    values, sigma, weight = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, inverse), noise)
     # What moves and what stands still are surfaces of their own, however near they are.
-    weight, mover = weight / float(np.median(weight)), moving > 0.5
+    weight = weight / float(np.median(weight))
     still, moved = (fit_planes(values, weight * of + 1e-9, config.frame_radius) for of in (~mover, mover))
     planes = still.where(mover, moved)
     guide = np.concatenate([picture, (4.0 * config.color * (splats.moving > 0.5))[..., None]], axis=2, dtype=np.float32)
     small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
     small = np.concatenate([small, (4.0 * config.color * mover)[..., None]], axis=2, dtype=np.float32)
-    return selected(planes, sigma, small, splats.inverse, guide, config)
+    return selected(planes, sigma, small, whole, guide, config)
 
 
-def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array, Array]:
-    """(inverse depth, its standard deviation, weight), [h, w] each: the key views' where they agree with the splats."""
+def combined(surfaces: StillSurfaces, view: KeyView, noise: Array) -> tuple[Array, Array, Array]:
+    """(inverse depth, its standard deviation, weight), [h, w] each: the key views' where they agree with the splats,
+    whose own relative standard deviation is `noise` [h, w]."""
     config, radius = surfaces.config, surfaces.config.frame_radius
     rough = fit_planes(view.inverse, np.ones_like(view.inverse), radius)
     smooth = rough.around(config.noise * float(np.median(view.inverse)), radius)[0]
@@ -362,7 +379,7 @@ def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array, Arra
     information = total / (1.0 + total * spread)
     splats = 1.0 / np.square(config.prior * smooth)
     share = information / (information + splats)
-    variance = share * share / np.maximum(information, 1e-12) + np.square((1.0 - share) * config.noise * smooth)
+    variance = share * share / np.maximum(information, 1e-12) + np.square((1.0 - share) * noise * smooth)
     value = smooth + share * mean / known + (1.0 - share) * (view.inverse - smooth)
     return value, np.sqrt(variance), information + splats
 
@@ -474,18 +491,23 @@ class FrameDepths:
         return self._surfaces
 
     @torch.no_grad()
-    def of(self, viewmat: Tensor, K: Tensor, depth: Tensor, motion: Tensor, picture: Tensor) -> tuple[Tensor, Tensor]:
+    def of(
+        self, viewmat: Tensor, K: Tensor, depth: Tensor, motion: Tensor, picture: Tensor,
+        measured: Correction | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """(depth, its standard deviation) of a frozen frame, [H, W] each in scene units; 1e10 and 0 where nothing is.
 
         Args:
             viewmat: [4, 4] world-to-camera, scene units. `K`: [3, 3] pixels of the picture, overscan included.
             depth: [H, W] the splats' median depth. `motion`: [H, W] in 0..1, how much of it moves in the clip.
             picture: [H, W, 3] the finished frame, display-referred.
+            measured: what the artist's depth maps say of the instant, if anything.
         """
         there = depth < NO_DEPTH
         inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / _LEAST), 0.0)
         splats = Splats(viewmat.double().numpy(), K.double().numpy(), inverse.numpy(), motion.numpy())
-        found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, picture.clamp(0.0, 1.0).numpy()))
+        shown = picture.clamp(0.0, 1.0).numpy()
+        found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, shown, measured))
         refined = torch.where(there, 1.0 / found.clamp_min(_LEAST), NO_DEPTH)
         return refined, torch.where(there, sigma * refined.square(), 0.0)
 

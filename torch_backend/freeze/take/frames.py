@@ -94,7 +94,8 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
         h, w = made.terms["motion"].shape
         made.terms |= origin_terms(frozen, output.viewmat, K, spec.whole, spec.beyond, (w, h))
     picture = _display(made, slice(None)) + (1.0 - made.alpha[..., None]) * 0.5
-    made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture)
+    measured = spec.measured.at(output.t_star, frozen)
+    made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture, measured)
     return made
 
 

@@ -33,6 +33,7 @@ from ...torch_types import floats
 from ...train import LoadedRun, choose_device, load_run, static_views
 from ..composite.compositor import Compositor
 from ..composite.grain import Grain, measure_plate
+from ..composite.measured_depth import MeasuredDepths
 from ..composite.surface_depth import FrameDepths
 from ..frozen import CandidateInstant, OutputFrame, best_instants, rank_instants
 from ..instant.instants import Instants
@@ -65,6 +66,8 @@ class FrameSpec:
     """Width and height in pixels at which a frame's grain is drawn, without overscan."""
     depths: FrameDepths
     """Makes the frames' depth."""
+    measured: MeasuredDepths
+    """What the artist's depth maps say of the instants."""
     detail: Compositor | None = None
     """Makes the frames of plates; None: splats alone."""
     detail_key: str = ""
@@ -155,8 +158,8 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
     spec = FrameSpec(
-        run, instants, params.query, (width, height), beyond, grain, plate, FrameDepths(run, scene), detail,
-        detail_key(shot, detail), footage_light(shot),
+        run, instants, params.query, (width, height), beyond, grain, plate, FrameDepths(run, scene),
+        MeasuredDepths(run, scene), detail, detail_key(shot, detail), footage_light(shot),
         Path(params.debug_terms) if params.debug_terms else None, _start(shot),
     )  # fmt: skip
     keys = {f.frame: spec.key(f) for f in whole}

@@ -1,0 +1,216 @@
+"""A training with depth maps: they are fitted, what moves is nearer to its true depth, nothing stale is believed."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world, paint_motion
+from torch_backend.contract import DEPTH_FILE, PAINTED_FOLDER, ExitCode, JobError, TrainParams
+from torch_backend.freeze.composite.measured_depth import MeasuredDepths
+from torch_backend.freeze.composite.surface_depth import FrameDepths
+from torch_backend.freeze.frozen import freeze_at, render_frozen, span_of
+from torch_backend.raster import rasterize
+from torch_backend.scene import load_scene
+from torch_backend.shot import write_json
+from torch_backend.train import load_run, train_shot
+from torch_backend.train.checkpoint import read_meta
+from torch_backend.train.depth import depth_pull, load_fitted
+from torch_backend.train.model import render
+
+
+def true_depth(world, n):
+    """[H, W] of a frame of the tiny world, its units."""
+    out = rasterize(
+        **world.at(n / (FRAMES - 1)), viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=WIDTH, height=HEIGHT,
+        with_depth=True,
+    )  # fmt: skip
+    return out.depth_median[0].double().numpy()
+
+
+def write_depth(world, folder: Path, of=lambda depth, n: 0.4 * depth, noise=0.02, frames=range(FRAMES)) -> Path:
+    """Depth maps of the tiny world as 16-bit PNG, with noise."""
+    folder.mkdir(exist_ok=True)
+    rng = np.random.default_rng(0)
+    for n in frames:
+        depth = true_depth(world, n)
+        values = of(depth * (1.0 + noise * rng.standard_normal(depth.shape)), n)
+        cv2.imwrite(str(folder / f"{FIRST + n:06d}.png"), np.clip(values * 2e4, 1, 65535).astype(np.uint16))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def swaying(tmp_path_factory):
+    """A tiny world of its own, whose lens is told and whose patch is painted as moving."""
+    world = build_world(tmp_path_factory.mktemp("swaying"))
+    paint_motion(world)
+    write_json(
+        world.shot.solve_record,
+        {"version": 1, "camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0},
+    )
+    return world
+
+
+def asked(run, depth=""):
+    return TrainParams(run=run, iterations=60, max_gaussians=1500, holdout=8, depth=str(depth))
+
+
+def moving_error(world, run):
+    """Median relative error of the depth of what moves, inside, at each frame's own time."""
+    model, scene, errors = load_run(world.shot, run).model, load_scene(world.shot), []
+    for n in range(FRAMES):
+        matte = cv2.imread(str(world.shot.root / PAINTED_FOLDER / f"{FIRST + n:06d}.png"), cv2.IMREAD_GRAYSCALE) > 200
+        inside = cv2.erode(matte.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        state = model.state_at(float(scene.times[n]))
+        out = render(state, model.sh_degree, scene.viewmats[n], scene.Ks[n], WIDTH, HEIGHT, with_depth=True)
+        depth = out.depth_median[0].detach().numpy() / scene.scale
+        errors.append(np.abs(depth / true_depth(world, n) - 1.0)[inside])
+    return float(np.median(np.concatenate(errors)))
+
+
+@pytest.fixture(scope="module")
+def pairs(swaying, quiet, tmp_path_factory):
+    """Runs without-SEED and with-SEED of two seeds, without and with depth maps."""
+    folder = write_depth(swaying, tmp_path_factory.mktemp("maps") / "depth")
+    for seed in (0, 1):
+        for name, depth in ((f"without-{seed}", ""), (f"with-{seed}", folder)):
+            train_shot(swaying.shot, dataclasses.replace(asked(name, depth), seed=seed, iterations=500), quiet())
+    return swaying
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_moves_is_nearer_to_its_true_depth(pairs, seed):
+    assert moving_error(pairs, f"with-{seed}") < 0.8 * moving_error(pairs, f"without-{seed}")
+
+
+@pytest.mark.parametrize("pose", [6, 8])
+def test_the_depth_of_a_frozen_frame_is_measured_by_the_map_of_its_instant(pairs, pose):
+    """From plate t* itself and from beside it, against the world as it stood at t*."""
+    t_star = 6
+    run, scene = load_run(pairs.shot, "with-0"), load_scene(pairs.shot)
+    frozen = freeze_at(run.model, float(scene.times[t_star]), span_of(scene, run))
+    image = render_frozen(frozen, scene.viewmats[pose], scene.Ks[pose], WIDTH, HEIGHT)
+    measured = MeasuredDepths(run, scene).at(FIRST + t_star, frozen)
+    assert measured is not None and MeasuredDepths(run, scene).at(FIRST + 0.5, frozen) is None
+    state = {name: value[pairs.moving] for name, value in pairs.at(t_star / (FRAMES - 1)).items()}
+    camera = {"viewmats": pairs.viewmats[pose : pose + 1], "Ks": pairs.K[None], "width": WIDTH, "height": HEIGHT}
+    patch = rasterize(**state, **camera, with_depth=True)
+    inside = cv2.erode((patch.alphas[0] > 0.9).numpy().astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    inside &= image.motion.numpy() > 0.5
+    assert inside.sum() > 50
+
+    def error(depth):
+        return float(np.median(np.abs(depth.numpy() / scene.scale / patch.depth_median[0].numpy() - 1.0)[inside]))
+
+    depths, picture = FrameDepths(run, scene), pairs.image(pose, t_star / (FRAMES - 1))
+    given = scene.viewmats[pose], scene.Ks[pose], image.depth, image.motion, picture
+    without, _ = depths.of(*given)
+    with_map, sigma = depths.of(*given, measured)
+    assert error(with_map) < 0.7 * error(without)
+    assert bool((sigma >= 0).all()) and bool(torch.isfinite(sigma).all())
+
+
+@pytest.mark.parametrize("kind", ["depth", "inverse depth"])
+def test_fitted_maps_are_the_true_depth_whatever_scale_and_shift_they_had(swaying, quiet, tmp_path, kind):
+    def values(depth, n):
+        return (0.3 + 0.01 * n) * depth + 0.2 if kind == "depth" else (2.0 + 0.1 * n) / depth + 0.1
+
+    folder = write_depth(swaying, tmp_path / "depth", values, noise=0.005)
+    name = kind.replace(" ", "-")
+    report = quiet()
+    summary = train_shot(swaying.shot, asked(name, folder), report)
+    facts, scene = summary["depth"], load_scene(swaying.shot)
+    # The tiny world has two depths: a line through both is right, of whatever kind.
+    assert facts["residual"] < 0.02 and facts["frames"] == FRAMES
+    assert any(facts["linear_in"] in event[4] for event in report.events if event[:2] == ("progress", "depth"))
+    fitted = load_run(swaying.shot, name).depth()
+    assert fitted is not None and fitted.frames == list(range(FIRST, FIRST + FRAMES))
+    for n in (0, 7, 15):
+        inverse, sigma = fitted.at(FIRST + n)
+        off = 1.0 / inverse.numpy() / scene.scale / true_depth(swaying, n) - 1.0
+        assert np.median(np.abs(off)) < 0.02
+        assert 0.005 < float((sigma / inverse).median()) < 0.03
+
+
+def test_frames_without_a_usable_map_are_trained_without_in_one_sentence(swaying, quiet, tmp_path):
+    folder = write_depth(swaying, tmp_path / "depth")
+    (folder / "000103.png").unlink()
+    (folder / "000104.png").write_bytes(b"no picture")
+    cv2.imwrite(str(folder / "000105.png"), np.full((48, 20), 9, np.uint16))
+    report = quiet()
+    summary = train_shot(swaying.shot, asked("holes", folder), report)
+    assert summary["depth"]["frames"] == FRAMES - 3 and math.isfinite(summary["heldout_psnr_db"])
+    told = [event[1] for event in report.events if event[0] == "warning" and str(folder) in event[1]]
+    assert len(told) == 1 and "frame 103" in told[0] and "frame 104" in told[0] and "frame 105" in told[0]
+
+
+def test_a_sequence_of_something_else_is_refused_and_so_is_one_without_a_usable_map(swaying, quiet, tmp_path):
+    rng = np.random.default_rng(1)
+    other = write_depth(swaying, tmp_path / "other", lambda depth, n: rng.uniform(0.1, 1.0, depth.shape))
+    broken = write_depth(swaying, tmp_path / "broken")
+    for file in broken.iterdir():
+        file.write_bytes(b"no picture")
+    for folder in (other, broken):
+        with pytest.raises(JobError) as refused:
+            train_shot(swaying.shot, asked("refused", folder), quiet())
+        assert refused.value.exit_code == ExitCode.TRAIN and str(folder) in str(refused.value)
+    assert not (swaying.shot.run("refused") / "checkpoint.safetensors").is_file()
+
+
+def test_a_run_is_known_by_the_contents_of_its_maps(swaying, quiet, tmp_path):
+    folder = write_depth(swaying, tmp_path / "depth")
+
+    def key_after(depth):
+        report = quiet()
+        train_shot(swaying.shot, asked("keyed", depth), report)
+        done = ("progress", "training", 1, 1, "already trained") in report.events
+        return read_meta(swaying.shot.run("keyed") / "checkpoint.safetensors")["key"], done
+
+    plain, _ = key_after("")
+    assert not (swaying.shot.run("keyed") / DEPTH_FILE).exists()
+    first, done = key_after(folder)
+    assert first != plain and not done
+    assert key_after(folder) == (first, True)
+    stored = load_run(swaying.shot, "keyed").depth()
+    (swaying.shot.run("keyed") / DEPTH_FILE).unlink()
+    with pytest.raises(JobError, match="depth"):
+        load_run(swaying.shot, "keyed").depth()
+    assert key_after(folder) == (first, True), "what was removed is fitted again"
+    assert torch.equal(load_run(swaying.shot, "keyed").depth().inverse, stored.inverse)
+    write_depth(swaying, folder, frames=[5], noise=0.1)
+    second, done = key_after(folder)
+    assert second not in (first, plain) and not done
+    with pytest.raises(JobError):
+        load_fitted(swaying.shot.run("keyed"), "another key")
+    assert key_after("")[0] == plain
+    assert load_run(swaying.shot, "keyed").depth() is None
+    assert not (swaying.shot.run("keyed") / DEPTH_FILE).exists()
+    config = json.loads((swaying.shot.run("keyed") / "config.json").read_text())
+    assert "depth" not in config
+
+
+def test_an_extended_run_keeps_its_maps_without_the_folder(swaying, quiet, tmp_path):
+    folder = write_depth(swaying, tmp_path / "depth")
+    train_shot(swaying.shot, asked("longer", folder), quiet())
+    for file in folder.iterdir():
+        file.unlink()
+    summary = train_shot(swaying.shot, TrainParams(run="longer", extend=10), quiet())
+    assert summary["iterations"] >= 61 and summary["depth"]["frames"] == FRAMES
+    assert load_run(swaying.shot, "longer").depth() is not None
+
+
+def test_the_pull_is_hubers_loss_in_deviations_of_inverse_depth():
+    expected = torch.tensor([[2.0, 4.0, 5.0]], dtype=torch.float64, requires_grad=True)
+    wanted = torch.tensor([[[0.5, 0.2, 0.0]], [[0.1, 0.1, 0.1]]], dtype=torch.float64)
+    loss = depth_pull(expected, wanted)
+    assert float(loss.detach()) == pytest.approx((0.0 + 0.5 * 0.5**2 + 0.0) / 3.0)
+    loss.backward()
+    reference = (0.25 - 0.2) / 0.1**2 * (-1.0 / 16.0) / 3.0
+    np.testing.assert_allclose(expected.grad.numpy(), [[0.0, reference, 0.0]], atol=1e-12)
+    far = torch.tensor([[1e10]], dtype=torch.float64)
+    assert math.isfinite(float(depth_pull(far, wanted[:, :, :1])))

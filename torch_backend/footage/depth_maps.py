@@ -1,0 +1,183 @@
+"""Depth maps that an artist gives: one picture per frame, of a phone's sensor or a monocular network.
+
+Values are what the files hold: metres, disparity, or anything that grows or falls with either. What they mean is found
+by `train.depth_fit`. Pictures go by number (`pairing`) and are stretched over the frame as it was filmed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from ..contract import JobError, Reporter, files_digest, is_pattern, regular_file
+from ..shot import Shot
+from .images import check_size, error_of
+from .importing import load_frames
+from .oiio_types import channel_names
+from .pairing import counted_of, pair, pairing_words
+from .sequence import find_sequence
+from .sources import footage_error, frame_words
+
+_FARTHEST = 1e9
+"""Values from which on renderers and sensors mean "nothing here": Blender writes 1e10, others 1e30 or infinity."""
+_SHAPE = 0.04
+"""How much a map's aspect may differ from the frame's: networks round sides to multiples of 14 or 32 pixels."""
+_GREY = 1.0 / 512.0
+"""Difference of red, green and blue, in 0..1, from which on a picture is coloured: half a step of 8 bits."""
+
+
+class UnusableMap(Exception):
+    """A depth map that is left out; its text completes "The depth map of frame 4 ..."."""
+
+
+@dataclass
+class DepthSequence:
+    """The depth maps of a shot's frames."""
+
+    source: Path
+    """What the artist named: a folder, one of its files or a pattern."""
+    files: dict[int, Path]
+    """Frame number of the shot -> its map, ascending."""
+    aspect: float
+    """Width over height of the frames as they were filmed."""
+    stretched: float = 1.0
+    """Width of the footage's pixels over their height."""
+    refused: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
+    """Reason -> frames whose map was left out for it."""
+
+    @property
+    def key(self) -> str:
+        """Changes with the numbers and contents of the files."""
+        return files_digest(self.files)
+
+    def read(self, frame: int) -> NDArray[np.float32] | None:
+        """[h, w] values of a frame's map, NaN where it holds none; None, noted in `refused`, if it is of no use."""
+        file = self.files.get(frame)
+        try:
+            if file is None:
+                raise UnusableMap("is missing")
+            values = read_map(file)
+            h, w = values.shape
+            if all(abs(w / h / (self.aspect / ratio) - 1.0) > _SHAPE for ratio in (1.0, self.stretched)):
+                raise UnusableMap(f"has another shape than the footage ({w}x{h})")
+            return values
+        except UnusableMap as reason:
+            self.refused.setdefault(str(reason), []).append(frame)
+            return None
+
+    def refused_words(self, frames: int) -> str:
+        """A sentence about the maps that were left out, of `frames` wanted ones; empty if none was."""
+        count = sum(map(len, self.refused.values()))
+        if not count:
+            return ""
+        reasons = "; ".join(f"{frame_words(sorted(of))} {reason}" for reason, of in self.refused.items())
+        return f"{count} of {frames} depth maps of {self.source} are not used: {reasons}."
+
+
+def find_depth(shot: Shot, source: str, report: Reporter) -> DepthSequence:
+    """The depth maps that `source` names, a folder, one of its pictures or a pattern, by the shot's frames.
+
+    JobError (FOOTAGE) if there are none, or if none belongs to a frame.
+    """
+    path, record = Path(source), load_frames(shot)
+    if not path.exists() and not is_pattern(path.name):
+        raise footage_error(f"The depth sequence {path} does not exist.", "Check the path.")
+    sequence = find_sequence(path)
+    counted = counted_of(record)
+    theirs = sorted(sequence.files)
+    paired = pair(theirs, counted)
+    if not paired.numbers:
+        raise footage_error(
+            f"None of the depth maps {sequence.pattern} ({theirs[0]} to {theirs[-1]}) belongs to a frame "
+            f"({counted.frames[0]} to {counted.frames[-1]}).",
+            "Number them as the clip's frames.",
+        )
+    words = pairing_words(f"The depth sequence {sequence.pattern}", theirs, paired)
+    if words is not None:
+        report.warning(*words)
+    width, height = record.get("source_size") or (record["width"], record["height"])
+    stretched = float(record.get("reading", {}).get("pixel_aspect", 1.0))
+    files = {frame: sequence.files[number] for frame, number in paired.numbers.items()}
+    return DepthSequence(path, files, width / height, stretched)
+
+
+def read_map(file: Path) -> NDArray[np.float32]:
+    """[h, w] float32 values of a depth map as stored, NaN where it holds none.
+
+    Unknown is what is not finite, zero, or beyond 1e9. Of an EXR the channel Z, or one named depth, or the only one is
+    read. UnusableMap says what is wrong with a file.
+    """
+    try:
+        image = oiio.ImageInput.open(regular_file(file))
+    except (OSError, ValueError) as error:
+        raise UnusableMap("cannot be read") from error
+    if image is None:
+        error_of()
+        raise UnusableMap("cannot be read")
+    try:
+        part, channels = _depth_channels(file, image)
+        spec = image.spec()
+        pixels = image.read_image(part, 0, channels.start, channels.stop, oiio.FLOAT)
+        if pixels is None:
+            error_of(image)
+            raise UnusableMap("cannot be read")
+        values = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, -1)
+    finally:
+        image.close()
+    if values.shape[2] > 1 and float(np.ptp(np.nan_to_num(values), axis=2).max()) > _GREY:
+        raise UnusableMap("is a coloured picture, not a map of depth")
+    one = values[..., 0].copy()
+    one[~(np.isfinite(one) & (one != 0.0) & (np.abs(one) < _FARTHEST))] = np.nan
+    if not np.isfinite(one).any():
+        raise UnusableMap("holds no depth")
+    return one
+
+
+def _depth_channels(file: Path, image: oiio.ImageInput) -> tuple[int, range]:
+    """(part, channels) of a picture that hold its depth; three channels are to be grey. The part is sought."""
+    best: tuple[int, int, range] | None = None
+    seen: list[str] = []
+    part, is_exr = 0, image.format_name() == "openexr"
+    while image.seek_subimage(part, 0) and (part == 0 or is_exr):
+        spec = image.spec()
+        try:
+            check_size(file.name, spec)
+        except JobError as error:
+            raise UnusableMap("is too large") from error
+        if spec.deep:
+            raise UnusableMap("holds deep data")
+        names = list(channel_names(spec))
+        seen += names
+        for rank, channels in _candidates(names, spec.alpha_channel, is_exr):
+            if best is None or rank < best[0]:
+                best = rank, part, channels
+        part += 1
+    if best is None:
+        raise UnusableMap(f"has no depth channel, only {', '.join(seen[:8])}")
+    image.seek_subimage(best[1], 0)
+    return best[1], best[2]
+
+
+def _candidates(names: list[str], alpha: int, is_exr: bool) -> list[tuple[int, range]]:
+    """(rank, channels) of what may be depth, the surest with the lowest rank."""
+    found: list[tuple[int, range]] = []
+    lower = [name.lower() for name in names]
+    for n, name in enumerate(lower):
+        layer, _, last = name.rpartition(".")
+        dot = layer + "." if layer else ""
+        if last == "z" and dot + "x" not in lower:  # a Z beside an X is a vector's
+            found.append((0, range(n, n + 1)))
+        elif "depth" in name:
+            found.append((1, range(n, n + 1)))
+        elif last == "y" and dot + "x" not in lower and dot + "ry" not in lower:
+            found.append((2, range(n, n + 1)))
+    plain = [n for n in range(len(names)) if n != alpha]
+    if len(plain) == 1:
+        found.append((3, range(plain[0], plain[0] + 1)))
+    elif plain[:3] == [0, 1, 2] and (not is_exr or len(plain) == 3):
+        found.append((4, range(0, 3)))
+    return found
