@@ -70,6 +70,10 @@ class FreezeSettings:
         **contract.panel(contract.FreezeParams, "develop"),
         options=set(),
     )
+    passes = BoolProperty(
+        **contract.panel(contract.FreezeParams, "passes"),
+        options=set(),
+    )
     freeze_width = IntProperty(
         **contract.panel(contract.FreezeParams, "width"),
         min=0,

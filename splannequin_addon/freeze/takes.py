@@ -36,6 +36,7 @@ def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
         overscan={"OFF": 0.0, "LENS": -1.0, "PERCENT": props.overscan_percent}[props.overscan],
         detail="on" if props.detail else "off",
         develop="on" if props.develop else "off",
+        passes=props.passes,
         only_missing=True,
         device=backend.device(),
     )
@@ -104,6 +105,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         grain=bool(facts.get("grain")),
         detail="on" if facts.get("detail") else "off",
         develop="on" if facts.get("developed") is not None else "off",
+        passes=bool(facts.get("passes")),
     )
 
 

@@ -236,6 +236,8 @@ MESSAGES: dict[str, str] = {
     "Make frozen frames of the plates, where they can be believed: as sharp as the plate. Off: of the splats alone, soft throughout": "Eingefrorene Bilder aus den Plates machen, wo ihnen zu trauen ist: so scharf wie die Plate. Aus: aus den Splats allein, durchweg weich",
     "Develop": "Entwickeln",
     "Train the frozen instant on as the still scene that it is, before it is rendered: what moves is there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each t*. Off: the instant as the training left it": "Den eingefrorenen Zeitpunkt vor dem Rendern als die stillstehende Szene, die er ist, weitertrainieren: was sich bewegt, ist da, wie die Plate bei t* es zeigt, und was stillsteht, ist schärfer. Dauert bis zu einige Minuten, einmal je t*. Aus: der Zeitpunkt, wie das Training ihn hinterließ",
+    "Passes": "Passes",
+    "Write motion vectors of the camera's move (Blender's Vector layout), normals and positions as further layers of the frames, in the scene's axes and units": "Bewegungsvektoren der Kamerafahrt (wie in Blenders Vektor-Pass), Normalen und Positionen als weitere Layer der Bilder schreiben, in den Achsen und Einheiten der Szene",
     "Developing": "Entwickeln",
     "t* {}, step {} of {}": "t* {}, Schritt {} von {}",
     "The developed instant is not kept: {}": "Der entwickelte Zeitpunkt wird nicht aufgehoben: {}",

@@ -32,6 +32,11 @@ class FrameLayer:
     socket: str = "NodeSocketFloat"
     """Type of that output."""
 
+    @property
+    def is_colour(self) -> bool:
+        """True if the file has it in the light of its header; numbers such as positions stay as they are."""
+        return len(self.channels) > 1 and self.channels[0].endswith("R")
+
 
 FRAME_LAYERS = (
     FrameLayer(
@@ -115,6 +120,31 @@ FRAME_LAYERS = (
         part="detail",
         output="Source",
         tip="Number of the frame whose plate gives most of the pixel",
+    ),
+    FrameLayer(
+        "Vector",
+        ("Vector.X", "Vector.Y", "Vector.Z", "Vector.W"),
+        "half",
+        "Vector.X Y Z W",
+        "motion by the camera's move in pixels, y up, as Blender's Vector pass: from here to the frame before in X Y, "
+        "from the frame after to here in Z W; with `--passes`, like the next two",
+        part="passes",
+    ),
+    FrameLayer(
+        "Normal",
+        ("Normal.X", "Normal.Y", "Normal.Z"),
+        "half",
+        "Normal.X Y Z",
+        "direction that the surface faces, in the scene's axes",
+        part="passes",
+    ),
+    FrameLayer(
+        "Position",
+        ("Position.X", "Position.Y", "Position.Z"),
+        "float",
+        "Position.X Y Z",
+        "place of the surface in the scene's axes and units, as the shot stood there when it was frozen",
+        part="passes",
     ),
 )
 """In the order of the file."""

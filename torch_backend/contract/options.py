@@ -612,6 +612,16 @@ class FreezeParams:
         True, flag="--no-grain", switch=True, help="leave the plate's grain out of the files: a third smaller"
     )
     """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
+    passes: bool = option(
+        False,
+        flag="--passes",
+        switch=True,
+        help="motion vectors, normals and positions as layers of the frames",
+        label="Passes",
+        tip="Write motion vectors of the camera's move (Blender's Vector layout), normals and positions as further "
+        "layers of the frames, in the scene's axes and units",
+    )
+    """Write the layers of `FRAME_LAYERS` whose part is passes."""
     debug_terms: str = option(
         "",
         flag="--debug-terms",

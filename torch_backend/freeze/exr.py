@@ -299,7 +299,8 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
     for name, row in _MORE.items():
         if set(row.channels) <= set(names):
             at = [names.index(channel) for channel in row.channels]
-            layer = in_light(pixels[..., at], back) if len(at) > 1 else pixels[..., at[0]]
+            layer = pixels[..., at] if len(at) > 1 else pixels[..., at[0]]
+            layer = in_light(layer, back) if row.is_colour else layer
             more[name] = np.ascontiguousarray(layer)
     return FrozenFrame(rgba, depth, support, motion, metadata, beyond, grain, detail, more)
 
@@ -348,7 +349,7 @@ _STORED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
 def _stored(name: str, layer: Rows, matrix: NDArray[np.float32] | None) -> Rows:
     """A layer as its file has it: colours in the file's light, rounded as the layer's kind is."""
     change = _STORED.get(name, lambda rows: rows)
-    if matrix is not None and len(layer.shape) == 3:
+    if matrix is not None and len(layer.shape) == 3 and (name not in _MORE or _MORE[name].is_colour):
         return Made(layer.shape, lambda rows: change(in_light(layer[rows], matrix)))
     return Made(layer.shape, lambda rows: change(layer[rows])) if name in _STORED else layer
 

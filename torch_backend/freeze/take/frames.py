@@ -7,6 +7,7 @@ from collections.abc import Callable, Set
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...contract import (
@@ -36,7 +37,11 @@ from .write_beside import WriteBeside
 def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> None:
     """Develops the instants of those of `frames` that are not done. JobError if the disk has no room for the frames."""
     spec, missing = take.spec, [f for f in frames if f.frame not in done]
-    each = spec.whole[0] * spec.whole[1] * (20.0 + (6.0 if spec.grain else 0.0) + (24.0 if spec.detail else 0.0))
+    each = (
+        spec.whole[0]
+        * spec.whole[1]
+        * (20.0 + (6.0 if spec.grain else 0.0) + (24.0 if spec.detail else 0.0) + (26.0 if spec.passes else 0.0))
+    )
     need_disk(take.folder.root, len(missing) * each, "the take")
     spec.instants.prepare((f.t_star for f in missing), report)
 
@@ -86,8 +91,7 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
     """A frame of the take, of splats or of plates."""
     frozen = spec.instants.at(output.t_star, report)
     exposed_at = scene.time_of_frame(output.exposed_like)
-    K = output.K.clone()
-    K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")  # the same camera, with more pixels around
+    K = whole_camera(output, spec)
     image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
     made = image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
     if spec.debug_terms is not None and isinstance(made, CompositeFrame):
@@ -97,6 +101,13 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
     measured = spec.measured.at(output.t_star, frozen)
     made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture, measured)
     return made
+
+
+def whole_camera(output: OutputFrame, spec: FrameSpec) -> Tensor:
+    """[3, 3] a frame's camera in pixels of its picture with overscan."""
+    K = output.K.clone()
+    K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")
+    return K
 
 
 def _write(
@@ -144,7 +155,11 @@ def _write_frame(
         splat, covered = image.splat.numpy(), image.splat_alpha.numpy()
         shown = Made((*size, 4), lambda rows: scene_linear(splat[rows], covered[rows], scene.display))
         layers = DetailLayers(shown, image.plate, image.source)
-    sigma = None if image.depth_sigma is None else (image.depth_sigma / scene.scale).numpy()
+    more: dict[str, NDArray[np.float32] | Made] = {}
+    if image.depth_sigma is not None:
+        more["DepthSigma"] = (image.depth_sigma / scene.scale).numpy()
+    if spec.passes is not None:
+        more |= spec.passes.of(output, whole_camera(output, spec), image.depth)
     write_frozen_exr(
         folder.frame(output.frame),
         Made((*size, 4), rgba),
@@ -163,7 +178,7 @@ def _write_frame(
         spec.beyond,
         None if spec.grain is None else _grain(spec.grain, output.frame, image, spec, scene.display),
         layers,
-        None if sigma is None else {"DepthSigma": sigma},
+        more,
     )
 
 

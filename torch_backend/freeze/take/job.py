@@ -134,6 +134,7 @@ def _finish(
         **({} if params.t_star is None else {"t_star_asked": params.t_star}),
         "fps": shot.info().fps,
         "scale": scene.scale,
+        "passes": spec.passes is not None,
         "grain": None if spec.grain is None else spec.grain.to_json(),
         "footage": footage_facts(shot, folder.root),
         "exr_dir": str(folder.root),

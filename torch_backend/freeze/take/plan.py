@@ -28,6 +28,7 @@ from ...footage.plates import Plates
 from ...scene import Scene, frame_table, load_scene
 from ...shot import Shot, content_key
 from ...solve.motion import find_motion, motion_key
+from ...solve.placement import Similarity, placement_for
 from ...solve.stmap import margin
 from ...torch_types import floats
 from ...train import LoadedRun, choose_device, load_run, static_views
@@ -39,6 +40,7 @@ from ..frozen import CandidateInstant, OutputFrame, best_instants, rank_instants
 from ..instant.instants import Instants
 from .cameras import intrinsics, output_size, plan
 from .footage_facts import footage_light
+from .passes import Passes
 
 TAKE_VERSION = 3
 """Rises when frames rendered before must not stand beside new ones."""
@@ -74,6 +76,8 @@ class FrameSpec:
     """Identifies the plates and mattes that it uses; empty without it."""
     light: str = LIGHTS[0]
     """Primaries of the light in which frames leave, one of `LIGHTS`: the footage's own."""
+    passes: Passes | None = None
+    """Makes motion vectors, normals and positions; None: they are not written."""
     debug_terms: Path | None = None
     """Folder that gets the terms behind each frame's decisions; None: they are not written."""
     start: tuple[str, int, float] = ("", 0, 0.0)
@@ -109,6 +113,7 @@ class FrameSpec:
             floats(output.K.flatten()),
             *([self.beyond] if any(self.beyond) else []),
             *([self.detail_key] if self.detail_key else []),
+            *([] if self.passes is None else self.passes.facts(output)),
             *([self.light] if self.light != LIGHTS[0] else []),
             *([self.instants.keys[output.t_star]] if output.t_star in self.instants.keys else []),
         )
@@ -160,6 +165,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     spec = FrameSpec(
         run, instants, params.query, (width, height), beyond, grain, plate, FrameDepths(run, scene),
         MeasuredDepths(run, scene), detail, detail_key(shot, detail), footage_light(shot),
+        Passes(whole, scene, Similarity.of(placement_for(shot, params.placement))) if params.passes else None,
         Path(params.debug_terms) if params.debug_terms else None, _start(shot),
     )  # fmt: skip
     keys = {f.frame: spec.key(f) for f in whole}

@@ -1,0 +1,146 @@
+"""Passes of a frozen frame: motion vectors of the camera's move, normals and positions, from the depth that is written.
+
+The world stands still, so a pixel's motion is that of its point between the cameras of two frames. Layouts are those of
+Blender's own passes, as a Cycles render of bpy 5.0 has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...contract import NO_DEPTH
+from ...scene import Scene
+from ...solve.placement import Similarity
+from ...torch_types import floats
+from ..exr import Made
+from ..frozen import OutputFrame
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+_NEAREST = 1e-6
+"""Depth in scene units of the model below which a point is behind a camera."""
+
+
+@dataclass(frozen=True)
+class Passes:
+    """Makes the passes of a take's frames."""
+
+    frames: Sequence[OutputFrame]
+    """All frames of the take, ascending."""
+    scene: Scene
+    """Of the shot."""
+    to_scene: Similarity
+    """From solve units to the axes and units of Blender's scene."""
+
+    def facts(self, output: OutputFrame) -> list[Any]:
+        """What a frame's passes depend on beside its own picture, for its key."""
+        near = [floats(each.viewmat.flatten()) for each in self._beside(output) if each is not None]
+        return [self.to_scene.matrix.flatten().tolist(), near]
+
+    def of(self, output: OutputFrame, K: Tensor, depth: Tensor) -> dict[str, Made]:
+        """The layers of a frame by name, made some rows at a time.
+
+        Args:
+            output: the frame.
+            K: [3, 3] its camera in pixels of `depth`, overscan included.
+            depth: [H, W] along the camera's axis, scene units of the model; `NO_DEPTH` where nothing is.
+
+        Returns:
+            Vector: [H, W, 4] pixels, x right and y up: where the point was in the frame before, less where it is; where
+            it is, less where it will be in the frame after. 0 at the ends of the take and where nothing is.
+            Normal: [H, W, 3] unit vectors towards the camera's side, in the scene's axes; 0 where nothing is.
+            Position: [H, W, 3] in the scene's axes and units; 0 where nothing is.
+        """
+        height, width = depth.shape
+        lens = K.double().numpy()
+
+        def seen(rows: slice) -> tuple[Array, Mask]:
+            return _unprojected(depth[rows].double().numpy(), rows.start, output, lens)
+
+        def layer(channels: int, rows: Callable[[slice], NDArray[np.float32]]) -> Made:
+            return Made((height, width, channels), rows)
+
+        return {
+            "Vector": layer(4, lambda rows: self._vectors(*seen(rows), output, lens, rows.start)),
+            "Normal": layer(3, lambda rows: self._normals(seen, rows, height)),
+            "Position": layer(3, lambda rows: self._positions(*seen(rows))),
+        }
+
+    def _beside(self, output: OutputFrame) -> tuple[OutputFrame | None, OutputFrame | None]:
+        """The take's frames before and after one."""
+        at = {each.frame: each for each in self.frames}
+        return at.get(output.frame - 1), at.get(output.frame + 1)
+
+    def _positions(self, points: Array, is_solid: Mask) -> NDArray[np.float32]:
+        solve = points / self.scene.scale + self.scene.centre
+        return np.where(is_solid[..., None], self.to_scene.points(solve), 0.0).astype(np.float32)
+
+    def _normals(
+        self, seen: Callable[[slice], tuple[Array, Mask]], rows: slice, height: int
+    ) -> NDArray[np.float32]:  # fmt: skip
+        """Of the plane through each point and its nearer neighbours across and down: a step in depth is none of it."""
+        wide = slice(max(0, rows.start - 1), min(height, rows.stop + 1))
+        inner = slice(rows.start - wide.start, rows.stop - wide.start)
+        points, is_solid = seen(wide)
+        normals = np.cross(_slope(points, is_solid, 0), _slope(points, is_solid, 1))[inner]
+        lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+        has_normal = is_solid[inner][..., None] & (lengths > 0.0)
+        units = normals / np.where(has_normal, lengths, 1.0) @ self.to_scene.rotation.T
+        return np.where(has_normal, units, 0.0).astype(np.float32)
+
+    def _vectors(
+        self, points: Array, is_solid: Mask, output: OutputFrame, lens: Array, top: int
+    ) -> NDArray[np.float32]:  # fmt: skip
+        found = np.zeros((*is_solid.shape, 4), np.float32)
+        x, y = _centres(is_solid.shape, top)
+        for at, sign, other in zip((0, 2), (1.0, -1.0), self._beside(output), strict=True):
+            if other is None:
+                continue
+            its_lens = other.K.double().numpy().copy()
+            its_lens[:2, 2] += (lens - output.K.double().numpy())[:2, 2]  # as much overscan as this frame has
+            viewmat = other.viewmat.double().numpy()
+            local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+            is_ahead = is_solid & (local[..., 2] > _NEAREST)
+            ahead = np.where(is_ahead, local[..., 2], 1.0)
+            across = its_lens[0, 0] * local[..., 0] / ahead + its_lens[0, 2] - x
+            down = its_lens[1, 1] * local[..., 1] / ahead + its_lens[1, 2] - y
+            found[..., at] = np.where(is_ahead, sign * across, 0.0)
+            found[..., at + 1] = np.where(is_ahead, -sign * down, 0.0)
+        return found
+
+
+def _centres(shape: tuple[int, ...], top: int) -> tuple[Array, Array]:
+    """(x [w], y [h, 1]) of the pixels' centres of some rows, the first of which is row `top`."""
+    x, y = np.arange(shape[1], dtype=np.float64), np.arange(top, top + shape[0], dtype=np.float64)
+    half = np.float64(0.5)
+    return x + half, y[:, None] + half
+
+
+def _unprojected(depth: Array, top: int, output: OutputFrame, lens: Array) -> tuple[Array, Mask]:
+    """([h, w, 3] points in scene units of the model, [h, w] where there is something) of rows of depth [h, w]."""
+    x, y = _centres(depth.shape, top)
+    is_solid = depth < NO_DEPTH
+    solid = np.where(is_solid, depth, 1.0)
+    local = np.stack([(x - lens[0, 2]) / lens[0, 0] * solid, (y - lens[1, 2]) / lens[1, 1] * solid, solid], axis=-1)
+    viewmat = output.viewmat.double().numpy()
+    return (local - viewmat[:3, 3]) @ viewmat[:3, :3], is_solid
+
+
+def _slope(points: Array, is_solid: Mask, axis: int) -> Array:
+    """[h, w, 3] the difference along an axis (0 down, 1 across) to the nearer of both neighbours; 0 without any."""
+    steps = np.diff(points, axis=axis)
+    has_both = np.take(is_solid, range(1, is_solid.shape[axis]), axis) & np.take(
+        is_solid, range(is_solid.shape[axis] - 1), axis
+    )
+    steps[~has_both] = np.inf
+    edge = np.full_like(np.take(points, [0], axis), np.inf)
+    forward, backward = np.concatenate([steps, edge], axis), np.concatenate([edge, steps], axis)
+    is_forward = np.linalg.norm(forward, axis=-1) <= np.linalg.norm(backward, axis=-1)
+    nearer = np.where(is_forward[..., None], forward, backward)
+    return np.where(np.isfinite(nearer), nearer, 0.0)
