@@ -8,6 +8,7 @@ carries the same key.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from torch import Tensor
 from ..contract import DEPTH_FILE, ExitCode, JobError, Reporter, depth_line
 from ..contract.files import is_json_object
 from ..footage.depth_maps import DepthSequence
+from ..raster import rasterize
 from ..scene import Scene, resize_intrinsics, surface_of
 from ..shot import Shot, content_key, need_disk
 from ..solve.map_lens import MapLens
@@ -33,7 +35,7 @@ DEPTH_VERSION = 1
 _MOST_POINTS = 4000
 """Points of the solve that a frame's fit looks at, of each kind."""
 _AHEAD = 1e-3
-"""Least depth of a point that counts, scene units."""
+"""Least depth of a point that counts, scene units; and least share of a pixel that Gaussians cover."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,9 @@ class DepthConfig:
 
     width: int = 480
     """Width in pixels at which fitted maps are kept; less for smaller working frames. Networks work at about 500."""
-    weight: float = 0.02
-    """Colour difference, display-referred, that a moving pixel's depth counts for when it is off by one standard
-    deviation of the fit: about what a trained picture is off by anyway (5 of 255)."""
+    weight: float = 0.08
+    """Colour difference, display-referred, that each standard deviation of a moving pixel's depth counts for. With 0.02
+    in place of 0.08 the error of depth on the tests' tiny world was 1.3 instead of 1.1 %."""
 
 
 @dataclass
@@ -104,18 +106,44 @@ class DepthTargets:
         return found if bool((found[0] > 0).any()) else None
 
 
-def depth_pull(expected: Tensor, wanted: Tensor) -> Tensor:
-    """Mean over all pixels of Huber's loss of how many standard deviations the rendered depth is off, 0-dim.
+def depth_pull(state: Mapping[str, Tensor], moves: Tensor | None, viewmat: Tensor, K: Tensor, wanted: Tensor) -> Tensor:
+    """How far the Gaussians of a view are from the depth that they should have, 0-dim, see `deviation`.
+
+    The gradient moves means along the camera's axis and does nothing else. Through the rendered depth it would also
+    reach opacities and sizes, and a noisy map would fade what it disagrees with: on the tests' tiny world that left an
+    error of 5.9 % and cost 2.6 dB, this 1.1 % and 0.5 dB (500 steps, maps of 2 % noise, 11.7 % without maps).
 
     Args:
-        expected: [H, W] rendered depth, scene units, differentiable.
-        wanted: [2, H, W] inverse depth that it should have, 0 where nothing is asked, and its standard deviation.
-
-    Compared is inverse depth: a Gaussian far behind must not outweigh all that is near. Linear beyond one standard
-    deviation, so that a wrong pixel of the map pulls no more than a right one.
+        state: parameters at the frame's time, as `DynamicModel.moved` gives them.
+        moves: bool [N] which Gaussians are pulled; None: all.
+        viewmat: [4, 4] world-to-camera. `K`: [3, 3] pixels of a picture of H x W.
+        wanted: [2, H, W] inverse depth, 0 where nothing is asked, and its standard deviation.
     """
-    off = torch.where(wanted[0] > 0, (1.0 / expected.clamp_min(1e-6) - wanted[0]) / wanted[1], 0.0)
-    return torch.nn.functional.huber_loss(off, torch.zeros_like(off), delta=1.0)
+    height, width = wanted.shape[1:]
+    view = viewmat.detach()
+    depth = state["means"] @ view[2, :3] + view[2, 3]
+    if moves is not None:
+        depth = torch.where(moves, depth, depth.detach())
+    held = {name: state[name].detach() for name in ("means", "quats", "log_scales", "opacity_logits")}
+    inverse = 1.0 / depth.clamp_min(_AHEAD)
+    moments = torch.stack([inverse, inverse.square()], dim=1)
+    out = rasterize(**held, colors=moments, viewmats=view[None], Ks=K[None], width=width, height=height)
+    return deviation(out.colors[0] / out.alphas[0].clamp_min(_AHEAD)[..., None], wanted)
+
+
+def deviation(moments: Tensor, wanted: Tensor) -> Tensor:
+    """Mean over all pixels of the Pseudo-Huber loss of how many standard deviations inverse depth is off, 0-dim.
+
+    Args:
+        moments: [H, W, 2] mean of the inverse depth of a pixel's Gaussians, and of its square: each of them has to be
+            right, not their mean alone.
+        wanted: as in `depth_pull`.
+
+    Linear beyond one standard deviation, so that a wrong pixel of the map pulls no more than a right one.
+    """
+    squared = moments[..., 1] - 2.0 * wanted[0] * moments[..., 0] + wanted[0].square()
+    squared = torch.where(wanted[0] > 0, (squared / wanted[1].square()).clamp_min(0.0), 0.0)
+    return (torch.sqrt(1.0 + squared) - 1.0).mean()
 
 
 def depth_key(sequence: DepthSequence, solve: str, config: DepthConfig | None = None) -> str:

@@ -134,6 +134,8 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     if sequence is not None:
         depth = fitted_depth(sequence, scene, depth_key(sequence, solve_key(shot)), folder, report)
     warm_up(config, device)
+    if depth is not None and device.type == "cpu":
+        raster_cpu.warm_up(channels=2)
     pictures = pictures_of(shot, scene, config, report)
     width, height = pictures.size
     images = pictures.load(train + test, report, folder)

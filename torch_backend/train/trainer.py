@@ -379,7 +379,7 @@ class Trainer:
         viewmat = corrected(facts.viewmat, self.poses.values[frame]) if self._refines_poses() else facts.viewmat
         out = render(
             state, model.sh_degree, viewmat, facts.K, self.width, self.height, background=facts.background,
-            with_depth=kind.hidden or kind.depth, with_contributions=True,
+            with_depth=kind.hidden, with_contributions=True,
         )  # fmt: skip
         paper = kind.moves and supervision.paper_due(self.iteration, self.progress)
         if paper:
@@ -390,9 +390,9 @@ class Trainer:
         if deltas is not None and supervision.preset == "support":
             price = stillness(deltas, len(model.gaussians), loss, facts.motion_price, supervision)
             total = total + self.config.field.still * price
-        if facts.depth is not None and self.targets is not None and out.depth_expected is not None:
-            pull = depth_pull(out.depth_expected[0], facts.depth)
-            total = total + self.targets.weight * pull
+        if facts.depth is not None and self.targets is not None:
+            moves = model.gaussians.open if kind.moves else None
+            total = total + self.targets.weight * depth_pull(state, moves, viewmat, facts.K, facts.depth)
         if self._refines_poses():
             total = total + self.poses.regularisation()
         if pairs is not None and anchored is not None:
@@ -410,13 +410,12 @@ class Trainer:
             self.soundness.skipped(self, frame)
             return loss.detach()
         self.soundness.count(applied)
-        self._observe(kind, facts, rows, state, out, applied)
+        self._observe(facts, rows, state, out, applied)
         return loss.detach()
 
     def _observe(
-        self, kind: StepKind, facts: StepFacts, rows: Tensor, state: dict[str, Tensor], out: RasterOutput,
-        applied: Tensor,
-    ) -> None:  # fmt: skip
+        self, facts: StepFacts, rows: Tensor, state: dict[str, Tensor], out: RasterOutput, applied: Tensor
+    ) -> None:
         """After a step, applied or not (0-dim bool): what it tells the densifier and the support bitmap."""
         if out.weight_sum is None:
             raise RuntimeError("the frame was rendered without contributions")
@@ -425,7 +424,7 @@ class Trainer:
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
         mark_seen(self.model.gaussians, facts.time_bin, weight)
-        if kind.hidden and out.depth_median is not None:
+        if out.depth_median is not None:  # at steps that mark who was hidden
             view = facts.viewmat, facts.K, out.depth_median[0]
             mark_hidden(self.model.gaussians, rows, facts.time_bin, state, *view)
 

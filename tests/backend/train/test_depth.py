@@ -20,7 +20,7 @@ from torch_backend.scene import load_scene
 from torch_backend.shot import write_json
 from torch_backend.train import load_run, train_shot
 from torch_backend.train.checkpoint import read_meta
-from torch_backend.train.depth import depth_pull, load_fitted
+from torch_backend.train.depth import depth_pull, deviation, load_fitted
 from torch_backend.train.model import render
 
 
@@ -85,14 +85,16 @@ def pairs(swaying, quiet, tmp_path_factory):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_what_moves_is_nearer_to_its_true_depth(pairs, seed):
-    assert moving_error(pairs, f"with-{seed}") < 0.8 * moving_error(pairs, f"without-{seed}")
+    assert moving_error(pairs, f"with-{seed}") < 0.4 * moving_error(pairs, f"without-{seed}")
 
 
 @pytest.mark.parametrize("pose", [6, 8])
 def test_the_depth_of_a_frozen_frame_is_measured_by_the_map_of_its_instant(pairs, pose):
     """From plate t* itself and from beside it, against the world as it stood at t*."""
     t_star = 6
-    run, scene = load_run(pairs.shot, "with-0"), load_scene(pairs.shot)
+    deep, scene = load_run(pairs.shot, "with-0"), load_scene(pairs.shot)
+    # The maps of one beside the splats of the other, which have what moves 7 to 12 % too far.
+    run = dataclasses.replace(load_run(pairs.shot, "without-0"), folder=deep.folder, depth_key=deep.depth_key)
     frozen = freeze_at(run.model, float(scene.times[t_star]), span_of(scene, run))
     image = render_frozen(frozen, scene.viewmats[pose], scene.Ks[pose], WIDTH, HEIGHT)
     measured = MeasuredDepths(run, scene).at(FIRST + t_star, frozen)
@@ -111,7 +113,7 @@ def test_the_depth_of_a_frozen_frame_is_measured_by_the_map_of_its_instant(pairs
     given = scene.viewmats[pose], scene.Ks[pose], image.depth, image.motion, picture
     without, _ = depths.of(*given)
     with_map, sigma = depths.of(*given, measured)
-    assert error(with_map) < 0.7 * error(without)
+    assert error(with_map) < 0.5 * error(without)
     assert bool((sigma >= 0).all()) and bool(torch.isfinite(sigma).all())
 
 
@@ -204,13 +206,31 @@ def test_an_extended_run_keeps_its_maps_without_the_folder(swaying, quiet, tmp_p
     assert load_run(swaying.shot, "longer").depth() is not None
 
 
-def test_the_pull_is_hubers_loss_in_deviations_of_inverse_depth():
-    expected = torch.tensor([[2.0, 4.0, 5.0]], dtype=torch.float64, requires_grad=True)
-    wanted = torch.tensor([[[0.5, 0.2, 0.0]], [[0.1, 0.1, 0.1]]], dtype=torch.float64)
-    loss = depth_pull(expected, wanted)
-    assert float(loss.detach()) == pytest.approx((0.0 + 0.5 * 0.5**2 + 0.0) / 3.0)
+def test_the_deviation_is_pseudo_hubers_loss_in_standard_deviations():
+    inverse = torch.tensor([[0.5, 0.25, 0.9, 0.7]], dtype=torch.float64, requires_grad=True)
+    wanted = torch.tensor([[[0.5, 0.2, 0.0, 0.4]], [[0.1, 0.1, 0.1, 0.1]]], dtype=torch.float64)
+    loss = deviation(torch.stack([inverse, inverse.square()], -1), wanted)
+    assert float(loss.detach()) == pytest.approx((math.sqrt(1.25) - 1.0 + math.sqrt(10.0) - 1.0) / 4.0)
     loss.backward()
-    reference = (0.25 - 0.2) / 0.1**2 * (-1.0 / 16.0) / 3.0
-    np.testing.assert_allclose(expected.grad.numpy(), [[0.0, reference, 0.0]], atol=1e-12)
-    far = torch.tensor([[1e10]], dtype=torch.float64)
-    assert math.isfinite(float(depth_pull(far, wanted[:, :, :1])))
+    pulls = [0.0, 0.5 / math.sqrt(1.25) / 0.1 / 4.0, 0.0, 3.0 / math.sqrt(10.0) / 0.1 / 4.0]
+    np.testing.assert_allclose(inverse.grad.numpy()[0], pulls, atol=1e-9)
+    spread = torch.tensor([[[0.5, 0.26]]], dtype=torch.float64)  # of 0.4 and 0.6: right on average
+    assert float(deviation(spread, wanted[:, :, :1])) == pytest.approx(math.sqrt(2.0) - 1.0)
+
+
+def test_the_pull_moves_means_of_what_moves_along_the_cameras_axis_and_nothing_else(world):
+    state = {name: value.clone().requires_grad_() for name, value in world.state.items() if name != "colors"}
+    depth = torch.from_numpy(true_depth(world, 3)).float()
+    wanted = torch.stack([1.0 / (0.9 * depth), torch.full_like(depth, 0.01)])
+
+    def pull(of, moves):
+        return depth_pull(of, moves, world.viewmats[3], world.K, wanted)
+
+    pull(state, world.moving).backward()
+    assert all(value.grad is None for name, value in state.items() if name != "means")
+    slope = state["means"].grad
+    assert bool((slope[:, :2] == 0).all()) and float(slope[world.moving, 2].max()) > 0.0, "the world looks along z"
+    assert bool((slope[~world.moving] == 0).all())
+    with torch.no_grad():
+        nearer = {**state, "means": state["means"] - 1e-2 * slope.sign()}
+        assert pull(nearer, None) < pull(state, None)
