@@ -3,26 +3,32 @@
     python -m benchmarks.splats SHOT... --take NAME
 
 Of each take: frozen.ply and frozen.usdc, the camera of the stage, and camera.chan and camera.nk as they are exported
-now. Means are projected by each exported camera; the take's own camera and pixels are the truth (figures in pixels of
-the frame). Depth: splats rendered through the exported camera (expected depth), and the means of those that a pixel
-shows most of, against the frame's Z in the scene's units: medians of the signed relative difference, over all frames.
+now. All figures are medians over all frames of the take.
+
+    _px      distance in pixels of a mean seen by an exported camera from where the take's own camera sees it
+    _own     relative difference of the splats' depth by the exported camera from their depth in the take's own render
+    _Z       signed relative difference of the splats' depth by the exported camera from the frame's Z
+    points_Z the same of the solve's points, placed: Z and the splats are two measurements of one surface, by plates
+             and by Gaussians, and differ by more than where they stand
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import re
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from pxr import Usd, UsdGeom, UsdVol
 
-from torch_backend.contract import CameraPath, TakeFolder, placement_of, read_json
+from torch_backend.contract import NO_DEPTH, CameraPath, TakeFolder, placement_of, read_json
 from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.freeze.placed import placed
 from torch_backend.freeze.take.splats import camera_path_of
 from torch_backend.freeze.usd import CAMERA, SPLATS
 from torch_backend.gaussians.ply import PlyGaussians, read_ply
@@ -30,6 +36,10 @@ from torch_backend.raster import rasterize
 from torch_backend.shot import Shot
 from torch_backend.solve.nuke import Y_UP, chan_text, nk_text
 from torch_backend.solve.placement import Similarity
+from torch_backend.solve.stored import load_points
+
+# usd-core has no types: everything of it is Any.
+Usd, UsdGeom, UsdVol = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdVol"))
 
 SHOWN = 0.5
 """Weight in some pixel from which a Gaussian counts as what that pixel shows."""
@@ -54,6 +64,7 @@ def measured(shot: Shot, take: str) -> dict[str, float]:
     stage = Usd.Stage.Open(str(folder.usd))
     splats = {"ply": read_ply(folder.ply), "usd": splats_of(stage)}
     found: dict[str, list[np.ndarray]] = {}
+    sparse = where.points(load_points(shot)["xyz"])
     frames = [frame for frame in path.frames if folder.frame(frame.frame).is_file()]
     with tempfile.TemporaryDirectory() as scratch:
         (Path(scratch) / "a.chan").write_text(chan_text(path, where, "a"))
@@ -75,17 +86,26 @@ def measured(shot: Shot, take: str) -> dict[str, float]:
                 found.setdefault(f"{name}_by_{program}_px", []).append(np.linalg.norm(pixels - at, axis=1)[seen])
             viewmat, K = cameras["usd_camera"]
             alpha, rendered, weight = painted(gaussians, viewmat, K, size)
+            _, own, _ = painted(placed(gaussians, where.inverse()), *truth, size)
             solid = (alpha > 0.9) & (image.rgba[..., 3] > 0.9)
-            found.setdefault(f"{name}_rendered_depth", []).append((rendered / where.scale / image.depth - 1.0)[solid])
-            pixels, depth = projected(gaussians.means.astype(np.float64), viewmat, K)
-            shown = seen & (weight > SHOWN) & (pixels >= 0).all(1) & (pixels < size).all(1)
-            x, y = np.floor(pixels[shown]).astype(int).T
-            z = image.depth[y, x]
-            known = z < 1e9
-            found.setdefault(f"{name}_means_depth", []).append((depth[shown] / where.scale / z - 1.0)[known])
+            found.setdefault(f"{name}_own", []).append(np.abs(rendered / where.scale / own - 1.0)[solid])
+            found.setdefault(f"{name}_rendered_Z", []).append((rendered / where.scale / image.depth - 1.0)[solid])
+            shown = gaussians.means[seen & (weight > SHOWN)].astype(np.float64)
+            found.setdefault(f"{name}_means_Z", []).append(beside_z(shown, (viewmat, K), image.depth, where.scale))
+        points = beside_z(sparse, cameras["usd_camera"], image.depth, where.scale)
+        found.setdefault("points_Z", []).append(points)
     result = {"frames": float(len(frames)), "scale": where.scale, "gaussians": float(len(splats["ply"].means))}
     result |= {name: round(float(np.median(np.concatenate(parts))), 6) for name, parts in found.items()}
     return result
+
+
+def beside_z(points: np.ndarray, camera: tuple[np.ndarray, np.ndarray], z: np.ndarray, scale: float) -> np.ndarray:
+    """Signed relative difference of the depth of points [P, 3] of the scene from a frame's Z [H, W]; of those seen."""
+    pixels, depth = projected(points, *camera)
+    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < (z.shape[1], z.shape[0])).all(1)
+    x, y = np.floor(pixels[inside]).astype(int).T
+    known = z[y, x] < NO_DEPTH / 10.0
+    return (depth[inside] / scale / z[y, x] - 1.0)[known]
 
 
 def projected(points: np.ndarray, viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +139,7 @@ def resized(K: list[float], path: CameraPath, size: tuple[int, int]) -> np.ndarr
     return np.array([[K[0] * x, 0, K[2] * x], [0, K[1] * y, K[3] * y], [0, 0, 1]])
 
 
-def usd_camera(stage: Usd.Stage, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def usd_camera(stage: Any, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """(viewmat OpenCV, K) of the stage's camera, by USD's own frustum."""
     frustum = UsdGeom.Camera.Get(stage, CAMERA).GetCamera(Usd.TimeCode(frame)).frustum
     viewmat = np.diag([1.0, -1.0, -1.0, 1.0]) @ np.array(frustum.ComputeViewMatrix()).T
@@ -128,7 +148,7 @@ def usd_camera(stage: Usd.Stage, frame: int, size: tuple[int, int]) -> tuple[np.
     return viewmat, np.array([[fx, 0, -left * fx], [0, fy, top * fy], [0, 0, 1]])
 
 
-def splats_of(stage: Usd.Stage) -> PlyGaussians:
+def splats_of(stage: Any) -> PlyGaussians:
     """The splats of a stage, as a PLY has them."""
     field = UsdVol.ParticleField3DGaussianSplat.Get(stage, SPLATS)
     means = np.array(field.GetPositionsAttr().Get(), np.float32)

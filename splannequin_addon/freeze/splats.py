@@ -282,7 +282,7 @@ def _node_group() -> bpy.types.NodeTree:
         return kept
     tree = bpy.data.node_groups.new(SHOWN_AS, "GeometryNodeTree")  # pyright: ignore[reportArgumentType]
     tree[TAG] = SHOWN_AS
-    interface = present(tree.interface)
+    interface: Any = tree.interface
     interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     kinds = ("NodeGroupInput", "GeometryNodeMeshToPoints", "GeometryNodeSetMaterial", "NodeGroupOutput")

@@ -25,7 +25,7 @@ def placement_in(scene: bpy.types.Scene, shot: Path) -> contract.Placement | Non
     # In float64: single precision leaves a large scale too far from even.
     matrix = np.eye(4)
     matrix[:3, :3] = scale * _orthonormal(np.array(turn.to_matrix(), dtype=np.float64))
-    matrix[:3, 3] = place
+    matrix[:3, 3] = place[:]
     units = scene.unit_settings
     metres = units.scale_length if units.system != "NONE" else 1.0
     return contract.Placement(matrix.ravel().tolist(), float(metres), contract.file_digest(cameras))

@@ -38,9 +38,10 @@ def test_st_maps(addon, contract, trap, shot):
     assert not trap.exists(), trap.read_text()
 
 
-def test_exported_cameras(addon, trap, shot):
+def test_exported_cameras(addon, contract, trap, shot):
     solves = addon("solve.exchange")
-    asked = solves.begin_export(shot, "nerfstudio", shot / "out")
+    words = contract.ExportWords(shot=str(shot), format="nerfstudio", output=str(shot / "out"))
+    asked = solves.begin_export(words)
     assert str(shot / "out") in solves.exported(asked, shot / "out")
     assert (shot / "out" / "transforms.json").is_file()
     assert not trap.exists(), trap.read_text()

@@ -192,10 +192,10 @@ def test_the_export_button_says_what_is_wrong(scene, shot, tmp_path):
 
 
 @pytest.mark.parametrize("well", [True, False])
-def test_an_export_in_a_window_is_followed_without_waiting(addon, scene, shot, tmp_path, well):
+def test_an_export_in_a_window_is_followed_without_waiting(addon, contract, scene, shot, tmp_path, well):
     solves, supervisor = addon("solve.exchange"), addon("process.job_timer")
     scene.splannequin.shot_path = str(shot)
-    asked = solves.begin_export(shot if well else tmp_path, "colmap", tmp_path / "out")
+    asked = solves.begin_export(contract.ExportWords(str(shot if well else tmp_path), output=str(tmp_path / "out")))
     told = addon("solve.operators").tell
     supervisor.when_answered(asked, lambda: told(shot, lambda: [solves.exported(asked, tmp_path / "out")]))
     supervisor.tick()
