@@ -98,7 +98,7 @@ def _begun(folder: str) -> Shot:
 
 
 def one_step(args: argparse.Namespace, console: Console) -> int:
-    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`."""
+    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`, `mattes SHOT`."""
     ((kind, params),) = contract.requested_params(args).items()
     folder = args.clip if args.command == "freeze" else args.shot
     shot = _begun(folder) if kind == "import" else Shot.open(folder)
@@ -109,6 +109,8 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
         print_verdict(result, console)
     if kind == "freeze":
         print_places(result, console)
+    if kind == "mattes":
+        print_mattes(result, console)
     return ExitCode.OK
 
 
@@ -183,6 +185,14 @@ def print_places(take: dict[str, Any], console: Console) -> None:
     if not console.as_json:
         for name, key in (("EXR frames:", "exr_dir"), ("Contact sheet:", "contact_sheet"), ("Video:", "video")):
             print(f"{name:<14} {take[key]}", file=console.stream, flush=True)
+
+
+def print_mattes(made: dict[str, Any], console: Console) -> None:
+    """Where the mattes of a take lie."""
+    if not console.as_json:
+        for name, folder in made["mattes"].items():
+            print(f"Matte {name}: {folder}", file=console.stream, flush=True)
+        print(f"Cryptomatte: {made['cryptomatte'] or 'none'}", file=console.stream, flush=True)
 
 
 def print_verdict(facts: dict[str, Any], console: Console) -> None:

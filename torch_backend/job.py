@@ -368,10 +368,17 @@ def _freeze(shot: Shot, params: contract.FreezeParams, report: Reporter) -> Any:
     return freeze_shot(shot, params, report)
 
 
+def _mattes(shot: Shot, params: contract.MatteParams, report: Reporter) -> Any:
+    from .freeze.mattes.job import make_mattes
+
+    return make_mattes(shot, params, report)
+
+
 RUNNERS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "import": _import,
     "solve": _solve,
     "train": _train,
     "freeze": _freeze,
+    "mattes": _mattes,
 }
 """Kind of job -> the station that does it: (shot, typed params, reporter) -> JSON-able result."""

@@ -105,7 +105,7 @@ def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: C
     rendered = time.perf_counter()
     write_regions(folder, seed, kind, size, _Eta(say, f"{size.name}/{folder.name}: regions"))
     seconds = {"geometry": made - began, "pictures": rendered - made, "regions": time.perf_counter() - rendered}
-    _write_record(folder, size, seed, kind, key, seconds)
+    write_record(folder, size, seed, kind, key, seconds)
     say(f"{size.name}/{folder.name}: finished, {sum(seconds.values()):.0f} s in this run")
     return folder
 
@@ -161,7 +161,7 @@ class _Eta:
             self.say(f"{self.what} {done} of {total}" + (f", {left:.0f} s left" if done < total else ""))
 
 
-def _write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seconds: dict[str, float]) -> None:
+def write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seconds: dict[str, float]) -> None:
     """scene.json, which says that the scene is whole."""
     meter = json.loads((folder / "meter.json").read_text(encoding="utf-8"))
     plan: dict[str, Any] = json.loads((folder / "plan.json").read_text(encoding="utf-8"))

@@ -16,7 +16,7 @@ from ..process.steps import Step, View
 from ..scene import paths, scene_setup, session
 from ..shot import scene_objects, selection
 from ..shot.shot_state import ShotState
-from . import farm, freeze_group, insertion, operators, panel, progress, shown_take
+from . import farm, freeze_group, insertion, matte_node, operators, panel, progress, shown_take
 
 
 class Bake(Step):
@@ -28,7 +28,7 @@ class Bake(Step):
     button = "Bake and Render"
     again = "Bake Again"
     needs = "Freeze first."
-    classes = (*operators.CLASSES, *farm.CLASSES, *panel.CLASSES)
+    classes = (*operators.CLASSES, *farm.CLASSES, *matte_node.CLASSES, *panel.CLASSES)
     parts = (progress,)
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:

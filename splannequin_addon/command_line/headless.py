@@ -174,6 +174,11 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
     )
 
 
+def make_mattes(args: argparse.Namespace, console: Console) -> int:
+    """`mattes SHOT`: a job that the step Freeze starts."""
+    return _one_step(args, console, "freeze", args.shot)
+
+
 def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
     """Import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
     began = time.perf_counter()
@@ -472,6 +477,7 @@ _DOES = {
     "solve": solve,
     "train": train,
     "freeze": freeze,
+    "mattes": make_mattes,
     "bake": bake_take,
     "stmaps": write_stmaps,
     "export": export,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 
 from ..access import camera_of, layout_of, present, scene_in, settings_of
@@ -74,12 +76,35 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
         watch = self._watch(context)
         if watch is None or watch.state is None or not watch.state.listed("take"):
             return
+        chosen = watch.state.takes.get(settings_of(scene_in(context)).take_name)
+        body = step_panel.sub_panel(layout_of(self), "mattes", "Mattes") if chosen is not None else None
+        if body is not None and chosen is not None:
+            self._mattes(context, body, chosen)
         body = step_panel.sub_panel(layout_of(self), "takes", "Takes")
         if body is not None:
             listing.draw(body, "take", watch.state, settings_of(scene_in(context)).take_name)
             for told in watch.state.damaged["take"].values():
                 wrap(body, context, told, "ERROR")
             body.operator("splannequin.add_splats", icon=icons.of("splannequin.add_splats"))
+
+    def _mattes(self, context: bpy.types.Context, layout: bpy.types.UILayout, take: dict[str, Any]) -> None:
+        """A mask to make one of, and what there is."""
+        column = layout.column()
+        column.enabled = self._idle(context)
+        column.operator("splannequin.draw_matte", icon=icons.of("splannequin.draw_matte"))
+        column.prop(settings_of(scene_in(context)), "matte_mask")
+        column.operator("splannequin.matte_from_mask", icon=icons.of("splannequin.matte_from_mask"))
+        for name, frames in take["mattes"].items():
+            row = column.row(align=True)
+            lassoed = ", ".join(str(frame) for frame in sorted(set(frames)))
+            row.label(text=tr(f"{name}, drawn at {lassoed}"), translate=False)
+            row.operator("splannequin.insert_matte", text="", icon="NODE_COMPOSITING").name = name
+            row.operator("splannequin.remove_matte", text="", icon="TRASH").name = name
+
+    def _idle(self, context: bpy.types.Context) -> bool:
+        """True if no step of the shot runs."""
+        watch = self._watch(context)
+        return watch is not None and watch.running() is None
 
     def _live(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """Scrubbing: on or off, what is shown, suggestions and why."""

@@ -105,6 +105,12 @@ class FreezeSettings:
         items=[(name, *words) for name, words in contract.LIVE_SHOWS.items()],
         options=set(),
     )
+    matte_mask = PointerProperty(
+        name="Mask",
+        description="Mask drawn around a person or a thing in a frozen frame; the matte has its name",
+        type=bpy.types.Mask,
+        options=set(),
+    )
     take_name = StringProperty(
         **contract.panel(contract.FreezeParams, "take"),
         options=set(),

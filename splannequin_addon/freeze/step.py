@@ -10,7 +10,17 @@ from ..access import settings_of
 from ..process import jobs
 from ..process.steps import Step, View
 from ..shot.shot_state import ShotState
-from . import hidden_points, operators, own_camera, panel, splats, takes, viewport
+from . import (
+    hidden_points,
+    matte_operators,
+    mattes,
+    operators,
+    own_camera,
+    panel,
+    splats,
+    takes,
+    viewport,
+)
 
 if TYPE_CHECKING:
     import bpy
@@ -22,10 +32,11 @@ class Freeze(Step):
     name = "freeze"
     label = "Freeze"
     kind = "freeze"
+    also = ("mattes",)
     button = "Freeze"
     again = "Freeze Again"
     needs = "Train first."
-    classes = (*operators.CLASSES, *panel.CLASSES)
+    classes = (*operators.CLASSES, *matte_operators.CLASSES, *panel.CLASSES)
     parts = (viewport, hidden_points)
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:
@@ -54,7 +65,9 @@ class Freeze(Step):
         return View(True, True, lines, "Next: bake it into your compositor.")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """An instant that nobody chose is the one that was taken."""
+        """An instant that nobody chose is the one that was taken; mattes are read again where they are shown."""
+        if job.kind == "mattes":
+            return mattes.arrived(job.shot, job.result)
         if not settings_of(scene).choose_t_star:
             settings_of(scene).t_star = int(job.result["t_star_frame"])
         return []

@@ -31,7 +31,7 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
         if steps.STEPS[step].makes_shot:
             inventory.create(folder)
         placement.write(scene, folder)
-        job = jobs.new_job(folder, steps.STEPS[step].kind, params)
+        job = jobs.new_job(folder, jobs.kind_of(params), params)
         (job.folder / contract.STEP_FILE).write_text(step, encoding="utf-8")
         (job.folder / contract.SCENE_FILE).write_text(scene.name, encoding="utf-8")
         job.scene_uid, job.blend = scene.session_uid, os.path.basename(bpy.data.filepath)

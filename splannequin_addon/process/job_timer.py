@@ -115,7 +115,9 @@ def watch_of(shot: Path) -> Watch:
     if watch is None:
         watch = _watches[shot] = Watch(shot)
         with contextlib.suppress(OSError):  # a path that can be none: `refresh` says so
-            watch.jobs = {steps.step_of(job): job for job in jobs.latest(shot).values()}
+            # A step that starts jobs of several kinds shows the newest of them.
+            found = sorted(jobs.latest(shot).values(), key=lambda job: job.folder.name)
+            watch.jobs = {steps.step_of(job): job for job in found}
         for job in watch.jobs.values():
             job.blend = steps.blend_of(job)
     if watch.state is None:

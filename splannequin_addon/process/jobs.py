@@ -95,8 +95,15 @@ class Job:
         return self.status.state if self.status else "queued"
 
 
-Params = contract.ImportParams | contract.SolveParams | contract.TrainParams | contract.FreezeParams
+Params = (
+    contract.ImportParams | contract.SolveParams | contract.TrainParams | contract.FreezeParams | contract.MatteParams
+)
 """What a job may be asked for; `contract.PARAMS` by kind."""
+
+
+def kind_of(params: Params) -> str:
+    """Kind of the job that takes these parameters."""
+    return next(kind for kind, cls in contract.PARAMS.items() if isinstance(params, cls))
 
 
 def new_job(shot: Path, kind: str, params: Params) -> Job:

@@ -53,6 +53,8 @@ class Step:
     """Name on the panel."""
     kind: ClassVar[str]
     """Kind of the job behind it."""
+    also: ClassVar[tuple[str, ...]] = ()
+    """Other kinds of jobs that its panel starts."""
     button: ClassVar[str]
     """What the button says."""
     again: ClassVar[str]
@@ -151,7 +153,7 @@ def add(step: Step) -> None:
 def step_of(job: jobs.Job) -> str:
     """Name of the step that a job found in a shot folder belongs to: Freeze and Bake ask for the same kind."""
     told = current(_noted(job, contract.STEP_FILE))
-    names = [s.name for s in STEPS.values() if s.kind == job.kind]
+    names = [s.name for s in STEPS.values() if job.kind in (s.kind, *s.also)]
     return told if told in names else names[0]
 
 

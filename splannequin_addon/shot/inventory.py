@@ -70,6 +70,7 @@ def read(folder: Path) -> ShotState:
     for name, take in state.takes.items():
         folder_of = contract.TakeFolder(there.takes / name)
         take["frame_count"] = file_cache.of(folder_of.root, _frame_count, _mtime(folder_of.facts))
+        take["mattes"] = mattes(folder_of)
     return state
 
 
@@ -82,7 +83,47 @@ def stamp(folder: Path) -> tuple[float, ...]:
     anew = [p for place in places if place.is_dir() for p in place.iterdir()]
     # Windows dates no folder of a FAT or exFAT disk, as memory cards and portable disks are, when its files change.
     files = [place / name for place in [*deep, *anew] for name in _TOLD]
+    files += [contract.TakeFolder(place).mattes_record for place in deep]
     return tuple(_mtime(p) for p in [*parts, *deep, *anew, *files])
+
+
+def mattes(take: contract.TakeFolder) -> dict[str, list[int]]:
+    """Name -> frames at which it was lassoed, of the mattes of a take; none if its record cannot be read."""
+    found: dict[str, list[int]] = {}
+    for row in lassos(take):
+        found.setdefault(row["name"], []).append(row["frame"])
+    return found
+
+
+def lassos(take: contract.TakeFolder) -> list[dict[str, Any]]:
+    """Lassos of a take, as its mattes.json has them: name, frame, polygon; none if it cannot be read."""
+    if not take.mattes_record.is_file():
+        return []
+    try:
+        return file_cache.of(take.mattes_record, _lassos)
+    except (OSError, ValueError):
+        return []
+
+
+def _lassos(path: Path) -> list[dict[str, Any]]:
+    data = contract.read_json(path)
+    contract.check_version(data, str(path))
+    rows = cast("list[Any]", data["mattes"]) if isinstance(data.get("mattes"), list) else []
+    return [row for row in rows if _is_lasso(row)]
+
+
+def _is_lasso(row: Any) -> bool:
+    """True of what names a matte as ours are named, a frame and a polygon."""
+    if not isinstance(row, dict):
+        return False
+    name, frame, polygon = (cast("dict[str, Any]", row).get(key) for key in ("name", "frame", "polygon"))
+    if not isinstance(name, str) or type(frame) is not int or not isinstance(polygon, list):
+        return False
+    try:
+        contract.checked_name(name, "matte")
+    except ValueError:
+        return False
+    return name.isprintable() and abs(frame) < _LARGEST
 
 
 def _is_unfinished(motion: Path) -> bool:

@@ -51,7 +51,7 @@ def test_old_jobs_are_told_and_can_be_asked_for_again(shot: Shot, capsys):
             **dataclasses.asdict(contract.PARAMS[request.kind]()), **request.params,
         }  # fmt: skip
         kinds.add(request.kind)
-    assert kinds == set(contract.PARAMS)
+    assert kinds == set(contract.STEP_PARAMS)
     assert cli.main(["status", str(shot.root)]) == 0
     assert capsys.readouterr().out.count("  done  ") == 4
     assert cli.main(["status", str(shot.root), "--json"]) == 0

@@ -1,4 +1,4 @@
-"""The layers of a frozen frame, in one table: the EXR writer, the compositor and the manual read it."""
+"""The layers of a frozen frame and of its mattes, in one table: EXR writers, compositor and manual read it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ NO_DEPTH = 1e10
 
 @dataclass(frozen=True)
 class FrameLayer:
-    """One layer of takes/NAME/NNNNNN.exr."""
+    """One layer of takes/NAME/NNNNNN.exr, or of a file of mattes beside it."""
 
     name: str
     """Socket of Blender's Image node, 4.2 to 5.2."""
@@ -149,10 +149,26 @@ FRAME_LAYERS = (
 )
 """In the order of the file."""
 
+CRYPTOMATTE = "Mattes"
+"""Name of the Cryptomatte of a take's mattes, and part of its layers."""
+MATTE_LAYERS = tuple(
+    FrameLayer(
+        f"{CRYPTOMATTE}{n:02d}",
+        tuple(f"{CRYPTOMATTE}{n:02d}.{channel}" for channel in "RGBA"),
+        "float",
+        f"{CRYPTOMATTE}{n:02d}.R G B A",
+        f"mattes {2 * n + 1} and {2 * n + 2} of the pixel: identifier and share, twice",
+        part=CRYPTOMATTE,
+        socket="NodeSocketColor",
+    )
+    for n in range(3)  # six mattes in a pixel, what other programs write too
+)
+"""Of takes/NAME/mattes/cryptomatte/NNNNNN.exr, in the order of the file: Cryptomatte specification 1.2.0."""
+
 
 def layers_of(part: str) -> tuple[FrameLayer, ...]:
     """The layers of a part, in the order of the file."""
-    return tuple(layer for layer in FRAME_LAYERS if layer.part == part)
+    return tuple(layer for layer in (*FRAME_LAYERS, *MATTE_LAYERS) if layer.part == part)
 
 
 def channels_of(part: str) -> tuple[str, ...]:

@@ -70,7 +70,7 @@ class JobRequest:
     """What Blender asks for: one station, on one shot."""
 
     kind: str
-    """import, solve, train or freeze."""
+    """import, solve, train, freeze or mattes."""
     shot: str
     """Absolute path of the shot folder."""
     params: dict[str, Any] = field(default_factory=dict[str, Any])
@@ -143,7 +143,13 @@ class Status:
         return self.state in ("done", "failed", "cancelled")
 
 
-WORK = {"import": "The import", "solve": "The camera solve", "train": "The training", "freeze": "The freeze"}
+WORK = {
+    "import": "The import",
+    "solve": "The camera solve",
+    "train": "The training",
+    "freeze": "The freeze",
+    "mattes": "The job of the mattes",
+}
 """Kind of job -> what a sentence calls it."""
 
 

@@ -35,6 +35,8 @@ DETECTORS = ("weight", "grad_norm", "grad_signed")
 """What `TrainParams.detector` may be."""
 QUERIES = ("nearest", "plain")
 """What `FreezeParams.query` may be."""
+MATTE_FORMATS = ("exr", "png")
+"""What `MatteParams.matte_format` may be: suffixes of the files."""
 DEVICES = ("auto", "cpu", "cuda")
 """Where a run may train and freeze."""
 
@@ -636,12 +638,43 @@ class FreezeParams:
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
 
-PARAMS: dict[str, type] = {
+@dataclass
+class MatteParams:
+    """Mattes of things in a take, each lassoed at one frame."""
+
+    take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
+    """Name of the take's folder in takes/."""
+    polygons: str = option(
+        "",
+        flag="--polygons",
+        metavar="FILE",
+        is_path=True,
+        help='JSON with the lassos: {"mattes": [{"name": NAME, "frame": N, "polygon": [[x, y], ...]}]}, in pixels '
+        "of the frozen frames from the top left corner; several of one name add to each other",
+        words="those of the take's mattes",
+    )
+    """JSON file of lassos; empty: those of before. A matte of before keeps its lassos unless the file has its name."""
+    remove: str = option("", flag="--remove", metavar="NAME", help="name of a matte to remove", words="none")
+    """Matte that is removed; empty: none."""
+    matte_format: str = option(
+        "exr",
+        flag="--matte-format",
+        choices=MATTE_FORMATS,
+        help="files of the single mattes: `exr` (half floats) or `png` (16 bits)",
+    )
+    """Files of the single mattes: exr or png."""
+    device: str = option("auto", **{**DEVICE, "help": "where to render: `auto` takes an NVIDIA GPU"})
+    """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
+
+
+STEP_PARAMS: dict[str, type] = {
     "import": ImportParams,
     "solve": SolveParams,
     "train": TrainParams,
     "freeze": FreezeParams,
 }
+"""Kind of job on the way from a clip to frozen frames -> the dataclass of its parameters."""
+PARAMS: dict[str, type] = {**STEP_PARAMS, "mattes": MatteParams}
 """Kind of job -> the dataclass of its parameters."""
 LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.values()}
 """The numbers of each kind of parameters, by field."""

@@ -60,6 +60,10 @@ TAKE_REDISTORT = Path("stmap") / "redistort.exr"
 """Of a take with overscan: the way back through the lens."""
 TAKE_UNDISTORT = Path("stmap") / "undistort.exr"
 """Of a take: from the footage as it was filmed to the plate without the lens, as large as the footage."""
+MATTES_FOLDER, MATTES_FILE, DRAWN_FILE = "mattes", "mattes.json", "drawn.json"
+"""In a take's folder: mattes that somebody lassoed; their lassos; and those that Blender sent last."""
+CRYPTOMATTE_FOLDER, MATTE_FOLDER = "cryptomatte", "single"
+"""In a take's mattes: all of them in one sequence, and each in one of its own."""
 LIVE_LOG = "live.log"
 FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER = "farm", "trash", "tracking", "paths"
 REPLACED_FOLDER = "replaced"
@@ -336,6 +340,39 @@ class TakeFolder:
     def warp(self, number: int) -> Path:
         """How the plate of a frame is warped to its frozen frame."""
         return self.warps / frame_file(number, LAYERS)
+
+    @property
+    def mattes(self) -> Path:
+        """Mattes of things that somebody lassoed."""
+        return self.root / MATTES_FOLDER
+
+    @property
+    def mattes_record(self) -> Path:
+        """Names and lassos of the mattes, and whether all of their files are written."""
+        return self.mattes / MATTES_FILE
+
+    @property
+    def drawn_lassos(self) -> Path:
+        """Lassos that were drawn in Blender, as the last job was asked for them."""
+        return self.mattes / DRAWN_FILE
+
+    @property
+    def cryptomattes(self) -> Path:
+        """All mattes of each frame, as a Cryptomatte."""
+        return self.mattes / CRYPTOMATTE_FOLDER
+
+    def cryptomatte(self, number: int) -> Path:
+        """All mattes of a frame."""
+        return self.cryptomattes / frame_file(number, LAYERS)
+
+    @property
+    def single_mattes(self) -> Path:
+        """A folder for each matte."""
+        return self.mattes / MATTE_FOLDER
+
+    def matte_frames(self, name: str) -> Path:
+        """Frames of one matte; ValueError if its name could leave the folder."""
+        return self.single_mattes / checked_name(name, "matte")
 
     @property
     def contact_sheet(self) -> Path:

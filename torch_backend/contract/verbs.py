@@ -9,7 +9,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from .option_table import option
-from .options import DEVICE, PARAMS, PLACEMENT, FreezeParams, ImportParams, SolveParams, TrainParams
+from .options import (
+    DEVICE,
+    PLACEMENT,
+    STEP_PARAMS,
+    FreezeParams,
+    ImportParams,
+    MatteParams,
+    SolveParams,
+    TrainParams,
+)
 
 BACKEND, BLENDER = "backend", "Blender"
 """The sides that have a command line."""
@@ -317,7 +326,7 @@ VERBS: dict[str, Verb] = {
     "freeze": Verb(
         "frozen frames of a shot; of a clip, all that is missing first: import, solve, train",
         WholeWords,
-        PARAMS,
+        STEP_PARAMS,
         shown={
             "source": INPUT,
             "first": ("N", "first frame number of the clip; of a shot folder, first frame that is frozen"),
@@ -330,11 +339,16 @@ VERBS: dict[str, Verb] = {
         },
     ),
     "take": Verb("`freeze SHOT`", ShotWords, {"freeze": FreezeParams}, (BACKEND,), now="freeze"),
+    "mattes": Verb(
+        "mattes of things in a take, each lassoed at one frame: single sequences and a Cryptomatte",
+        ShotWords,
+        {"mattes": MatteParams},
+    ),
     "bake": Verb("a take through the compositor: DIR/composited and DIR/shot.blend", BakeWords, sides=(BLENDER,)),
     "stmaps": Verb("ST maps of the lens, both ways, into the shot's solve folder", MapWords),
     "export": Verb("cameras, points and splats of a shot for other programs", ExportWords),
     "status": Verb("jobs of a shot", ShotWords),
-    "farm": Verb("a job for a render farm, as Open Job Description, and what it will cost", FarmWords, PARAMS),
+    "farm": Verb("a job for a render farm, as Open Job Description, and what it will cost", FarmWords, STEP_PARAMS),
     "farm-task": Verb("one task of such a job (what the farm starts)", TaskWords, sides=(BACKEND,), json=False),
     "doctor": Verb("what this environment can do, as JSON", DoctorWords, json=False),
     "run-job": Verb("the job in a folder (what Blender starts)", JobWords, sides=(BACKEND,)),

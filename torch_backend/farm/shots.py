@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from ..contract import (
-    PARAMS,
     SHORT_JSON,
     SHOT_SUFFIX,
+    STEP_PARAMS,
     ExitCode,
     ImportParams,
     JobError,
@@ -309,10 +309,10 @@ def read_requests(path: str, requests: dict[str, Any]) -> dict[str, Any]:
         try:
             told = read_json(path)
             for kind, values in told.items():
-                if kind not in PARAMS or not is_json_object(values):
-                    raise ValueError(f"{kind!r} is none of {', '.join(PARAMS)}")
-                requests[kind] = from_dict(PARAMS[kind], {**dataclasses.asdict(requests[kind]), **values})
-                for field, spec in options_of(PARAMS[kind]):
+                if kind not in STEP_PARAMS or not is_json_object(values):
+                    raise ValueError(f"{kind!r} is none of {', '.join(STEP_PARAMS)}")
+                requests[kind] = from_dict(STEP_PARAMS[kind], {**dataclasses.asdict(requests[kind]), **values})
+                for field, spec in options_of(STEP_PARAMS[kind]):
                     value: Any = getattr(requests[kind], field.name)
                     if spec.choices and value not in (*spec.choices, field.default):
                         raise ValueError(f"{field.name} is {value!r}, none of {', '.join(spec.choices)}")

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..contract import PARAMS, ExitCode, JobError, write_json
+from ..contract import STEP_PARAMS, ExitCode, JobError, write_json
 from ..contract.option_table import MASK_ALPHA, MASK_FOUND, ignored_path, mask_path, options_of
 from .request import VERSION as REQUEST_VERSION
 from .shots import FarmShot
@@ -128,7 +128,7 @@ _ITS_OWN = {("import", "source"), ("freeze", "camera_path")}
 
 
 def _path_fields(kind: str) -> list[str]:
-    return [one.name for one, spec in options_of(PARAMS[kind]) if spec.is_path or spec.parse in _MASKS]
+    return [one.name for one, spec in options_of(STEP_PARAMS[kind]) if spec.is_path or spec.parse in _MASKS]
 
 
 def _parameter_name(kind: str, field: str) -> str:
@@ -172,7 +172,7 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
     if kind == "import":
         space.append({"name": "Clip", "type": "PATH", "range": [_refused(shot.clip)]})
         said.append("import.source={{Task.Param.Clip}}")
-    for field in _path_fields(kind) if kind in PARAMS else ():
+    for field in _path_fields(kind) if kind in STEP_PARAMS else ():
         name = _parameter_name(kind, field)
         if name in paths and shot.requests[kind][field] == paths[name]:
             said.append(f"{kind}.{field}={{{{Param.{name}}}}}")
@@ -209,7 +209,7 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
 def _request(step: Step) -> str:
     """What a task is asked for, as the text of a file: parameters without paths, and the takes' names."""
     shot, kind = step.shot, step.kind
-    asked = kind if kind in PARAMS else "freeze"
+    asked = kind if kind in STEP_PARAMS else "freeze"
     values = dict(shot.requests[asked])
     for field in _path_fields(asked):
         if values[field] not in _NO_FILES and (asked, field) != ("freeze", "camera_path"):

@@ -1,0 +1,199 @@
+"""Mattes from one lasso against rendered truth: `python -m benchmarks.mattes SCENE ... --results DIR`.
+
+SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot with exact
+cameras, an `auto` run and a take for each instant are made in DIR if they are missing. Truth are the pixels whose
+centre shows a person, by rays through the scene's triangles.
+
+Each person is lassoed once per instant, at the pose with a truth where most of them is seen. The lasso is the outline
+of the truth there, a corner every `--corner` pixels, each moved by up to `--sloppy` pixels in any direction. Judged
+are all other poses that show at least `LEAST` pixels of the person: intersection over union of the matte, cut at half,
+and the truth; and of the matte as splats alone render it, without the picture's own edges. Seconds are those of the
+whole job up to its first matte, loading included, and of each further frame with all its mattes.
+
+DIR gets mattes-NAME.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.detail_truth import scene_arguments, trained
+from benchmarks.sources import Log, SyntheticTruth, load_source
+from benchmarks.synthetic.folder import SyntheticScene
+from benchmarks.synthetic.regions import Geometry, View
+from torch_backend.contract import FreezeParams, JobError, MatteParams, TakeFolder
+from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.mattes.files import matte_file, read_matte
+from torch_backend.freeze.mattes.job import make_mattes
+from torch_backend.native import default_threads
+from torch_backend.shot import Shot, write_json
+
+LEAST = 200
+"""Pixels of a person below which a pose says little: half a pixel of outline is a tenth of it."""
+PERSON = "person"
+"""What the names of movers that are people begin with."""
+
+
+def person_masks(scene: SyntheticScene, t_star: int, poses: Sequence[int]) -> dict[str, dict[int, NDArray[np.bool_]]]:
+    """Person -> pose -> [H, W]: the pixels that show them while time stands still at frame `t_star`."""
+    geometry, faces = Geometry.load(scene.root), faces_of_people(scene.root)
+    standing = geometry.at(scene.frames.index(t_star))
+    found: dict[str, dict[int, NDArray[np.bool_]]] = {name: {} for name in faces}
+    for pose in poses:
+        view = View(scene.world_to_camera[pose], scene.K, scene.width, scene.height)
+        rays = view.rays()
+        face = standing.cast(np.broadcast_to(view.eye, rays.shape), rays).face.reshape(scene.height, scene.width)
+        for name, (first, last) in faces.items():
+            found[name][pose] = (face >= first) & (face < last)
+    return found
+
+
+def faces_of_people(folder: Path) -> dict[str, tuple[int, int]]:
+    """Person -> the first of their triangles in `Geometry.triangles`, and the one after the last."""
+    plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+    with np.load(folder / "geometry" / "static.npz", allow_pickle=False) as data:
+        at = len(data["triangles"])
+    found: dict[str, tuple[int, int]] = {}
+    for mover in plan["movers"]:
+        if not mover["in_view"]:
+            continue
+        with np.load(folder / "geometry" / f"{mover['name']}.npz", allow_pickle=False) as data:
+            count = len(data["triangles"])
+        if mover["name"].startswith(PERSON):
+            found[mover["name"]] = at, at + count
+        at += count
+    return found
+
+
+def lasso(mask: NDArray[np.bool_], corner: float, sloppy: float, seed: int) -> list[list[float]]:
+    """Corners [x, y] in pixels of a polygon that somebody draws around a mask [H, W], up to `sloppy` pixels off.
+
+    The outline is that of the mask's largest part, a corner every `corner` pixels.
+    """
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    outline = max(outlines, key=cv2.contourArea)[:, 0].astype(np.float64) + 0.5
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
+    at = np.arange(0.0, length[-1], corner)
+    corners = np.stack([np.interp(at, length, outline[:, axis]) for axis in (0, 1)], axis=1)
+    generator = np.random.default_rng(seed)
+    turn, far = generator.uniform(0.0, 2.0 * np.pi, len(at)), sloppy * np.sqrt(generator.uniform(0.0, 1.0, len(at)))
+    return (corners + far[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)).tolist()
+
+
+def overlap(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
+    """Intersection over union of two masks; 1 where both are empty."""
+    return float((found & truth).sum() / max(1, (found | truth).sum())) if (found | truth).any() else 1.0
+
+
+class Watch(Log):
+    """A reporter that notes when frames with mattes were done."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.began, self.at = time.perf_counter(), list[float]()
+
+    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
+        if stage == "making mattes" and done:
+            self.at.append(time.perf_counter())
+
+    def metric(self, stage: str, values: Any) -> None:
+        """Nothing: figures are the benchmark's own."""
+
+
+def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> list[dict[str, Any]]:
+    """One row per person and pose that is judged: {t_star, person, lasso, pose, pixels, iou}."""
+    poses = scene.poses
+    take = f"mattes{t_star}"
+    freeze_shot(shot, FreezeParams(run=run, take=take, t_star=t_star, only_missing=True), Log())
+    folder = TakeFolder(shot.take(take))
+    masks = {
+        n: of for n, of in person_masks(scene, t_star, poses).items() if max(m.sum() for m in of.values()) >= LEAST
+    }
+    at = {name: max(of, key=lambda pose, of=of: int(of[pose].sum())) for name, of in masks.items()}
+    rows = [
+        {"name": name, "frame": at[name], "polygon": lasso(masks[name][at[name]], args.corner, args.sloppy, seed)}
+        for seed, name in enumerate(masks)
+    ]
+    path = args.results.absolute() / f"lassos-{shot.root.stem}-{t_star}.json"
+    write_json(path, {"mattes": rows})
+    watch = Watch()
+    make_mattes(shot, MatteParams(take=take, polygons=str(path)), watch)
+    steps = np.diff(watch.at)
+    seconds = (
+        {"first": round(watch.at[0] - watch.began, 2), "others": round(float(steps.mean()), 3)} if len(steps) else {}
+    )
+    found: list[dict[str, Any]] = []
+    for name, of in masks.items():
+        for pose, mask in of.items():
+            if pose == at[name] or mask.sum() < LEAST:
+                continue
+            matte = read_matte(matte_file(folder, name, pose, "exr"), (0, 0)) > 0.5
+            row = {"t_star": t_star, "person": name, "lasso": at[name], "pose": pose, "pixels": int(mask.sum())}
+            found.append({**row, "iou": round(overlap(matte, mask), 4), **seconds})
+    return found
+
+
+def table(found: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """Mean and worst intersection over union, and seconds, by scene and person, in Markdown."""
+    lines = [
+        "| scene | person | poses | mean | worst | first matte, s | others, s |",
+        "|---|---|---:|---:|---:|---:|---:|",
+    ]
+    for scene, rows in found.items():
+        for person in sorted({row["person"] for row in rows}):
+            of = [row for row in rows if row["person"] == person]
+            lines.append(f"| {scene} | {person} | {_cells(of)} |")
+    everything = [row for rows in found.values() for row in rows]
+    return [*lines, f"| all | | {_cells(everything)} |"] if everything else lines
+
+
+def _cells(rows: Sequence[dict[str, Any]]) -> str:
+    overlaps = [row["iou"] for row in rows]
+    first, others = (statistics.fmean(row[name] for row in rows) for name in ("first", "others"))
+    return f"{len(rows)} | {statistics.fmean(overlaps):.3f} | {min(overlaps):.3f} | {first:.1f} | {others:.2f}"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    scene_arguments(parser)
+    parser.add_argument("--seed", type=int, default=0, help="of the training")
+    parser.add_argument("--corner", type=float, default=8.0, help="pixels of outline between two corners of a lasso")
+    parser.add_argument("--sloppy", type=float, default=3.0, help="pixels by which a corner may be off the outline")
+    args = parser.parse_args(argv)
+    torch.set_num_threads(default_threads())
+    found: dict[str, list[dict[str, Any]]] = {}
+    try:
+        for folder in args.scenes:
+            source = f"{args.cameras}:{folder.absolute()}"
+            truth = load_source(source, args.results.absolute())
+            if not isinstance(truth, SyntheticTruth) or args.cameras != "exact":
+                raise ValueError(f"{folder}: people are only known of scenes of benchmarks/synthetic, by exact cameras")
+            run, scene = trained(truth, source, args), SyntheticScene.load(folder)
+            rows = [row for t in args.t_star or truth.t_stars for row in judge(truth.shot, scene, run, t, args)]
+            found[truth.name] = rows
+            write_json(args.results / f"mattes-{truth.name.replace(' ', '-')}.json", {"version": 1, "rows": rows})
+    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
+    print("\n".join(["", *table(found)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""A matte of a take in the scene's compositor: a Cryptomatte node that picks it by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ...torch_backend import contract
+from .. import compat
+from ..access import Outcome, library_of, scene_in, settings_of
+from ..properties import StringProperty
+from ..scene import numbered, paths, sequences
+from ..shot import inventory
+from ..ui import step_operator
+
+
+def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str]:
+    """Adds a Cryptomatte node of a matte to the scene's compositor, linked to nothing; returns what was done, in words.
+
+    JobError if the take has no such matte, or the scene no compositor that can be changed.
+    """
+    folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
+    frames = numbered.frame_numbers(folder.cryptomattes)
+    if name not in inventory.mattes(folder) or not frames:
+        raise contract.JobError(f"The take has no matte {name}.", "Make it first.", contract.ExitCode.BAKE)
+    tree = compat.compositor_tree(scene)
+    if tree is None or library_of(tree) is not None:
+        raise contract.JobError(
+            "This scene has no compositor of its own.", "Bake, or make one, first.", contract.ExitCode.BAKE
+        )
+    tree = compat.own_compositor_tree(scene)
+    image = sequences.load_numbers(folder.cryptomatte(frames[0]), f"Mattes {take}")
+    if image.source != "SEQUENCE":
+        image.source = "SEQUENCE"
+    node = next((n for n in tree.nodes if _shows(n, folder.cryptomatte(frames[0]), name)), None)
+    if node is not None:
+        return [f"The node of the matte {name} is there already."]
+    node = tree.nodes.new("CompositorNodeCryptomatteV2")
+    node.label, node.source = f"Matte {name}", "IMAGE"
+    sequences.show_sequence(node, image, frames[0], frames[-1])
+    node.matte_id = _quoted(name)
+    others = [other for other in tree.nodes if other != node]
+    left = min((other.location.x for other in others), default=0.0)
+    low = min((other.location.y - other.height for other in others), default=0.0)
+    node.location = left, low - 200.0
+    return [f"The node Matte {name} was added: link its output Matte."]
+
+
+def _quoted(name: str) -> str:
+    """A name as a node's list of names has it: separated by commas, in quotation marks where it has one."""
+    return f'"{name}"' if "," in name else name
+
+
+def _shows(node: bpy.types.Node, path: Path, name: str) -> bool:
+    """True of a Cryptomatte node that picks this matte from this sequence."""
+    if node.bl_idname != "CompositorNodeCryptomatteV2" or node.image is None or node.source != "IMAGE":
+        return False
+    return paths.same(paths.absolute(node.image.filepath), str(path)) and node.matte_id == _quoted(name)
+
+
+class SPLANNEQUIN_OT_insert_matte(bpy.types.Operator):
+    """Add a Cryptomatte node that picks this matte to your compositor, linked to nothing"""
+
+    bl_idname = "splannequin.insert_matte"
+    bl_label = "Add Matte Node"
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}
+
+    name = StringProperty(name="Matte", description="Name of the matte", options={"SKIP_SAVE"})
+
+    def execute(self, context: bpy.types.Context) -> Outcome:
+        """Adds the node; a refusal is reported."""
+        take = settings_of(scene_in(context)).take_name
+        return step_operator.edit(self, context, "bake", lambda scene, shot: insert(scene, shot, take, self.name))
+
+
+CLASSES = (SPLANNEQUIN_OT_insert_matte,)

@@ -1,0 +1,121 @@
+"""The buttons of the mattes: a frame to draw on, a matte from a mask, and one that is removed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from ..access import Outcome, scene_in, settings_of
+from ..process import backend, begin, job_timer
+from ..properties import StringProperty
+from ..scene import sequences
+from ..shot import selection
+from ..translations import tr
+from ..ui import step_operator
+from . import mattes
+
+
+def _has_take(context: bpy.types.Context) -> bool:
+    """True if the shot has the take that is chosen."""
+    folder = selection.shot_folder(scene_in(context))
+    state = job_timer.watch_of(folder).state if folder else None
+    return state is not None and settings_of(scene_in(context)).take_name in state.takes
+
+
+class SPLANNEQUIN_OT_draw_matte(bpy.types.Operator):
+    """Show the frozen frames in an Image Editor, to draw a mask around a person or a thing"""
+
+    bl_idname = "splannequin.draw_matte"
+    bl_label = "Draw on Frozen Frame"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a take."""
+        if not _has_take(context):
+            cls.poll_message_set(tr("Freeze first"))
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> Outcome:
+        """Loads the frames, and a mask where none is chosen; in a window an editor shows both."""
+        scene = scene_in(context)
+        folder, props = selection.shot_folder(scene), settings_of(scene)
+        assert folder is not None
+        try:
+            image, first, last = mattes.frozen_sequence(folder, props.take_name)
+        except (contract.JobError, OSError, ValueError, RuntimeError) as error:
+            self.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
+            return {"CANCELLED"}
+        if props.matte_mask is None:
+            props.matte_mask = bpy.data.masks.new("Matte")
+        space = None if bpy.app.background else _editor(context)
+        if space is not None:
+            space.image, space.ui_mode, space.mask = image, "MASK", props.matte_mask
+            sequences.show_sequence(space.image_user, image, first, last)
+        self.report({"INFO"}, tr(f"Frames {first} to {last} can be drawn on."))
+        return {"FINISHED"}
+
+
+def _editor(context: bpy.types.Context) -> Any:
+    """An Image Editor, the one in this window first, else in a new window."""
+    windows = sorted(context.window_manager.windows, key=lambda window: window != context.window)
+    areas = [area for window in windows for area in window.screen.areas if area.type == "IMAGE_EDITOR"]
+    if not areas:
+        bpy.ops.wm.window_new()
+        areas = [context.window_manager.windows[-1].screen.areas[0]]
+        areas[0].type = "IMAGE_EDITOR"
+    return areas[0].spaces.active
+
+
+class SPLANNEQUIN_OT_matte_from_mask(step_operator.StepOperator, bpy.types.Operator):
+    """Make a matte for every frame of the take from what the mask surrounds at the current frame. It has the mask's
+    name; drawn again at another frame, it adds to it"""
+
+    bl_idname = "splannequin.matte_from_mask"
+    bl_label = "Matte from Mask"
+    bl_options = {"REGISTER"}
+    step = "freeze"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a take, and while a step of this shot runs."""
+        if not _has_take(context):
+            cls.poll_message_set(tr("Freeze first"))
+            return False
+        return super().poll(context)
+
+    def params(self, scene: bpy.types.Scene) -> contract.MatteParams:
+        """The lassos of the mask."""
+        return mattes.params_of(scene, begin.needed(scene, self.step))
+
+
+class SPLANNEQUIN_OT_remove_matte(step_operator.StepOperator, bpy.types.Operator):
+    """Delete a matte of the take from the shot folder on disk, after a question"""
+
+    bl_idname = "splannequin.remove_matte"
+    bl_label = "Remove Matte"
+    bl_options = {"REGISTER", "INTERNAL"}
+    step = "freeze"
+
+    name = StringProperty(name="Matte", description="Name of the matte to delete", options={"SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
+        """Asks first: what is removed from disk does not come back with undo."""
+        return context.window_manager.invoke_confirm(
+            self, event, title="Delete this matte from disk?",
+            message="It can be drawn again. This cannot be undone.", confirm_text="Remove", icon="WARNING",
+        )  # fmt: skip
+
+    def params(self, scene: bpy.types.Scene) -> contract.MatteParams:
+        """The matte that goes."""
+        return contract.MatteParams(take=settings_of(scene).take_name, remove=self.name, device=backend.device())
+
+
+CLASSES = (
+    SPLANNEQUIN_OT_draw_matte,
+    SPLANNEQUIN_OT_matte_from_mask,
+    SPLANNEQUIN_OT_remove_matte,
+)

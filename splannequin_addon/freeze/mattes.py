@@ -1,0 +1,119 @@
+"""Mattes of things in a take: lassos from a mask that was drawn in Blender, and what their job left."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...torch_backend import contract
+from ..access import settings_of
+from ..process import backend
+from ..scene import paths, sequences
+from ..shot import inventory, scene_objects
+
+CURVE_STEPS = 12
+"""Corners of a polygon for each piece of a curve between two points of a mask."""
+
+Corner = tuple[float, float]
+
+
+def params_of(scene: bpy.types.Scene, shot: Path) -> contract.MatteParams:
+    """What the mask that is chosen asks for, at the scene's current frame; its lassos are written into the take.
+
+    Lassos of the same name at other frames stay. JobError if there is no take or no mask, or nothing is drawn in it.
+    """
+    props = settings_of(scene)
+    mask, folder = props.matte_mask, take_of(shot, props.take_name)
+    if mask is None:
+        raise contract.JobError(
+            "No mask is chosen.", "Draw one over the frozen frame, and choose it.", contract.ExitCode.USAGE
+        )
+    name, frame = contract.checked_name(mask.name, "matte"), scene.frame_current
+    facts = inventory.read(shot).takes[props.take_name]
+    drawn = polygons(mask, int(facts["width"]), int(facts["height"]))
+    if not drawn:
+        raise contract.JobError(
+            f"Nothing is drawn in the mask {name}.", "Draw a closed spline around the thing.", contract.ExitCode.USAGE
+        )
+    if inventory.missing_frames(shot, props.take_name, [frame]):
+        raise contract.JobError(
+            f"The take has no frame {frame}.", "Go to a frame of the take.", contract.ExitCode.USAGE
+        )
+    rows = [row for row in inventory.lassos(folder) if row["name"] == name and row["frame"] != frame]
+    rows += [{"name": name, "frame": frame, "polygon": polygon} for polygon in drawn]
+    path = folder.drawn_lassos
+    try:
+        contract.ShotFolder(shot).own(path.parent).mkdir(exist_ok=True)
+        contract.write_json(path, {"mattes": rows}, parents=False)
+    except OSError as error:
+        raise inventory.unwritable(
+            path, error, "Make room, or see to it that the shot's folder can be written."
+        ) from error
+    return contract.MatteParams(take=props.take_name, polygons=str(path), device=backend.device())
+
+
+def take_of(shot: Path, name: str) -> contract.TakeFolder:
+    """A take that is there. JobError if it is not."""
+    if name not in inventory.read(shot).takes:
+        raise contract.JobError("There is no take yet.", "Freeze first.", contract.ExitCode.USAGE)
+    return contract.TakeFolder(contract.ShotFolder(shot).take(name))
+
+
+def polygons(mask: bpy.types.Mask, width: int, height: int) -> list[list[Corner]]:
+    """Closed splines of a mask's visible layers as polygons, in pixels of a picture from its top left corner.
+
+    A mask's coordinates go from 0 to 1 along the longer side of the picture, and are centred along the other.
+    """
+    longest = max(width, height)
+    found: list[list[Corner]] = []
+    for layer in mask.layers:
+        for spline in () if layer.hide else layer.splines:
+            corners = _corners(spline)
+            if len(corners) >= 3:
+                found.append(
+                    [((x - 0.5) * longest + 0.5 * width, 0.5 * height - (y - 0.5) * longest) for x, y in corners]
+                )
+    return found
+
+
+def _corners(spline: Any) -> list[Corner]:
+    """A spline of a mask as a polygon, in the mask's coordinates: cubic pieces from point to point."""
+    points = list(spline.points)
+    found: list[Corner] = []
+    for n, point in enumerate(points):
+        after = points[(n + 1) % len(points)]
+        piece = [tuple(at) for at in (point.co, point.handle_right, after.handle_left, after.co)]
+        if point.handle_type == "VECTOR" and after.handle_type == "VECTOR":
+            found.append((float(piece[0][0]), float(piece[0][1])))
+            continue
+        for step in range(CURVE_STEPS):
+            t = step / CURVE_STEPS
+            shares = ((1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3)
+            x, y = (sum(share * at[axis] for share, at in zip(shares, piece, strict=True)) for axis in (0, 1))
+            found.append((float(x), float(y)))
+    return found
+
+
+def frozen_sequence(shot: Path, name: str) -> tuple[bpy.types.Image, int, int]:
+    """Frozen frames of a take without overscan, to draw on, as a sequence; and their first and last number."""
+    folder, facts = take_of(shot, name), inventory.read(shot).takes[name]
+    path = folder.preview(facts["first"])
+    if not path.is_file():
+        raise contract.JobError(f"{path} is not there.", "Freeze again.", contract.ExitCode.USAGE)
+    image = sequences.load_sequence(path, f"Frozen {name} of {scene_objects.name_of(shot)}", "srgb")
+    return image, facts["first"], facts["last"]
+
+
+def arrived(shot: Path, result: dict[str, Any]) -> list[str]:
+    """Has what shows mattes of a take read them again; returns what there is, in words."""
+    folder = contract.TakeFolder(contract.ShotFolder(shot).take(str(result["take"])))
+    inside = os.path.abspath(folder.mattes)
+    for image in bpy.data.images:
+        file = paths.absolute(image.filepath) if image.filepath and not image.library else ""
+        if file and os.path.abspath(file).startswith(inside + os.sep):
+            image.reload()
+    made = list(inventory.mattes(folder))
+    return [f"{len(made)} mattes in take {result['take']}: {', '.join(made)}."] if made else ["The take has no mattes."]

@@ -1,0 +1,147 @@
+"""Mattes of a take of the tiny world: against its truth at every pose, kept, made anew, removed, refused."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from torch_backend.contract import Cancelled, FreezeParams, JobError, MatteParams, TakeFolder
+from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.mattes.carry import in_order
+from torch_backend.freeze.mattes.files import read_matte
+from torch_backend.freeze.mattes.job import make_mattes, stored_lassos
+from torch_backend.raster import rasterize
+
+T_STAR, LASSO = 105, 108
+
+
+def truth(world, pose):
+    """[H, W] bool: what the patch covers from a pose while time stands still."""
+    state = {name: value[world.moving] for name, value in world.at((T_STAR - 101) / 15).items()}
+    n = pose - 101
+    out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
+    return out.alphas[0].numpy() > 0.5
+
+
+def outline(mask):
+    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return (max(found, key=len)[:, 0] + 0.5).tolist()
+
+
+@pytest.fixture
+def take(trained, quiet, tmp_path, request):
+    """(world, folder of a take of its own, writes a file of lassos)."""
+    world, _ = trained
+    name = f"m{abs(hash(request.node.name)) % 10**9}"
+    freeze_shot(world.shot, FreezeParams(take=name, t_star=T_STAR, first=104, last=112, detail="off"), quiet())
+
+    def lassos(*rows):
+        path = tmp_path / f"lassos{len(list(tmp_path.iterdir()))}.json"
+        path.write_text(json.dumps({"mattes": list(rows)}), encoding="utf-8")
+        return MatteParams(take=name, polygons=str(path))
+
+    return world, TakeFolder(world.shot.take(name)), lassos
+
+
+def patch(world, name="patch", frame=LASSO):
+    return {"name": name, "frame": frame, "polygon": outline(truth(world, frame))}
+
+
+CORNER = {"name": "corner", "frame": 107, "polygon": [[2, 2], [12, 2], [12, 12], [2, 12]]}
+
+
+def overlaps(world, folder, name="patch"):
+    found = {}
+    for n in range(104, 113):
+        matte, mask = read_matte(folder.matte_frames(name) / f"{n:06d}.exr", (0, 0)) > 0.5, truth(world, n)
+        found[n] = (matte & mask).sum() / (matte | mask).sum()
+    return found
+
+
+def test_one_lasso_is_a_matte_at_every_pose(take, quiet):
+    world, folder, lassos = take
+    told = make_mattes(world.shot, lassos(patch(world)), quiet())
+    found = overlaps(world, folder)
+    assert np.mean(list(found.values())) > 0.85 and min(found.values()) > 0.75
+    assert list(told["mattes"]) == ["patch"] and told["frames"] == 9
+    assert sorted(p.name for p in folder.cryptomattes.iterdir()) == [f"{n:06d}.exr" for n in range(104, 113)]
+    assert [lasso.name for lasso in stored_lassos(folder, 64, 48)] == ["patch"]
+
+
+def test_what_is_right_stays_and_what_is_stale_is_made_again(take, quiet):
+    world, folder, lassos = take
+    make_mattes(world.shot, lassos(patch(world)), quiet())
+    first = folder.matte_frames("patch") / "000106.exr"
+    before = first.stat().st_mtime_ns
+    told = make_mattes(world.shot, lassos(CORNER), quiet())
+    assert told["made"] == ["corner"] and sorted(told["mattes"]) == ["corner", "patch"]
+    assert first.stat().st_mtime_ns == before
+    assert make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())["made"] == []
+    first.write_bytes(b"cut off")
+    assert make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())["made"] == ["patch"]
+    assert read_matte(first, (0, 0)).any()
+    freeze_shot(world.shot, FreezeParams(take=folder.root.name, t_star=106, first=104, last=112, detail="off"), quiet())
+    told = make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())
+    assert sorted(told["made"]) == ["corner", "patch"]
+
+
+def test_a_matte_is_removed_and_the_other_stays(take, quiet):
+    world, folder, lassos = take
+    make_mattes(world.shot, lassos(patch(world), CORNER), quiet())
+    told = make_mattes(world.shot, MatteParams(take=folder.root.name, remove="corner"), quiet())
+    assert list(told["mattes"]) == ["patch"] and told["made"] == []
+    assert [p.name for p in folder.single_mattes.iterdir()] == ["patch"]
+    make_mattes(world.shot, MatteParams(take=folder.root.name, remove="patch"), quiet())
+    assert not list(folder.single_mattes.iterdir()) and not list(folder.cryptomattes.iterdir())
+
+
+def test_pictures_take_the_place_of_exrs(take, quiet):
+    world, folder, lassos = take
+    params = lassos(patch(world))
+    make_mattes(world.shot, params, quiet())
+    params.matte_format = "png"
+    make_mattes(world.shot, params, quiet())
+    assert {p.suffix for p in folder.matte_frames("patch").iterdir()} == {".png"}
+    assert (read_matte(folder.matte_frames("patch") / "000110.png", (0, 0)) > 0.5).any()
+
+
+def test_a_cancelled_job_goes_on(take, quiet):
+    world, folder, lassos = take
+    with pytest.raises(Cancelled):
+        make_mattes(world.shot, lassos(patch(world)), quiet(cancel_at=("making mattes", 0.5)))
+    assert [lasso.name for lasso in stored_lassos(folder, 64, 48)] == ["patch"]
+    assert not json.loads(folder.mattes_record.read_text(encoding="utf-8"))["finished"]
+    make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())
+    assert json.loads(folder.mattes_record.read_text(encoding="utf-8"))["finished"]
+    assert min(overlaps(world, folder).values()) > 0.75
+
+
+@pytest.mark.parametrize(
+    ("row", "word"),
+    [
+        ({"frame": 300}, "frame 300"),
+        ({"polygon": [[900, 900], [950, 900], [950, 950]]}, "outside"),
+        ({"name": "CORNER"}, "capitals"),
+    ],
+)
+def test_wrong_lassos_are_sentences(take, quiet, row, word):
+    world, _, lassos = take
+    with pytest.raises(JobError, match=word):
+        make_mattes(world.shot, lassos(CORNER, {**CORNER, **row}), quiet())
+
+
+def test_a_take_that_is_not_there_and_no_lassos_are_sentences(take, quiet):
+    world, folder, _ = take
+    with pytest.raises(JobError, match="no finished take"):
+        make_mattes(world.shot, MatteParams(take="nowhere"), quiet())
+    with pytest.raises(JobError, match="no lassos"):
+        make_mattes(world.shot, MatteParams(take=folder.root.name), quiet())
+    with pytest.raises(JobError, match="no matte"):
+        make_mattes(world.shot, MatteParams(take=folder.root.name, remove="nobody"), quiet())
+
+
+def test_frames_are_taken_outwards_from_the_lassos():
+    polygons = {"a": {5: []}, "b": {9: []}}
+    order = in_order(polygons, range(1, 12))
+    assert set(order[:2]) == {5, 9} and order[-1] == 1

@@ -1,0 +1,63 @@
+"""Votes and membership against the rasteriser's own reference, pixel by pixel."""
+
+import torch
+
+from torch_backend.freeze.frozen import FrozenGaussians
+from torch_backend.freeze.mattes.membership import RIM, membership, render_members, rule_out, vote
+from torch_backend.raster import rasterize
+
+VIEW, K = torch.eye(4), torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+
+
+def scene(means, scales, logits):
+    n = len(means)
+    state = {
+        "means": torch.tensor(means),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
+        "log_scales": torch.tensor(scales).log()[:, None].repeat(1, 3),
+        "opacity_logits": torch.tensor(logits),
+        "sh0": torch.zeros(n, 1, 3),
+        "shN": torch.zeros(n, 0, 3),
+    }
+    return FrozenGaussians(state, 0, torch.ones(n), torch.zeros(n))
+
+
+def test_a_vote_is_the_share_of_what_is_seen():
+    """Against float64 weights of each Gaussian, one at a time in its own channel."""
+    frozen = scene([[0.0, 0.0, 2.0], [0.2, 0.1, 3.0], [-0.5, 0.0, 2.5]], [0.2, 0.3, 0.1], [2.0, 3.0, 0.5])
+    generator = torch.Generator().manual_seed(3)
+    weights = torch.rand(24, 32, 2, generator=generator)
+    state = {name: frozen.state[name].double() for name in ("means", "quats", "log_scales", "opacity_logits")}
+    each = rasterize(
+        **state, colors=torch.eye(3).double(), viewmats=VIEW[None].double(), Ks=K[None].double(), width=32, height=24,
+        backend="reference",
+    ).colors[0]  # fmt: skip
+    expected = torch.einsum("hwn,hwc->nc", each, weights.double())
+    assert torch.allclose(vote(frozen, VIEW, K, weights).double(), expected, rtol=1e-3, atol=1e-3)
+
+
+def test_who_stands_outside_of_the_picture_is_not_seen():
+    frozen = scene([[1.3, 0.0, 2.0], [0.0, 0.0, 2.0]], [0.5, 0.2], [3.0, 3.0])
+    told = vote(frozen, VIEW, K, torch.ones(24, 32, 1))
+    assert told[0] == 0.0 < told[1]
+
+
+def test_members_are_rendered_as_shares_of_what_is_known():
+    frozen = scene([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]], [0.3, 0.6], [0.0, 4.0])
+    votes = torch.tensor([[0.0, 0.0], [8.0, 10.0]])  # nobody saw the first
+    members = membership(votes)
+    assert members.tolist() == [[0.0, 0.0], [0.800000011920929, 1.0]]
+    shown = render_members(frozen, members, VIEW, K, 32, 24)
+    middle = shown[12, 16]
+    assert abs(float(middle[0]) - 0.8) < 1e-3 and 0.3 < float(middle[1]) < 0.7
+
+
+def test_what_is_far_from_a_thing_and_was_not_seen_is_none_of_it():
+    line = torch.stack([torch.linspace(0.0, 1.0, 101), torch.zeros(101), torch.zeros(101)], dim=1)
+    means = torch.cat([line, torch.tensor([[1.0, 0.5 * RIM, 0.0], [1.0, 3.0 * RIM, 0.0], [0.5, 2.0, 0.0]])])
+    votes = torch.zeros(104, 2)
+    votes[:101] = 5.0
+    votes[103] = torch.tensor([4.0, 4.0])  # seen: what was seen is believed
+    known = membership(rule_out(votes, means))
+    assert known[101].tolist() == [0.0, 0.0] and known[102].tolist() == [0.0, 1.0] and known[103].tolist() == [1.0, 1.0]
+    assert torch.equal(rule_out(torch.zeros(104, 2), means), torch.zeros(104, 2))

@@ -1,0 +1,106 @@
+"""Cryptomatte: all mattes of a frame in one file, from which compositors pick by name.
+
+Cryptomatte specification 1.2.0 (Friedman, Jones: "Fully automatic ID mattes with support for motion blur and
+transparency", SIGGRAPH 2015 posters; https://github.com/Psyop/Cryptomatte). A matte is known by the MurmurHash3 of its
+name, read as a float. Each pixel holds pairs of such an identifier and of the share of the pixel that is the matte's,
+the largest share first; two pairs are a layer of R G B A. The header's manifest says which name is which identifier.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from ...contract import CRYPTOMATTE, layers_of
+from ..exr import Made, linear_spec, set_margin, write_exr
+
+LAYERS = layers_of(CRYPTOMATTE)
+PAIRS = 2 * len(LAYERS)
+"""Mattes that a pixel can belong to; of more, those with the smallest shares are left out."""
+_MASK = 0xFFFFFFFF
+
+
+def murmur3(data: bytes, seed: int = 0) -> int:
+    """MurmurHash3_x86_32 (Appleby, public domain) of bytes."""
+    hashed = seed
+    whole = len(data) // 4 * 4
+    blocks = [*struct.unpack(f"<{whole // 4}I", data[:whole]), int.from_bytes(data[whole:], "little")]
+    for n, block in enumerate(blocks):
+        block = block * 0xCC9E2D51 & _MASK
+        block = _turned(block, 15) * 0x1B873593 & _MASK
+        hashed ^= block
+        if n < whole // 4:  # the rest of fewer than four bytes is mixed in, and nothing more
+            hashed = (_turned(hashed, 13) * 5 + 0xE6546B64) & _MASK
+    hashed ^= len(data)
+    hashed = (hashed ^ hashed >> 16) * 0x85EBCA6B & _MASK
+    hashed = (hashed ^ hashed >> 13) * 0xC2B2AE35 & _MASK
+    return hashed ^ hashed >> 16
+
+
+def _turned(value: int, by: int) -> int:
+    """A word of 32 bits, rotated to the left."""
+    return (value << by | value >> 32 - by) & _MASK
+
+
+def identifier(name: str) -> int:
+    """Bits of the float by which a Cryptomatte knows a name: its hash, where that is neither infinite, NaN nor
+    denormal."""
+    hashed = murmur3(name.encode())
+    return hashed ^ 1 << 23 if hashed >> 23 & 255 in (0, 255) else hashed
+
+
+def as_float(bits: int) -> np.float32:
+    """The float of 32 bits."""
+    return np.uint32(bits).view(np.float32)
+
+
+def manifest(names: Sequence[str]) -> str:
+    """JSON: name -> identifier as eight hexadecimal digits."""
+    return json.dumps({name: f"{identifier(name):08x}" for name in names}, ensure_ascii=False, separators=(",", ":"))
+
+
+def ranked(mattes: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
+    """[H, W, 2 * PAIRS]: identifier and share of the mattes of each pixel, the largest share first; 0 where none is.
+
+    Shares of a pixel that together are more than it are scaled to it. ValueError without mattes, or of unlike sizes.
+    """
+    identifiers = np.array([as_float(identifier(name)) for name in mattes], np.float32)
+    shares = np.stack([np.clip(matte, 0.0, 1.0) for matte in mattes.values()], axis=-1).astype(np.float32)
+    shares /= np.maximum(shares.sum(-1, keepdims=True), 1.0)
+    order = np.argsort(-shares, axis=-1, kind="stable")[..., :PAIRS]
+    found = np.take_along_axis(shares, order, -1)
+    pairs = np.zeros((*shares.shape[:2], PAIRS, 2), np.float32)
+    pairs[..., : order.shape[-1], 1] = found
+    pairs[..., : order.shape[-1], 0] = np.where(found > 0.0, identifiers[order], np.float32(0.0))
+    return pairs.reshape(*shares.shape[:2], 2 * PAIRS)
+
+
+def write_cryptomatte(
+    path: str | Path, mattes: Mapping[str, NDArray[np.float32]], margin: tuple[int, int] = (0, 0), key: str = ""
+) -> Path:
+    """Writes mattes [H, W] in 0..1 of a frame as a Cryptomatte, whole or not at all: float32, ZIP.
+
+    `margin`: pixels of the arrays beyond the frame, as `write_frozen_exr`. OSError if the file cannot be written.
+    """
+    shape = next(iter(mattes.values())).shape
+    names = tuple(channel for layer in LAYERS for channel in layer.channels)
+    spec = linear_spec(shape[1], shape[0], names, (oiio.FLOAT,) * len(names))
+    layer = CRYPTOMATTE
+    where = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
+    told = {"name": layer, "hash": "MurmurHash3_32", "conversion": "uint32_to_float32", "manifest": manifest([*mattes])}
+    for name, value in told.items():
+        spec.attribute(f"{where}/{name}", value)
+    if key:
+        spec.attribute("splannequin:key", key)
+    set_margin(spec, margin)
+
+    def rows(of: slice) -> NDArray[np.float32]:
+        return ranked({name: matte[of] for name, matte in mattes.items()})
+
+    return write_exr(Path(path), spec, [Made((*shape, 2 * PAIRS), rows)])

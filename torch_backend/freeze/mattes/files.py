@@ -1,0 +1,58 @@
+"""Files of mattes: single ones as EXR or 16-bit PNG, known by the key of what they were made from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from ...contract import MATTE_FORMATS, TakeFolder, UserError, frame_file, is_whole_picture, regular_file
+from ...footage.images import write_png
+from ..exr import linear_spec, read_key, set_margin, write_exr
+
+
+def matte_file(folder: TakeFolder, name: str, frame: int, suffix: str) -> Path:
+    """Where a frame of a matte lies; `suffix` is one of `MATTE_FORMATS`."""
+    return folder.matte_frames(name) / frame_file(frame, f".{suffix}")
+
+
+def write_matte(path: Path, matte: NDArray[np.float32], margin: tuple[int, int], key: str) -> None:
+    """Writes a matte [H, W] in 0..1, whole or not at all.
+
+    R, G and B of an EXR (half) or a PNG (16 bits, linear) are the matte: every program shows that as a picture. A PNG
+    has no overscan: `margin` pixels, left and right, and above and below, are cut off. OSError if it cannot be written.
+    """
+    three = np.repeat(matte[..., None], 3, axis=2)
+    if path.suffix == ".png":
+        across, down = margin
+        height, width = matte.shape
+        inner = three[down : height - down, across : width - across]
+        write_png(path, np.rint(inner * 65535.0).astype(np.uint16), key)
+        return
+    spec = linear_spec(matte.shape[1], matte.shape[0], ("R", "G", "B"), (oiio.HALF,) * 3)
+    spec.attribute("splannequin:key", key)
+    set_margin(spec, margin)
+    write_exr(path, spec, [three])
+
+
+def read_matte(path: Path, margin: tuple[int, int]) -> NDArray[np.float32]:
+    """[H, W] in 0..1 of a file of `write_matte`, with its overscan. ValueError if it cannot be read."""
+    buffer = oiio.ImageBuf(regular_file(path))
+    pixels = None if buffer.has_error else buffer.get_pixels(oiio.FLOAT)
+    if pixels is None or buffer.has_error:
+        raise UserError(f"matte {path} cannot be read: {buffer.geterror()}")
+    matte = np.ascontiguousarray(np.asarray(pixels, np.float32)[..., 0])
+    across, down = margin
+    return np.pad(matte, ((down, down), (across, across))) if path.suffix == ".png" else matte
+
+
+def is_current(path: Path, key: str) -> bool:
+    """True if a file is whole and was made from what `key` identifies."""
+    return is_whole_picture(path) and read_key(path) == key
+
+
+def suffixes_beside(suffix: str) -> list[str]:
+    """The other formats of single mattes."""
+    return [other for other in MATTE_FORMATS if other != suffix]

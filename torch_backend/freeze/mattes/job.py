@@ -1,0 +1,264 @@
+"""The job that makes the mattes of a take: lassos in, single sequences and a Cryptomatte out."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...contract import (
+    ExitCode,
+    JobError,
+    MatteParams,
+    Reporter,
+    TakeFolder,
+    check_version,
+    frame_number,
+    read_json,
+    sweep_half_written,
+)
+from ...footage.color import linear_to_srgb8
+from ...scene import Scene, load_scene
+from ...shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, remove_file, write_json
+from ...torch_types import from_numpy
+from ...train import choose_device, load_run
+from ..exr import read_frozen_exr, read_key
+from ..instant.instants import Instants
+from ..take.folder import frames_of
+from .carry import TakeFrame, carry, in_order
+from .cryptomatte import write_cryptomatte
+from .files import is_current, matte_file, read_matte, suffixes_beside, write_matte
+from .lassos import Lasso, json_list, lasso_of, read_lassos
+from .segment import Matte, SegmentConfig
+
+MATTES_VERSION = 1
+"""Of mattes.json; and rises when mattes made before are not to be used any more."""
+
+
+@dataclass(frozen=True)
+class _Take:
+    """A finished take, as mattes need it."""
+
+    folder: TakeFolder
+    facts: dict[str, Any]
+    """take.json."""
+    frames: list[int]
+    """Numbers of its frames, ascending."""
+
+    @property
+    def margin(self) -> tuple[int, int]:
+        """Pixels of overscan left and right, and above and below."""
+        across, down = self.facts.get("margin", (0, 0))
+        return int(across), int(down)
+
+
+def make_mattes(shot: Shot, params: MatteParams, report: Reporter) -> dict[str, Any]:
+    """Makes the mattes of a take that are missing or stale, and their Cryptomatte.
+
+    Returns {take, mattes: name -> folder, cryptomatte: folder, frames, seconds of the first matte}. JobError in words
+    if it cannot be done.
+    """
+    take = _opened(shot, params.take)
+    lassos = _lassos(take, params)
+    wanted: dict[str, list[Lasso]] = {}
+    for lasso in lassos:
+        wanted.setdefault(lasso.name, []).append(lasso)
+    for inner in (take.folder.mattes, take.folder.cryptomattes, *map(take.folder.matte_frames, wanted)):
+        make_folder(shot.own(inner))
+        sweep_half_written(inner)
+    pixels = (int(take.facts["width"]) + 2 * take.margin[0]) * (int(take.facts["height"]) + 2 * take.margin[1])
+    need_disk(take.folder.root, len(take.frames) * pixels * (4.0 + len(wanted)), "the mattes")
+    keys = _keys(take, wanted)
+    stale = {
+        name: of for name, of in wanted.items()
+        if not all(is_current(matte_file(take.folder, name, n, params.matte_format), keys[name]) for n in take.frames)
+    }  # fmt: skip
+    record = {
+        "version": MATTES_VERSION,
+        "finished": False,
+        "format": params.matte_format,
+        "keys": keys,
+        "mattes": [lasso.to_json() for lasso in lassos],
+    }
+    try:
+        write_json(take.folder.mattes_record, record)  # a job that is cancelled loses no lasso
+        _write(shot, take, params, wanted, stale, keys, report)
+        _sweep(take, params, wanted)
+        write_json(take.folder.mattes_record, {**record, "finished": True})
+    except OSError as error:
+        raise (disk_error(take.folder.root) if is_disk_full(error) else error) from error
+    return {
+        "take": params.take,
+        "frames": len(take.frames),
+        "mattes": {name: str(take.folder.matte_frames(name)) for name in wanted},
+        "made": list(stale),
+        "cryptomatte": str(take.folder.cryptomattes) if wanted else "",
+    }
+
+
+def stored_lassos(folder: TakeFolder, width: int, height: int) -> list[Lasso]:
+    """The lassos that a take's mattes were made of; none if it has no mattes. JobError if their record is damaged."""
+    if not folder.mattes_record.is_file():
+        return []
+    record = read_json(folder.mattes_record)
+    check_version(record, str(folder.mattes_record), MATTES_VERSION)
+    rows = json_list(record.get("mattes"))
+    return [lasso_of(row, f"Lasso {n} of {folder.mattes_record}", width, height) for n, row in enumerate(rows, 1)]
+
+
+def _opened(shot: Shot, name: str) -> _Take:
+    """A take that is there. JobError if it is not."""
+    folder = TakeFolder(shot.own(shot.take(name)))
+    if not folder.facts.is_file():
+        raise JobError(f"{shot.root.name} has no finished take {name!r}.", "Freeze it first.", ExitCode.FREEZE)
+    facts = read_json(folder.facts)
+    if not all(name in facts for name in ("run", "checkpoint", "width", "height", "query")):
+        raise JobError(f"{folder.facts} is damaged.", "Freeze the take again.", ExitCode.FREEZE)
+    return _Take(folder, facts, frames_of(folder))
+
+
+def _lassos(take: _Take, params: MatteParams) -> list[Lasso]:
+    """The lassos of before and those of the file, which take the place of those of the same name."""
+    size = int(take.facts["width"]), int(take.facts["height"])
+    lassos = stored_lassos(take.folder, *size)
+    if params.remove:
+        if params.remove not in {lasso.name for lasso in lassos}:
+            raise JobError(f"The take has no matte {params.remove!r}.", "Check its name.", ExitCode.USAGE)
+        lassos = [lasso for lasso in lassos if lasso.name != params.remove]
+    if params.polygons:
+        drawn = read_lassos(params.polygons, *size)
+        names = {lasso.name for lasso in drawn}
+        lassos = [lasso for lasso in lassos if lasso.name not in names] + drawn
+    if not lassos and not params.remove:
+        raise JobError("The take has no lassos yet.", "Give a file of them with --polygons.", ExitCode.USAGE)
+    folded = [name.casefold() for name in dict.fromkeys(lasso.name for lasso in lassos)]
+    if len(set(folded)) < len(folded):
+        raise JobError(
+            "Two mattes have names that differ in capitals alone: their folders would be one on some systems.",
+            "Rename one of them.",
+            ExitCode.USAGE,
+        )
+    for lasso in lassos:
+        x, y = lasso.corners().T
+        if lasso.frame not in take.frames:
+            span = f"frames {take.frames[0]} to {take.frames[-1]}" if take.frames else "none"
+            raise JobError(
+                f"{lasso.name} was lassoed at frame {lasso.frame}, which the take lacks: it has {span}.",
+                "Lasso it at a frame of the take.",
+                ExitCode.USAGE,
+            )
+        if x.max() <= 0.0 or y.max() <= 0.0 or x.min() >= size[0] or y.min() >= size[1]:
+            raise JobError(
+                f"The lasso of {lasso.name} lies outside of frame {lasso.frame}, of {size[0]} x {size[1]} pixels.",
+                "Draw it within the frame.",
+                ExitCode.USAGE,
+            )
+    return lassos
+
+
+def _keys(take: _Take, wanted: Mapping[str, list[Lasso]]) -> dict[str, str]:
+    """Name -> what identifies all that its matte is made from. Evidence goes from frame to frame, so every frame
+    counts."""
+    shown = [[n, read_key(take.folder.frame(n))] for n in take.frames]
+    how = dataclasses.asdict(SegmentConfig())
+    return {
+        name: content_key(MATTES_VERSION, shown, [[one.frame, one.polygon] for one in of], how)
+        for name, of in wanted.items()
+    }
+
+
+def _write(
+    shot: Shot, take: _Take, params: MatteParams, wanted: Mapping[str, list[Lasso]], stale: Mapping[str, list[Lasso]],
+    keys: Mapping[str, str], report: Reporter,
+) -> None:  # fmt: skip
+    """Writes the mattes that are stale, and the Cryptomattes that hold one of them or a removed one."""
+    if not wanted:
+        return
+    whole = content_key(MATTES_VERSION, {name: keys[name] for name in wanted})
+    none: Iterator[tuple[int, dict[str, Matte]]] = ((number, {}) for number in take.frames)
+    made = _carried(shot, take, params, stale, report) if stale else none
+    for done, (number, mattes) in enumerate(made):
+        report.progress("making mattes", done, len(take.frames), f"frame {number}")
+        report.check_cancelled()
+        for name, matte in mattes.items():
+            write_matte(matte_file(take.folder, name, number, params.matte_format), matte, take.margin, keys[name])
+        path = take.folder.cryptomatte(number)
+        if mattes or not is_current(path, whole):
+            every = {
+                name: mattes[name] if name in mattes
+                else read_matte(matte_file(take.folder, name, number, params.matte_format), take.margin)
+                for name in wanted
+            }  # fmt: skip
+            write_cryptomatte(path, every, take.margin, whole)
+    report.progress("making mattes", len(take.frames), len(take.frames), f"{len(take.frames)} frames")
+
+
+def _carried(
+    shot: Shot, take: _Take, params: MatteParams, stale: Mapping[str, list[Lasso]], report: Reporter
+) -> Iterator[tuple[int, dict[str, Matte]]]:
+    """Frames with their mattes, the lassoed ones first."""
+    run = load_run(shot, str(take.facts["run"]), choose_device(params.device, report, "Making mattes"))
+    if run.stamp != take.facts["checkpoint"]:
+        raise JobError(
+            f"The run {take.facts['run']!r} was trained since the take was frozen: they do not belong together.",
+            "Freeze the take again.",
+            ExitCode.FREEZE,
+        )
+    scene = load_scene(shot)
+    polygons: dict[str, dict[int, list[np.ndarray]]] = {}
+    for name, of in stale.items():
+        for lasso in of:
+            polygons.setdefault(name, {}).setdefault(lasso.frame, []).append(lasso.corners())
+    order = in_order(polygons, take.frames)
+    held: dict[int, TakeFrame] = {}
+
+    def read(number: int) -> TakeFrame:
+        if number not in held:
+            held.clear()  # a frame with a lasso is asked for twice in a row if it is the only one
+            held[number] = read_take_frame(take.folder, number, scene)
+        return held[number]
+
+    instants = [read(n).t_star for n in take.frames] if take.facts.get("t_star_per_frame") else [read(order[0]).t_star]
+    frozen = Instants(shot, run, scene, str(take.facts["query"]), instants, "developed" in take.facts)
+    frozen.prepare(instants, report)
+    for frame, mattes in carry(polygons, take.frames, read, lambda t_star: frozen.at(t_star, report)):
+        yield frame.number, mattes
+
+
+def read_take_frame(folder: TakeFolder, number: int, scene: Scene) -> TakeFrame:
+    """A frame of a take, from its EXR. ValueError if that cannot be read."""
+    frame = read_frozen_exr(folder.frame(number))
+    viewmat = scene.from_solve(frame.metadata.viewmat.astype(np.float64)[None])[0]
+    K = from_numpy(frame.metadata.K.copy())
+    K[0, 2] += frame.margin[0]
+    K[1, 2] += frame.margin[1]
+    picture = linear_to_srgb8(np.clip(frame.rgba[..., :3], 0.0, 1.0))
+    return TakeFrame(number, picture, frame.depth, viewmat, K, frame.margin, frame.metadata.t_star_frame)
+
+
+def _sweep(take: _Take, params: MatteParams, wanted: Mapping[str, list[Lasso]]) -> None:
+    """Removes single mattes of other names and formats, and frames that the take has no more."""
+    keep = set(take.frames)
+    with contextlib.suppress(FileNotFoundError):
+        for old in [*take.folder.single_mattes.iterdir()]:
+            if old.name not in wanted and old.is_dir() and not old.is_symlink():
+                shutil.rmtree(old, ignore_errors=True)
+    for name in wanted:
+        for suffix in (params.matte_format, *suffixes_beside(params.matte_format)):
+            for file in take.folder.matte_frames(name).glob(f"*.{suffix}"):
+                if suffix != params.matte_format or not _is_of(file, keep):
+                    remove_file(file)
+    for file in take.folder.cryptomattes.glob("*.exr"):
+        if not wanted or not _is_of(file, keep):
+            remove_file(file)
+
+
+def _is_of(file: Path, frames: set[int]) -> bool:
+    """True if a file is that of one of the frames."""
+    return frame_number(file.stem) in frames
