@@ -37,6 +37,7 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
     if node is not None:
         return [f"The node of the matte {name} is there already."]
     node = tree.nodes.new("CompositorNodeCryptomatteV2")
+    assert isinstance(node, bpy.types.CompositorNodeCryptomatteV2)
     node.label, node.source = f"Matte {name}", "IMAGE"
     sequences.show_sequence(node, image, frames[0], frames[-1])
     node.matte_id = _quoted(name)
@@ -54,7 +55,7 @@ def _quoted(name: str) -> str:
 
 def _shows(node: bpy.types.Node, path: Path, name: str) -> bool:
     """True of a Cryptomatte node that picks this matte from this sequence."""
-    if node.bl_idname != "CompositorNodeCryptomatteV2" or node.image is None or node.source != "IMAGE":
+    if not isinstance(node, bpy.types.CompositorNodeCryptomatteV2) or node.image is None or node.source != "IMAGE":
         return False
     return paths.same(paths.absolute(node.image.filepath), str(path)) and node.matte_id == _quoted(name)
 
