@@ -79,7 +79,7 @@ def polygons(mask: bpy.types.Mask, width: int, height: int) -> list[list[Corner]
     return found
 
 
-def _corners(spline: Any) -> list[Corner]:
+def _corners(spline: bpy.types.MaskSpline) -> list[Corner]:
     """A spline of a mask as a polygon, in the mask's coordinates: cubic pieces from point to point."""
     points = list(spline.points)
     found: list[Corner] = []
