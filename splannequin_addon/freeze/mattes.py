@@ -103,9 +103,9 @@ def polygons(mask: bpy.types.Mask, width: int, height: int) -> list[list[Corner]
     return found
 
 
-def _corners(spline: Any) -> list[Corner]:
+def _corners(spline: bpy.types.MaskSpline) -> list[Corner]:
     """A spline of a mask as a polygon, in the mask's coordinates: cubic pieces from point to point."""
-    points = list(spline.points)
+    points: list[Any] = list(spline.points)
     found: list[Corner] = []
     for n, point in enumerate(points):
         after = points[(n + 1) % len(points)]

@@ -112,7 +112,7 @@ def _lassos(path: Path) -> list[dict[str, Any]]:
     return [row for row in rows if _is_lasso(row)]
 
 
-def _is_lasso(row: Any) -> bool:
+def _is_lasso(row: object) -> bool:
     """True of what names a matte as ours are named, a frame and a polygon."""
     if not isinstance(row, dict):
         return False
