@@ -369,7 +369,7 @@ def _freeze(shot: Shot, params: contract.FreezeParams, report: Reporter) -> Any:
 
 
 def _combine(shot: Shot, params: contract.CombineParams, report: Reporter) -> Any:
-    from .freeze.take.combined import combine
+    from .freeze.mattes.combined import combine
 
     return combine(shot, params, report)
 

@@ -31,10 +31,10 @@ from ...footage.images import read_png, write_png
 from ...footage.plates import Plates
 from ...shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, remove_file, write_json
 from ..exr import DetailLayers, FrozenFrame, read_frozen_exr, read_key, write_frozen_exr
-from ..mattes.files import is_current, matte_file, read_matte
-from .contact_sheet import write_contact_sheet
-from .folder import frames_of
-from .video import write_video
+from ..take.contact_sheet import write_contact_sheet
+from ..take.folder import frames_of
+from ..take.video import write_video
+from .files import is_current, matte_file, read_matte
 
 VERSION = 1
 """Rises when pictures combined before are not to be used any more."""
