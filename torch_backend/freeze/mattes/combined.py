@@ -156,8 +156,9 @@ def grown(matte: Array, width: int) -> Array:
     return np.asarray(cv2.GaussianBlur(cv2.dilate(matte, kernel), (0, 0), 0.5 * reach), np.float32)
 
 
-def living(matte: Array, motion: Array) -> Array:
-    """What a thing under a matte [H, W] covers while it lives: of what moves (`motion` [H, W]) that which touches it.
+def with_motion(matte: Array, motion: Array) -> Array:
+    """A matte [H, W] with all that moves (`motion` [H, W]) and touches it: a hand that the matte missed, or where the
+    thing is while it lives.
 
     `motion` is the layer of a frozen frame: what moves at t* or in the frame's own plate.
     """
@@ -235,16 +236,16 @@ def _write_frame(
     (height, width), (across, down) = frame.depth.shape, base.margin
     inner = slice(down, height - down), slice(across, width - across)
     for matte, take in things.items():
-        source, mask = sources[take], base.matte(matte, number)
+        source, mask = sources[take], with_motion(base.matte(matte, number), frame.motion)
         if source is None:
             assert live is not None
-            whole, mask = grown(living(mask, frame.motion), width), np.zeros_like(mask)
+            whole, mask = grown(mask, width), np.zeros_like(mask)
             mask[inner] = whole[inner]  # the plate ends where the frame does
             other = _living_frame(frame, live, number, inner)
             picture = np.asarray(live.display(number).clamp(0.0, 1.0).numpy() * 255.0, np.float32)
         else:
-            mask = grown(np.maximum(mask, source.matte(matte, number)), width)
             other = read_frozen_exr(source.folder.frame(number))
+            mask = grown(np.maximum(mask, with_motion(source.matte(matte, number), other.motion)), width)
             picture = read_png(source.folder.preview(number)).astype(np.float32)
         share = mask[inner][..., None]
         shown = shown * (1.0 - share) + picture * share

@@ -12,7 +12,7 @@ from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.freeze.mattes.combined import combine, combined, grown, living
+from torch_backend.freeze.mattes.combined import combine, combined, grown, with_motion
 from torch_backend.freeze.mattes.job import make_mattes
 from torch_backend.raster import rasterize
 
@@ -141,7 +141,7 @@ def frame_like(value):
 def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
     matte, motion = np.zeros((40, 60), np.float32), np.zeros((40, 60), np.float32)
     matte[10:20, 10:20], motion[15:30, 18:25], motion[5:10, 50:55] = 1.0, 1.0, 1.0
-    alive = living(matte, motion)
+    alive = with_motion(matte, motion)
     assert alive[25, 22] == 1.0 and alive[7, 52] == 0.0 and alive[12, 12] == 1.0
     soft = grown(matte, 640)
     assert soft[15, 15] == pytest.approx(1.0, abs=1e-3) and 0.2 < soft[15, 23] < 1.0 and soft[15, 32] == 0.0
