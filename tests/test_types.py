@@ -23,8 +23,6 @@ OPEN = {
     "scene/scene_setup.py: _same(one)": "the value of any setting",
     "scene/scene_setup.py: _same(other)": "the value of any setting",
     "scene/sequences.py: show_sequence(user)": "an image user, or a node that has the same in itself",
-    "freeze/mattes.py: _corners(spline)": "Blender's types have no points of a mask's spline",
-    "shot/inventory.py: _is_lasso(row)": "whatever a file holds",
 }
 """Parameters that are `Any` -> why."""
 

@@ -368,6 +368,12 @@ def _freeze(shot: Shot, params: contract.FreezeParams, report: Reporter) -> Any:
     return freeze_shot(shot, params, report)
 
 
+def _combine(shot: Shot, params: contract.CombineParams, report: Reporter) -> Any:
+    from .freeze.mattes.combined import combine
+
+    return combine(shot, params, report)
+
+
 def _mattes(shot: Shot, params: contract.MatteParams, report: Reporter) -> Any:
     from .freeze.mattes.job import make_mattes
 
@@ -380,5 +386,6 @@ RUNNERS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "train": _train,
     "freeze": _freeze,
     "mattes": _mattes,
+    "combine": _combine,
 }
 """Kind of job -> the station that does it: (shot, typed params, reporter) -> JSON-able result."""

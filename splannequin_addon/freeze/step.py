@@ -34,7 +34,7 @@ class Freeze(Step):
     name = "freeze"
     label = "Freeze"
     kind = "freeze"
-    also = ("mattes",)
+    also = ("mattes", "combine")
     button = "Freeze"
     again = "Freeze Again"
     needs = "Train first."
@@ -76,6 +76,9 @@ class Freeze(Step):
         """An instant that nobody chose is the one that was taken; mattes are read again where they are shown."""
         if job.kind == "mattes":
             return mattes.arrived(job.shot, job.result)
+        if job.kind == "combine":
+            settings_of(scene).take_name = str(job.result["take"])
+            return [f"The take {job.result['take']} is chosen: {job.result['frames']} frames."]
         if not settings_of(scene).choose_t_star:
             settings_of(scene).t_star = int(job.result["t_star_frame"])
         return []
