@@ -13,7 +13,9 @@ from ..scene import scene_setup, session
 from ..shot import inventory, scene_objects, seen_camera, selection
 
 
-def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Generator[int, None, contract.CameraPath]:
+def sample_path(
+    scene: bpy.types.Scene, name: str, shot: Path, width: int, every: int = 1
+) -> Generator[int, None, contract.CameraPath]:
     """Reads an animated camera over the scene's range, a frame per turn; yields frames done, returns the CameraPath.
 
     Nothing of bpy is kept between two turns. The scene's current frame is put back at the end.
@@ -23,6 +25,7 @@ def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Ge
         name: of the camera object.
         shot: shot folder whose solve the path is to be in.
         width: of the frames in pixels; 0: the scene's.
+        every: of the scene's frames that one is read of, the last one as well.
 
     Raises:
         contract.JobError: the camera is gone, or is no perspective camera.
@@ -32,6 +35,7 @@ def sample_path(scene: bpy.types.Scene, name: str, shot: Path, width: int) -> Ge
     width = width or size[0]
     height = max(1, round(size[1] * width / size[0]))
     numbers = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+    numbers = sorted({*numbers[::every], *numbers[-1:]})
     del scene
     frames: list[contract.CameraFrame] = []
     try:

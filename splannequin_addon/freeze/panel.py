@@ -134,6 +134,11 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
         if props.overscan == "PERCENT":
             layout.prop(props, "overscan_percent")
         layout.prop(props, "path_camera")
+        grid = layout.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
+        for name in ("smooth", "retime", "hold", "orbit"):
+            grid.operator(f"splannequin.move_{name}", icon=icons.of(f"splannequin.move_{name}"))
+        if props.path_camera is not None:
+            layout.operator("splannequin.check_move", icon=icons.of("splannequin.check_move"))
         if props.path_camera is not None and present(camera_of(props.path_camera).dof).use_dof:
             wrap(
                 layout,

@@ -14,6 +14,8 @@ from . import (
     hidden_points,
     matte_operators,
     mattes,
+    move_check,
+    move_operators,
     operators,
     own_camera,
     panel,
@@ -36,7 +38,13 @@ class Freeze(Step):
     button = "Freeze"
     again = "Freeze Again"
     needs = "Train first."
-    classes = (*operators.CLASSES, *matte_operators.CLASSES, *panel.CLASSES)
+    classes = (
+        *operators.CLASSES,
+        *matte_operators.CLASSES,
+        *move_operators.CLASSES,
+        *move_check.CLASSES,
+        *panel.CLASSES,
+    )
     parts = (viewport, hidden_points)
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:

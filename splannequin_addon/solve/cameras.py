@@ -82,7 +82,7 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
         ValueError: a file of it is broken, or Blender cannot show the plate. The scene is then as it was.
     """
     path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
-    xyz, rgb = _points(shot)
+    xyz, rgb = points_of(shot)
     floor, unsolved = inventory.floor(shot), guesses.ranges(path, guesses.solved(shot, path))
     name = scene_objects.name_of(shot)
     with rollback.scene_of(scene):
@@ -233,32 +233,56 @@ def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> Non
 
 def _animate(camera: bpy.types.Object, path: contract.CameraPath) -> None:
     """Keys the camera on the clip's own frame numbers, straight between keys."""
-    data = camera_of(camera)
-    lenses = [axes.lens_from_k((f.K[0], f.K[1], f.K[2], f.K[3]), path.width, path.height) for f in path.frames]
-    varies = max(map(max, zip(*lenses))) > 0 and any(
-        max(column) - min(column) > 1e-6 * max(abs(max(column)), 1.0) for column in zip(*lenses)
-    )
+    frames, lenses = [frame.frame for frame in path.frames], lenses_of(path)
+    key_path(camera, frames, axes.poses(path), lenses, (path.width, path.height), guesses.key_types(path))
+
+
+def lenses_of(path: contract.CameraPath) -> np.ndarray:
+    """Focal length in mm, shift_x and shift_y of every frame of a path, [F, 3] float64, as `axes.lens_from_k`."""
+    found = [axes.lens_from_k((f.K[0], f.K[1], f.K[2], f.K[3]), path.width, path.height) for f in path.frames]
+    return np.array(found, dtype=np.float64).reshape(-1, 3)
+
+
+def key_path(
+    camera: bpy.types.Object,
+    frames: Sequence[int],
+    poses: np.ndarray,
+    lenses: np.ndarray,
+    size: tuple[int, int],
+    types: Sequence[str] = (),
+) -> None:
+    """Keys where a camera stands and, if it changes, its lens, straight between keys.
+
+    Args:
+        camera: a camera object; keys that it has of these are replaced.
+        frames: [F] ascending frame numbers.
+        poses: camera-to-world, [F, 4, 4], Blender's camera axes, in the world of the camera's parent.
+        lenses: [F, 3], see `lenses_of`.
+        size: width and height of its pictures in pixels.
+        types: [F] types of the keys, see `compat.set_keys`.
+    """
+    data, (width, height) = camera_of(camera), size
+    ends = lenses.min(axis=0), lenses.max(axis=0)
+    varies = lenses.max() > 0 and bool((ends[1] - ends[0] > 1e-6 * np.maximum(np.abs(ends[1]), 1.0)).any())
     before: Quaternion | None = None
     places: list[tuple[float, ...]] = []
     turns: list[tuple[float, ...]] = []
-    for matrix in axes.poses(path).tolist():
+    for matrix in poses.tolist():
         location, rotation, _ = Matrix(matrix).decompose()
         if before is not None and before.dot(rotation) < 0:  # q and -q turn alike, but keys would go the long way
             rotation.negate()
         before = rotation
         places.append(location[:])
         turns.append(rotation[:])
-    frames = [frame.frame for frame in path.frames]
     data.sensor_fit, data.sensor_width = "HORIZONTAL", axes.SENSOR_MM
-    data.sensor_height = axes.SENSOR_MM * path.height / path.width
+    data.sensor_height = axes.SENSOR_MM * height / width
     camera.rotation_mode = "QUATERNION"
     camera.location, camera.rotation_quaternion = places[-1], turns[-1]
-    data.lens, data.shift_x, data.shift_y = lenses[-1]
+    data.lens, data.shift_x, data.shift_y = lenses[-1].tolist()
     keyed = {"location": np.array(places), "rotation_quaternion": np.array(turns)}
-    compat.set_keys(camera, frames, keyed, guesses.key_types(path))
+    compat.set_keys(camera, frames, keyed, types)
     if varies:
-        columns = np.array(lenses).T
-        compat.set_keys(data, frames, {n: columns[i][:, None] for i, n in enumerate(_LENS)})
+        compat.set_keys(data, frames, {n: lenses[:, i : i + 1] for i, n in enumerate(_LENS)})
     else:
         compat.remove_keys(data, _LENS)
 
@@ -292,7 +316,7 @@ def _show_plate(data: bpy.types.Camera, plate: tuple[bpy.types.Image, int, int] 
         bpy.data.images.remove(old)
 
 
-def _points(shot: Path) -> tuple[np.ndarray, np.ndarray]:
+def points_of(shot: Path) -> tuple[np.ndarray, np.ndarray]:
     """Sparse points of the solve: xyz [P, 3] float32 in solve units, rgb [P, 3] uint8; empty without them.
 
     ValueError if they cannot be read.

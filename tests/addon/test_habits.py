@@ -11,6 +11,7 @@ CHANGES_NO_SCENE = {
     "render", "cancel", "live", "open_log", "set_up", "cancel_setup", "check_backend", "remove_backend",
     "write_stmaps", "export_cameras", "export_for_farm", "remove_run", "remove_take", "clear_motion",  # files on disk
     "matte_from_mask", "remove_matte", "combine_takes",  # start a job, which writes files
+    "check_move",  # looks, and says what it saw
 }  # fmt: skip
 
 

@@ -220,6 +220,7 @@ from .path_rules import (
 )
 from .picture_files import (
     is_whole_picture,
+    read_exr_header,
 )
 from .placement import (
     Placement,
@@ -572,6 +573,7 @@ __all__ = [
     "process_start",
     "program",
     "python_child",
+    "read_exr_header",
     "read_json",
     "read_lines",
     "read_message",

@@ -95,7 +95,7 @@ def _exr(file: BinaryIO, size: int) -> bool:
     is_multipart = bool(flags & 0x1000)
     counts: list[int] = []
     while True:
-        header = _exr_header(file)
+        header = read_exr_header(file)
         if not header:
             break
         counts.append(_exr_chunks(header))
@@ -111,7 +111,7 @@ def _exr(file: BinaryIO, size: int) -> bool:
     return bool(offsets)
 
 
-def _exr_header(file: BinaryIO) -> dict[str, bytes]:
+def read_exr_header(file: BinaryIO) -> dict[str, bytes]:
     """Attributes of a header, from where the file stands; empty at the end of all headers."""
     found: dict[str, bytes] = {}
     while name := _text(file):

@@ -1,0 +1,189 @@
+"""Share of a camera's pictures that will be a guess: a live session draws their support, small, before the freeze.
+
+A pixel is a guess where the splats leave it uncovered, or where no frame near t* saw what they show there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Generator
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...torch_backend import contract
+from ..access import Outcome, scene_in, settings_of
+from ..process import backend, job_timer
+from ..scene import session
+from ..shot import selection
+from ..translations import tr
+from ..ui import step_operator
+from . import live, own_camera, takes, viewport
+
+WIDTH = 160
+"""Of the small pictures, in pixels."""
+MOST_FRAMES = 24
+"""Of a camera that are looked at, at equal distances."""
+_SUPPORTED = 0.5
+"""Support from which on a pixel is no guess: half of what it shows was seen near t*."""
+_PAUSE_SECONDS = 0.005
+"""Between two looks at the session, where nothing else waits for Blender."""
+_VIEW = -1
+"""Number of the live session's view: windows have theirs from 0 on."""
+
+
+@dataclass(frozen=True)
+class Guesses:
+    """Share of a camera's pictures that is a guess."""
+
+    camera: str
+    """Name of the camera."""
+    shares: dict[int, float]
+    """Frame number -> share of its pixels, 0..1."""
+
+    def sentence(self) -> str:
+        """Mean and worst, in words."""
+        mean = sum(self.shares.values()) / len(self.shares)
+        worst = max(self.shares, key=lambda frame: self.shares[frame])
+        told = [
+            f"Seen from {self.camera}, about {_percent(mean)} % of the picture is a guess.",
+            f"Most of it in frame {worst}: {_percent(self.shares[worst])} %.",
+        ]
+        return " ".join(told)
+
+
+def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_timer.Progress, None, Guesses]:
+    """Looks at the support along a camera, for the timer: a frame or less a turn. Keeps nothing of bpy between turns.
+
+    Args:
+        scene: the scene, whose range and settings are those of the freeze.
+        shot: its shot folder.
+        name: of the camera object.
+
+    Raises:
+        contract.JobError: the camera cannot be read, there is no run or no backend, or the session ended.
+    """
+    props = settings_of(scene)
+    run, asked = props.run_name, takes.params_of(scene)
+    total = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
+    every = max(1, math.ceil(total / MOST_FRAMES))
+    turns = own_camera.sample_path(scene, name, shot, WIDTH, every)
+    del scene, props
+    shown = viewport.session()
+    shared = shown is not None and (shown.shot, shown.run) == (shot, run)
+    drawn = (
+        shown
+        if shown is not None and shared
+        else live.open_session(shot, run, backend.python(), backend.package_root())
+    )
+    try:
+        path, done = None, 0
+        with contextlib.closing(turns):
+            while path is None:
+                try:
+                    done = next(turns)
+                    yield job_timer.Progress("Reading the camera", done, total)
+                except StopIteration as end:
+                    path = end.value
+        while not drawn.facts:
+            _still_open(drawn)
+            yield job_timer.Progress("The backend is loading the run", 0, len(path.frames))
+        t_star = float(drawn.facts["suggestions"][0]["frame"] if asked.t_star is None else asked.t_star)
+        shares: dict[int, float] = {}
+        for frame in path.frames:
+            at, develop = asked.t_star_per_frame.get(str(frame.frame), t_star), asked.develop == "on"
+            view = contract.LiveView(
+                _VIEW, 0, frame.viewmat, frame.K, path.width, path.height, at, show="support", develop=develop
+            )
+            drawn.ask(view)
+            while drawn.busy(_VIEW):
+                _still_open(drawn)
+                yield job_timer.Progress("Looking at the camera's pictures", len(shares), len(path.frames))
+            shares[frame.frame] = share_of(drawn.frames.get(_VIEW), view)
+        return Guesses(name, shares)
+    finally:
+        drawn.frames.pop(_VIEW, None)
+        if not shared:
+            drawn.close()
+
+
+def share_of(frame: live.Frame | None, asked: contract.LiveView) -> float:
+    """Share of a drawn view's pixels that is a guess, 0..1. JobError if it is not the one that was asked for."""
+    if frame is None or frame.asked.seq != asked.seq:
+        raise contract.JobError("The backend could not draw what the camera sees.", "Try again.")
+    return float(np.count_nonzero(frame.rgba[..., 0] < _SUPPORTED) / max(1, frame.rgba[..., 0].size))
+
+
+def _still_open(drawn: live.Session) -> None:
+    """JobError if a session draws no more."""
+    if not drawn.open:
+        raise contract.JobError(*(drawn.failure or ("Scrubbing was stopped.", "Check the move again.")))
+
+
+def _percent(share: float) -> int:
+    """Whole percent; what is there is not called 0."""
+    return max(round(100.0 * share), 1 if share > 0.0 else 0)
+
+
+def _in_turns(scene_uid: int, shot: Path, name: str) -> Generator[job_timer.Progress, None, None]:
+    """`checking` in a window: what it found stands on the panel."""
+    scene = session.scene_of(scene_uid)
+    if scene is None:
+        return
+    turns = checking(scene, shot, name)
+    del scene
+    found = yield from turns
+    job_timer.watch_of(shot).notes["freeze"] = [found.sentence()]
+
+
+class SPLANNEQUIN_OT_check_move(step_operator.StepOperator, bpy.types.Operator):
+    """Draw small pictures along the chosen camera and say how much of them will be a guess, before you freeze"""
+
+    bl_idname = "splannequin.check_move"
+    bl_label = "Check Move"
+    bl_options = {"REGISTER"}
+    step = "freeze"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a camera of one's own, and without a trained run."""
+        scene = scene_in(context)
+        folder = selection.shot_folder(scene)
+        state = job_timer.watch_of(folder).state if folder else None
+        if not own_camera.name_of(scene):
+            cls.poll_message_set(tr("Choose a camera or make a move first"))
+            return False
+        if state is None or settings_of(scene).run_name not in state.runs:
+            cls.poll_message_set(tr("Train first"))
+            return False
+        return super().poll(context)
+
+    def perform(self, context: bpy.types.Context) -> Outcome:
+        """Has the timer look; headless waits for it."""
+        scene, name = scene_in(context), own_camera.name_of(scene_in(context))
+        folder = selection.shot_folder(scene)
+        assert folder is not None  # `poll` asked
+        if not bpy.app.background:
+            job_timer.work(folder, self.step, _in_turns(scene.session_uid, folder, name))
+            return {"FINISHED"}
+        found = waited(checking(scene, folder, name))
+        job_timer.watch_of(folder).notes[self.step] = [found.sentence()]
+        self.report({"INFO"}, tr(found.sentence()))
+        return {"FINISHED"}
+
+
+def waited(turns: Generator[job_timer.Progress, None, Guesses]) -> Guesses:
+    """What `checking` finds, all at once."""
+    while True:
+        try:
+            next(turns)
+        except StopIteration as end:
+            return end.value
+        time.sleep(_PAUSE_SECONDS)
+
+
+CLASSES = (SPLANNEQUIN_OT_check_move,)
