@@ -96,7 +96,12 @@ class Job:
 
 
 Params = (
-    contract.ImportParams | contract.SolveParams | contract.TrainParams | contract.FreezeParams | contract.MatteParams
+    contract.ImportParams
+    | contract.SolveParams
+    | contract.TrainParams
+    | contract.FreezeParams
+    | contract.MatteParams
+    | contract.SurfaceParams
 )
 """What a job may be asked for; `contract.PARAMS` by kind."""
 

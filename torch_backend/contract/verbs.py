@@ -17,6 +17,7 @@ from .options import (
     ImportParams,
     MatteParams,
     SolveParams,
+    SurfaceParams,
     TrainParams,
 )
 
@@ -343,6 +344,11 @@ VERBS: dict[str, Verb] = {
         "mattes of things in a take, each lassoed at one frame: single sequences and a Cryptomatte",
         ShotWords,
         {"mattes": MatteParams},
+    ),
+    "surface": Verb(
+        "the frozen scene of a take as a mesh, to catch shadows and to hide what is behind it",
+        ShotWords,
+        {"surface": SurfaceParams},
     ),
     "bake": Verb("a take through the compositor: DIR/composited and DIR/shot.blend", BakeWords, sides=(BLENDER,)),
     "stmaps": Verb("ST maps of the lens, both ways, into the shot's solve folder", MapWords),
