@@ -4,11 +4,11 @@ SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 t
 cameras, an `auto` run and a take for each instant are made in DIR if they are missing. Truth are the pixels whose
 centre shows a person, by rays through the scene's triangles.
 
-Each person is lassoed once per instant, at the pose with a truth where most of them is seen. The lasso is the outline
-of the truth there, a corner every `--corner` pixels, each moved by up to `--sloppy` pixels in any direction. Judged
-are all other poses that show at least `LEAST` pixels of the person: intersection over union of the matte, cut at half,
-and the truth; and of the matte as splats alone render it, without the picture's own edges. Seconds are those of the
-whole job up to its first matte, loading included, and of each further frame with all its mattes.
+Each person is lassoed once per instant, at the frame of the instant itself. The lasso is the outline of the truth
+there, a corner every `--corner` pixels, each moved by up to `--sloppy` pixels in any direction; a person whom something
+parts has a polygon for each part of a twentieth or more. Judged are all other poses that show at least `LEAST` pixels
+of the person: intersection over union of the matte, cut at half, and the truth. Seconds are those of the job up to its
+first matte, loading of the run included, and of each further frame with all its mattes.
 
 DIR gets mattes-NAME.json.
 """
@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import statistics
 import sys
 import time
@@ -80,13 +81,18 @@ def faces_of_people(folder: Path) -> dict[str, tuple[int, int]]:
     return found
 
 
-def lasso(mask: NDArray[np.bool_], corner: float, sloppy: float, seed: int) -> list[list[float]]:
-    """Corners [x, y] in pixels of a polygon that somebody draws around a mask [H, W], up to `sloppy` pixels off.
+def lassos(mask: NDArray[np.bool_], corner: float, sloppy: float, seed: int) -> list[list[list[float]]]:
+    """Polygons, corners [x, y] in pixels, that somebody draws around a mask [H, W], up to `sloppy` pixels off.
 
-    The outline is that of the mask's largest part, a corner every `corner` pixels.
+    One for each part of a twentieth of the mask or more, with a corner every `corner` pixels.
     """
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = max(outlines, key=cv2.contourArea)[:, 0].astype(np.float64) + 0.5
+    large = [outline for outline in outlines if cv2.contourArea(outline) >= 0.05 * mask.sum()]
+    return [_drawn(outline[:, 0].astype(np.float64) + 0.5, corner, sloppy, seed + n) for n, outline in enumerate(large)]
+
+
+def _drawn(outline: NDArray[np.float64], corner: float, sloppy: float, seed: int) -> list[list[float]]:
+    """A closed outline [P, 2] as somebody draws it."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
     at = np.arange(0.0, length[-1], corner)
     corners = np.stack([np.interp(at, length, outline[:, axis]) for axis in (0, 1)], axis=1)
@@ -116,19 +122,19 @@ class Watch(Log):
 
 
 def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> list[dict[str, Any]]:
-    """One row per person and pose that is judged: {t_star, person, lasso, pose, pixels, iou}."""
+    """One row per person and pose that is judged: {t_star, person, pose, pixels, iou, first, others}."""
     poses = scene.poses
     take = f"mattes{t_star}"
     freeze_shot(shot, FreezeParams(run=run, take=take, t_star=t_star, only_missing=True), Log())
     folder = TakeFolder(shot.take(take))
-    masks = {
-        n: of for n, of in person_masks(scene, t_star, poses).items() if max(m.sum() for m in of.values()) >= LEAST
-    }
-    at = {name: max(of, key=lambda pose, of=of: int(of[pose].sum())) for name, of in masks.items()}
+    masks = person_masks(scene, t_star, sorted({*poses, t_star}))
+    masks = {name: of for name, of in masks.items() if of[t_star].sum() >= LEAST}
     rows = [
-        {"name": name, "frame": at[name], "polygon": lasso(masks[name][at[name]], args.corner, args.sloppy, seed)}
+        {"name": name, "frame": t_star, "polygon": polygon}
         for seed, name in enumerate(masks)
+        for polygon in lassos(masks[name][t_star], args.corner, args.sloppy, 100 * seed)
     ]
+    shutil.rmtree(folder.mattes, ignore_errors=True)  # kept ones would take no time
     path = args.results.absolute() / f"lassos-{shot.root.stem}-{t_star}.json"
     write_json(path, {"mattes": rows})
     watch = Watch()
@@ -140,10 +146,10 @@ def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argpar
     found: list[dict[str, Any]] = []
     for name, of in masks.items():
         for pose, mask in of.items():
-            if pose == at[name] or mask.sum() < LEAST:
+            if pose == t_star or mask.sum() < LEAST:
                 continue
             matte = read_matte(matte_file(folder, name, pose, "exr"), (0, 0)) > 0.5
-            row = {"t_star": t_star, "person": name, "lasso": at[name], "pose": pose, "pixels": int(mask.sum())}
+            row = {"t_star": t_star, "person": name, "pose": pose, "pixels": int(mask.sum())}
             found.append({**row, "iou": round(overlap(matte, mask), 4), **seconds})
     return found
 

@@ -98,7 +98,7 @@ def _begun(folder: str) -> Shot:
 
 
 def one_step(args: argparse.Namespace, console: Console) -> int:
-    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`, `mattes SHOT`, `surface SHOT`."""
+    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`, `mattes SHOT`, `combine SHOT`, `surface SHOT`."""
     ((kind, params),) = contract.requested_params(args).items()
     folder = args.clip if args.command == "freeze" else args.shot
     shot = _begun(folder) if kind == "import" else Shot.open(folder)
@@ -107,7 +107,7 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
         print_reading(result, console)
     if kind in ("train", "freeze"):
         print_verdict(result, console)
-    if kind == "freeze":
+    if kind in ("freeze", "combine"):
         print_places(result, console)
     if kind == "mattes":
         print_mattes(result, console)

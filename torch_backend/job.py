@@ -368,6 +368,12 @@ def _freeze(shot: Shot, params: contract.FreezeParams, report: Reporter) -> Any:
     return freeze_shot(shot, params, report)
 
 
+def _combine(shot: Shot, params: contract.CombineParams, report: Reporter) -> Any:
+    from .freeze.mattes.combined import combine
+
+    return combine(shot, params, report)
+
+
 def _mattes(shot: Shot, params: contract.MatteParams, report: Reporter) -> Any:
     from .freeze.mattes.job import make_mattes
 
@@ -387,5 +393,6 @@ RUNNERS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "freeze": _freeze,
     "mattes": _mattes,
     "surface": _surface,
+    "combine": _combine,
 }
 """Kind of job -> the station that does it: (shot, typed params, reporter) -> JSON-able result."""

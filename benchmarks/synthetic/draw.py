@@ -24,7 +24,7 @@ from .make import write_record
 from .noise import stream
 from .rays import RayScene
 from .regions import Geometry, views_of
-from .sizes import SIZES
+from .sizes import SIZES, Size
 
 LIGHT = np.array([0.3, -0.4, 0.87])
 """Direction to the light; surfaces are lit from both sides."""
@@ -73,10 +73,15 @@ class Painter:
         return colours
 
 
-def draw(source: Path, out: Path) -> Path:
-    """The folder of the drawn scene, made if it is not there."""
+def draw(source: Path, out: Path, size: Size) -> Path:
+    """The folder of the drawn scene, made if it is not there.
+
+    ValueError if `size` has other frames than the scene's geometry.
+    """
     plan = json.loads((source / "plan.json").read_text(encoding="utf-8"))
-    size, seed, kind = SIZES[source.parent.name], int(plan["seed"]), str(plan["kind"])
+    made, seed, kind = SIZES[source.parent.name], int(plan["seed"]), str(plan["kind"])
+    if (size.frames, size.fps) != (made.frames, made.fps):
+        raise ValueError(f"{source} moves as size {made.name} does: {size.name} has other frames")
     folder = out / size.name / source.name
     if (folder / "scene.json").is_file():
         return folder
@@ -103,9 +108,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--size", choices=tuple(SIZES), help="of the pictures (default: the scene's own)")
     args = parser.parse_args(argv)
-    for scene in args.scenes:
-        print(draw(scene.absolute(), args.out.absolute()), flush=True)
+    try:
+        for scene in args.scenes:
+            size = SIZES[args.size or scene.absolute().parent.name]
+            print(draw(scene.absolute(), args.out.absolute(), size), flush=True)
+    except (FileNotFoundError, ValueError) as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return 1
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import bpy
 
@@ -33,10 +34,9 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
     image = sequences.load_numbers(folder.cryptomatte(frames[0]), f"Mattes {take}")
     if image.source != "SEQUENCE":
         image.source = "SEQUENCE"
-    node = next((n for n in tree.nodes if _shows(n, folder.cryptomatte(frames[0]), name)), None)
-    if node is not None:
+    if any(_shows(node, folder.cryptomatte(frames[0]), name) for node in tree.nodes):
         return [f"The node of the matte {name} is there already."]
-    node = tree.nodes.new("CompositorNodeCryptomatteV2")
+    node: Any = tree.nodes.new("CompositorNodeCryptomatteV2")
     node.label, node.source = f"Matte {name}", "IMAGE"
     sequences.show_sequence(node, image, frames[0], frames[-1])
     node.matte_id = _quoted(name)
@@ -54,9 +54,10 @@ def _quoted(name: str) -> str:
 
 def _shows(node: bpy.types.Node, path: Path, name: str) -> bool:
     """True of a Cryptomatte node that picks this matte from this sequence."""
-    if node.bl_idname != "CompositorNodeCryptomatteV2" or node.image is None or node.source != "IMAGE":
+    told: Any = node
+    if node.bl_idname != "CompositorNodeCryptomatteV2" or told.image is None or told.source != "IMAGE":
         return False
-    return paths.same(paths.absolute(node.image.filepath), str(path)) and node.matte_id == _quoted(name)
+    return paths.same(paths.absolute(told.image.filepath), str(path)) and bool(told.matte_id == _quoted(name))
 
 
 class SPLANNEQUIN_OT_insert_matte(bpy.types.Operator):

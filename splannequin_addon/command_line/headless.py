@@ -175,7 +175,7 @@ def freeze(args: argparse.Namespace, console: Console) -> int:
 
 
 def make_mattes(args: argparse.Namespace, console: Console) -> int:
-    """`mattes SHOT`: a job that the step Freeze starts."""
+    """`mattes SHOT`, `combine SHOT`: jobs that the step Freeze starts."""
     return _one_step(args, console, "freeze", args.shot)
 
 
@@ -484,6 +484,7 @@ _DOES = {
     "freeze": freeze,
     "mattes": make_mattes,
     "surface": make_surface,
+    "combine": make_mattes,
     "bake": bake_take,
     "stmaps": write_stmaps,
     "export": export,

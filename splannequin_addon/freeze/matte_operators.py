@@ -114,7 +114,37 @@ class SPLANNEQUIN_OT_remove_matte(step_operator.StepOperator, bpy.types.Operator
         return contract.MatteParams(take=settings_of(scene).take_name, remove=self.name, device=backend.device())
 
 
+class SPLANNEQUIN_OT_combine_takes(step_operator.StepOperator, bpy.types.Operator):
+    """Make a take in which this thing is as another take has it, or goes on living; all else is the chosen take's"""
+
+    bl_idname = "splannequin.combine_takes"
+    bl_label = "Instant of Its Own"
+    bl_options = {"REGISTER", "INTERNAL"}
+    step = "freeze"
+
+    name = StringProperty(name="Matte", description="Name of the thing's matte", options={"SKIP_SAVE"})
+    source = StringProperty(
+        name="From",
+        description="Take that has this thing as you want it, with a matte of the same name; live: it goes on living "
+        "as in the clip",
+        default=contract.LIVE_SOURCE,
+        options=set(),
+        search=lambda self, context, text: mattes.sources_of(scene_in(context), str(getattr(self, "name", ""))),
+        search_options={"SUGGESTION"},
+    )
+    result = StringProperty(name="Into", description="Name of the take that is made", default="combined", options=set())
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
+        """Asks which take, and for a name."""
+        return context.window_manager.invoke_props_dialog(self)
+
+    def params(self, scene: bpy.types.Scene) -> contract.CombineParams:
+        """This thing, beside those that the take has from elsewhere already."""
+        return mattes.combination(scene, begin.needed(scene, self.step), self.name, self.source, self.result)
+
+
 CLASSES = (
+    SPLANNEQUIN_OT_combine_takes,
     SPLANNEQUIN_OT_draw_matte,
     SPLANNEQUIN_OT_matte_from_mask,
     SPLANNEQUIN_OT_remove_matte,

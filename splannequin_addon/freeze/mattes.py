@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import bpy
 
@@ -12,7 +12,7 @@ from ...torch_backend import contract
 from ..access import settings_of
 from ..process import backend
 from ..scene import paths, sequences
-from ..shot import inventory, scene_objects
+from ..shot import inventory, scene_objects, selection
 
 CURVE_STEPS = 12
 """Corners of a polygon for each piece of a curve between two points of a mask."""
@@ -55,6 +55,30 @@ def params_of(scene: bpy.types.Scene, shot: Path) -> contract.MatteParams:
     return contract.MatteParams(take=props.take_name, polygons=str(path), device=backend.device())
 
 
+def sources_of(scene: bpy.types.Scene, matte: str) -> list[str]:
+    """Where a thing may come from: takes that have its matte, but the chosen one, and the clip itself."""
+    folder = selection.shot_folder(scene)
+    takes = inventory.read(folder).takes if folder is not None else {}
+    chosen = settings_of(scene).take_name
+    return [contract.LIVE_SOURCE, *(name for name, take in takes.items() if name != chosen and matte in take["mattes"])]
+
+
+def combination(scene: bpy.types.Scene, shot: Path, matte: str, source: str, result: str) -> contract.CombineParams:
+    """What the take `result` is to be made of: a thing from `source`, and what it has from elsewhere already."""
+    base = settings_of(scene).take_name
+    takes = inventory.read(shot).takes
+    before: dict[str, Any] = takes[result]["combined"] if result in takes else {}
+    if base == result and before:  # the combined take is chosen since it was made
+        base = str(before.get("base"))
+    kept = before.get("things") if before.get("base") == base else None
+    pairs = cast("dict[Any, Any]", kept) if isinstance(kept, dict) else {}
+    things = {str(name): str(take) for name, take in pairs.items()}
+    things[matte] = source.strip()
+    return contract.CombineParams(
+        take=result, base=base, things=",".join(f"{name}={take}" for name, take in things.items())
+    )
+
+
 def take_of(shot: Path, name: str) -> contract.TakeFolder:
     """A take that is there. JobError if it is not."""
     if name not in inventory.read(shot).takes:
@@ -79,9 +103,9 @@ def polygons(mask: bpy.types.Mask, width: int, height: int) -> list[list[Corner]
     return found
 
 
-def _corners(spline: Any) -> list[Corner]:
+def _corners(spline: bpy.types.MaskSpline) -> list[Corner]:
     """A spline of a mask as a polygon, in the mask's coordinates: cubic pieces from point to point."""
-    points = list(spline.points)
+    points: list[Any] = list(spline.points)
     found: list[Corner] = []
     for n, point in enumerate(points):
         after = points[(n + 1) % len(points)]

@@ -99,6 +99,7 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
             row = column.row(align=True)
             lassoed = ", ".join(str(frame) for frame in sorted(set(frames)))
             row.label(text=tr(f"{name}, drawn at {lassoed}"), translate=False)
+            row.operator("splannequin.combine_takes", text="", icon=icons.of("splannequin.combine_takes")).name = name
             row.operator("splannequin.insert_matte", text="", icon="NODE_COMPOSITING").name = name
             row.operator("splannequin.remove_matte", text="", icon="TRASH").name = name
 

@@ -35,7 +35,7 @@ class Freeze(Step):
     name = "freeze"
     label = "Freeze"
     kind = "freeze"
-    also = ("mattes", "surface")
+    also = ("mattes", "combine", "surface")
     button = "Freeze"
     again = "Freeze Again"
     needs = "Train first."
@@ -75,6 +75,9 @@ class Freeze(Step):
         if job.kind == "surface":
             is_here = scene_objects.part(scene, job.shot, "root") is not None
             return surfaces.add(scene, job.shot, str(job.result["take"])) if is_here else []
+        if job.kind == "combine":
+            settings_of(scene).take_name = str(job.result["take"])
+            return [f"The take {job.result['take']} is chosen: {job.result['frames']} frames."]
         if not settings_of(scene).choose_t_star:
             settings_of(scene).t_star = int(job.result["t_star_frame"])
         return []

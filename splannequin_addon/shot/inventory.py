@@ -112,7 +112,7 @@ def _lassos(path: Path) -> list[dict[str, Any]]:
     return [row for row in rows if _is_lasso(row)]
 
 
-def _is_lasso(row: Any) -> bool:
+def _is_lasso(row: object) -> bool:
     """True of what names a matte as ours are named, a frame and a polygon."""
     if not isinstance(row, dict):
         return False
@@ -287,6 +287,8 @@ class _Take:
     """Frames that the take can have; 0 of a take from before this was noted."""
     t_star_asked: int | None = None
     """t* as it was asked for, which `t_star_frame` may be near; None: suggested, or not noted."""
+    combined: dict[str, Any] = field(default_factory=dict[str, Any])
+    """Of a take that was put together: `base`, and `things`, matte to take."""
 
     def __post_init__(self) -> None:
         numbers = [*self.margin, *self.t_star_per_frame.values()]

@@ -16,6 +16,7 @@ OF: dict[str, Icon] = {
     "splannequin.check_backend": "VIEWZOOM",
     "splannequin.clear_motion": "TRASH",
     "splannequin.combine_cg": "MESH_CUBE",
+    "splannequin.combine_takes": "TIME",
     "splannequin.draw_matte": "MOD_MASK",
     "splannequin.export_cameras": "EXPORT",
     "splannequin.export_for_farm": "NETWORK_DRIVE",

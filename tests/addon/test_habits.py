@@ -10,7 +10,7 @@ CHANGES_NO_SCENE = {
     "add_splats", "add_surface",  # the same: the timer reads the file
     "render", "cancel", "live", "open_log", "set_up", "cancel_setup", "check_backend", "remove_backend",
     "write_stmaps", "export_cameras", "export_for_farm", "remove_run", "remove_take", "clear_motion",  # files on disk
-    "matte_from_mask", "remove_matte",  # start a job, which writes files
+    "matte_from_mask", "remove_matte", "combine_takes",  # start a job, which writes files
 }  # fmt: skip
 
 

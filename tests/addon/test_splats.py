@@ -225,6 +225,18 @@ def test_the_buttons_hand_on_where_the_shot_stands(scene, shot, stood, addon, tm
         assert np.radians(row[7]) == pytest.approx(2 * np.arctan(12 / 2 / 20.0), abs=1e-6)
 
 
+def test_blenders_own_importer_reads_a_ply_that_lies_on_the_camera(scene, shot, stood, addon, contract):
+    """frozen.ply is in the scene's axes and units: nothing has to be turned."""
+    placed_take(shot, addon, scene)
+    known = set(bpy.data.objects)
+    bpy.ops.wm.ply_import(filepath=str(shot / "takes/freeze/frozen.ply"))
+    (item,) = set(bpy.data.objects) - known
+    scene.frame_set(7)
+    bpy.context.view_layer.update()
+    found = pixels_in_blender(scene, scene.camera, [item.matrix_world @ v.co for v in item.data.vertices], (16, 12))
+    np.testing.assert_allclose(found, pixels_in_solve(shot, 7, contract), atol=1e-3)
+
+
 USD = """
 import json, sys
 from pathlib import Path
@@ -237,6 +249,56 @@ write_usd(Path(out), None, path, Similarity.of(told), told.metres_per_unit, 12.5
 """
 
 
+POINTS = """
+import json, sys
+from pxr import Usd, UsdGeom, Vt
+out, places = sys.argv[1], json.loads(sys.argv[2])
+stage = Usd.Stage.CreateNew(out)
+UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/frozen").GetPrim())
+if places:
+    points = UsdGeom.Points.Define(stage, "/frozen/splats")
+    points.CreatePointsAttr(Vt.Vec3fArray([tuple(p) for p in places]))
+    points.CreateWidthsAttr([0.1] * len(places))
+stage.Save()
+"""
+
+
+def in_backend(addon, root: Path, code: str, *words: str) -> None:
+    """Runs code in the backend's Python; skips the test where that has no usd-core."""
+    paths = [str(root), *filter(None, [os.environ.get("USD_CORE")])]
+    ran = subprocess.run(
+        [addon("process.backend").python(), "-P", "-c", code, *words], capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+    )  # fmt: skip
+    if "NoUsdError" in ran.stderr or "No module named 'pxr'" in ran.stderr:
+        pytest.skip("the backend has no usd-core")
+    assert ran.returncode == 0, ran.stderr
+
+
+@pytest.mark.parametrize("reads", [True, False])
+def test_where_blenders_importer_reads_splats_it_is_used(scene, shot, stood, addon, contract, root, monkeypatch, reads):
+    """Points stand in for splats, which no Blender reads yet; where the importer brings nothing, ours are added."""
+    if "import_points" not in addon("compat").usd_import_options():
+        pytest.skip("this Blender reads no points from USD")
+    told = placed_take(shot, addon, scene)
+    places = splats(np.reshape(told["scene_from_solve"], (4, 4)))[:, :3].tolist() if reads else []
+    in_backend(addon, root, POINTS, str(shot / "takes/freeze/frozen.usdc"), json.dumps(places))
+    monkeypatch.setattr(addon("compat"), "splat_import_option", lambda: "import_points")
+    known = {o.name for o in scene.objects}
+    for _ in range(2):
+        bpy.ops.splannequin.add_splats()
+    bpy.context.view_layer.update()
+    item = addon("freeze.splats").find(scene, shot, "freeze")
+    assert {o.name for o in scene.objects} - known == {item.name}, "no empties of the stage, nothing of before"
+    assert item.type == ("POINTCLOUD" if reads else "MESH") and item.parent == stood and item.hide_render
+    found = item.data.attributes["position"].data if reads else item.data.vertices
+    at = [item.matrix_world @ (p.vector if reads else p.co) for p in found]
+    scene.frame_set(5)
+    seen = pixels_in_blender(scene, scene.camera, at, (16, 12))
+    np.testing.assert_allclose(seen, pixels_in_solve(shot, 5, contract), atol=1e-3)
+
+
 @pytest.mark.parametrize("metres", [1.0, 0.01])
 def test_blenders_own_importer_brings_the_camera_back_to_where_it_is(
     scene, shot, stood, addon, contract, root, tmp_path, metres
@@ -246,14 +308,8 @@ def test_blenders_own_importer_brings_the_camera_back_to_where_it_is(
         pytest.skip("this Blender reads no USD")
     scene.unit_settings.scale_length = metres
     addon("shot.placement").write(scene, shot)
-    out, python = tmp_path / "camera.usdc", addon("process.backend").python()
-    ran = subprocess.run(
-        [python, "-P", "-c", USD, str(shot), str(shot / "placement.json"), str(out)], capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(root), *filter(None, [os.environ.get("USD_CORE")])])},
-    )  # fmt: skip
-    if "NoUsdError" in ran.stderr:
-        pytest.skip("the backend has no usd-core")
-    assert ran.returncode == 0, ran.stderr
+    out = tmp_path / "camera.usdc"
+    in_backend(addon, root, USD, str(shot), str(shot / "placement.json"), str(out))
     ours, known = scene.camera, set(bpy.data.objects)
     switches = {"apply_unit_conversion_scale": False}
     switches = {k: v for k, v in switches.items() if k in addon("compat").usd_import_options()}

@@ -667,6 +667,29 @@ class MatteParams:
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
 
+LIVE_SOURCE = "live"
+"""In `CombineParams.things`, in place of a take: the clip's own plates."""
+
+
+@dataclass
+class CombineParams:
+    """One take made of several: each thing under a matte from a take of its own."""
+
+    take: str = option("combined", flag="--take", metavar="NAME", help="name of the take that is made")
+    """Name of the new take's folder in takes/."""
+    base: str = option("freeze", flag="--base", metavar="TAKE", help="take that shows everything else")
+    """Name of the take that everything else comes from."""
+    things: str = option(
+        "",
+        flag="--things",
+        metavar="MATTE=TAKE,...",
+        help="which thing comes from which take; both takes must have the matte. `MATTE=live`: it goes on living, as "
+        "the clip has it",
+        words="none",
+    )
+    """Pairs of matte and take, separated by commas; `LIVE_SOURCE` in place of a take: the clip itself."""
+
+
 @dataclass
 class SurfaceParams:
     """The frozen scene of a take as a mesh."""
@@ -682,7 +705,7 @@ STEP_PARAMS: dict[str, type] = {
     "freeze": FreezeParams,
 }
 """Kind of job on the way from a clip to frozen frames -> the dataclass of its parameters."""
-PARAMS: dict[str, type] = {**STEP_PARAMS, "mattes": MatteParams, "surface": SurfaceParams}
+PARAMS: dict[str, type] = {**STEP_PARAMS, "mattes": MatteParams, "combine": CombineParams, "surface": SurfaceParams}
 """Kind of job -> the dataclass of its parameters."""
 LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.values()}
 """The numbers of each kind of parameters, by field."""

@@ -13,6 +13,7 @@ from .options import (
     DEVICE,
     PLACEMENT,
     STEP_PARAMS,
+    CombineParams,
     FreezeParams,
     ImportParams,
     MatteParams,
@@ -344,6 +345,11 @@ VERBS: dict[str, Verb] = {
         "mattes of things in a take, each lassoed at one frame: single sequences and a Cryptomatte",
         ShotWords,
         {"mattes": MatteParams},
+    ),
+    "combine": Verb(
+        "one take of several: each thing under a matte from a take of its own, or living on",
+        ShotWords,
+        {"combine": CombineParams},
     ),
     "surface": Verb(
         "the frozen scene of a take as a mesh, to catch shadows and to hide what is behind it",

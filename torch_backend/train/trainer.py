@@ -336,7 +336,8 @@ class Trainer:
         # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         background = torch.rand(3, generator=self.generator, device="cpu")
         left, right, share = model.exposure.place(time)
-        depth = None if self.targets is None else self.targets.at(frame)
+        due = self.targets is not None and self.iteration % self.targets.every == 0
+        depth = self.targets.at(frame) if due and self.targets is not None else None
         numbers = from_numpy(np.array([asked, 1.0 - share, share, still_weight(self.progress, s)], np.float32))
         ignored = self.ignored.get(index)
         movers = self.softened.movers_at(frame, self.progress)

@@ -1,8 +1,10 @@
 """Separates a lassoed thing from what surrounds it, in one frozen frame: by its colours and its depth.
 
-GrabCut (Rother, Kolmogorov, Blake: "GrabCut", SIGGRAPH 2004; OpenCV's) decides which pixels belong to the thing, and a
-guided filter (He, Sun, Tang: "Guided image filtering", PAMI 2013) turns that decision into soft edges that follow the
-frame's own picture.
+Log-odds of three cues are added: the outline that was drawn or rendered, colour, and depth. The last two are histograms
+of what lies inside and around, as in GrabCut (Rother, Kolmogorov, Blake, SIGGRAPH 2004). In place of a graph cut, a
+guided filter (He, Sun, Tang: "Guided image filtering", PAMI 2013) smooths them along the frame's own edges; it then
+turns the decision into soft edges. OpenCV's GrabCut takes neither a prior nor a fourth channel: it lost legs and arms
+of people 25 pixels wide.
 """
 
 from __future__ import annotations
@@ -23,26 +25,23 @@ Matte = NDArray[np.float32]
 class SegmentConfig:
     """How a thing is separated from what surrounds it."""
 
-    longest: int = 480
-    """GrabCut works on a crop around the thing of at most so many pixels along its longer side: its cost grows with the
-    number of pixels, and the guided filter brings the edge back to full size."""
     slack: float = 0.008
     """A lasso may miss the outline by this share of the frame's width; 0.008 is 5 pixels of 640."""
     band: float = 0.008
     """The outline that splats render may miss the picture's by this share of the frame's width; 5 pixels of 640."""
-    around: float = 0.25
-    """Share of the frame's width around the thing from which the colours of what surrounds it are learnt where no vote
-    is known: white next to a white shirt is known from the wall farther away."""
+    around: float = 0.06
+    """Share of the frame's width around the thing from which the colours of what surrounds it are learnt; 38 pixels of
+    640."""
     least: int = 4
-    """`slack` and `band` are at least so many pixels, however small the frame is."""
-    iterations: int = 3
-    """Rounds of fitting colours and cutting."""
-    log_depth: float = 0.5
-    """Scale in natural logarithms over which depth is told apart: beyond a factor of e^0.5 all is far."""
+    """`slack` is at least so many pixels, however small the frame is: a hand that draws misses by 3."""
+    most: float = 3.0
+    """Log-odds of one cue at most, 20 to 1: no cue overrules two others that agree."""
+    prior: float = 3.0
+    """Log-odds of the outline that was drawn or rendered at a distance of `slack` or `band` from it: 20 to 1."""
     radius: float = 0.004
-    """Radius of the guided filter's window as a share of the frame's width; 2.5 pixels of 640."""
-    epsilon: float = 1e-4
-    """Regularisation of the guided filter on pictures in 0..1: contrast below its root, 0.01, is no edge."""
+    """Radius of the guided filters' window as a share of the frame's width; 2.5 pixels of 640."""
+    epsilon: float = 1e-3
+    """Regularisation of the guided filters on pictures in 0..1: contrast below its root, 0.03, is no edge."""
 
 
 def segment_lasso(
@@ -55,9 +54,8 @@ def segment_lasso(
     config = config or SegmentConfig()
     inside = filled(polygon, picture.shape[:2])
     slack = max(config.least, round(config.slack * picture.shape[1]))
-    outer, inner = _grown(inside, slack), _shrunk(inside, slack)
-    surely = inner & _at_its_depth(depth, inside, slack)
-    return _cut(picture, depth, inside, ~outer, surely, 4 * slack, config)
+    prior = config.prior / slack * signed_distance(inside)
+    return _cut(picture, depth, prior, ~_grown(inside, slack), config)
 
 
 def refine(
@@ -72,14 +70,18 @@ def refine(
     inside = (rendered > 0.5) & told
     if not inside.any():
         return np.zeros_like(rendered)
-    band = max(config.least, round(config.band * picture.shape[1]))
-    surely = _shrunk(inside | ~told, band) & inside
-    never = told & ~_grown(inside, band)
-    margin = 4 * band
-    if not told.all():
-        never |= ~told & ~_at_its_depth(depth, inside, margin)
-        margin = round(config.around * picture.shape[1])
-    return _cut(picture, depth, inside, never, surely, margin, config)
+    band = max(2, round(config.band * picture.shape[1]))
+    prior = np.where(told, config.prior / band * signed_distance(inside), -config.prior)
+    return _cut(picture, depth, prior, told & ~_grown(inside, band), config)
+
+
+def signed_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """[H, W] pixels from the outline of a mask: above 0 inside, below 0 outside, halves beside the outline."""
+    within, beyond = (
+        np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+        for mask in (inside, ~inside)
+    )
+    return np.where(inside, within - 0.5, 0.5 - beyond)
 
 
 def filled(polygon: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -91,62 +93,64 @@ def filled(polygon: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.b
     return mask > 0
 
 
-def _at_its_depth(depth: NDArray[np.float32], inside: NDArray[np.bool_], around: int) -> NDArray[np.bool_]:
-    """bool [H, W]: depths of which more pixels lie `inside` than within `around` pixels outside."""
-    away = np.log(np.maximum(depth, 1e-9))
-    low, high = np.quantile(away[inside], (0.01, 0.99)) if inside.any() else (0.0, 0.0)
-    bins = np.rint((away - low) / max(high - low, 1e-3) * 30.0).clip(-1, 31).astype(np.int64) + 1
-    ring = _grown(inside, around) & ~inside
-    mine, others = (np.bincount(bins[mask], minlength=33) for mask in (inside, ring))
-    return (mine > others)[bins]
-
-
 def _cut(
-    picture: Picture, depth: NDArray[np.float32], inside: NDArray[np.bool_], never: NDArray[np.bool_],
-    surely: NDArray[np.bool_], margin: int, config: SegmentConfig,
+    picture: Picture, depth: NDArray[np.float32], prior: NDArray[np.float32], never: NDArray[np.bool_],
+    config: SegmentConfig,
 ) -> Matte:  # fmt: skip
-    """GrabCut of what is neither `never` nor `surely` the thing, beginning with `inside`; then soft edges.
-
-    Colours are learnt from `margin` pixels around.
-    """
-    rows, columns = _crop(~never, margin)
-    part = picture[rows, columns]
-    cues = _cues(part, depth[rows, columns], inside[rows, columns], config)
-    labels = np.where(inside[rows, columns], cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[never[rows, columns]] = cv2.GC_BGD
-    labels[surely[rows, columns]] = cv2.GC_FGD
-    shrink = min(1.0, config.longest / max(part.shape[:2]))
-    size = max(1, round(part.shape[1] * shrink)), max(1, round(part.shape[0] * shrink))
-    small = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
-    if (small == cv2.GC_BGD).any() and (small != cv2.GC_BGD).any():
-        cv2.setRNGSeed(0)  # k-means begins at random: the same lasso makes the same matte
-        cues = cv2.resize(cues, size, interpolation=cv2.INTER_AREA)
-        nowhere, models = (0, 0, 1, 1), (np.zeros((1, 65)), np.zeros((1, 65)))  # the rectangle is not read with a mask
-        small = cv2.grabCut(cues, small, nowhere, *models, config.iterations, cv2.GC_INIT_WITH_MASK)[0]
-    hard = ((small == cv2.GC_FGD) | (small == cv2.GC_PR_FGD)).astype(np.float32)
-    hard = np.asarray(cv2.resize(hard, part.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
-    radius = max(1, round(config.radius * inside.shape[1]))
-    matte = np.zeros(inside.shape, np.float32)
-    matte[rows, columns] = guided(part.astype(np.float32) / 255.0, hard, radius, config.epsilon)
+    """The matte by log-odds: those of the outline, of colour and of depth, smoothed along the picture's edges."""
+    width = prior.shape[1]
+    rows, columns = _crop(~never, round(config.around * width))
+    part, start = picture[rows, columns], prior[rows, columns]
+    guide = part.astype(np.float32) / 255.0
+    radius = max(1, round(config.radius * width))
+    away = np.log(np.maximum(depth[rows, columns], 1e-9))
+    inside = (start > 0.0) & ~never[rows, columns]
+    odds = start + ratio(_colour_bins(part), COLOURS**3, inside, config.most)
+    odds += ratio(_depth_bins(away, inside), DEPTHS, inside, config.most)
+    odds = smoothed(guide, np.clip(odds, -2.0 * config.most, 2.0 * config.most), radius, config.epsilon)
+    hard = ((odds > 0.0) & ~never[rows, columns]).astype(np.float32)
+    matte = np.zeros(prior.shape, np.float32)
+    matte[rows, columns] = guided(guide, hard, radius, config.epsilon)
     return matte
 
 
-def _cues(picture: Picture, depth: NDArray[np.float32], inside: NDArray[np.bool_], config: SegmentConfig) -> Picture:
-    """[H, W, 3]: the two directions in which the picture's colours vary most, and depth.
+COLOURS, DEPTHS = 12, 48
+"""Bins of each colour axis, and of depth."""
 
-    OpenCV's GrabCut takes three channels; the third principal direction of colours holds 1 to 3 % of their variance.
+
+def _colour_bins(picture: Picture) -> NDArray[np.int64]:
+    """[H, W] bin of each pixel's colour in CIE Lab, `COLOURS` a side."""
+    lab = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)).astype(np.int64) * COLOURS // 256
+    return (lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2]
+
+
+def _depth_bins(away: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """[H, W] bin of each pixel's logarithm of depth: those of the thing's own depths lie in the middle half."""
+    low, high = np.quantile(away[inside], (0.02, 0.98)) if inside.any() else (0.0, 0.0)
+    span = max(float(high - low), 0.02)
+    return np.clip((away - low + 0.5 * span) / (2.0 * span) * DEPTHS, 0, DEPTHS - 1).astype(np.int64)
+
+
+def ratio(bins: NDArray[np.int64], count: int, inside: NDArray[np.bool_], most: float) -> NDArray[np.float32]:
+    """[H, W] log-ratio of how frequent each pixel's bin is inside and outside of a mask, `most` at most.
+
+    A bin counts as if one pixel of a thousand on either side were in it: rare ones tell nothing.
     """
-    colours = picture.reshape(-1, 3).astype(np.float32)
-    colours = colours - colours.mean(0)
-    _, axes = np.linalg.eigh(colours.T @ colours)
-    main = colours @ axes[:, :0:-1] + 128.0
-    middle = float(np.median(depth[inside])) if inside.any() else 1.0
-    away = np.log(np.maximum(depth, 1e-9) / max(middle, 1e-9)) / config.log_depth
-    cues = np.concatenate([main.reshape(*depth.shape, 2), (128.0 + 127.0 * np.tanh(away))[..., None]], axis=2)
-    return np.clip(np.rint(cues), 0, 255).astype(np.uint8)
+    shares: list[NDArray[np.float64]] = []
+    for mask in (inside, ~inside):
+        found = np.bincount(bins[mask], minlength=count).astype(np.float64)
+        shares.append(found / max(1.0, found.sum()) + 1e-3)
+    return np.clip(np.log(shares[0] / shares[1]), -most, most).astype(np.float32)[bins]
 
 
 def guided(guide: NDArray[np.float32], values: Matte, radius: int, epsilon: float) -> Matte:
+    """`smoothed`, held in 0..1."""
+    return np.clip(smoothed(guide, values, radius, epsilon), 0.0, 1.0)
+
+
+def smoothed(
+    guide: NDArray[np.float32], values: NDArray[np.float32], radius: int, epsilon: float
+) -> NDArray[np.float32]:
     """Guided filter with a colour guide [H, W, 3] in 0..1: `values` [H, W] with edges where the guide has them.
 
     He et al. 2013, equations 19 to 21: within each window values are a linear function of the guide's colour.
@@ -166,7 +170,7 @@ def guided(guide: NDArray[np.float32], values: Matte, radius: int, epsilon: floa
     slopes = np.linalg.solve(spread, joint[..., None])[..., 0]
     offset = level - (slopes * middle).sum(-1)
     found = (mean(slopes) * guide).sum(-1) + mean(offset)
-    return np.clip(found, 0.0, 1.0).astype(np.float32)
+    return np.asarray(found, np.float32)
 
 
 def _crop(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
@@ -185,8 +189,3 @@ def _disc(radius: int) -> NDArray[np.uint8]:
 
 def _grown(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), _disc(by))) > 0
-
-
-def _shrunk(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    # What the frame's border cuts off goes on beyond it.
-    return np.asarray(cv2.erode(mask.astype(np.uint8), _disc(by), borderType=cv2.BORDER_REPLICATE)) > 0

@@ -2,7 +2,7 @@
 
     open_take      what all parts share: the instant is chosen and developed, and what the take shows is written down
     freeze_part    frames of a range; any number of parts at once, in any order, on any computer
-    finish_take    contact sheet, video, PLY and take.json, when all frames are there
+    finish_take    contact sheet, video, splats and take.json, when all frames are there
 
 Each may run twice, also at once, and after it was killed: nothing that is right is removed, every file is renamed into
 its place whole, and two who make the same frame write the same bytes. Nobody holds the shot's lock: parts of different

@@ -152,6 +152,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     width, height = output_size(shot, scene, params)
     whole = plan(scene, params, t_star, width, height)
     folder = TakeFolder(shot.own(shot.take(params.take)))
+    _refuse_combined(folder)
     for inner in (folder.previews, folder.redistort.parent, folder.warps, folder.next.root):
         shot.own(inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
@@ -171,6 +172,20 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     keys = {f.frame: spec.key(f) for f in whole}
     key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))
     return PlannedTake(folder, scene, t_star, whole, spec, keys, key)
+
+
+def _refuse_combined(folder: TakeFolder) -> None:
+    """JobError if a take was put together from others: frozen frames would take its place."""
+    try:
+        is_combined = "combined" in read_json(folder.facts)
+    except (OSError, ValueError):
+        return
+    if is_combined:
+        raise JobError(
+            f"The take {folder.root.name} is combined from others.",
+            "Freeze those and combine them again, or give this one another name.",
+            ExitCode.FREEZE,
+        )
 
 
 def plate_detail(

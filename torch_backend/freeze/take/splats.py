@@ -22,7 +22,7 @@ from ...contract import (
 )
 from ...gaussians.ply import PlyGaussians, read_ply, write_ply
 from ...scene import Scene
-from ...shot import Shot
+from ...shot import Shot, remove_file
 from ...solve.placement import Similarity, placement_for
 from ...solve.stored import load_cameras
 from ...torch_types import from_numpy
@@ -60,11 +60,15 @@ def camera_path_of(shot: Shot, file: str) -> CameraPath:
 def write_stage(
     path: Path, splats: PlyGaussians, cameras: CameraPath, placement: Placement, fps: float, report: Reporter
 ) -> None:
-    """Writes a take's USD stage, or warns that the environment cannot. OSError if the file cannot be written."""
+    """Writes a take's USD stage, or warns that the environment cannot, and removes the one of an earlier freeze.
+
+    OSError if the file cannot be written.
+    """
     where = Similarity.of(placement)
     try:
         write_usd(path, splats, cameras, where, placement.metres_per_unit, fps or PLAIN_FPS)
     except NoUsdError:
+        remove_file(path)
         report.warning(*_NO_USD)
 
 

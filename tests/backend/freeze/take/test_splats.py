@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom, UsdVol
 from torch_backend.contract import FreezeParams, JobError, Placement, UserError, file_digest, write_json
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.freeze.take.splats import export_splats
+from torch_backend.freeze.take.splats import export_splats, write_stage
 from torch_backend.freeze.usd import CAMERA, SPLATS
 from torch_backend.gaussians.ply import PlyGaussians, read_ply
 from torch_backend.raster import rasterize
@@ -136,3 +136,20 @@ def test_what_cannot_be_exported_is_said(taken, tmp_path):
         export_splats(shot, "ply", tmp_path, "none")
     with pytest.raises(UserError, match="format is"):
         export_splats(shot, "abc", tmp_path, "placed")
+
+
+def test_an_environment_without_usd_freezes_all_the_same(taken, quiet, tmp_path, monkeypatch):
+    """It was set up by an earlier version: said in words, and no stage of an earlier freeze passes for this one."""
+    shot, facts = taken
+
+    def missing(name: str):
+        raise ImportError(name)
+
+    monkeypatch.setattr("torch_backend.freeze.usd.importlib.import_module", missing)
+    (tmp_path / "frozen.usdc").write_bytes(b"old")
+    report = quiet()
+    splats_file = tmp_path / "frozen.usdc"
+    write_stage(splats_file, read_ply(facts["ply"]), load_cameras(shot), Placement(), 25.0, report)
+    assert not splats_file.exists() and "usd-core" in report.events[0][1]
+    with pytest.raises(JobError, match="usd-core"):
+        export_splats(shot, "usd", tmp_path, "placed")

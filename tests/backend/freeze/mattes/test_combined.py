@@ -1,0 +1,148 @@
+"""Takes put together of others, against the world's truth: a thing at an instant of its own, a thing that lives on."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from torch_backend.contract import CombineParams, FreezeParams, JobError, MatteParams, TakeFolder
+from torch_backend.footage.color import srgb_to_linear
+from torch_backend.footage.images import read_png
+from torch_backend.freeze import freeze_shot
+from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.freeze.mattes.combined import combine, combined, grown, living
+from torch_backend.freeze.mattes.job import make_mattes
+from torch_backend.raster import rasterize
+
+FIRST, LAST = 104, 111
+INSTANTS = {"early": 105, "late": 113}
+"""The patch is elsewhere at each."""
+
+
+def covered(world, pose, t):
+    """[H, W] bool: what the patch covers from a pose at the time of frame `t`."""
+    state = {name: value[world.moving] for name, value in world.at((t - 101) / 15).items()}
+    n = pose - 101
+    out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
+    return out.alphas[0].numpy() > 0.5
+
+
+@pytest.fixture(scope="module")
+def world(trained, quiet, tmp_path_factory):
+    """The tiny world with a take at each instant, and the patch's matte in both."""
+    world, _ = trained
+    for name, t_star in INSTANTS.items():
+        asked = FreezeParams(take=name, t_star=t_star, first=FIRST, last=LAST, passes=True)
+        freeze_shot(world.shot, asked, quiet())
+        mask = covered(world, 107, t_star).astype(np.uint8)
+        outline, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        row = {"name": "patch", "frame": 107, "polygon": (max(outline, key=len)[:, 0] + 0.5).tolist()}
+        path = tmp_path_factory.mktemp("lassos") / "lassos.json"
+        path.write_text(json.dumps({"mattes": [row]}), encoding="utf-8")
+        make_mattes(world.shot, MatteParams(take=name, polygons=str(path)), quiet())
+    return world
+
+
+def frame_of(world, take, number):
+    return read_frozen_exr(world.shot.take(take) / f"{number:06d}.exr")
+
+
+def error(world, take, number, t, where):
+    """Mean squared error, scene-linear, against the world from a frame's pose at the time of frame `t`."""
+    truth = srgb_to_linear(world.image(number - 101, (t - 101) / 15).numpy())
+    return float(np.square(frame_of(world, take, number).rgba[..., :3] - truth)[where].mean())
+
+
+def test_a_thing_stands_as_another_instant_has_it(world, quiet):
+    told = combine(world.shot, CombineParams(take="both", base="early", things="patch=late"), quiet())
+    assert told["frames"] == LAST - FIRST + 1 and told["combined"]["things"] == {"patch": "late"}
+    everywhere = np.ones((48, 64), bool)
+    ours, takes, apart = [], [], []
+    for n in range(FIRST, LAST + 1):
+        ours.append(error(world, "both", n, INSTANTS["late"], everywhere))
+        takes.append(error(world, "late", n, INSTANTS["late"], everywhere))
+        apart.append(error(world, "early", n, INSTANTS["late"], everywhere))
+        combined_frame, early = frame_of(world, "both", n), frame_of(world, "early", n)
+        near = cv2.dilate(np.float32(covered(world, n, 105) | covered(world, n, 113)), np.ones((15, 15))) > 0
+        for layer in ("rgba", "depth", "support"):
+            np.testing.assert_array_equal(getattr(combined_frame, layer)[~near], getattr(early, layer)[~near])
+        late = covered(world, n, 113) & ~covered(world, n, 105)
+        assert np.mean(combined_frame.depth[late] == frame_of(world, "late", n).depth[late]) > 0.5
+        assert combined_frame.more.keys() == early.more.keys() >= {"Vector", "Normal", "Position", "DepthSigma"}
+    # No worse by half a dB than the take of that instant by itself, in which the rest of the world is the same: mattes
+    # of 64 pixels are a pixel off.
+    assert np.mean(ours) <= np.mean(takes) * 10**0.05 and np.mean(ours) < 0.5 * np.mean(apart)
+    preview = read_png(TakeFolder(world.shot.take("both")).preview(107)).astype(int)
+    alone = read_png(TakeFolder(world.shot.take("late")).preview(107)).astype(int)
+    assert np.abs(preview - alone)[covered(world, 107, 113)].mean() < 3
+
+
+def test_a_thing_lives_on_while_all_else_stands(world, quiet):
+    combine(world.shot, CombineParams(take="alive", base="early", things="patch=live"), quiet())
+    for n in (104, 109, 111):
+        frame, now = frame_of(world, "alive", n), covered(world, n, n)
+        inside = cv2.erode(np.uint8(now), np.ones((3, 3))) > 0
+        assert error(world, "alive", n, n, inside) < 1e-3
+        assert (frame.detail.source[inside] == n).mean() > 0.95 and (frame.detail.plate[inside] > 0.95).mean() > 0.95
+
+
+def test_what_is_there_stays_and_what_changed_is_made_again(world, quiet):
+    params = CombineParams(take="again", base="early", things="patch=late")
+    combine(world.shot, params, quiet())
+    folder = TakeFolder(world.shot.take("again"))
+    before = {n: folder.frame(n).stat().st_mtime_ns for n in range(FIRST, LAST + 1)}
+    folder.frame(106).write_bytes(b"cut off")
+    combine(world.shot, params, quiet())
+    after = {n: folder.frame(n).stat().st_mtime_ns for n in before}
+    assert {n for n in before if before[n] != after[n]} == {106}
+    combine(world.shot, CombineParams(take="again", base="late", things="patch=early"), quiet())
+    assert all(folder.frame(n).stat().st_mtime_ns != after[n] for n in before)
+
+
+def test_what_cannot_be_combined_is_said(world, quiet):
+    def refused(match, **changes):
+        with pytest.raises(JobError, match=match):
+            combine(
+                world.shot, CombineParams(**{"take": "x", "base": "early", "things": "patch=late", **changes}), quiet()
+            )
+        assert not world.shot.take("x").exists()
+
+    refused("no matte 'dog'", things="dog=late")
+    refused("no finished take 'never'", base="never")
+    refused("names no matte and no take", things="patch")
+    refused("Nothing is said", things="")
+    with pytest.raises(JobError, match="holds frozen frames"):
+        combine(world.shot, CombineParams(take="late", base="early", things="patch=late"), quiet())
+    combine(world.shot, CombineParams(take="mine", base="early", things="patch=late"), quiet())
+    with pytest.raises(JobError, match="combined from others"):
+        freeze_shot(world.shot, FreezeParams(take="mine", t_star=105, first=FIRST, last=LAST), quiet())
+    freeze_shot(world.shot, FreezeParams(take="wide", t_star=105, first=FIRST, last=LAST, width=128), quiet())
+    refused("has no matte", base="wide")
+
+
+def test_a_mask_takes_one_layer_or_the_other():
+    base = frame_like(1.0)
+    made = combined(base, frame_like(3.0), np.float32([[0.0, 0.25], [0.75, 1.0]]))
+    np.testing.assert_allclose(made.rgba[..., 0], [[1.0, 1.5], [2.5, 3.0]])
+    np.testing.assert_array_equal(made.depth, [[1.0, 1.0], [3.0, 3.0]])
+    np.testing.assert_array_equal(made.more["Position"][..., 2], [[1.0, 1.0], [3.0, 3.0]])
+
+
+def frame_like(value):
+    from torch_backend.freeze.exr import FrameMetadata, FrozenFrame
+
+    flat, meta = np.full((2, 2), value, np.float32), FrameMetadata(1, 1.0, np.eye(4, dtype="f4"), np.eye(3, dtype="f4"))
+    more = {"Position": np.repeat(flat[..., None], 3, 2)}
+    return FrozenFrame(np.repeat(flat[..., None], 4, 2), flat, flat, flat, meta, (0, 0), None, None, more)
+
+
+def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
+    matte, motion = np.zeros((40, 60), np.float32), np.zeros((40, 60), np.float32)
+    matte[10:20, 10:20], motion[15:30, 18:25], motion[5:10, 50:55] = 1.0, 1.0, 1.0
+    alive = living(matte, motion)
+    assert alive[25, 22] == 1.0 and alive[7, 52] == 0.0 and alive[12, 12] == 1.0
+    soft = grown(matte, 640)
+    assert soft[15, 15] == pytest.approx(1.0, abs=1e-3) and 0.2 < soft[15, 23] < 1.0 and soft[15, 32] == 0.0
+    assert torch.from_numpy(soft).isfinite().all()

@@ -1,0 +1,309 @@
+"""One picture of several instants: things under a matte come from another take, or go on living as the plate has them.
+
+Where a thing stands in either take, the picture is the other take's: it stands as that instant has it, and what it
+hid at the base's instant is seen. Around things both takes show the same pixels, because nothing moves there, so the
+border may run a few pixels away from the thing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...contract import (
+    LIVE_SOURCE,
+    CombineParams,
+    ExitCode,
+    JobError,
+    Reporter,
+    TakeFolder,
+    checked_name,
+    read_json,
+    sweep_half_written,
+)
+from ...footage.images import read_png, write_png
+from ...footage.plates import Plates
+from ...shot import Shot, content_key, disk_error, is_disk_full, make_folder, need_disk, remove_file, write_json
+from ..exr import DetailLayers, FrozenFrame, read_frozen_exr, read_key, write_frozen_exr
+from ..take.contact_sheet import write_contact_sheet
+from ..take.folder import frames_of
+from ..take.video import write_video
+from .files import is_current, matte_file, read_matte
+
+VERSION = 1
+"""Rises when pictures combined before are not to be used any more."""
+GROW = 4.0
+"""Pixels of pictures 640 wide by which a matte grows: its edge is soft, and hair reaches beyond it."""
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A finished take that gives pixels."""
+
+    name: str
+    """Its name."""
+    folder: TakeFolder
+    """Its folder."""
+    facts: dict[str, Any]
+    """take.json."""
+    matte_keys: dict[str, str]
+    """Name of a finished matte -> key of its files."""
+    matte_format: str
+    """Suffix of its single mattes."""
+
+    @property
+    def margin(self) -> tuple[int, int]:
+        """Pixels of overscan left and right, and above and below."""
+        across, down = self.facts.get("margin", (0, 0))
+        return int(across), int(down)
+
+    def matte(self, name: str, frame: int) -> Array:
+        """[H, W] in 0..1, with overscan. JobError if the file is missing or was made from something else."""
+        path = matte_file(self.folder, name, frame, self.matte_format)
+        if not is_current(path, self.matte_keys[name]):
+            raise JobError(
+                f"The matte {name} of take {self.name} lacks frame {frame}.", "Make the mattes again.", ExitCode.FREEZE
+            )
+        return read_matte(path, self.margin)
+
+
+def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, Any]:
+    """Writes a take whose things come from the takes that `params` name. Returns its take.json.
+
+    JobError in words if it cannot be done. What is there already, made of the same, stays.
+    """
+    things = things_of(params.things)
+    base = _opened(shot, params.base)
+    sources = {name: None if name == LIVE_SOURCE else _opened(shot, name) for name in dict.fromkeys(things.values())}
+    frames = _check(base, things, sources)
+    folder = TakeFolder(shot.own(shot.take(checked_name(params.take, "take"))))
+    _refuse_frozen(folder, params)
+    live = Plates(shot, (int(base.facts["width"]), int(base.facts["height"]))) if None in sources.values() else None
+    for inner in (folder.root, folder.previews):
+        make_folder(shot.own(inner))
+        sweep_half_written(inner)
+    pixels = int(base.facts["width"]) * int(base.facts["height"])
+    need_disk(folder.root, len(frames) * pixels * 50.0, "the take")
+    try:
+        remove_file(folder.facts)  # until all frames are there it is no take
+        for done, number in enumerate(frames):
+            report.progress("combining takes", done, len(frames), f"frame {number}")
+            report.check_cancelled()
+            _write_frame(folder, number, base, things, sources, live)
+        return _finish(shot, params, folder, base, frames, report)
+    except OSError as error:
+        raise (disk_error(folder.root) if is_disk_full(error) else error) from error
+
+
+def things_of(text: str) -> dict[str, str]:
+    """Matte -> take that its thing comes from, of "MATTE=TAKE, ...". JobError on what is none."""
+    found: dict[str, str] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        matte, is_pair, take = (word.strip() for word in part.partition("="))
+        if not (matte and is_pair and take):
+            raise JobError(
+                f"--things {part!r} names no matte and no take.", "Write MATTE=TAKE, ... or MATTE=live.", ExitCode.USAGE
+            )
+        found[checked_name(matte, "matte")] = checked_name(take, "take")
+    if not found:
+        raise JobError("Nothing is said of what comes from which take.", "Write --things MATTE=TAKE.", ExitCode.USAGE)
+    return found
+
+
+def combined(base: FrozenFrame, other: FrozenFrame, mask: Array) -> FrozenFrame:
+    """`other` where `mask` [H, W] is 1, `base` where it is 0. Numbers such as depth are either the one or the other."""
+    is_other = mask > 0.5
+
+    def mixed(a: object, b: object) -> Array:
+        one, two = np.asarray(a, np.float32), np.asarray(b, np.float32)
+        share = mask if one.ndim == 2 else mask[..., None]
+        return np.asarray(one * (1.0 - share) + two * share, np.float32)
+
+    def chosen(a: object, b: object) -> Array:
+        one, two = np.asarray(a, np.float32), np.asarray(b, np.float32)
+        return np.where(is_other if one.ndim == 2 else is_other[..., None], two, one)
+
+    detail = None
+    if base.detail is not None and other.detail is not None:
+        one, two = base.detail, other.detail
+        detail = DetailLayers(
+            mixed(one.splat, two.splat), mixed(one.plate, two.plate), chosen(one.source, two.source)
+        )  # fmt: skip
+    return dataclasses.replace(
+        base,
+        rgba=mixed(base.rgba, other.rgba),
+        depth=chosen(base.depth, other.depth),
+        support=mixed(base.support, other.support),
+        motion=mixed(base.motion, other.motion),
+        grain=None if base.grain is None or other.grain is None else mixed(base.grain, other.grain),
+        detail=detail,
+        more={name: chosen(layer, other.more[name]) for name, layer in base.more.items() if name in other.more},
+    )
+
+
+def grown(matte: Array, width: int) -> Array:
+    """A matte [H, W] with a soft border `GROW` pixels of a picture 640 wide further out."""
+    reach = max(1, round(GROW * width / 640))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray(cv2.GaussianBlur(cv2.dilate(matte, kernel), (0, 0), 0.5 * reach), np.float32)
+
+
+def living(matte: Array, motion: Array) -> Array:
+    """What a thing under a matte [H, W] covers while it lives: of what moves (`motion` [H, W]) that which touches it.
+
+    `motion` is the layer of a frozen frame: what moves at t* or in the frame's own plate.
+    """
+    _, labels = cv2.connectedComponents(((matte > 0.5) | (motion > 0.5)).astype(np.uint8))
+    touched = np.unique(labels[matte > 0.5])
+    return np.maximum(matte, np.isin(labels, touched[touched > 0]).astype(np.float32))
+
+
+def _opened(shot: Shot, name: str) -> Source:
+    """A finished take. JobError if there is none."""
+    folder = TakeFolder(shot.own(shot.take(checked_name(name, "take"))))
+    if not folder.facts.is_file():
+        raise JobError(f"{shot.root.name} has no finished take {name!r}.", "Freeze it first.", ExitCode.FREEZE)
+    facts, record = read_json(folder.facts), dict[str, Any]()
+    if folder.mattes_record.is_file():
+        record = read_json(folder.mattes_record)
+    keys = record.get("keys") if record.get("finished") else None
+    known = {name: str(key) for name, key in cast("dict[str, Any]", keys or {}).items()}
+    return Source(name, folder, facts, known, str(record.get("format", "exr")))
+
+
+def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source | None]) -> list[int]:
+    """The frames that can be combined. JobError if takes do not fit each other, or lack a matte."""
+    frames = set(frames_of(base.folder))
+    for matte, take in things.items():
+        source = sources[take]
+        for each in (base, source):
+            if each is not None and matte not in each.matte_keys:
+                raise JobError(
+                    f"Take {each.name} has no matte {matte!r}.", "Draw it there, or make its mattes.", ExitCode.FREEZE
+                )
+        if source is None:
+            if base.facts.get("camera_path"):
+                raise JobError(
+                    f"{matte} cannot live in take {base.name}: it is seen from a camera of its own, and only the "
+                    "clip's own shows the plate.", "Use a take from the clip's own poses.", ExitCode.FREEZE,
+                )  # fmt: skip
+            continue
+        for name in ("width", "height", "margin", "camera_path"):
+            if source.facts.get(name) != base.facts.get(name):
+                raise JobError(
+                    f"Takes {base.name} and {source.name} differ in {name.replace('_', ' ')}.",
+                    "Freeze both with the same size, overscan and camera.", ExitCode.FREEZE,
+                )  # fmt: skip
+        frames &= set(frames_of(source.folder))
+    if not frames:
+        raise JobError("The takes have no frame in common.", "Freeze the same frames of each.", ExitCode.FREEZE)
+    return sorted(frames)
+
+
+def _refuse_frozen(folder: TakeFolder, params: CombineParams) -> None:
+    """JobError if the result would take the place of frozen frames."""
+    if params.take in (params.base, *things_of(params.things).values()) or (
+        folder.facts.is_file() and "combined" not in read_json(folder.facts)
+    ):
+        raise JobError(
+            f"The take {params.take} holds frozen frames: a combined one would take their place.",
+            "Give it another name with --take.", ExitCode.USAGE,
+        )  # fmt: skip
+
+
+def _write_frame(
+    folder: TakeFolder, number: int, base: Source, things: Mapping[str, str], sources: Mapping[str, Source | None],
+    live: Plates | None,
+) -> None:  # fmt: skip
+    """Writes a frame and its preview, unless they are there, made of the same."""
+    key = content_key(
+        VERSION, GROW, read_key(base.folder.frame(number)), None if live is None else live.key,
+        [[matte, take, base.matte_keys[matte], *_keys(sources[take], matte, number)] for matte, take in things.items()],
+    )  # fmt: skip
+    if is_current(folder.preview(number), key) and is_current(folder.frame(number), key):
+        return
+    frame = read_frozen_exr(base.folder.frame(number))
+    shown = read_png(base.folder.preview(number)).astype(np.float32)
+    (height, width), (across, down) = frame.depth.shape, base.margin
+    inner = slice(down, height - down), slice(across, width - across)
+    for matte, take in things.items():
+        source, mask = sources[take], base.matte(matte, number)
+        if source is None:
+            assert live is not None
+            whole, mask = grown(living(mask, frame.motion), width), np.zeros_like(mask)
+            mask[inner] = whole[inner]  # the plate ends where the frame does
+            other = _living_frame(frame, live, number, inner)
+            picture = np.asarray(live.display(number).clamp(0.0, 1.0).numpy() * 255.0, np.float32)
+        else:
+            mask = grown(np.maximum(mask, source.matte(matte, number)), width)
+            other = read_frozen_exr(source.folder.frame(number))
+            picture = read_png(source.folder.preview(number)).astype(np.float32)
+        share = mask[inner][..., None]
+        shown = shown * (1.0 - share) + picture * share
+        frame = combined(frame, other, mask)
+    write_png(folder.preview(number), (shown + 0.5).astype(np.uint8), key)
+    write_frozen_exr(
+        folder.frame(number), frame.rgba, frame.depth, frame.support, frame.motion,
+        dataclasses.replace(frame.metadata, key=key), frame.margin, frame.grain, frame.detail, frame.more,
+    )  # fmt: skip
+
+
+def _keys(source: Source | None, matte: str, number: int) -> list[str | None]:
+    """What a thing's pixels come from: frame and matte of another take; nothing more for the plate."""
+    return [] if source is None else [read_key(source.folder.frame(number)), source.matte_keys[matte]]
+
+
+def _living_frame(base: FrozenFrame, plates: Plates, number: int, inner: tuple[slice, slice]) -> FrozenFrame:
+    """A frame of the plate, with the depth of the frozen scene: how far away a living thing is, nobody knows."""
+    rgba = np.zeros_like(base.rgba)
+    rgba[inner] = np.concatenate(
+        [plates.linear(number).numpy(), np.ones((*base.depth[inner].shape, 1), np.float32)], axis=2
+    )
+    ones = np.ones_like(base.depth)
+    detail = None
+    if base.detail is not None:
+        detail = DetailLayers(base.detail.splat, ones, ones * number)
+    grain = None if base.grain is None else np.zeros_like(base.grain)
+    return dataclasses.replace(base, rgba=rgba, support=ones, motion=ones, grain=grain, detail=detail)
+
+
+def _finish(
+    shot: Shot, params: CombineParams, folder: TakeFolder, base: Source, frames: list[int], report: Reporter
+) -> dict[str, Any]:  # fmt: skip
+    """Contact sheet, video and take.json; frames of before that are none of this take go."""
+    for number in frames_of(folder):
+        if number not in frames:
+            for old in (folder.frame(number), folder.preview(number)):
+                remove_file(old)
+    previews = [folder.preview(number) for number in frames]
+    title = f"{shot.info().name}: {params.take}, {params.base} with {params.things}"
+    write_contact_sheet(folder.contact_sheet, None, previews, frames, title, mark=int(base.facts["t_star_frame"]))
+    note = write_video(folder.video, (read_png(path) for path in previews), shot.info().fps or 24.0)
+    if note:
+        report.warning(note)
+    own = ("detail", "warp_dir", "verdict", "ply", "usd", "redistort")
+    facts = {
+        **{name: value for name, value in base.facts.items() if name not in own},
+        "take": params.take,
+        "combined": {"base": params.base, "things": things_of(params.things)},
+        "key": content_key([read_key(folder.frame(number)) for number in frames]),
+        "exr_dir": str(folder.root),
+        "contact_sheet": str(folder.contact_sheet),
+        "video": str(folder.video),
+        "redistort": "",
+        "first": frames[0],
+        "last": frames[-1],
+        "frames": len(frames),
+    }
+    write_json(folder.facts, facts)
+    report.image("contact sheet", folder.contact_sheet)
+    report.progress("combining takes", len(frames), len(frames), f"{len(frames)} frames")
+    return facts
