@@ -6,7 +6,9 @@ hide what is behind them. They carry the frozen colours as a vertex attribute, w
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,18 +43,16 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
     """The same for the timer: reading the file, and each mesh, in turns. Keeps nothing of bpy between two turns."""
     _facts(_scene(scene_uid), shot, take)
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
-    vertices, triangles = yield from reading(folder.surface)
+    parts = yield from _in_thread(lambda: [_part(*read(folder.surface), part == "people") for part in PARTS])
     meshes: list[str] = []
     try:
-        for part in PARTS:
-            places, colors, corners = _part(vertices, triangles, part == "people")
-            yield None
+        for part, shape in zip(PARTS, parts, strict=True):
             mesh = bpy.data.meshes.new(f"{scene_objects.name_of(shot)} {take} {part}")
             meshes.append(mesh.name)
             del mesh
-            for fill in (_fill_points, _fill_faces, _fill_colors):
+            for fill in (_fill_points, _fill_edges, _fill_corners, _fill_faces, _fill_colors):
                 yield None
-                fill(present(named(bpy.data.meshes, meshes[-1])), places, colors, corners)  # an undo may have taken it
+                fill(present(named(bpy.data.meshes, meshes[-1])), shape)  # an undo may have taken it
         scene = _scene(scene_uid)
         facts = _facts(scene, shot, take)
     except BaseException:
@@ -106,8 +106,35 @@ def check_root(scene: bpy.types.Scene, shot: Path) -> None:
 # ------------------------------------------------------------------------------------------------- the file
 
 
-def reading(path: Path) -> Generator[job_timer.Progress, None, tuple[np.ndarray, np.ndarray]]:
-    """Reads a take's surface; returns its vertices and triangles as the contract's fields say.
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """What a mesh is filled with. Blender would take a second to find the edges of a large one."""
+
+    places: np.ndarray
+    """[V, 3] float32."""
+    colors: np.ndarray
+    """[V, 4] float32 in 0..1, as displayed."""
+    edges: np.ndarray
+    """[E, 2] int32, vertices of each edge."""
+    corners: np.ndarray
+    """[T, 3] int32, vertices of each triangle."""
+    sides: np.ndarray
+    """[T, 3] int32, edge of each triangle from each of its corners to the next."""
+
+
+def _in_thread(make: Callable[[], list[Shape]]) -> Generator[job_timer.Progress, None, list[Shape]]:
+    """What `make` returns or raises, made beside the window: it takes a second and needs no bpy."""
+    with ThreadPoolExecutor(1) as pool:
+        made = pool.submit(make)
+        while not made.done():
+            yield job_timer.Progress("Reading the surface", 0, 1)
+            if bpy.app.background:
+                break
+        return made.result()
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a take's surface, as the contract's fields say.
 
     ValueError if it is no such file, is cut short, or has triangles without vertices.
     """
@@ -115,7 +142,6 @@ def reading(path: Path) -> Generator[job_timer.Progress, None, tuple[np.ndarray,
         header = contract.read_surface_header(handle, path)
         of_vertices, of_triangles = (np.dtype(list(f)) for f in (contract.VERTEX_FIELDS, contract.TRIANGLE_FIELDS))
         vertices = np.frombuffer(handle.read(header.vertices * of_vertices.itemsize), of_vertices)
-        yield job_timer.Progress("Reading the surface", 1, 2)
         triangles = np.frombuffer(handle.read(header.triangles * of_triangles.itemsize), of_triangles)
     corners = _corners(triangles)
     is_right = np.isin(triangles["corners"], 3).all() and (corners >= 0).all() and (corners < header.vertices).all()
@@ -129,35 +155,55 @@ def _corners(triangles: np.ndarray) -> np.ndarray:
     return np.stack([triangles[name] for name in "abc"], axis=1)
 
 
-def _part(vertices: np.ndarray, triangles: np.ndarray, people: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(places [V, 3] float32, colours [V, 4] float32 in 0..1 as displayed, triangles [T, 3]) of one part."""
-    kept, corners = np.unique(_corners(triangles[(triangles["people"] > 0) == people]), return_inverse=True)
+def _part(vertices: np.ndarray, triangles: np.ndarray, people: bool) -> Shape:
+    """One part of a surface."""
+    kept, flat = np.unique(_corners(triangles[(triangles["people"] > 0) == people]), return_inverse=True)
+    corners = flat.reshape(-1, 3).astype(np.int32)
     chosen = vertices[kept]
     colors = np.stack([chosen[name] for name in ("red", "green", "blue")], axis=1).astype(np.float32) / 255.0
     places = np.stack([chosen[axis] for axis in "xyz"], axis=1)
-    return places, np.concatenate([colors, np.ones((len(kept), 1), np.float32)], axis=1), corners.reshape(-1, 3)
+    ends = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2).astype(np.int64), axis=1)
+    count = max(len(kept), 1)
+    found, sides = np.unique(ends[:, 0] * count + ends[:, 1], return_inverse=True)
+    return Shape(
+        places,
+        np.concatenate([colors, np.ones((len(kept), 1), np.float32)], axis=1),
+        np.stack([found // count, found % count], axis=1).astype(np.int32),
+        corners,
+        sides.reshape(-1, 3).astype(np.int32),
+    )
 
 
-def _fill_points(mesh: bpy.types.Mesh, places: np.ndarray, colors: np.ndarray, corners: np.ndarray) -> None:
+def _fill_points(mesh: bpy.types.Mesh, shape: Shape) -> None:
     vertices: Any = mesh.vertices
-    vertices.add(len(places))
-    vertices.foreach_set("co", places.ravel())
+    vertices.add(len(shape.places))
+    vertices.foreach_set("co", shape.places.ravel())
 
 
-def _fill_faces(mesh: bpy.types.Mesh, places: np.ndarray, colors: np.ndarray, corners: np.ndarray) -> None:
+def _fill_edges(mesh: bpy.types.Mesh, shape: Shape) -> None:
+    edges: Any = mesh.edges
+    edges.add(len(shape.edges))
+    edges.foreach_set("vertices", shape.edges.ravel())
+
+
+def _fill_corners(mesh: bpy.types.Mesh, shape: Shape) -> None:
     loops: Any = mesh.loops
-    loops.add(corners.size)
-    loops.foreach_set("vertex_index", corners.ravel().astype(np.int32))
+    loops.add(shape.corners.size)
+    loops.foreach_set("vertex_index", shape.corners.ravel())
+    loops.foreach_set("edge_index", shape.sides.ravel())
+
+
+def _fill_faces(mesh: bpy.types.Mesh, shape: Shape) -> None:
     polygons: Any = mesh.polygons
-    polygons.add(len(corners))
-    polygons.foreach_set("loop_start", np.arange(0, corners.size, 3, dtype=np.int32))
-    polygons.foreach_set("use_smooth", np.ones(len(corners), dtype=bool))
-    mesh.update(calc_edges=True)
+    polygons.add(len(shape.corners))
+    polygons.foreach_set("loop_start", np.arange(0, shape.corners.size, 3, dtype=np.int32))
+    polygons.foreach_set("use_smooth", np.ones(len(shape.corners), dtype=bool))
 
 
-def _fill_colors(mesh: bpy.types.Mesh, places: np.ndarray, colors: np.ndarray, corners: np.ndarray) -> None:
+def _fill_colors(mesh: bpy.types.Mesh, shape: Shape) -> None:
     attribute: Any = mesh.attributes.new("Col", "BYTE_COLOR", "POINT")
-    attribute.data.foreach_set("color_srgb", colors.ravel())
+    attribute.data.foreach_set("color_srgb", shape.colors.ravel())
+    mesh.update()
 
 
 # ------------------------------------------------------------------------------------------------- the scene
