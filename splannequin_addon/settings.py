@@ -72,6 +72,7 @@ class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, bpy.types.PropertyGroup):
 def register() -> None:
     """Registers the property groups and hangs them on the scene."""
     bpy.utils.register_class(scene_objects.SPLANNEQUIN_PG_splats)
+    bpy.utils.register_class(scene_objects.SPLANNEQUIN_PG_surface)
     bpy.utils.register_class(scene_objects.SPLANNEQUIN_PG_made)
     bpy.utils.register_class(SPLANNEQUIN_PG_shot)
     bpy.utils.register_class(SPLANNEQUIN_PG_scene)
@@ -84,4 +85,5 @@ def unregister() -> None:
     bpy.utils.unregister_class(SPLANNEQUIN_PG_scene)
     bpy.utils.unregister_class(SPLANNEQUIN_PG_shot)
     bpy.utils.unregister_class(scene_objects.SPLANNEQUIN_PG_made)
+    bpy.utils.unregister_class(scene_objects.SPLANNEQUIN_PG_surface)
     bpy.utils.unregister_class(scene_objects.SPLANNEQUIN_PG_splats)

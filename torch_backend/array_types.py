@@ -38,16 +38,20 @@ def sparse_entries(
 def connected(values: NDArray[np.floating[Any]], step: float) -> NDArray[np.int32]:
     """Labels [H, W] from 0 of the parts of a picture [H, W] whose pixels are joined by neighbours, across or down, that
     differ by less than `step`."""
-    from scipy.sparse import csgraph
-
     height, width = values.shape
     places = np.arange(height * width, dtype=np.int64).reshape(height, width)
     across, down = (np.asarray(np.abs(np.diff(values, axis=axis)) < step, np.bool_) for axis in (1, 0))
     ends = np.concatenate([places[:, 1:][across], places[1:][down]])
     others = np.concatenate([places[:, :-1][across], places[:-1][down]])
-    graph = sparse_entries(np.ones(len(ends), np.float32), ends, others, (height * width, height * width))
-    labels = cast(Any, csgraph).connected_components(graph, directed=False)[1]
-    return np.asarray(labels, np.int32).reshape(height, width)
+    return pieces(ends, others, height * width).reshape(height, width)
+
+
+def pieces(ends: NDArray[np.integer[Any]], others: NDArray[np.integer[Any]], count: int) -> NDArray[np.int32]:
+    """Labels [count] from 0 of the pieces of a graph of `count` nodes. Its edges join `ends` [E] with `others` [E]."""
+    from scipy.sparse import csgraph
+
+    graph = sparse_entries(np.ones(len(ends), np.float32), ends, others, (count, count))
+    return np.asarray(cast(Any, csgraph).connected_components(graph, directed=False)[1], np.int32)
 
 
 def meshgrid(x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

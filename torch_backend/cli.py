@@ -98,7 +98,7 @@ def _begun(folder: str) -> Shot:
 
 
 def one_step(args: argparse.Namespace, console: Console) -> int:
-    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`, `mattes SHOT`, `combine SHOT`."""
+    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`, `mattes SHOT`, `combine SHOT`, `surface SHOT`."""
     ((kind, params),) = contract.requested_params(args).items()
     folder = args.clip if args.command == "freeze" else args.shot
     shot = _begun(folder) if kind == "import" else Shot.open(folder)
@@ -111,6 +111,8 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
         print_places(result, console)
     if kind == "mattes":
         print_mattes(result, console)
+    if kind == "surface" and not console.as_json:
+        print(f"Surface: {result['surface']}", file=console.stream, flush=True)
     return ExitCode.OK
 
 

@@ -380,12 +380,19 @@ def _mattes(shot: Shot, params: contract.MatteParams, report: Reporter) -> Any:
     return make_mattes(shot, params, report)
 
 
+def _surface(shot: Shot, params: contract.SurfaceParams, report: Reporter) -> Any:
+    from .freeze.surface.job import make_surface
+
+    return make_surface(shot, params, report)
+
+
 RUNNERS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "import": _import,
     "solve": _solve,
     "train": _train,
     "freeze": _freeze,
     "mattes": _mattes,
+    "surface": _surface,
     "combine": _combine,
 }
 """Kind of job -> the station that does it: (shot, typed params, reporter) -> JSON-able result."""

@@ -179,6 +179,11 @@ def make_mattes(args: argparse.Namespace, console: Console) -> int:
     return _one_step(args, console, "freeze", args.shot)
 
 
+def make_surface(args: argparse.Namespace, console: Console) -> int:
+    """`surface SHOT`: a job that the step Freeze starts."""
+    return _one_step(args, console, "freeze", args.shot)
+
+
 def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
     """Import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
     began = time.perf_counter()
@@ -478,6 +483,7 @@ _DOES = {
     "train": train,
     "freeze": freeze,
     "mattes": make_mattes,
+    "surface": make_surface,
     "combine": make_mattes,
     "bake": bake_take,
     "stmaps": write_stmaps,

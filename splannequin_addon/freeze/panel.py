@@ -86,6 +86,7 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
             for told in watch.state.damaged["take"].values():
                 wrap(body, context, told, "ERROR")
             body.operator("splannequin.add_splats", icon=icons.of("splannequin.add_splats"))
+            body.operator("splannequin.add_surface", icon=icons.of("splannequin.add_surface"))
 
     def _mattes(self, context: bpy.types.Context, layout: bpy.types.UILayout, take: dict[str, Any]) -> None:
         """A mask to make one of, and what there is."""

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from ...torch_backend import contract
 from ..access import settings_of
-from ..process import jobs
+from ..process import job_timer, jobs
 from ..process.steps import Step, View
+from ..shot import scene_objects
 from ..shot.shot_state import ShotState
 from . import (
     hidden_points,
@@ -20,6 +21,8 @@ from . import (
     own_camera,
     panel,
     splats,
+    surface_operators,
+    surfaces,
     takes,
     viewport,
 )
@@ -34,7 +37,7 @@ class Freeze(Step):
     name = "freeze"
     label = "Freeze"
     kind = "freeze"
-    also = ("mattes", "combine")
+    also = ("mattes", "combine", "surface")
     button = "Freeze"
     again = "Freeze Again"
     needs = "Train first."
@@ -43,6 +46,7 @@ class Freeze(Step):
         *matte_operators.CLASSES,
         *move_operators.CLASSES,
         *move_check.CLASSES,
+        *surface_operators.CLASSES,
         *panel.CLASSES,
     )
     parts = (viewport, hidden_points)
@@ -73,9 +77,13 @@ class Freeze(Step):
         return View(True, True, lines, "Next: bake it into your compositor.")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """An instant that nobody chose is the one that was taken; mattes are read again where they are shown."""
+        """An instant that nobody chose is the one that was taken; mattes are read again where they are shown; a
+        surface comes into the scene that has its shot."""
         if job.kind == "mattes":
             return mattes.arrived(job.shot, job.result)
+        if job.kind == "surface":
+            is_here = scene_objects.part(scene, job.shot, "root") is not None
+            return surfaces.add(scene, job.shot, str(job.result["take"])) if is_here else []
         if job.kind == "combine":
             settings_of(scene).take_name = str(job.result["take"])
             return [f"The take {job.result['take']} is chosen: {job.result['frames']} frames."]
@@ -83,9 +91,18 @@ class Freeze(Step):
             settings_of(scene).t_star = int(job.result["t_star_frame"])
         return []
 
+    def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
+        """Has the timer read a surface."""
+        if job.kind != "surface" or scene_objects.part(scene, job.shot, "root") is None:
+            return False
+        take = str(job.result["take"])
+        job_timer.work(job.shot, self.name, surfaces.added_in_turns(scene.session_uid, job.shot, take))
+        return True
+
     def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
-        """Takes splats out of the file."""
-        return ["Splats were removed."] if splats.remove(scene, shot) else []
+        """Takes splats and surfaces out of the file."""
+        done = ["Splats were removed."] if splats.remove(scene, shot) else []
+        return [*done, "Surfaces were removed."] if surfaces.remove(scene, shot) else done
 
     def in_use(self, shot: Path, folder: Path) -> str:
         """A run that is scrubbed through."""

@@ -101,6 +101,7 @@ Params = (
     | contract.TrainParams
     | contract.FreezeParams
     | contract.MatteParams
+    | contract.SurfaceParams
     | contract.CombineParams
 )
 """What a job may be asked for; `contract.PARAMS` by kind."""

@@ -28,6 +28,12 @@ class SPLANNEQUIN_PG_splats(bpy.types.PropertyGroup):
     object = PointerProperty(name="Object", description="The splats of the take", type=bpy.types.Object)
 
 
+class SPLANNEQUIN_PG_surface(bpy.types.PropertyGroup):
+    """A mesh of the surface of one take in the scene; its name is the take's."""
+
+    object = PointerProperty(name="Object", description="A part of the take's surface", type=bpy.types.Object)
+
+
 class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     """What there is of one shot; its name is the shot's."""
 
@@ -45,6 +51,9 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
         options={"HIDDEN"},
     )
     splats = CollectionProperty(name="Splats", description="Splats of takes", type=SPLANNEQUIN_PG_splats, options=set())
+    surfaces = CollectionProperty(
+        name="Surfaces", description="Surfaces of takes", type=SPLANNEQUIN_PG_surface, options=set()
+    )
     collection = PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
     points_hidden_in = StringProperty(
         name="Points Hidden In",
@@ -122,10 +131,11 @@ def tidy(scene: bpy.types.Scene) -> None:
             item = getattr(entry, name)
             if item is not None and not _stands(item, [*own, scene.objects]):
                 setattr(entry, name, None)
-        for index in reversed(range(len(entry.splats))):
-            item = entry.splats[index].object
-            if item is None or not _stands(item, [*own, scene.objects]):
-                entry.splats.remove(index)
+        for kept in (entry.splats, entry.surfaces):
+            for index in reversed(range(len(kept))):
+                item = kept[index].object
+                if item is None or not _stands(item, [*own, scene.objects]):
+                    kept.remove(index)
 
 
 def _stands(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:

@@ -97,6 +97,18 @@ MESSAGES: dict[str, str] = {
     "The take has no mattes.": "Der Take hat keine Matten.",
     "{}, drawn at {}": "{}, gezeichnet in {}",
     "Making mattes": "Matten machen",
+    # ------------------------------------------------------------------------------------------ surface
+    "Add Frozen Surface": "Eingefrorene Oberfläche hinzufügen",
+    "Make meshes of the chosen take's frozen room and people, and bring them into the scene under the shot's root. They catch the shadows of what you place, hide what is behind them, and are seen in reflections": "Aus Raum und Menschen des gewählten Takes, wie sie eingefroren sind, Meshes machen und in die Szene bringen, unter die Wurzel des Shots. Sie fangen die Schatten von dem, was du hinstellst, verdecken, was hinter ihnen ist, und sind in Spiegelungen zu sehen",
+    "The surface of take {} is in the scene, under the shot's root.": "Die Oberfläche des Takes {} ist in der Szene, unter der Wurzel des Shots.",
+    "Take {} has no surface.": "Der Take {} hat keine Oberfläche.",
+    "{} is damaged: make it again.": "{} ist beschädigt: neu machen.",
+    "A part of the take's surface": "Ein Teil der Oberfläche des Takes",
+    "Surfaces": "Oberflächen",
+    "Surfaces of takes": "Oberflächen von Takes",
+    "Surfaces were removed.": "Oberflächen wurden entfernt.",
+    "Reading the surface": "Oberfläche lesen",
+    "Making the surface": "Oberfläche machen",
     # ------------------------------------------------------------------------------------------ panel: the steps
     "1  Import": "1  Import",
     "2  Solve": "2  Lösen",

@@ -6,6 +6,7 @@ from ..access import Icon
 
 OF: dict[str, Icon] = {
     "splannequin.add_splats": "OUTLINER_OB_POINTCLOUD",
+    "splannequin.add_surface": "OUTLINER_OB_MESH",
     "splannequin.align_floor": "GRID",
     "splannequin.align_origin": "OBJECT_ORIGIN",
     "splannequin.align_scale": "ARROW_LEFTRIGHT",

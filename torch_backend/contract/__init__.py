@@ -18,6 +18,7 @@
     camera_path     a pinhole camera over frames
     placement       where a solve stands in Blender's scene
     ply_header      the header of a file of splats
+    surface_header  the header of a file of a take's surface
     live_messages   what Blender and a live session say to each other
     colour          a colour by which two programs know that they mean the same space, and the display of light
     frame_names     frame numbers in file names
@@ -211,6 +212,7 @@ from .options import (
     ImportParams,
     MatteParams,
     SolveParams,
+    SurfaceParams,
     TrainParams,
     check_params,
 )
@@ -291,6 +293,7 @@ from .shot_folder import (
     STMAP_FILES,
     SUMMARY_FILE,
     SURFACE,
+    SURFACE_FILE,
     TAKE_FILE,
     TAKE_UNDISTORT,
     TAKES_FOLDER,
@@ -304,6 +307,13 @@ from .shot_folder import (
 from .shot_work import (
     FOLDERS_OF_FRAMES,
     work_words,
+)
+from .surface_header import (
+    TRIANGLE_FIELDS,
+    VERTEX_FIELDS,
+    SurfaceHeader,
+    read_surface_header,
+    surface_of_take,
 )
 from .timecode import (
     later,
@@ -456,15 +466,18 @@ __all__ = [
     "SUMMARY_FILE",
     "SUPERVISIONS",
     "SURFACE",
+    "SURFACE_FILE",
     "SWITCH",
     "TAKES_FOLDER",
     "TAKE_FILE",
     "TAKE_UNDISTORT",
     "TORCH_INDEX",
+    "TRIANGLE_FIELDS",
     "UNPUBLISHED_FILE",
     "USD_FILE",
     "VERBS",
     "VERDICT_WORDS",
+    "VERTEX_FIELDS",
     "WORK",
     "WRITER_FILE",
     "CameraFrame",
@@ -493,6 +506,8 @@ __all__ = [
     "ShotFolder",
     "SolveParams",
     "Status",
+    "SurfaceHeader",
+    "SurfaceParams",
     "TakeFolder",
     "TrainParams",
     "UnreadableFile",
@@ -578,6 +593,7 @@ __all__ = [
     "read_lines",
     "read_message",
     "read_ply_header",
+    "read_surface_header",
     "read_writer",
     "readable_stem",
     "record_packages",
@@ -599,6 +615,7 @@ __all__ = [
     "shot_beside",
     "site_packages",
     "summarise",
+    "surface_of_take",
     "sweep_half_written",
     "take_figures",
     "torch_index",

@@ -70,7 +70,7 @@ class JobRequest:
     """What Blender asks for: one station, on one shot."""
 
     kind: str
-    """import, solve, train, freeze, mattes or combine."""
+    """import, solve, train, freeze, mattes, combine or surface."""
     shot: str
     """Absolute path of the shot folder."""
     params: dict[str, Any] = field(default_factory=dict[str, Any])
@@ -149,6 +149,7 @@ WORK = {
     "train": "The training",
     "freeze": "The freeze",
     "mattes": "The job of the mattes",
+    "surface": "The job of the surface",
     "combine": "The job that combines takes",
 }
 """Kind of job -> what a sentence calls it."""

@@ -690,6 +690,14 @@ class CombineParams:
     """Pairs of matte and take, separated by commas; `LIVE_SOURCE` in place of a take: the clip itself."""
 
 
+@dataclass
+class SurfaceParams:
+    """The frozen scene of a take as a mesh."""
+
+    take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
+    """Name of the take's folder in takes/."""
+
+
 STEP_PARAMS: dict[str, type] = {
     "import": ImportParams,
     "solve": SolveParams,
@@ -697,7 +705,7 @@ STEP_PARAMS: dict[str, type] = {
     "freeze": FreezeParams,
 }
 """Kind of job on the way from a clip to frozen frames -> the dataclass of its parameters."""
-PARAMS: dict[str, type] = {**STEP_PARAMS, "mattes": MatteParams, "combine": CombineParams}
+PARAMS: dict[str, type] = {**STEP_PARAMS, "mattes": MatteParams, "combine": CombineParams, "surface": SurfaceParams}
 """Kind of job -> the dataclass of its parameters."""
 LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.values()}
 """The numbers of each kind of parameters, by field."""

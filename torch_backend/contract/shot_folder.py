@@ -54,8 +54,8 @@ PREVIEWS_FOLDER, NEXT_FOLDER, DEVELOPED_FOLDER = "previews", "next", "developed"
 TAKE_FILE, TAKE_STATE_FILE = "take.json", "state.json"
 TAKE_PREVIEW_FOLDER, WARP_FOLDER, TAKE_NEXT_FOLDER = "preview", "warp", ".next"
 CONTACT_SHEET_FILE, VIDEO_FILE, PLY_FILE = "contact_sheet.png", "video.mp4", "frozen.ply"
-USD_FILE = "frozen.usdc"
-"""Of a take: the splats and the animated camera."""
+USD_FILE, SURFACE_FILE = "frozen.usdc", "surface.ply"
+"""Of a take: the splats and the animated camera; the frozen scene as a mesh."""
 TAKE_REDISTORT = Path("stmap") / "redistort.exr"
 """Of a take with overscan: the way back through the lens."""
 TAKE_UNDISTORT = Path("stmap") / "undistort.exr"
@@ -391,6 +391,11 @@ class TakeFolder:
     def usd(self) -> Path:
         """The frozen Gaussians and the camera, as one USD stage."""
         return self.root / USD_FILE
+
+    @property
+    def surface(self) -> Path:
+        """The frozen scene as a mesh."""
+        return self.root / SURFACE_FILE
 
     @property
     def redistort(self) -> Path:

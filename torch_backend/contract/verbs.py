@@ -18,6 +18,7 @@ from .options import (
     ImportParams,
     MatteParams,
     SolveParams,
+    SurfaceParams,
     TrainParams,
 )
 
@@ -349,6 +350,11 @@ VERBS: dict[str, Verb] = {
         "one take of several: each thing under a matte from a take of its own, or living on",
         ShotWords,
         {"combine": CombineParams},
+    ),
+    "surface": Verb(
+        "the frozen scene of a take as a mesh, to catch shadows and to hide what is behind it",
+        ShotWords,
+        {"surface": SurfaceParams},
     ),
     "bake": Verb("a take through the compositor: DIR/composited and DIR/shot.blend", BakeWords, sides=(BLENDER,)),
     "stmaps": Verb("ST maps of the lens, both ways, into the shot's solve folder", MapWords),

@@ -90,7 +90,14 @@ def read_of(files, names: tuple[str, ...]) -> set[str]:
 
 @pytest.mark.parametrize(
     ("kind", "station"),
-    [("import", "footage"), ("solve", "solve"), ("train", "train"), ("freeze", "freeze"), ("mattes", "freeze")],
+    [
+        ("import", "footage"),
+        ("solve", "solve"),
+        ("train", "train"),
+        ("freeze", "freeze"),
+        ("mattes", "freeze"),
+        ("surface", "freeze"),
+    ],
 )
 def test_no_parameter_of_a_step_is_passed_over_by_its_station(kind, station):
     backend = ROOT / "torch_backend"

@@ -1,0 +1,52 @@
+"""The button that makes the surface of a take and brings it into the scene."""
+
+from __future__ import annotations
+
+import bpy
+
+from ...torch_backend import contract
+from ..access import Outcome, scene_in, settings_of
+from ..process import begin, job_timer
+from ..shot import selection
+from ..translations import tr
+from ..ui import step_operator
+from . import surfaces
+
+
+class SPLANNEQUIN_OT_add_surface(step_operator.StepOperator, bpy.types.Operator):
+    """Make meshes of the chosen take's frozen room and people, and bring them into the scene under the shot's root.
+    They catch the shadows of what you place, hide what is behind them, and are seen in reflections"""
+
+    bl_idname = "splannequin.add_surface"
+    bl_label = "Add Frozen Surface"
+    bl_options = {"REGISTER"}
+    step = "freeze"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a take, and while a step of this shot runs."""
+        folder = selection.shot_folder(scene_in(context))
+        state = job_timer.watch_of(folder).state if folder else None
+        if state is None or settings_of(scene_in(context)).take_name not in state.takes:
+            cls.poll_message_set(tr("Freeze first"))
+            return False
+        return super().poll(context)
+
+    def perform(self, context: bpy.types.Context) -> Outcome:
+        """Makes the surface if the take has none, and adds it; in a window the timer does both."""
+        scene = scene_in(context)
+        folder, take = begin.needed(scene, self.step), settings_of(scene).take_name
+        surfaces.check_root(scene, folder)
+        if not surfaces.is_made(folder, take):
+            return super().perform(context)
+        if bpy.app.background:
+            return step_operator.edit(self, context, self.step, lambda scene, shot: surfaces.add(scene, shot, take))
+        job_timer.work(folder, self.step, surfaces.added_in_turns(scene.session_uid, folder, take))
+        return {"FINISHED"}
+
+    def params(self, scene: bpy.types.Scene) -> contract.SurfaceParams:
+        """The take that is chosen."""
+        return contract.SurfaceParams(take=settings_of(scene).take_name)
+
+
+CLASSES = (SPLANNEQUIN_OT_add_surface,)

@@ -1,0 +1,1 @@
+"""The surface of a frozen scene, fused from the depth of a take's frames."""
