@@ -6,9 +6,7 @@ hide what is behind them. They carry the frozen colours as a vertex attribute, w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,8 @@ from ..process import job_timer
 from ..scene import session
 from ..scene.ownership import TAG
 from ..shot import inventory, placement, scene_objects
+from . import surface_shapes
+from .surface_shapes import Shape
 
 SHOWN_AS = "Splannequin Surface"
 """Name of the material."""
@@ -43,7 +43,7 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
     """The same for the timer: reading the file, and each mesh, in turns. Keeps nothing of bpy between two turns."""
     _facts(_scene(scene_uid), shot, take)
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
-    parts = yield from _in_thread(lambda: [_part(*read(folder.surface), part == "people") for part in PARTS])
+    parts = yield from _reading(folder.surface)
     meshes: list[str] = []
     try:
         for part, shape in zip(PARTS, parts, strict=True):
@@ -106,72 +106,12 @@ def check_root(scene: bpy.types.Scene, shot: Path) -> None:
 # ------------------------------------------------------------------------------------------------- the file
 
 
-@dataclass(frozen=True, eq=False)
-class Shape:
-    """What a mesh is filled with. Blender would take a second to find the edges of a large one."""
-
-    places: np.ndarray
-    """[V, 3] float32."""
-    colors: np.ndarray
-    """[V, 4] float32 in 0..1, as displayed."""
-    edges: np.ndarray
-    """[E, 2] int32, vertices of each edge."""
-    corners: np.ndarray
-    """[T, 3] int32, vertices of each triangle."""
-    sides: np.ndarray
-    """[T, 3] int32, edge of each triangle from each of its corners to the next."""
-
-
-def _in_thread(make: Callable[[], list[Shape]]) -> Generator[job_timer.Progress, None, list[Shape]]:
-    """What `make` returns or raises, made beside the window: it takes a second and needs no bpy."""
-    with ThreadPoolExecutor(1) as pool:
-        made = pool.submit(make)
-        while not made.done():
-            yield job_timer.Progress("Reading the surface", 0, 1)
-            if bpy.app.background:
-                break
-        return made.result()
-
-
-def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a take's surface, as the contract's fields say.
-
-    ValueError if it is no such file, is cut short, or has triangles without vertices.
-    """
-    with contract.open_regular(path, contract.LONGEST_CHECKPOINT) as handle:
-        header = contract.read_surface_header(handle, path)
-        of_vertices, of_triangles = (np.dtype(list(f)) for f in (contract.VERTEX_FIELDS, contract.TRIANGLE_FIELDS))
-        vertices = np.frombuffer(handle.read(header.vertices * of_vertices.itemsize), of_vertices)
-        triangles = np.frombuffer(handle.read(header.triangles * of_triangles.itemsize), of_triangles)
-    corners = _corners(triangles)
-    is_right = np.isin(triangles["corners"], 3).all() and (corners >= 0).all() and (corners < header.vertices).all()
-    if not is_right or not all(np.isfinite(vertices[axis]).all() for axis in "xyz"):
-        raise contract.UserError(f"{path} is damaged: make it again.")
-    return vertices, triangles
-
-
-def _corners(triangles: np.ndarray) -> np.ndarray:
-    """[T, 3] int32."""
-    return np.stack([triangles[name] for name in "abc"], axis=1)
-
-
-def _part(vertices: np.ndarray, triangles: np.ndarray, people: bool) -> Shape:
-    """One part of a surface."""
-    kept, flat = np.unique(_corners(triangles[(triangles["people"] > 0) == people]), return_inverse=True)
-    corners = flat.reshape(-1, 3).astype(np.int32)
-    chosen = vertices[kept]
-    colors = np.stack([chosen[name] for name in ("red", "green", "blue")], axis=1).astype(np.float32) / 255.0
-    places = np.stack([chosen[axis] for axis in "xyz"], axis=1)
-    ends = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2).astype(np.int64), axis=1)
-    count = max(len(kept), 1)
-    found, sides = np.unique(ends[:, 0] * count + ends[:, 1], return_inverse=True)
-    return Shape(
-        places,
-        np.concatenate([colors, np.ones((len(kept), 1), np.float32)], axis=1),
-        np.stack([found // count, found % count], axis=1).astype(np.int32),
-        corners,
-        sides.reshape(-1, 3).astype(np.int32),
-    )
+def _reading(path: Path) -> Generator[job_timer.Progress, None, list[Shape]]:
+    """The shapes of a surface, `PARTS`, read beside the window: it takes a second. ValueError if it is damaged."""
+    made = surface_shapes.begin(path)
+    while not made.done() and not bpy.app.background:
+        yield job_timer.Progress("Reading the surface", 0, 1)
+    return made.result()
 
 
 def _fill_points(mesh: bpy.types.Mesh, shape: Shape) -> None:
