@@ -54,10 +54,10 @@ def _quoted(name: str) -> str:
 
 def _shows(node: bpy.types.Node, path: Path, name: str) -> bool:
     """True of a Cryptomatte node that picks this matte from this sequence."""
-    told: Any = node
-    if node.bl_idname != "CompositorNodeCryptomatteV2" or told.image is None or told.source != "IMAGE":
+    picker: Any = node
+    if node.bl_idname != "CompositorNodeCryptomatteV2" or picker.image is None or picker.source != "IMAGE":
         return False
-    return paths.same(paths.absolute(told.image.filepath), str(path)) and bool(told.matte_id == _quoted(name))
+    return paths.same(paths.absolute(picker.image.filepath), str(path)) and bool(picker.matte_id == _quoted(name))
 
 
 class SPLANNEQUIN_OT_insert_matte(bpy.types.Operator):

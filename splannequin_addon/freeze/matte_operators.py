@@ -8,20 +8,13 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in, settings_of
-from ..process import backend, begin, job_timer
+from ..process import backend, begin
 from ..properties import StringProperty
 from ..scene import sequences
 from ..shot import selection
 from ..translations import tr
 from ..ui import step_operator
-from . import mattes
-
-
-def _has_take(context: bpy.types.Context) -> bool:
-    """True if the shot has the take that is chosen."""
-    folder = selection.shot_folder(scene_in(context))
-    state = job_timer.watch_of(folder).state if folder else None
-    return state is not None and settings_of(scene_in(context)).take_name in state.takes
+from . import mattes, takes
 
 
 class SPLANNEQUIN_OT_draw_matte(bpy.types.Operator):
@@ -34,7 +27,7 @@ class SPLANNEQUIN_OT_draw_matte(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a take."""
-        if not _has_take(context):
+        if not takes.has_chosen(context):
             cls.poll_message_set(tr("Freeze first"))
             return False
         return True
@@ -82,7 +75,7 @@ class SPLANNEQUIN_OT_matte_from_mask(step_operator.StepOperator, bpy.types.Opera
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a take, and while a step of this shot runs."""
-        if not _has_take(context):
+        if not takes.has_chosen(context):
             cls.poll_message_set(tr("Freeze first"))
             return False
         return super().poll(context)

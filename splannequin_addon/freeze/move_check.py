@@ -49,11 +49,11 @@ class Guesses:
         """Mean and worst, in words."""
         mean = sum(self.shares.values()) / len(self.shares)
         worst = max(self.shares, key=lambda frame: self.shares[frame])
-        told = [
+        sentences = [
             f"Seen from {self.camera}, about {_percent(mean)} % of the picture is a guess.",
             f"Most of it in frame {worst}: {_percent(self.shares[worst])} %.",
         ]
-        return " ".join(told)
+        return " ".join(sentences)
 
 
 def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_timer.Progress, None, Guesses]:

@@ -178,9 +178,7 @@ class SPLANNEQUIN_OT_add_splats(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a take."""
-        folder = selection.shot_folder(scene_in(context))
-        state = job_timer.watch_of(folder).state if folder else None
-        if state is None or settings_of(scene_in(context)).take_name not in state.takes:
+        if not takes.has_chosen(context):
             cls.poll_message_set(tr("Freeze first"))
             return False
         return True

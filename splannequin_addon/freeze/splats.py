@@ -18,7 +18,6 @@ from ...torch_backend import contract
 from .. import compat
 from ..access import named, present
 from ..process import job_timer
-from ..scene import session
 from ..scene.ownership import TAG
 from ..shot import inventory, placement, scene_objects
 
@@ -44,12 +43,16 @@ def add(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
 
 def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:
     """The same for the timer: part of the file, or one attribute, a turn. Keeps nothing of bpy between two turns."""
-    scene = _scene(scene_uid)
+    scene = scene_objects.needed_scene(scene_uid)
     facts = _facts(scene, shot, take)
     del scene
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
     option = compat.splat_import_option()
-    if option and folder.usd.is_file() and import_natively(_scene(scene_uid), shot, take, option, facts):
+    if (
+        option
+        and folder.usd.is_file()
+        and import_natively(scene_objects.needed_scene(scene_uid), shot, take, option, facts)
+    ):
         return
     columns = yield from reading(folder.ply)
     name = f"{scene_objects.name_of(shot)} {take} splats"
@@ -62,7 +65,7 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
             yield None
             mesh = present(named(bpy.data.meshes, called))  # an undo may have taken it away
             _set(mesh, *attribute)
-        scene = _scene(scene_uid)
+        scene = scene_objects.needed_scene(scene_uid)
         _facts(scene, shot, take)
     except BaseException:
         left = named(bpy.data.meshes, called)
@@ -84,20 +87,12 @@ def _done(take: str) -> str:
     return f"The splats of take {take} are in the scene, under the shot's root."
 
 
-def _scene(scene_uid: int) -> bpy.types.Scene:
-    scene = session.scene_of(scene_uid)
-    if scene is None:
-        raise contract.JobError("The scene is not there any more.", "", contract.ExitCode.USAGE)
-    return scene
-
-
 def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
     """take.json of a take whose splats can be added. JobError says what is missing."""
     facts = inventory.read(shot).takes.get(take)
     if facts is None or not contract.TakeFolder(contract.ShotFolder(shot).take(take)).ply.is_file():
         raise contract.JobError(f"Take {take} has no splats.", "Freeze first.", contract.ExitCode.USAGE)
-    if scene_objects.part(scene, shot, "root") is None:
-        raise contract.JobError("The solve is not in this scene.", "Load the camera first.", contract.ExitCode.USAGE)
+    scene_objects.check_root(scene, shot)
     return facts
 
 

@@ -7,10 +7,10 @@ import bpy
 from ...torch_backend import contract
 from ..access import Outcome, scene_in, settings_of
 from ..process import begin, job_timer
-from ..shot import selection
+from ..shot import scene_objects
 from ..translations import tr
 from ..ui import step_operator
-from . import surfaces
+from . import surfaces, takes
 
 
 class SPLANNEQUIN_OT_add_surface(step_operator.StepOperator, bpy.types.Operator):
@@ -25,9 +25,7 @@ class SPLANNEQUIN_OT_add_surface(step_operator.StepOperator, bpy.types.Operator)
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off without a take, and while a step of this shot runs."""
-        folder = selection.shot_folder(scene_in(context))
-        state = job_timer.watch_of(folder).state if folder else None
-        if state is None or settings_of(scene_in(context)).take_name not in state.takes:
+        if not takes.has_chosen(context):
             cls.poll_message_set(tr("Freeze first"))
             return False
         return super().poll(context)
@@ -36,7 +34,7 @@ class SPLANNEQUIN_OT_add_surface(step_operator.StepOperator, bpy.types.Operator)
         """Makes the surface if the take has none, and adds it; in a window the timer does both."""
         scene = scene_in(context)
         folder, take = begin.needed(scene, self.step), settings_of(scene).take_name
-        surfaces.check_root(scene, folder)
+        scene_objects.check_root(scene, folder)
         if not surfaces.is_made(folder, take):
             return super().perform(context)
         if bpy.app.background:

@@ -17,7 +17,6 @@ from mathutils import Matrix
 from ...torch_backend import contract
 from ..access import mesh_of, named, present
 from ..process import job_timer
-from ..scene import session
 from ..scene.ownership import TAG
 from ..shot import inventory, placement, scene_objects
 from . import surface_shapes
@@ -41,7 +40,7 @@ def add(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
 
 def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:
     """The same for the timer: reading the file, and each mesh, in turns. Keeps nothing of bpy between two turns."""
-    _facts(_scene(scene_uid), shot, take)
+    _facts(scene_objects.needed_scene(scene_uid), shot, take)
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
     parts = yield from _reading(folder.surface)
     meshes: list[str] = []
@@ -53,7 +52,7 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
             for fill in (_fill_points, _fill_edges, _fill_corners, _fill_faces, _fill_colors):
                 yield None
                 fill(present(named(bpy.data.meshes, meshes[-1])), shape)  # an undo may have taken it
-        scene = _scene(scene_uid)
+        scene = scene_objects.needed_scene(scene_uid)
         facts = _facts(scene, shot, take)
     except BaseException:
         for name in meshes:
@@ -81,26 +80,13 @@ def _done(take: str) -> str:
     return f"The surface of take {take} is in the scene, under the shot's root."
 
 
-def _scene(scene_uid: int) -> bpy.types.Scene:
-    scene = session.scene_of(scene_uid)
-    if scene is None:
-        raise contract.JobError("The scene is not there any more.", "", contract.ExitCode.USAGE)
-    return scene
-
-
 def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
     """take.json of a take whose surface can be added. JobError says what is missing."""
     facts = inventory.read(shot).takes.get(take)
     if facts is None or not is_made(shot, take):
         raise contract.JobError(f"Take {take} has no surface.", "Make it first.", contract.ExitCode.USAGE)
-    check_root(scene, shot)
+    scene_objects.check_root(scene, shot)
     return facts
-
-
-def check_root(scene: bpy.types.Scene, shot: Path) -> None:
-    """JobError if the shot does not stand in the scene."""
-    if scene_objects.part(scene, shot, "root") is None:
-        raise contract.JobError("The solve is not in this scene.", "Load the camera first.", contract.ExitCode.USAGE)
 
 
 # ------------------------------------------------------------------------------------------------- the file

@@ -14,7 +14,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import settings_of
+from ..access import scene_in, settings_of
 from ..process import backend, begin, job_timer, steps
 from ..scene import session
 from ..shot import inventory, seen_camera, selection
@@ -22,6 +22,14 @@ from . import own_camera
 
 READING_SECONDS = 0.02
 """Of a turn of the timer, spent on reading a camera; one frame of a heavy scene may take longer."""
+
+
+def has_chosen(context: bpy.types.Context) -> bool:
+    """True if the shot has the take that is chosen."""
+    scene = scene_in(context)
+    folder = selection.shot_folder(scene)
+    state = job_timer.watch_of(folder).state if folder else None
+    return state is not None and settings_of(scene).take_name in state.takes
 
 
 def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:

@@ -14,7 +14,7 @@ import bpy
 from ...torch_backend import contract
 from ..access import named, settings_of
 from ..properties import BoolProperty, CollectionProperty, FloatProperty, PointerProperty, StringProperty
-from ..scene import paths
+from ..scene import paths, session
 from ..scene.ownership import TAG
 
 PARTS = ("root", "camera", "points")
@@ -177,3 +177,17 @@ def depth_scale(scene: bpy.types.Scene, shot: Path, graph: bpy.types.Depsgraph |
 def is_plate(camera: bpy.types.Object) -> bool:
     """True of a camera that shows a clip until it is solved, whichever shot's."""
     return any(entry.plate == camera for scene in bpy.data.scenes for entry in settings_of(scene).made)
+
+
+def needed_scene(scene_uid: int) -> bpy.types.Scene:
+    """The scene of this number. JobError if it is gone."""
+    scene = session.scene_of(scene_uid)
+    if scene is None:
+        raise contract.JobError("The scene is not there any more.", "", contract.ExitCode.USAGE)
+    return scene
+
+
+def check_root(scene: bpy.types.Scene, shot: Path) -> None:
+    """JobError if the shot does not stand in the scene."""
+    if part(scene, shot, "root") is None:
+        raise contract.JobError("The solve is not in this scene.", "Load the camera first.", contract.ExitCode.USAGE)

@@ -157,7 +157,7 @@ def test_what_cannot_be_added_is_a_sentence(scene, shot, stood, addon, contract)
     assert not [m for m in bpy.data.meshes if m.name.endswith(("room", "people"))]
     addon("process.begin").remove_all(scene, shot)
     with pytest.raises(contract.JobError, match="not in this scene"):
-        addon("freeze.surfaces").check_root(scene, shot)
+        addon("shot.scene_objects").check_root(scene, shot)
 
 
 def test_the_button_has_it_made_and_brings_it_in(scene, addon, tmp_path):
