@@ -49,7 +49,10 @@ def parser() -> argparse.ArgumentParser:
         if name == "freeze":
             command.add_argument("clip", metavar="INPUT", help=INPUT[1])
         if name in ("test", "setup"):
-            command.add_argument("--bpy", choices=sorted(BPY_WHEELS), help="the bpy wheel (default: one that fits)")
+            command.add_argument(
+                "--bpy", choices=sorted(BPY_WHEELS), action="append", default=[],
+                help="the bpy wheel (default: one that fits); may be repeated",
+            )  # fmt: skip
         if name == "test":
             command.add_argument(
                 "--instructions", action="store_true",
@@ -167,7 +170,7 @@ def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
     if args.command == "freeze":
         return freeze(args.clip, output, rest)
     if args.command == "setup":
-        return setup([args.bpy] if args.bpy else [], args.tests, args.backend, output, args.wheels)
+        return setup(args.bpy, args.tests, args.backend, output, args.wheels)
     if args.command == "bench":
         return bench(rest, output)
     if args.command == "test":

@@ -153,8 +153,14 @@ def cores() -> int:
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
-def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> int:
-    """ruff, pyright, the backend's tests in .venv, the add-on's in one bpy wheel; closes with `N passed, N failed`."""
+def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -> int:
+    """Runs ruff, pyright, the backend's tests and the add-on's in a bpy wheel; closes with `N passed, N failed`.
+
+    Args:
+        pytest_args: pytest's; paths among them choose which tests run.
+        series: bpy wheels in which the add-on's tests run, and nothing else; none: all tests, in one that fits.
+        output: folder for summary, reports and logs.
+    """
     paths = [a for a in pytest_args if not a.startswith("-") and (ROOT / a.split("::")[0]).exists()]
     rest = [a for a in pytest_args if a not in paths]
     if not paths:
@@ -174,11 +180,13 @@ def run_tests(pytest_args: Sequence[str], series: str | None, output: Path) -> i
     if not pytest_args and not series:
         legs += checkers(backend.python)
     if addon_paths:
-        blender = set_up_wheel(series, True)[0] if series else get_blender(testing=True)[0]
-        if not blender.is_wheel:
-            raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
-        command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
-        legs.append(Leg(f"add-on in {blender.label}", command, output / "junit-addon.xml"))
+        blenders = [set_up_wheel(one, True)[0] for one in series] or [get_blender(testing=True)[0]]
+        for blender in blenders:
+            if not blender.is_wheel:
+                raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
+            command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
+            report = output / f"junit-{blender.label.replace(' ', '-')}.xml"
+            legs.append(Leg(f"add-on in {blender.label}", command, report))
     output.mkdir(parents=True, exist_ok=True)
     run_legs(legs, backend.python, output, min(AT_ONCE, cores()))
     return _close_tests(legs, output)

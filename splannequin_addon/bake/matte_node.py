@@ -9,7 +9,7 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import Outcome, library_of, scene_in, settings_of
+from ..access import Outcome, library_of, scene_in, settings_of, size_of
 from ..properties import StringProperty
 from ..scene import numbered, paths, sequences
 from ..shot import inventory
@@ -33,6 +33,7 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
     tree = compat.own_compositor_tree(scene)
     image = sequences.load_numbers(folder.cryptomatte(frames[0]), f"Mattes {take}")
     if image.source != "SEQUENCE":
+        size_of(image)  # reads it: Blender 4.2 picks nothing from a sequence whose first picture it has not read
         image.source = "SEQUENCE"
     if any(_shows(node, folder.cryptomatte(frames[0]), name) for node in tree.nodes):
         return [f"The node of the matte {name} is there already."]

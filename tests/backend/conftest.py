@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -191,6 +192,16 @@ def trained(tmp_path_factory):
     paint_motion(world)
     summary = train_shot(world.shot, TrainParams(iterations=900, holdout=8, max_gaussians=1500), Quiet())
     return world, summary
+
+
+@pytest.fixture(scope="module")
+def trained_copy(trained, tmp_path_factory) -> World:
+    """The trained world with a copy of its shot, which the tests of one file may change: its takes and instants are
+    not those that other files count on."""
+    world, _ = trained
+    root = tmp_path_factory.mktemp("copy") / world.shot.root.name
+    shutil.copytree(world.shot.root, root)
+    return replace(world, shot=Shot.open(root))
 
 
 @pytest.fixture(scope="session")

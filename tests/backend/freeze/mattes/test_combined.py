@@ -30,9 +30,9 @@ def covered(world, pose, t):
 
 
 @pytest.fixture(scope="module")
-def world(trained, quiet, tmp_path_factory):
+def world(trained_copy, quiet, tmp_path_factory):
     """The tiny world with a take at each instant, and the patch's matte in both."""
-    world, _ = trained
+    world = trained_copy
     for name, t_star in INSTANTS.items():
         asked = FreezeParams(take=name, t_star=t_star, first=FIRST, last=LAST, passes=True)
         freeze_shot(world.shot, asked, quiet())

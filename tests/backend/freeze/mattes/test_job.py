@@ -30,9 +30,9 @@ def outline(mask):
 
 
 @pytest.fixture
-def take(trained, quiet, tmp_path, request):
+def take(trained_copy, quiet, tmp_path, request):
     """(world, folder of a take of its own, writes a file of lassos)."""
-    world, _ = trained
+    world = trained_copy
     name = f"m{abs(hash(request.node.name)) % 10**9}"
     freeze_shot(world.shot, FreezeParams(take=name, t_star=T_STAR, first=104, last=112, detail="off"), quiet())
 

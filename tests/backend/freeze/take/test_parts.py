@@ -1,7 +1,6 @@
 """A take in parts: the same bytes as at once, whatever the order, twice, after a kill, and not from another run."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -11,18 +10,15 @@ import pytest
 
 from torch_backend.contract import FreezeParams, JobError
 from torch_backend.freeze import finish_take, freeze_part, freeze_shot, open_take
-from torch_backend.shot import Shot, write_json
+from torch_backend.shot import write_json
 
 ASK = dict(t_star=104, first=103, last=108, only_missing=True)
 
 
 @pytest.fixture(scope="module")
-def own(trained, quiet, tmp_path_factory):
+def own(trained_copy, quiet):
     """A copy of the trained shot, with a take that was made at once."""
-    world, _ = trained
-    root = tmp_path_factory.mktemp("parts") / "tiny.splannequin"
-    shutil.copytree(world.shot.root, root)
-    shot = Shot.open(root)
+    shot = trained_copy.shot
     freeze_shot(shot, FreezeParams(take="whole", **ASK), quiet())
     return shot
 
