@@ -6,6 +6,9 @@ Blender's factory startup file.
 
 import importlib
 import importlib.util
+import os
+import shutil
+import subprocess
 import sys
 import types
 from collections.abc import Callable, Iterator
@@ -92,6 +95,22 @@ def pictures() -> types.SimpleNamespace:
 @pytest.fixture
 def shot(tmp_path: Path) -> Path:
     return make_shot.make_shot(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def _frozen_world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    python = os.environ.get("SPLANNEQUIN_BACKEND_PYTHON")
+    if not python:
+        pytest.skip("no backend to train with: SPLANNEQUIN_BACKEND_PYTHON names its Python")
+    folder = tmp_path_factory.mktemp("frozen world")
+    subprocess.run([python, str(DATA / "make_matte_take.py"), str(ROOT), str(folder)], check=True, timeout=600)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def frozen_world(_frozen_world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with tiny.splannequin, trained and frozen at 105 by a real backend, and truth.json: a module's own."""
+    return Path(shutil.copytree(_frozen_world, tmp_path_factory.mktemp("world") / "frozen"))
 
 
 @pytest.fixture

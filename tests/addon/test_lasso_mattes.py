@@ -1,8 +1,6 @@
 """Mattes from a mask in Blender: its polygons, the backend's job, what the panel lists, the node that picks one."""
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -61,17 +59,11 @@ def test_polygons_are_what_blender_renders_of_a_mask(addon, shot, handle, size):
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory):
+def world(frozen_world):
     """A frozen take of the backend's tiny world: (shot folder, masks by frame, outline at frame 107)."""
-    python = os.environ.get("SPLANNEQUIN_BACKEND_PYTHON")
-    if not python:
-        pytest.skip("no backend to make mattes with: SPLANNEQUIN_BACKEND_PYTHON names its Python")
-    folder = tmp_path_factory.mktemp("world")
-    script = Path(__file__).parent / "data" / "make_matte_take.py"
-    subprocess.run([python, str(script), str(script.parents[3]), str(folder)], check=True, timeout=600)
-    told = json.loads((folder / "truth.json").read_text())
+    told = json.loads((frozen_world / "truth.json").read_text())
     masks = {int(frame): np.array(mask, bool) for frame, mask in told["masks"].items()}
-    return folder / "tiny.splannequin", masks, told["outline"]
+    return frozen_world / "tiny.splannequin", masks, told["outline"]
 
 
 @pytest.fixture

@@ -1,9 +1,6 @@
 """What a camera's pictures will lack, asked of a real backend before anything is frozen."""
 
-import os
 import shutil
-import subprocess
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -12,15 +9,9 @@ from mathutils import Matrix
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory):
+def world(frozen_world):
     """The backend's tiny world, trained."""
-    python = os.environ.get("SPLANNEQUIN_BACKEND_PYTHON")
-    if not python:
-        pytest.skip("no backend to ask: SPLANNEQUIN_BACKEND_PYTHON names its Python")
-    folder = tmp_path_factory.mktemp("world")
-    script = Path(__file__).parent / "data" / "make_matte_take.py"
-    subprocess.run([python, str(script), str(script.parents[3]), str(folder)], check=True, timeout=600)
-    return folder / "tiny.splannequin"
+    return frozen_world / "tiny.splannequin"
 
 
 @pytest.fixture

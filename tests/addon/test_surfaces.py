@@ -1,9 +1,7 @@
 """The surface of a take in Blender: where it stands, what it catches and hides in a render, undone, of two shots."""
 
 import json
-import os
 import shutil
-import subprocess
 from pathlib import Path
 
 import bpy
@@ -161,13 +159,8 @@ def test_what_cannot_be_added_is_a_sentence(scene, shot, stood, addon, contract)
         addon("shot.scene_objects").check_root(scene, shot)
 
 
-def test_the_button_has_it_made_and_brings_it_in(scene, addon, tmp_path):
-    python = os.environ.get("SPLANNEQUIN_BACKEND_PYTHON")
-    if not python:
-        pytest.skip("no backend to make a surface with: SPLANNEQUIN_BACKEND_PYTHON names its Python")
-    script = Path(__file__).parent / "data" / "make_matte_take.py"
-    subprocess.run([python, str(script), str(script.parents[3]), str(tmp_path)], check=True, timeout=600)
-    shot = tmp_path / "tiny.splannequin"
+def test_the_button_has_it_made_and_brings_it_in(scene, addon, frozen_world):
+    shot = frozen_world / "tiny.splannequin"
     scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), "freeze"
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
     addon("process.job_timer").refresh(addon("process.job_timer").watch_of(shot))
