@@ -197,7 +197,8 @@ def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source
                     "clip's own shows the plate.", "Use a take from the clip's own poses.", ExitCode.FREEZE,
                 )  # fmt: skip
             continue
-        for name in ("width", "height", "margin", "camera_path"):
+        placed = ("placement",) if base.facts.get("passes") else ()  # in which the layer Position is
+        for name in ("width", "height", "margin", "camera_path", *placed):
             if source.facts.get(name) != base.facts.get(name):
                 raise JobError(
                     f"Takes {base.name} and {source.name} differ in {name.replace('_', ' ')}.",

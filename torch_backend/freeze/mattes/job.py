@@ -120,6 +120,11 @@ def _opened(shot: Shot, name: str) -> _Take:
     facts = read_json(folder.facts)
     if not all(name in facts for name in ("run", "checkpoint", "width", "height", "query")):
         raise JobError(f"{folder.facts} is damaged.", "Freeze the take again.", ExitCode.FREEZE)
+    if "combined" in facts:  # a matte is carried by the frozen scene of one instant
+        raise JobError(
+            f"The take {name} is combined from others: its mattes would be those of one instant alone.",
+            "Make the mattes in the takes that it was combined from.", ExitCode.USAGE,
+        )  # fmt: skip
     return _Take(folder, facts, frames_of(folder))
 
 

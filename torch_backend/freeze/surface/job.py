@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...contract import (
+    LIVE_SOURCE,
     NO_DEPTH,
     TRIANGLE_FIELDS,
     VERTEX_FIELDS,
@@ -57,6 +58,12 @@ def make_surface(
             "Freeze a take at one instant, and make the surface of that.",
             ExitCode.USAGE,
         )
+    if _has_living(facts):
+        raise JobError(
+            f"Something lives on in the take {params.take!r}: it has no shape that holds for all frames.",
+            "Make the surface of the take that it was combined from.",
+            ExitCode.USAGE,
+        )
     key = file_digest(folder.facts)
     header = surface_of_take(folder)
     is_made = header is None
@@ -78,6 +85,13 @@ def make_surface(
         "people": people,
         "made": is_made,
     }
+
+
+def _has_living(facts: dict[str, Any]) -> bool:
+    """True of a combined take in which something goes on living."""
+    combined = facts.get("combined")
+    things = cast("dict[str, Any]", combined).get("things") if isinstance(combined, dict) else None
+    return isinstance(things, dict) and LIVE_SOURCE in cast("dict[str, Any]", things).values()
 
 
 def _fused(folder: TakeFolder, config: SurfaceConfig, report: Reporter) -> Surface:

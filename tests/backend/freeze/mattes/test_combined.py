@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.contract import CombineParams, FreezeParams, JobError, MatteParams, TakeFolder
+from torch_backend.contract import CombineParams, FreezeParams, JobError, MatteParams, SurfaceParams, TakeFolder
 from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.mattes.combined import combine, combined, grown, with_motion
 from torch_backend.freeze.mattes.job import make_mattes
+from torch_backend.freeze.surface.job import make_surface
 from torch_backend.raster import rasterize
 
 FIRST, LAST = 104, 111
@@ -118,6 +119,11 @@ def test_what_cannot_be_combined_is_said(world, quiet):
     combine(world.shot, CombineParams(take="mine", base="early", things="patch=late"), quiet())
     with pytest.raises(JobError, match="combined from others"):
         freeze_shot(world.shot, FreezeParams(take="mine", t_star=105, first=FIRST, last=LAST), quiet())
+    with pytest.raises(JobError, match="combined from others"):
+        make_mattes(world.shot, MatteParams(take="mine"), quiet())
+    combine(world.shot, CombineParams(take="mine", base="early", things="patch=live"), quiet())
+    with pytest.raises(JobError, match="lives on"):
+        make_surface(world.shot, SurfaceParams(take="mine"), quiet())
     freeze_shot(world.shot, FreezeParams(take="wide", t_star=105, first=FIRST, last=LAST, width=128), quiet())
     refused("has no matte", base="wide")
 
