@@ -478,8 +478,8 @@ def over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
 
 
 def in_front(cg: float | np.ndarray, frozen: np.ndarray) -> np.ndarray:
-    """[H, W, 1]: 1 for CG up to the frozen depth, 0 from a hundredth of it behind."""
-    t = np.clip(1.0 - (cg / frozen - 1.0) / 0.01, 0.0, 1.0)
+    """[H, W, 1]: 1 for CG up to half a hundredth of the frozen depth behind it, 0 from a hundredth more."""
+    t = np.clip(1.0 - (cg / frozen - 1.005) / 0.01, 0.0, 1.0)
     return (t * t * (3.0 - 2.0 * t))[..., None]
 
 
@@ -565,7 +565,7 @@ def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, sce
     found = pictures.read(tmp_path / "out" / "000006.png")
     depth = make_depth(6)
     green = (found[..., 1] > 0.99) & (found[..., 0] < 0.01)
-    sure = np.abs(depth - 12.0) > 0.05
+    sure = np.abs(depth - 12.0) > 0.2  # where it is in front or behind wholly
     assert (green == (depth > 12.0))[sure & (np.arange(16) > 0)[None, :]].all()
     assert 10 < green.sum() < 150
     addon("process.begin").remove_all(scene, shot)

@@ -9,7 +9,6 @@ things stand, is taken from the take's own depth.
 """
 
 import argparse
-import os
 import importlib.util
 import sys
 import tempfile
@@ -26,7 +25,7 @@ _SPEC.loader.exec_module(cube)
 cube.TAKE, cube.FRAME = "among", 50
 DESK = ((0.33, 0.73), (0.60, 0.735), (0.42, 0.685), (0.55, 0.70))
 """Places on the desk, 0 to 1 from the upper left of frame 50."""
-SUZANNE, BEHIND, BALL = (0.475, 0.735), (0.255, 0.70), (0.625, 0.735)
+SUZANNE, BEHIND, BALL = (0.475, 0.735), (0.285, 0.715), (0.625, 0.735)
 """Where on the desk the three stand: between the men, behind the left man's hand, before the right man's keyboard."""
 TALL, SMALL, ROUND = 0.13, 0.11, 0.09
 """How large they are to be seen, in shares of the frame's width."""
@@ -72,7 +71,7 @@ def material_of(name: str, colour: tuple[float, ...], metal: float, rough: float
     return material
 
 
-def put(eye: Eye) -> dict[str, bpy.types.Object]:
+def put(eye: Eye) -> None:
     """Suzannes and ball on the desk, and a lamp."""
     scene = bpy.context.scene
     middle, up = plane_of([eye.at(place) for place in DESK], eye.place)
@@ -83,13 +82,12 @@ def put(eye: Eye) -> dict[str, bpy.types.Object]:
 
     front = (eye.place - middle).normalized()
     front = (front - up * front.dot(up)).normalized()
-    turn = Matrix((up.cross(-front), -front, up)).transposed()  # Suzanne looks along her -Y
-    made = {}
+    turn = Matrix((up.cross(front), -front, up)).transposed()  # Suzanne looks along her -Y
     for name, place, share, colour in (
         ("Suzanne", SUZANNE, TALL, (0.8, 0.25, 0.05)), ("Behind", BEHIND, SMALL, (0.05, 0.35, 0.7)),
     ):  # fmt: skip
         bpy.ops.mesh.primitive_monkey_add(size=1.0)
-        monkey = made[name] = bpy.context.object
+        monkey = bpy.context.object
         where = on_desk(place)
         wide = eye.size(where, share)
         middle_of = where + up * 0.36 * wide
@@ -99,7 +97,7 @@ def put(eye: Eye) -> dict[str, bpy.types.Object]:
     where = on_desk(BALL)
     radius = 0.5 * eye.size(where, ROUND)
     bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32, radius=radius, location=where + up * radius)
-    ball = made["Ball"] = bpy.context.object
+    ball = bpy.context.object
     ball.data.materials.append(material_of("Chrome", (0.9, 0.9, 0.9), 1.0, 0.02))
     bpy.ops.object.shade_smooth()
     lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "SUN"))
@@ -112,10 +110,29 @@ def put(eye: Eye) -> dict[str, bpy.types.Object]:
         scene.world.use_nodes = True
     sky = next((n for n in scene.world.node_tree.nodes if n.bl_idname == "ShaderNodeBackground"), None)
     if sky is not None:
-        sky.inputs["Color"].default_value, sky.inputs["Strength"].default_value = (0.9, 0.95, 1.0, 1.0), 0.6
+        sky.inputs["Color"].default_value, sky.inputs["Strength"].default_value = (0.9, 0.95, 1.0, 1.0), 0.4
     scene.render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.device, scene.cycles.seed = 64, False, "CPU", 0
-    return made
+
+
+def check(picture: np.ndarray, frozen: np.ndarray, cg: np.ndarray) -> str:
+    """How many pixels of CG and its shadows are as Cycles made them over the frozen frame, where no man is near."""
+    covered = cg[..., 3] > 0.01
+    covered[:, : int(0.36 * covered.shape[1])] = covered[:, int(0.72 * covered.shape[1]) :] = False
+    over = cg[..., :3] + (1.0 - cg[..., 3:]) * frozen[..., :3]
+    off = np.abs(display(picture[..., :3]) - display(over)).max(-1)
+    assert covered.sum() > 2000, f"things should be seen, {covered.sum()} pixels of them are"
+    solid, rims = covered & (cg[..., 3] >= 0.99), covered & (cg[..., 3] < 0.99)
+    parts = {"solid": solid, "rims and shadows": rims}
+    return ", ".join(
+        f"{n}: {of.sum()} px, {100 * (off[of] <= 1).mean():.1f} % within 1 of 255" for n, of in parts.items()
+    )
+
+
+def display(linear: np.ndarray) -> np.ndarray:
+    """8-bit sRGB of scene-linear values, not rounded."""
+    linear = np.clip(linear, 0.0, 1.0)
+    return 255.0 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def main() -> None:
@@ -141,12 +158,10 @@ def main() -> None:
         if not surfaces.is_made(shot, cube.TAKE):
             cube.add_on("process.begin").run(scene, "freeze", contract.SurfaceParams(take=cube.TAKE))
         print(*surfaces.add(scene, shot, cube.TAKE), sep="\n")
-        things = put(Eye(depth))
+        put(Eye(depth))
         picture = cube.see(group.outputs["Image"], folder, "picture")
         cg = cube.see(layers.outputs["Image"], folder, "cg")
-        far = cube.see(layers.outputs["Depth"], folder, "far")[..., 0]
-        np.savez(os.environ["AMONG"], depth=depth, frozen=frozen, picture=picture, cg=cg, far=far)
-        print({name: tuple(round(x, 2) for x in thing.location) for name, thing in things.items()})
+        print(check(picture, frozen, cg))
         cube.keep(args.output, folder)
 
 
