@@ -180,7 +180,8 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
         Path(params.debug_terms) if params.debug_terms else None, _start(shot),
     )  # fmt: skip
     keys = {f.frame: spec.key(f) for f in whole}
-    key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()), 0.0 if spec.blur is None else params.shutter)
+    shutter = 0.0 if spec.blur is None else params.shutter
+    key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()), shutter)
     return PlannedTake(folder, scene, t_star, whole, spec, keys, key)
 
 
