@@ -63,7 +63,7 @@ def moves(trained_copy):
 
 @pytest.mark.parametrize("detail", ["on", "off"])
 def test_a_blurred_frame_is_the_mean_of_many(trained_copy, moves, tmp_path, quiet, detail):
-    shot, ask = trained_copy.shot, dict(ASK, width=64, detail=detail)
+    shot, ask = trained_copy.shot, dict(ASK, width=64, detail=detail, grain=True)
     path = save_path(tmp_path / "path.json", moves)
     facts = freeze_shot(shot, FreezeParams(take=f"blur {detail}", camera_path=path, shutter=180.0, **ask), quiet())
     freeze_shot(shot, FreezeParams(take=f"sharp {detail}", camera_path=path, **ask), quiet())
@@ -79,6 +79,11 @@ def test_a_blurred_frame_is_the_mean_of_many(trained_copy, moves, tmp_path, quie
     assert facts["shutter"] == 180.0 and "warp_dir" not in facts
     for name in ("depth", "support", "motion"):
         np.testing.assert_array_equal(getattr(blurred, name), getattr(sharp, name))
+    if detail == "on":
+        plates = sharp.detail.plate > 0.5
+        assert plates.mean() > 0.3
+        kept, drawn = (np.abs(each.grain[plates]).mean() for each in (sharp, blurred))
+        assert drawn > 1.5 * kept, "what the mean took from the plates' grain is drawn"
 
 
 def test_a_camera_that_stands_gives_the_frame_without_blur(trained_copy, moves, tmp_path, quiet):
