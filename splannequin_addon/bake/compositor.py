@@ -95,6 +95,7 @@ def insert(
         freeze_group.set_defaults(node, freeze_group.give_sockets(present(node.node_tree)))
         changes.append(f'The node group "{GROUP_NAME}" was updated.')
     changes += freeze_group.switch_warp(node, wanted, flow is not None)
+    changes += freeze_group.give_passes(node, _layers_of(frozen, take))
     group_inside.fill(scene, node, take, frozen, flow)
     changes += freeze_group.lacking(node)
     if stream is not None:
@@ -136,16 +137,22 @@ def _warp_image(take: Take) -> bpy.types.Image | None:
 
 def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bpy.types.Image:
     """A sequence of the take, once it is known to have some layers. ValueError if not."""
+    there = _layers_of(image, take)
+    missing = [n for n in names if n not in there]
+    if missing:
+        raise contract.UserError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
+    return image
+
+
+def _layers_of(image: bpy.types.Image, take: Take) -> set[str]:
+    """Names of the layers that an Image node shows of a sequence of the take."""
     group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
     try:
         node = group.nodes.new("CompositorNodeImage")
         sequences.show_sequence(node, image, take.first, take.last)
-        missing = [n for n in names if n not in node.outputs]
+        return set(present(node.outputs).keys())
     finally:
         bpy.data.node_groups.remove(group)
-    if missing:
-        raise contract.UserError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
-    return image
 
 
 def may_combine_cg(scene: bpy.types.Scene) -> bpy.types.CompositorNodeGroup:

@@ -7,10 +7,11 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...torch_backend import contract
 from .. import compat
 from ..access import pixels_of, set_value
 from ..scene.ownership import TAG
-from .node_names import GAP, GRAIN
+from .node_names import GAP
 
 
 def across(group: bpy.types.NodeTree) -> bpy.types.NodeSocket:
@@ -37,6 +38,8 @@ def across(group: bpy.types.NodeTree) -> bpy.types.NodeSocket:
 
 RAMP = "Splannequin Ramp"
 _STEPS, _ROWS = 1024, 32
+_WIDE = {layer.name for layer in contract.FRAME_LAYERS if len(layer.channels) > 1}
+"""Layers that have more than one number in a pixel."""
 _BEYOND = 1.1
 """How much larger than the frame the ramp is shown."""
 
@@ -94,7 +97,7 @@ def fitted(
         if not name:
             coverage = node.outputs[0]
         else:
-            sockets[name] = _unfaded(group, node.outputs[0], coverage, name in ("Combined", GRAIN))
+            sockets[name] = _unfaded(group, node.outputs[0], coverage, name in _WIDE)
     return sockets
 
 

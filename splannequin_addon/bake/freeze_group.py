@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Set
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +122,8 @@ _LOOKS = (
     (INVENTED, 0.0, "1: what splats made up is tinted, what comes from a plate is not"),
 )
 """Factors of what only takes with detail can show."""
-_OUT = tuple((layer.output, layer.socket, layer.tip) for layer in contract.FRAME_LAYERS if layer.output)
+_OUT = tuple(layer for layer in contract.FRAME_LAYERS if layer.output and layer.part != "passes")
+_PASSES = tuple(layer for layer in contract.layers_of("passes") if layer.output)
 
 
 def _factor(socket: Any, value: float) -> None:
@@ -155,9 +157,28 @@ def give_sockets(group: bpy.types.NodeTree) -> set[str]:
     far = new("CG Depth", "INPUT", "NodeSocketFloat", "Depth pass of the rendered objects")
     if far is not None:
         far.default_value = contract.NO_DEPTH
-    for name, kind, text in _OUT:
-        new(name, "OUTPUT", kind, text)
+    for layer in _OUT:
+        new(layer.output, "OUTPUT", layer.socket, layer.tip)
     return given
+
+
+def give_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[str]:
+    """Gives our node the outputs of the passes among a take's layers, and takes away those of passes it lacks.
+
+    An output that leads somewhere stays without its pass. Returns a sentence for each of these.
+    """
+    group, said = present(node.node_tree), list[str]()
+    there = {i.name: i for i in compat.sockets_of(group) if i.in_out == "OUTPUT"}
+    for layer in _PASSES:
+        name = layer.output
+        if layer.name in layers:
+            if name not in there:
+                compat.new_socket(group, name, "OUTPUT", layer.socket, layer.tip)
+        elif name in there and node.outputs[name].is_linked:
+            said.append(f"The take has no {name}, which your compositor uses: freeze it again with Passes.")
+        elif name in there:
+            present(group.interface).remove(there[name])
+    return said
 
 
 def set_defaults(node: bpy.types.CompositorNodeGroup, names: set[str]) -> None:

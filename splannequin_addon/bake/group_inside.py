@@ -49,8 +49,9 @@ def fill(
         layers["Combined"] = _warped(group, enter, layers["Combined"], warp, take)
     if "Plate" in layers:
         layers["Combined"] = _looked_at(group, enter, layers)
-    for name in ("Splat", "DepthSigma", *(layer.name for layer in contract.layers_of("passes"))):
-        layers.pop(name, None)  # nothing behind this reads them
+    for layer in contract.FRAME_LAYERS:
+        if not layer.output and layer.name != GRAIN:
+            layers.pop(layer.name, None)  # nothing behind this reads it
     fitted = fitting.fitted(scene, group, take.size, take.margin, layers)
     share = _share(group, enter, fitted)
     nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0])

@@ -56,16 +56,16 @@ def read_ahead(scene: bpy.types.Scene, shot: Path, take: str) -> Iterator[None]:
 def _need_warp(shot: Path, take: Take) -> None:
     """JobError if a take cannot freeze a plate that shows frame n at frame n."""
     name = take.folder.name
-    if not any(take.plate_size):
-        raise contract.JobError(
-            f"The take {name!r} has no warp: it was frozen without detail.",
-            "Freeze it again with detail.",
-            contract.ExitCode.BAKE,
-        )
     if inventory.read(shot).takes.get(name, {}).get("camera_path"):
         raise contract.JobError(
             f"The take {name!r} is seen from a camera of your own: its warp looks into other frames of the plate.",
             "Use its frozen frames, or freeze a take on the clip's own camera.",
+            contract.ExitCode.BAKE,
+        )
+    if not any(take.plate_size):
+        raise contract.JobError(
+            f"The take {name!r} has no warp: it was frozen without detail.",
+            "Freeze it again with detail.",
             contract.ExitCode.BAKE,
         )
 

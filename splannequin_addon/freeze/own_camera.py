@@ -57,6 +57,13 @@ def name_of(scene: bpy.types.Scene) -> str:
     return str(camera.name)
 
 
+def shutter_of(scene: bpy.types.Scene) -> float:
+    """Degrees of 360 that the shutter of the artist's camera is open, as the scene renders; 0 without motion blur."""
+    if not settings_of(scene).motion_blur or not name_of(scene):
+        return 0.0
+    return min(360.0 * scene.render.motion_blur_shutter, 360.0)
+
+
 def follows_camera(scene: bpy.types.Scene) -> bool:
     """True if a bake has to look at the artist's camera again: the take was seen from one, and one is chosen."""
     folder = selection.shot_folder(scene)

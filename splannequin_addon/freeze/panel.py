@@ -139,6 +139,11 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
         for name in ("smooth", "retime", "hold", "orbit"):
             grid.operator(f"splannequin.move_{name}", icon=icons.of(f"splannequin.move_{name}"))
         if props.path_camera is not None:
+            row = layout.row()
+            row.prop(props, "motion_blur")
+            shutter = row.row()
+            shutter.active = props.motion_blur
+            shutter.prop(scene_in(context).render, "motion_blur_shutter")
             layout.operator("splannequin.check_move", icon=icons.of("splannequin.check_move"))
         if props.path_camera is not None and present(camera_of(props.path_camera).dof).use_dof:
             wrap(

@@ -62,6 +62,13 @@ class FreezeSettings:
         poll=lambda _, item: getattr(item, "type", "") == "CAMERA",
         options=set(),
     )
+    motion_blur = BoolProperty(
+        name="Motion Blur",
+        description="Blur the frames by the move of your camera, with the shutter of the scene's render settings. A "
+        "frame takes as many times as long as its blur is pixels long, 33 times at most",
+        default=False,
+        options=set(),
+    )
     detail = BoolProperty(
         **contract.panel(contract.FreezeParams, "detail"),
         options=set(),

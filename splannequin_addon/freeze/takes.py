@@ -45,6 +45,7 @@ def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
         detail="on" if props.detail else "off",
         develop="on" if props.develop else "off",
         passes=props.passes,
+        shutter=own_camera.shutter_of(scene),
         only_missing=True,
         device=backend.device(),
     )
@@ -114,6 +115,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         detail="on" if facts.get("detail") else "off",
         develop="on" if facts.get("developed") is not None else "off",
         passes=bool(facts.get("passes")),
+        shutter=float(facts.get("shutter", 0.0)),
     )
 
 
@@ -137,6 +139,8 @@ def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
         return f"Its t* is frame {take['t_star_frame']}, now frame {asked.t_star} is chosen."
     if abs(take["overscan"] - asked.overscan) > 1e-6:
         return "Its overscan is not the one chosen now."
+    if abs(take["shutter"] - asked.shutter) > 1e-3:
+        return "Its motion blur is not the one chosen now."
     lacking = 0 if camera else take["frames_in_all"] - take["frame_count"]
     return f"{lacking} of its {take['frames_in_all']} frames are not rendered yet." if lacking > 0 else ""
 

@@ -283,6 +283,7 @@ class _Take:
     margin: list[Any] = field(default_factory=lambda: [0, 0])
     camera_path: str = ""
     overscan: float = 0.0
+    shutter: float = 0.0
     frames_in_all: int = 0
     """Frames that the take can have; 0 of a take from before this was noted."""
     t_star_asked: int | None = None

@@ -322,6 +322,37 @@ def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
     assert addon("freeze.own_camera").name_of(scene) == "", "the clip's own camera is the clip's own move"
 
 
+def test_motion_blur_takes_the_scenes_shutter_and_only_on_a_camera_of_the_artists(addon, contract, scene, shot):
+    scene.splannequin.shot_path = str(shot)
+    scene.splannequin.set_up_scene = True
+    addon("solve.arrival").load_camera(scene, shot)
+    own = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    scene.collection.objects.link(own)
+    takes, props = addon("freeze.takes"), scene.splannequin
+    props.path_camera, scene.render.motion_blur_shutter = own, 0.25
+    assert takes.params_of(scene).shutter == 0.0, "unless it is asked for"
+    props.motion_blur = True
+    scene.frame_start, scene.frame_end = 5, 7
+    path = run_out(addon("freeze.own_camera").sample_path(scene, "mine", shot, 0))
+    asked = takes.freeze_from(scene, path)
+    assert asked.shutter == pytest.approx(90.0)
+    contract.check_params(asked)
+    scene.render.motion_blur_shutter = 3.0
+    contract.check_params(takes.params_of(scene))
+    assert takes.params_of(scene).shutter == 360.0
+    file = shot / "takes" / "freeze" / "take.json"
+    told = json.loads(file.read_text()) | {"camera_path": asked.camera_path, "shutter": 360.0}
+    file.write_text(json.dumps(told))
+    assert takes.take_params(shot, "freeze").shutter == 360.0
+    take = addon("shot.inventory").read(shot).takes["freeze"]
+    props.run_name = take["run"]
+    assert "motion blur" not in takes.outdated(scene, take)
+    scene.render.motion_blur_shutter = 0.5
+    assert takes.outdated(scene, take) == "Its motion blur is not the one chosen now."
+    props.path_camera = scene.camera
+    assert takes.params_of(scene).shutter == 0.0, "the clip's own path has its plates' blur"
+
+
 @pytest.fixture
 def moving(scene, shot):
     """The scene, with a camera that moves over frames 1 to 5, and the timer's watch of its shot."""

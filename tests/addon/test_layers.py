@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.addon.data import make_detail as made
+from tests.addon.data import make_frames as frames
 
 DATA = Path(__file__).resolve().parent / "data"
 SIZE = made.WIDTH, made.HEIGHT
@@ -200,6 +201,54 @@ def test_what_is_invented_is_tinted_and_the_rest_is_not(addon, scene, detailed, 
     assert relative(found[..., :3], expected) < 1e-3
     third = np.s_[:, : made.WIDTH // 3]
     assert relative(found[third][..., :3], half[third]) < 1e-3, "not tinted"
+
+
+@pytest.fixture
+def with_passes(shot):
+    """The shot, with a take `passes` of one frame."""
+    folder = shot / "takes" / "passes"
+    shutil.copytree(DATA / "passes", folder)
+    facts = {"version": 1, "take": "passes", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 1}
+    facts |= {"width": frames.WIDTH, "height": frames.HEIGHT, "first": 6, "last": 6, "passes": True}
+    (folder / "take.json").write_text(json.dumps(facts))
+    return shot
+
+
+def test_passes_leave_the_group_as_they_are_in_the_file(addon, scene, with_passes, tmp_path):
+    compat, size = addon("compat"), (frames.WIDTH, frames.HEIGHT)
+    scene.render.resolution_x, scene.render.resolution_y = size
+    addon("bake.insertion").insert_freeze(scene, with_passes, "passes")
+    tree = compat.compositor_tree(scene)
+    node = node_of(addon, scene)
+    assert not {"forward", "backward", "Splat"} & set(node.outputs.keys())
+    for name in ("Vector", "Normal", "Position"):
+        tree.links.new(node.outputs[name], compat.output_socket(tree))
+        wanted = frames.passes(6)[name]
+        np.testing.assert_array_equal(render(scene, tmp_path, 6, size)[..., : wanted.shape[2]], wanted)
+    tree.links.new(node.outputs["Image"], compat.output_socket(tree))
+    np.testing.assert_array_equal(render(scene, tmp_path, 6, size)[..., :3], frames.layers(6)["rgba"][..., :3])
+
+
+def test_outputs_of_passes_come_and_go_with_the_take_and_links_stay(addon, scene, with_passes):
+    compat, insert = addon("compat"), addon("bake.insertion").insert_freeze
+    passes = {"Vector", "Normal", "Position"}
+    insert(scene, with_passes, "freeze")
+    tree, node = compat.compositor_tree(scene), node_of(addon, scene)
+    assert not passes & set(node.outputs.keys())
+    viewer = tree.nodes.new("CompositorNodeViewer")
+    tree.links.new(node.outputs["Depth"], viewer.inputs[0])
+
+    def led():
+        return viewer.inputs[0].links[0].from_socket.name
+
+    insert(scene, with_passes, "passes")
+    assert passes <= set(node.outputs.keys()) and led() == "Depth"
+    tree.links.new(node.outputs["Vector"], viewer.inputs[0])
+    said = insert(scene, with_passes, "freeze")
+    assert passes & set(node.outputs.keys()) == {"Vector"} and led() == "Vector"
+    assert any("has no Vector" in line for line in said)
+    insert(scene, with_passes, "passes")
+    assert passes <= set(node.outputs.keys()) and led() == "Vector"
 
 
 @pytest.mark.parametrize("output", ["Plate", "Source"])

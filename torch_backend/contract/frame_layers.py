@@ -26,7 +26,7 @@ class FrameLayer:
     """Empty: every frame has it; grain, detail: those frames that were made with it. A name of its own: those whose
     writer was handed it as `more`; it goes by this row alone."""
     output: str = ""
-    """Output of the compositor group that gives it; empty: none does."""
+    """Output of the compositor group that gives it; empty: none does. Of passes only where a take has them."""
     tip: str = ""
     """Tooltip of that output."""
     socket: str = "NodeSocketFloat"
@@ -127,7 +127,27 @@ FRAME_LAYERS = (
         "half",
         "Vector.X Y Z W",
         "motion by the camera's move in pixels, y up, as Blender's Vector pass: from here to the frame before in X Y, "
-        "from the frame after to here in Z W; with `--passes`, like the next two",
+        "from the frame after to here in Z W; with `--passes`, like the next four",
+        part="passes",
+        output="Vector",
+        tip="Motion by the camera's move in pixels of the frozen frames, for the node Vector Blur",
+        socket="NodeSocketColor",  # keeps all four numbers in 4.2 to 5.2
+    ),
+    # Nuke's names. Blender has Vector: 4.2 and 5.2 show sockets of two channels, and no values of theirs.
+    FrameLayer(
+        "forward",
+        ("forward.u", "forward.v"),
+        "half",
+        "forward.u v",
+        "the same move as Nuke's built-in layer has it, in pixels, y up: from here to the frame after",
+        part="passes",
+    ),
+    FrameLayer(
+        "backward",
+        ("backward.u", "backward.v"),
+        "half",
+        "backward.u v",
+        "from here to the frame before, as Nuke's built-in layer",
         part="passes",
     ),
     FrameLayer(
@@ -137,6 +157,9 @@ FRAME_LAYERS = (
         "Normal.X Y Z",
         "direction that the surface faces, in the scene's axes",
         part="passes",
+        output="Normal",
+        tip="Direction that the surface faces, in the scene's axes",
+        socket="NodeSocketVector",
     ),
     FrameLayer(
         "Position",
@@ -145,6 +168,9 @@ FRAME_LAYERS = (
         "Position.X Y Z",
         "place of the surface in the scene's axes and units, as the shot stood there when it was frozen",
         part="passes",
+        output="Position",
+        tip="Place of the surface in the scene's axes and units",
+        socket="NodeSocketVector",
     ),
 )
 """In the order of the file."""

@@ -624,6 +624,15 @@ class FreezeParams:
         "layers of the frames, in the scene's axes and units",
     )
     """Write the layers of `FRAME_LAYERS` whose part is passes."""
+    shutter: float = option(
+        0.0,
+        flag="--shutter",
+        metavar="DEGREES",
+        help="motion blur by the move of a camera path of your own: degrees of 360 that the shutter is open, as a film "
+        "camera's 180; a frame takes as many times as long as its blur is pixels long, 33 times at most",
+        limit=Limit("shutter in degrees", 0, 360),
+    )
+    """Motion blur by the move of `camera_path`, degrees of 360 that the shutter is open around each frame; 0: none."""
     debug_terms: str = option(
         "",
         flag="--debug-terms",

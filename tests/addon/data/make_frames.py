@@ -1,5 +1,5 @@
 """The frozen frames of the add-on's tests: three files of 16 x 12 pixels whose every value can be computed again, and
-in overscan/ one whose frame is the 12 x 10 pixels in the middle.
+in overscan/ one whose frame is the 12 x 10 pixels in the middle, and in passes/ one with motion, normals and positions.
 
     python tests/addon/data/make_frames.py      (with the backend's Python: it uses the backend's own EXR writer)
 
@@ -32,6 +32,17 @@ def layers(frame: int) -> dict[str, np.ndarray]:
     }
 
 
+def passes(frame: int) -> dict[str, np.ndarray]:
+    """Passes by layer, [H, W, C] float32, top row first; positions are none of a half float."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    vector = np.stack([x - 8.0, y - 4.0, frame - x / 2.0, y / 4.0 - 2.0], axis=2)
+    normal = np.stack([(x % 5) / 4.0 - 0.5, (y % 5) / 4.0 - 0.5, (x + y) % 3 - 1.0], axis=2)
+    position = np.stack([1000.0 + x / 16.0, y - 2000.0, (x * y) / 8.0 - 3.0], axis=2)
+    made = {"Vector": vector, "forward": -vector[..., 2:], "backward": vector[..., :2]}
+    made |= {"Normal": normal, "Position": position}
+    return {name: layer.astype(np.float32) for name, layer in made.items()}
+
+
 def main() -> None:
     """Writes the files beside this one."""
     from torch_backend.freeze.exr import FrameMetadata, write_frozen_exr
@@ -46,6 +57,10 @@ def main() -> None:
             over = path.parent / "overscan" / path.name
             over.parent.mkdir(exist_ok=True)
             write_frozen_exr(over, data["rgba"], data["depth"], data["support"], data["motion"], about, MARGIN)
+            more = path.parent / "passes" / path.name
+            more.parent.mkdir(exist_ok=True)
+            found = [data[name] for name in ("rgba", "depth", "support", "motion")]
+            write_frozen_exr(more, *found, about, more=passes(frame))
 
 
 if __name__ == "__main__":

@@ -124,9 +124,7 @@ def check(picture: np.ndarray, frozen: np.ndarray, cg: np.ndarray) -> str:
     assert covered.sum() > 2000, f"things should be seen, {covered.sum()} pixels of them are"
     solid, rims = covered & (cg[..., 3] >= 0.99), covered & (cg[..., 3] < 0.99)
     parts = {"solid": solid, "rims and shadows": rims}
-    return ", ".join(
-        f"{n}: {of.sum()} px, {100 * (off[of] <= 1).mean():.1f} % within 1 of 255" for n, of in parts.items()
-    )
+    return ", ".join(f"{n}: {of.sum()} px, {100 * (off[of] <= 1).mean():.1f} % within 1" for n, of in parts.items())
 
 
 def display(linear: np.ndarray) -> np.ndarray:

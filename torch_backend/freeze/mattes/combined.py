@@ -198,11 +198,11 @@ def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source
                 )  # fmt: skip
             continue
         placed = ("placement",) if base.facts.get("passes") else ()  # in which the layer Position is
-        for name in ("width", "height", "margin", "camera_path", *placed):
-            if source.facts.get(name) != base.facts.get(name):
+        for name in ("width", "height", "margin", "camera_path", "shutter", *placed):
+            if (source.facts.get(name) or 0) != (base.facts.get(name) or 0):
                 raise JobError(
                     f"Takes {base.name} and {source.name} differ in {name.replace('_', ' ')}.",
-                    "Freeze both with the same size, overscan and camera.", ExitCode.FREEZE,
+                    "Freeze both with the same size, overscan, camera and motion blur.", ExitCode.FREEZE,
                 )  # fmt: skip
         frames &= set(frames_of(source.folder))
     if not frames:

@@ -46,7 +46,7 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
 
     One that is not asked for now is among them: a part of the range does not undo the rest of the take.
     """
-    folder, with_warps = take.folder, take.spec.detail is not None
+    folder, with_warps = take.folder, take.spec.has_warps
     make_folders(folder, with_warps)
     keys = stored_keys(folder, with_warps) if params.only_missing else {}
     here, beside, of_before = right_frames(take, keys), folder.next, "" in keys.values()

@@ -27,9 +27,10 @@ from ..composite.grain import Brush, Grain
 from ..composite.transfer import to_display
 from ..composite.warp import WarpMetadata, write_warp
 from ..exr import DetailLayers, FrameMetadata, Made, write_frozen_exr
-from ..frozen import FrozenImage, OutputFrame, render_frozen
+from ..frozen import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
 from ..views.reproject import resized
 from .debug_terms import origin_terms, write_terms
+from .motion_blur import MotionBlur, kept_grain
 from .plan import FrameSpec, PlannedTake
 from .write_beside import WriteBeside
 
@@ -88,19 +89,63 @@ def _render_all(
 
 
 def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter) -> FrozenImage | CompositeFrame:
-    """A frame of the take, of splats or of plates."""
+    """A frame of the take, of splats or of plates; layers but colour and alpha are those of the shutter's middle."""
     frozen = spec.instants.at(output.t_star, report)
-    exposed_at = scene.time_of_frame(output.exposed_like)
     K = whole_camera(output, spec)
-    image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
-    made = image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+    image, made = _composited(output, frozen, scene, spec)
     if spec.debug_terms is not None and isinstance(made, CompositeFrame):
         h, w = made.terms["motion"].shape
         made.terms |= origin_terms(frozen, output.viewmat, K, spec.whole, spec.beyond, (w, h))
     picture = _display(made, slice(None)) + (1.0 - made.alpha[..., None]) * 0.5
     measured = spec.measured.at(output.t_star, frozen)
     made.depth, made.depth_sigma = spec.depths.of(output.viewmat, K, made.depth, image.motion, picture, measured)
+    if spec.blur is not None:
+        _blur(made, spec.blur.beside_middle(output, K, made.depth), frozen, scene, spec, report)
     return made
+
+
+def _composited(
+    output: OutputFrame, frozen: FrozenGaussians, scene: Scene, spec: FrameSpec
+) -> tuple[FrozenImage, FrozenImage | CompositeFrame]:  # fmt: skip
+    """(the splats' render, the frame) of one camera; without detail both are the same."""
+    exposed_at, K = scene.time_of_frame(output.exposed_like), whole_camera(output, spec)
+    image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
+    return image, image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
+
+
+def _blur(
+    made: FrozenImage | CompositeFrame, cameras: list[OutputFrame], frozen: FrozenGaussians, scene: Scene,
+    spec: FrameSpec, report: Reporter,
+) -> None:  # fmt: skip
+    """Makes colours and alphas of a frame the mean, in scene-linear light, of it and of what other cameras see."""
+    if not cameras:
+        return
+    sums = _lights(made, scene.display)
+    for camera in cameras:
+        report.check_cancelled()
+        for total, one in zip(sums, _lights(_composited(camera, frozen, scene, spec)[1], scene.display), strict=True):
+            total += one
+    means = [total / (len(cameras) + 1) for total in sums]
+    if isinstance(made, CompositeFrame):
+        made.linear, made.alpha = means[0][..., :3], means[0][..., 3]
+        made.splat, made.splat_alpha = _shown(means[1], scene.display), means[1][..., 3]
+    else:
+        made.color, made.alpha = _shown(means[0], scene.display), means[0][..., 3]
+
+
+def _lights(image: FrozenImage | CompositeFrame, display: Display) -> list[Tensor]:
+    """[H, W, 4] each, scene-linear, premultiplied: a frame's picture, and of plates that of its splats."""
+    if isinstance(image, CompositeFrame):
+        splat = scene_linear(image.splat.numpy(), image.splat_alpha.numpy(), display)
+        return [torch.cat([image.linear, image.alpha[..., None]], dim=2), from_numpy(splat)]
+    return [from_numpy(scene_linear(image.color.numpy(), image.alpha.numpy(), display))]
+
+
+def _shown(light: Tensor, display: Display) -> Tensor:
+    """[H, W, 3] premultiplied, on the display, of [H, W, 4] as `scene_linear` makes it."""
+    alpha = light[..., 3:]
+    straight = torch.where(alpha > 0.0, light[..., :3] / alpha.clamp_min(1e-8), 0.0)
+    return to_display(straight, display) * alpha
 
 
 def whole_camera(output: OutputFrame, spec: FrameSpec) -> Tensor:
@@ -123,7 +168,8 @@ def _write(
     if isinstance(image, CompositeFrame):
         if spec.debug_terms is not None:
             write_terms(spec.debug_terms, output.frame, image.terms)
-        _write_warp(folder, output, image, spec, key)
+        if spec.has_warps:
+            _write_warp(folder, output, image, spec, key)
     _write_frame(folder, output, image, scene, spec, key)
 
 
@@ -176,18 +222,20 @@ def _write_frame(
             light=spec.light,
         ),
         spec.beyond,
-        None if spec.grain is None else _grain(spec.grain, output.frame, image, spec, scene.display),
+        None if spec.grain is None else _grain(spec.grain, output, image, spec, scene.display),
         layers,
         more,
     )
 
 
 def _grain(
-    grain: Grain, frame: int, image: FrozenImage | CompositeFrame, spec: FrameSpec, display: Display
+    grain: Grain, output: OutputFrame, image: FrozenImage | CompositeFrame, spec: FrameSpec, display: Display
 ) -> Made:  # fmt: skip
     """The layer of a frame's grain, [H, W, 3] scene-linear, premultiplied. It was measured on sRGB, whatever `display`
     the frame's splats are shown on."""
-    brush = Brush(grain, frame, image.alpha.shape, spec.whole_grain_size)
+    brush = Brush(grain, output.frame, image.alpha.shape, spec.whole_grain_size)
+    K, softness = whole_camera(output, spec), grain.softness * spec.whole[0] / spec.whole_grain_size[0]
+    blur: MotionBlur | None = None if spec.blur is None or spec.blur.is_still(output) else spec.blur
 
     def drawn(rows: slice) -> np.ndarray:
         colour = to_display(image.linear[rows], PLAIN) if isinstance(image, CompositeFrame) else image.color[rows]
@@ -196,7 +244,11 @@ def _grain(
             shown = on_straight_colour(shown, lambda x: display.straightened(np.asarray(x, np.float32)))
         made = brush.rows(rows, shown)
         if isinstance(image, CompositeFrame):  # plates have theirs
-            made = made * (1.0 - image.plate[rows].numpy()[..., None])
+            lacking = 1.0 - image.plate[rows]
+            if blur is not None:  # which has averaged theirs away in part; deviations add up by their squares
+                lengths = blur.lengths(output, K, image.depth[rows], rows.start)
+                lacking = (1.0 - kept_grain(lengths, softness).float() * (1.0 - lacking.square())).sqrt()
+            made = made * lacking.numpy()[..., None]
         return made
 
     return Made((*image.alpha.shape, 3), drawn)

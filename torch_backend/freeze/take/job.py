@@ -135,6 +135,7 @@ def _finish(
         "fps": shot.info().fps,
         "scale": scene.scale,
         "passes": spec.passes is not None,
+        "shutter": 0.0 if spec.blur is None else spec.blur.shutter,
         "grain": None if spec.grain is None else spec.grain.to_json(),
         "footage": footage_facts(shot, folder.root),
         "exr_dir": str(folder.root),
@@ -174,7 +175,7 @@ def _made_of(folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: di
         if frame.detail is not None:
             plate, support = (np.asarray(layer, np.float32) for layer in (frame.detail.plate, frame.support))
             shares[n] = small_share(from_numpy(plate), from_numpy(support))
-    return {"detail": detail_facts(shares), "warp_dir": str(folder.warps)}
+    return {"detail": detail_facts(shares), **({"warp_dir": str(folder.warps)} if spec.has_warps else {})}
 
 
 def _redistort(

@@ -6,6 +6,7 @@ Blender's own passes, as a Cycles render of bpy 5.0 has them.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +26,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _NEAREST = 1e-6
 """Depth in scene units of the model below which a point is behind a camera."""
+_VECTOR_SIGNS = np.array([1.0, 1.0, -1.0, -1.0], np.float32)
+"""Blender's Vector counts the frame after the other way: from there to here."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,8 @@ class Passes:
         Returns:
             Vector: [H, W, 4] pixels, x right and y up: where the point was in the frame before, less where it is; where
             it is, less where it will be in the frame after. 0 at the ends of the take and where nothing is.
+            forward: [H, W, 2] pixels, x right and y up: where the point will be in the frame after, less where it is.
+            backward: [H, W, 2] likewise, of the frame before; both as Nuke's VectorBlur reads them.
             Normal: [H, W, 3] unit vectors towards the camera's side, in the scene's axes; 0 where nothing is.
             Position: [H, W, 3] in the scene's axes and units; 0 where nothing is.
         """
@@ -63,11 +68,20 @@ class Passes:
         def seen(rows: slice) -> tuple[Array, Mask]:
             return _unprojected(depth[rows].double().numpy(), rows.start, output, lens)
 
+        @functools.lru_cache(maxsize=1)  # three layers are made of it, band by band
+        def moves(top: int, end: int) -> NDArray[np.float32]:
+            return self._moves(*seen(slice(top, end)), output, lens, top)
+
+        def moved(rows: slice) -> NDArray[np.float32]:
+            return moves(rows.start, rows.stop)
+
         def layer(channels: int, rows: Callable[[slice], NDArray[np.float32]]) -> Made:
             return Made((height, width, channels), rows)
 
         return {
-            "Vector": layer(4, lambda rows: self._vectors(*seen(rows), output, lens, rows.start)),
+            "Vector": layer(4, lambda rows: moved(rows) * _VECTOR_SIGNS),
+            "forward": layer(2, lambda rows: moved(rows)[..., 2:]),
+            "backward": layer(2, lambda rows: moved(rows)[..., :2]),
             "Normal": layer(3, lambda rows: self._normals(seen, rows, height)),
             "Position": layer(3, lambda rows: self._positions(*seen(rows))),
         }
@@ -94,12 +108,13 @@ class Passes:
         units = normals / np.where(has_normal, lengths, 1.0) @ self.to_scene.rotation.T
         return np.where(has_normal, units, 0.0).astype(np.float32)
 
-    def _vectors(
+    def _moves(
         self, points: Array, is_solid: Mask, output: OutputFrame, lens: Array, top: int
     ) -> NDArray[np.float32]:  # fmt: skip
+        """[h, w, 4] pixels, x right and y up: from here to the frame before, then from here to the frame after."""
         found = np.zeros((*is_solid.shape, 4), np.float32)
         x, y = _centres(is_solid.shape, top)
-        for at, sign, other in zip((0, 2), (1.0, -1.0), self._beside(output), strict=True):
+        for at, other in zip((0, 2), self._beside(output), strict=True):
             if other is None:
                 continue
             its_lens = other.K.double().numpy().copy()
@@ -110,8 +125,8 @@ class Passes:
             ahead = np.where(is_ahead, local[..., 2], 1.0)
             across = its_lens[0, 0] * local[..., 0] / ahead + its_lens[0, 2] - x
             down = its_lens[1, 1] * local[..., 1] / ahead + its_lens[1, 2] - y
-            found[..., at] = np.where(is_ahead, sign * across, 0.0)
-            found[..., at + 1] = np.where(is_ahead, -sign * down, 0.0)
+            found[..., at] = np.where(is_ahead, across, 0.0)
+            found[..., at + 1] = np.where(is_ahead, -down, 0.0)
         return found
 
 

@@ -40,6 +40,7 @@ from ..frozen import CandidateInstant, OutputFrame, best_instants, rank_instants
 from ..instant.instants import Instants
 from .cameras import intrinsics, output_size, plan
 from .footage_facts import footage_light
+from .motion_blur import MotionBlur
 from .passes import Passes
 
 TAKE_VERSION = 3
@@ -78,6 +79,8 @@ class FrameSpec:
     """Primaries of the light in which frames leave, one of `LIGHTS`: the footage's own."""
     passes: Passes | None = None
     """Makes motion vectors, normals and positions; None: they are not written."""
+    blur: MotionBlur | None = None
+    """The camera's motion blur; None: there is none."""
     debug_terms: Path | None = None
     """Folder that gets the terms behind each frame's decisions; None: they are not written."""
     start: tuple[str, int, float] = ("", 0, 0.0)
@@ -87,6 +90,11 @@ class FrameSpec:
         """Of a frame, as its file carries it: empty without one, and beyond 40 frames per second, which EXR cannot."""
         code, at, fps = self.start
         return later(code, frame - at, fps) if code and 1 <= round(fps) <= 40 else ""
+
+    @property
+    def has_warps(self) -> bool:
+        """True if frames leave as warps of a plate, too: what is blurred over many cameras is none."""
+        return self.detail is not None and self.blur is None
 
     @property
     def whole(self) -> tuple[int, int]:
@@ -114,6 +122,7 @@ class FrameSpec:
             *([self.beyond] if any(self.beyond) else []),
             *([self.detail_key] if self.detail_key else []),
             *([] if self.passes is None else self.passes.facts(output)),
+            *([] if self.blur is None else ["blur", self.blur.facts(output)]),
             *([self.light] if self.light != LIGHTS[0] else []),
             *([self.instants.keys[output.t_star]] if output.t_star in self.instants.keys else []),
         )
@@ -167,11 +176,26 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
         run, instants, params.query, (width, height), beyond, grain, plate, FrameDepths(run, scene),
         MeasuredDepths(run, scene), detail, detail_key(shot, detail), footage_light(shot),
         Passes(whole, scene, Similarity.of(placement_for(shot, params.placement))) if params.passes else None,
+        _motion_blur(whole, params, report),
         Path(params.debug_terms) if params.debug_terms else None, _start(shot),
     )  # fmt: skip
     keys = {f.frame: spec.key(f) for f in whole}
-    key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()))
+    shutter = 0.0 if spec.blur is None else params.shutter
+    key = take_key(run, params, t_star, width, height, beyond, sorted(instants.keys.values()), shutter)
     return PlannedTake(folder, scene, t_star, whole, spec, keys, key)
+
+
+def _motion_blur(whole: list[OutputFrame], params: FreezeParams, report: Reporter) -> MotionBlur | None:
+    """The motion blur that `params` ask for; None on the clip's own path, where the plates have the camera's own."""
+    if params.shutter <= 0.0:
+        return None
+    if not params.camera_path:
+        report.warning(
+            "No motion blur is added on the clip's own camera path: its plates have that of the camera.",
+            "Choose a camera of your own to blur its move.",
+        )
+        return None
+    return MotionBlur(whole, params.shutter)
 
 
 def _refuse_combined(folder: TakeFolder) -> None:
@@ -274,11 +298,11 @@ def _start(shot: Shot) -> tuple[str, int, float]:
 
 def take_key(
     run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, beyond: tuple[int, int] = (0, 0),
-    developed: Sequence[str] = (),
+    developed: Sequence[str] = (), shutter: float = 0.0,
 ) -> str:  # fmt: skip
     """Identifies what a take shows. The frame range is not part of it. Frames have keys of their own, see
     `FrameSpec.key`; this one tells about frames that were rendered before they had. `developed`: keys of the instants
-    that are."""
+    that are; `shutter`: degrees of motion blur that is there."""
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
         TAKE_VERSION,
@@ -291,4 +315,5 @@ def take_key(
         path,
         *([beyond] if any(beyond) else []),
         *([list(developed)] if developed else []),
+        *([["shutter", shutter]] if shutter else []),
     )

@@ -70,6 +70,8 @@ def test_a_planes_passes_are_its_geometry(bands):
     np.testing.assert_allclose(
         found["Vector"], np.concatenate([(before - here) * up, (here - after) * up], -1), atol=1e-3
     )
+    np.testing.assert_allclose(found["forward"], (after - here) * up, atol=1e-3)
+    np.testing.assert_allclose(found["backward"], (before - here) * up, atol=1e-3)
     assert np.abs(found["Vector"]).max() > 2.0, "or the test says nothing"
 
 
@@ -106,6 +108,8 @@ def test_a_takes_passes_lie_on_its_cameras(trained, tmp_path, quiet):
     frames = {n: read_frozen_exr(world.shot.take("passes") / f"{n:06d}.exr") for n in (104, 105, 106)}
     for n, frame in frames.items():
         assert frame.more["Vector"].shape == (*frame.depth.shape, 4)
+        np.testing.assert_array_equal(frame.more["forward"], -frame.more["Vector"][..., 2:])
+        np.testing.assert_array_equal(frame.more["backward"], frame.more["Vector"][..., :2])
         solve, meta = back.points(frame.more["Position"]), frame.metadata
         local = solve @ meta.viewmat[:3, :3].T + meta.viewmat[:3, 3]
         is_solid = frame.depth < NO_DEPTH
