@@ -97,6 +97,7 @@ def read_of(files, names: tuple[str, ...]) -> set[str]:
         ("freeze", "freeze"),
         ("mattes", "freeze"),
         ("surface", "freeze"),
+        ("light", "freeze"),
     ],
 )
 def test_no_parameter_of_a_step_is_passed_over_by_its_station(kind, station):
