@@ -1,6 +1,7 @@
 """The light of a take in Blender: what Cycles shows in each direction, the artist's world given back, undone."""
 
 import json
+import shutil
 from pathlib import Path
 
 import bpy
@@ -22,7 +23,7 @@ COLORS = {
 
 def write_light(shot: Path, contract, placement: dict, key: str = KEY) -> Path:
     """A panorama of the take, as the backend leaves it: each direction in the colour of the nearest axis."""
-    height, width = 32, 64
+    height, width = 128, 256
     u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height  # v from below, as Blender's rows
     longitude, latitude = 2 * np.pi * (0.5 - u), np.pi * (v - 0.5)
     x = np.cos(latitude)[:, None] * np.cos(longitude)
@@ -35,6 +36,7 @@ def write_light(shot: Path, contract, placement: dict, key: str = KEY) -> Path:
     path = folder.light(key)
     path.parent.mkdir(exist_ok=True)
     image = bpy.data.images.new("made", width, height, float_buffer=True)
+    image.colorspace_settings.is_data = True  # else it is saved as sRGB
     image.pixels[:] = pixels.ravel()
     image.filepath_raw, image.file_format = str(path), "OPEN_EXR"
     image.save()
@@ -61,39 +63,41 @@ def add(addon, scene, shot, key=KEY):
     return addon("freeze.lights").add(scene, shot, "freeze", key)
 
 
-def shown(scene, folder: Path) -> dict[tuple[int, int, int], np.ndarray]:
-    """What Cycles renders of the world alone, straight along each axis: linear light."""
+def shown(scene, folder: Path, side: int) -> dict[tuple[int, int, int], np.ndarray]:
+    """What Cycles renders of the world alone about the three axes of one side, 1 or -1: linear light."""
     for item in [o for o in scene.objects if o.type in ("MESH", "LIGHT")]:
         bpy.data.objects.remove(item)
     camera = bpy.data.objects.new("looking", bpy.data.cameras.new("looking"))
     scene.collection.objects.link(camera)
-    camera.data.angle, camera.rotation_mode = 0.05, "QUATERNION"
+    camera.data.angle, camera.rotation_mode, size = 2.2, "QUATERNION", 48
     scene.camera, render = camera, scene.render
     render.engine, render.film_transparent, scene.cycles.samples, scene.cycles.device = "CYCLES", False, 1, "CPU"
     scene.cycles.use_denoising = False  # Debian's Blender is built without it
-    render.resolution_x = render.resolution_y = 4
+    render.resolution_x = render.resolution_y = size
     render.resolution_percentage, render.use_compositing = 100, False
     render.image_settings.file_format = "OPEN_EXR"
+    camera.rotation_quaternion = Vector((side, side, side)).to_track_quat("-Z", "Y")
+    render.filepath = str(folder / f"{side}.exr")
+    bpy.ops.render.render(write_still=True)
+    pixels = np.array(bpy.data.images.load(render.filepath).pixels[:]).reshape(size, size, 4)
     found = {}
-    for n, axis in enumerate(COLORS):
-        camera.rotation_quaternion = Vector(axis).to_track_quat("-Z", "Y")
-        render.filepath = str(folder / f"{n}.exr")
-        bpy.ops.render.render(write_still=True)
-        image = bpy.data.images.load(render.filepath)
-        found[axis] = np.array(image.pixels[:]).reshape(-1, 4)[:, :3].mean(0)
-        bpy.data.images.remove(image)
+    for axis in (a for a in COLORS if sum(a) == side):
+        seen = camera.rotation_quaternion.inverted() @ Vector(axis)
+        x, y = (int(size / 2 * (1 + part / -seen.z / np.tan(2.2 / 2))) for part in (seen.x, seen.y))
+        found[axis] = pixels[y - 1 : y + 2, x - 1 : x + 2, :3].reshape(-1, 3).mean(0)
+    assert len(found) == 3
     return found
 
 
 def test_cycles_shows_every_direction_in_its_colour_and_follows_the_root(scene, shot, lit, addon, tmp_path):
     told = add(addon, scene, shot)
     assert "40 %" in told[0]
-    for axis, light in shown(scene, tmp_path).items():
+    for axis, light in shown(scene, tmp_path, 1).items():
         np.testing.assert_allclose(light, COLORS[axis], atol=0.01, err_msg=str(axis))
     turn = Quaternion((1, 1, 1), 2 * np.pi / 3)  # +X becomes +Y, +Y becomes +Z, +Z becomes +X
     lit.matrix_world = Matrix.Translation((1, 2, 3)) @ turn.to_matrix().to_4x4() @ lit.matrix_world
     bpy.context.view_layer.update()
-    for axis, light in shown(scene, tmp_path).items():
+    for axis, light in shown(scene, tmp_path, -1).items():
         x, y, z = axis
         np.testing.assert_allclose(light, COLORS[y, z, x], atol=0.01, err_msg=f"turned, {axis}")
 
@@ -128,8 +132,6 @@ def test_a_world_that_was_chosen_since_stays(scene, shot, lit, addon):
 
 
 def test_two_shots_take_turns(scene, shot, lit, addon, contract, tmp_path):
-    import shutil
-
     mine, lights = scene.world, addon("freeze.lights")
     add(addon, scene, shot)
     other = tmp_path / "other.splannequin"

@@ -76,7 +76,12 @@ def panorama(width: int, render: Callable[[NDArray[np.float64]], NDArray[np.floa
         face = cv2.remap(render(rotation), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         total += weight * face
         weights += weight
-    return cv2.resize(total / weights, (width, width // 2), interpolation=cv2.INTER_AREA)
+    return _smaller(total / weights, width // 2)
+
+
+def _smaller(picture: NDArray[np.float32], rows: int) -> NDArray[np.float32]:
+    """[rows, 2 rows, C]: the means of a panorama's pixels."""
+    return np.asarray(cv2.resize(picture, (2 * rows, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _fade(across: NDArray[np.float32], ahead: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -102,7 +107,7 @@ def filled(picture: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
     color: NDArray[np.float32] | None = None
     rows = _COARSEST
     while True:
-        small = picture if rows == height else cv2.resize(picture, (2 * rows, rows), interpolation=cv2.INTER_AREA)
+        small = picture if rows == height else _smaller(picture, rows)
         start = _weighted(small) if color is None else _twice(color)
         color = _relaxed(small, start)
         if rows == height:
@@ -125,7 +130,7 @@ def _twice(color: NDArray[np.float32]) -> NDArray[np.float32]:
     """A panorama [h, w, 3] at twice the size, bilinear, round the back."""
     around = np.concatenate([color[:, -1:], color, color[:, :1]], axis=1)
     large = cv2.resize(around, (2 * around.shape[1], 2 * len(around)), interpolation=cv2.INTER_LINEAR)
-    return large[:, 2:-2]
+    return np.asarray(large[:, 2:-2], np.float32)
 
 
 def _relaxed(small: NDArray[np.float32], start: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -140,10 +145,10 @@ def _relaxed(small: NDArray[np.float32], start: NDArray[np.float32]) -> NDArray[
     up, down, aside = edges[:-1] * middles, edges[1:] * middles, np.ones_like(middles)
     total = up + down + 2.0 * aside
     up, down, aside = ((part / total).astype(np.float32) for part in (up, down, aside))
-    color = start.astype(np.float32)
+    color = start
     for _ in range(_SWEEPS):
         above = np.concatenate([color[:1], color[:-1]])
         below = np.concatenate([color[1:], color[-1:]])
         mean = up * above + down * below + aside * (np.roll(color, 1, axis=1) + np.roll(color, -1, axis=1))
-        color = held + loose * mean
+        color = np.asarray(held + loose * mean, np.float32)
     return color

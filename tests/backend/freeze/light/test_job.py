@@ -8,8 +8,8 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from torch_backend import contract
 from tests.backend.conftest import build_world
+from torch_backend import contract
 from torch_backend.contract import Cancelled, JobError, LightParams, TakeFolder
 from torch_backend.footage.display import PLAIN, ROLLED
 from torch_backend.freeze.light import job
@@ -246,7 +246,7 @@ def test_the_light_is_exposed_as_at_the_instant(trained_copy, quiet):
 
 
 def test_a_run_that_is_gone_costs_the_exposure_and_says_so(take, quiet):
-    world, folder = take
+    world, _ = take
     report = quiet()
     make_light(world.shot, params(position="1.5,-0.5,0.76"), report, SMALL)
     assert [event for event in report.events if event[0] == "warning"]
