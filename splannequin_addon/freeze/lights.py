@@ -144,10 +144,11 @@ def _turn(facts: contract.LightFacts) -> Matrix:
     return Matrix((np.array(placement.scene_from_solve).reshape(4, 4)[:3, :3] / placement.scale).tolist())
 
 
-def _follow(rotation: Any, root: bpy.types.Object) -> None:
+def _follow(rotation: bpy.types.NodeSocket, root: bpy.types.Object) -> None:
     """Has a socket of three angles follow an object's rotation in the world. No script: it runs in any file."""
     for axis in range(3):
-        driver: Any = rotation.driver_add("default_value", axis).driver
+        curve: Any = rotation.driver_add("default_value", axis)
+        driver = curve.driver
         driver.type = "SUM"
         variable = driver.variables.new()
         variable.type = "TRANSFORMS"

@@ -1,4 +1,4 @@
-"""What is said of a panorama of a take's light: takes/NAME/light/KEY.json beside KEY.exr. Both sides read it."""
+"""What is said of a panorama of a take's light: takes/NAME/panorama/KEY.json beside KEY.exr. Both sides read it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The job that renders the light of a take's frozen scene at a point: takes/NAME/light/KEY.exr and KEY.json."""
+"""The job that renders the light of a take's frozen scene at a point: takes/NAME/panorama/KEY.exr and KEY.json."""
 
 from __future__ import annotations
 
