@@ -61,6 +61,12 @@ class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, bpy.types.PropertyGroup):
         type=bpy.types.Object,
         options={"HIDDEN"},
     )
+    world_before = PointerProperty(
+        name="World Before",
+        description="World of the scene before a shot's light was put in its place",
+        type=bpy.types.World,
+        options={"HIDDEN"},
+    )
     made = CollectionProperty(
         name="Made",
         description="What was put into this scene, by shot",

@@ -98,7 +98,8 @@ def _begun(folder: str) -> Shot:
 
 
 def one_step(args: argparse.Namespace, console: Console) -> int:
-    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`, `mattes SHOT`, `combine SHOT`, `surface SHOT`."""
+    """`import SHOT CLIP`, `solve SHOT`, `train SHOT`, `freeze SHOT`, `mattes SHOT`, `combine SHOT`, `surface SHOT`,
+    `light SHOT`."""
     ((kind, params),) = contract.requested_params(args).items()
     folder = args.clip if args.command == "freeze" else args.shot
     shot = _begun(folder) if kind == "import" else Shot.open(folder)
@@ -113,6 +114,11 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
         print_mattes(result, console)
     if kind == "surface" and not console.as_json:
         print(f"Surface: {result['surface']}", file=console.stream, flush=True)
+    if kind == "light" and not console.as_json:
+        said = (
+            f"Light: {result['light']}, an estimate: {result['filled']:.0%} of the sphere was not seen, and is filled."
+        )
+        print(said, file=console.stream, flush=True)
     return ExitCode.OK
 
 

@@ -386,6 +386,12 @@ def _surface(shot: Shot, params: contract.SurfaceParams, report: Reporter) -> An
     return make_surface(shot, params, report)
 
 
+def _light(shot: Shot, params: contract.LightParams, report: Reporter) -> Any:
+    from .freeze.light.job import make_light
+
+    return make_light(shot, params, report)
+
+
 RUNNERS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "import": _import,
     "solve": _solve,
@@ -393,6 +399,7 @@ RUNNERS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "freeze": _freeze,
     "mattes": _mattes,
     "surface": _surface,
+    "light": _light,
     "combine": _combine,
 }
 """Kind of job -> the station that does it: (shot, typed params, reporter) -> JSON-able result."""

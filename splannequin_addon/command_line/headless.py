@@ -180,7 +180,7 @@ def make_mattes(args: argparse.Namespace, console: Console) -> int:
 
 
 def make_surface(args: argparse.Namespace, console: Console) -> int:
-    """`surface SHOT`: a job that the step Freeze starts."""
+    """`surface SHOT`, `light SHOT`: jobs that the step Freeze starts."""
     return _one_step(args, console, "freeze", args.shot)
 
 
@@ -484,6 +484,7 @@ _DOES = {
     "freeze": freeze,
     "mattes": make_mattes,
     "surface": make_surface,
+    "light": make_surface,
     "combine": make_mattes,
     "bake": bake_take,
     "stmaps": write_stmaps,

@@ -12,7 +12,7 @@ from ..shot import markers
 from ..translations import tr
 from ..ui import icons, listing, step_panel
 from ..ui.sentences import wrap
-from . import viewport
+from . import lights, viewport
 
 
 def can_scrub(view: steps.View, running: str | None) -> bool:
@@ -87,6 +87,10 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
                 wrap(body, context, told, "ERROR")
             body.operator("splannequin.add_splats", icon=icons.of("splannequin.add_splats"))
             body.operator("splannequin.add_surface", icon=icons.of("splannequin.add_surface"))
+            row = body.row(align=True)
+            row.operator("splannequin.add_light", icon=icons.of("splannequin.add_light"))
+            if lights.find(scene_in(context), watch.shot) is not None:
+                row.operator("splannequin.remove_light", text="", icon=icons.of("splannequin.remove_light"))
 
     def _mattes(self, context: bpy.types.Context, layout: bpy.types.UILayout, take: dict[str, Any]) -> None:
         """A mask to make one of, and what there is."""

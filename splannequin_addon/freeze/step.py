@@ -13,6 +13,8 @@ from ..shot import scene_objects
 from ..shot.shot_state import ShotState
 from . import (
     hidden_points,
+    light_operators,
+    lights,
     matte_operators,
     mattes,
     move_check,
@@ -37,7 +39,7 @@ class Freeze(Step):
     name = "freeze"
     label = "Freeze"
     kind = "freeze"
-    also = ("mattes", "combine", "surface")
+    also = ("mattes", "combine", "surface", "light")
     button = "Freeze"
     again = "Freeze Again"
     needs = "Train first."
@@ -47,6 +49,7 @@ class Freeze(Step):
         *move_operators.CLASSES,
         *move_check.CLASSES,
         *surface_operators.CLASSES,
+        *light_operators.CLASSES,
         *panel.CLASSES,
     )
     parts = (viewport, hidden_points)
@@ -78,12 +81,17 @@ class Freeze(Step):
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """An instant that nobody chose is the one that was taken; mattes are read again where they are shown; a
-        surface comes into the scene that has its shot."""
+        surface comes into the scene that has its shot, a light into the one that it was asked for in."""
         if job.kind == "mattes":
             return mattes.arrived(job.shot, job.result)
         if job.kind == "surface":
             is_here = scene_objects.part(scene, job.shot, "root") is not None
             return surfaces.add(scene, job.shot, str(job.result["take"])) if is_here else []
+        if job.kind == "light":
+            is_here = scene_objects.part(scene, job.shot, "root") is not None
+            if not is_here or job.scene_uid not in (0, scene.session_uid):
+                return []
+            return lights.add(scene, job.shot, str(job.result["take"]), str(job.result["key"]))
         if job.kind == "combine":
             settings_of(scene).take_name = str(job.result["take"])
             return [f"The take {job.result['take']} is chosen: {job.result['frames']} frames."]
@@ -100,9 +108,10 @@ class Freeze(Step):
         return True
 
     def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
-        """Takes splats and surfaces out of the file."""
+        """Takes splats, surfaces and the light out of the file."""
         done = ["Splats were removed."] if splats.remove(scene, shot) else []
-        return [*done, "Surfaces were removed."] if surfaces.remove(scene, shot) else done
+        done += ["Surfaces were removed."] if surfaces.remove(scene, shot) else []
+        return [*done, "The light was removed."] if lights.remove(scene, shot) else done
 
     def in_use(self, shot: Path, folder: Path) -> str:
         """A run that is scrubbed through."""

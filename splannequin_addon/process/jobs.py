@@ -102,6 +102,7 @@ Params = (
     | contract.FreezeParams
     | contract.MatteParams
     | contract.SurfaceParams
+    | contract.LightParams
     | contract.CombineParams
 )
 """What a job may be asked for; `contract.PARAMS` by kind."""

@@ -54,6 +54,9 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     surfaces = CollectionProperty(
         name="Surfaces", description="Surfaces of takes", type=SPLANNEQUIN_PG_surface, options=set()
     )
+    light = PointerProperty(
+        name="Light", description="The world that lights the scene as the shot does", type=bpy.types.World
+    )
     collection = PointerProperty(name="Collection", description="What they lie in", type=bpy.types.Collection)
     points_hidden_in = StringProperty(
         name="Points Hidden In",

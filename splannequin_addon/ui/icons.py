@@ -5,6 +5,7 @@ from __future__ import annotations
 from ..access import Icon
 
 OF: dict[str, Icon] = {
+    "splannequin.add_light": "WORLD",
     "splannequin.add_splats": "OUTLINER_OB_POINTCLOUD",
     "splannequin.add_surface": "OUTLINER_OB_MESH",
     "splannequin.align_floor": "GRID",
@@ -40,6 +41,7 @@ OF: dict[str, Icon] = {
     "splannequin.pick_run": "RESTRICT_SELECT_OFF",
     "splannequin.pick_take": "RESTRICT_SELECT_OFF",
     "splannequin.remove_backend": "TRASH",
+    "splannequin.remove_light": "TRASH",
     "splannequin.remove_matte": "TRASH",
     "splannequin.remove_run": "TRASH",
     "splannequin.remove_shot": "TRASH",

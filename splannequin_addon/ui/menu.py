@@ -14,7 +14,7 @@ _GROUPS = (
     ("use_clip", "import_clip", "solve_camera", "load_camera", "train", "cancel"),
     ("t_star_here", "t_star_marker", "suggested_instant", "live", "freeze"),
     ("move_smooth", "move_retime", "move_hold", "move_orbit", "check_move"),
-    ("draw_matte", "matte_from_mask", "add_splats", "add_surface"),
+    ("draw_matte", "matte_from_mask", "add_splats", "add_surface", "add_light", "remove_light"),
     ("bake", "insert_freeze", "freeze_as_warp", "combine_cg", "render", "export_for_farm"),
     ("set_up", "check_backend", "remove_backend"),
     ("locate_shot", "remove_shot"),

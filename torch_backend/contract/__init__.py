@@ -19,6 +19,7 @@
     placement       where a solve stands in Blender's scene
     ply_header      the header of a file of splats
     surface_header  the header of a file of a take's surface
+    light_facts     what is said of a panorama of a take's light
     live_messages   what Blender and a live session say to each other
     colour          a colour by which two programs know that they mean the same space, and the display of light
     frame_names     frame numbers in file names
@@ -161,6 +162,11 @@ from .jobs import (
     new_job,
     runs_job,
 )
+from .light_facts import (
+    LightFacts,
+    light_of_take,
+    point_of,
+)
 from .live_messages import (
     LIVE_LIMIT,
     LIVE_SHOWS,
@@ -210,6 +216,7 @@ from .options import (
     CombineParams,
     FreezeParams,
     ImportParams,
+    LightParams,
     MatteParams,
     SolveParams,
     SurfaceParams,
@@ -493,6 +500,8 @@ __all__ = [
     "ImportParams",
     "JobError",
     "JobRequest",
+    "LightFacts",
+    "LightParams",
     "Limit",
     "LiveView",
     "MatteParams",
@@ -558,6 +567,7 @@ __all__ = [
     "is_whole_picture",
     "later",
     "layers_of",
+    "light_of_take",
     "limits_of",
     "locked",
     "make_folder",
@@ -582,6 +592,7 @@ __all__ = [
     "path_error",
     "placement_of",
     "png_size",
+    "point_of",
     "printable",
     "process",
     "process_of_ps",

@@ -70,7 +70,7 @@ class JobRequest:
     """What Blender asks for: one station, on one shot."""
 
     kind: str
-    """import, solve, train, freeze, mattes, combine or surface."""
+    """import, solve, train, freeze, mattes, combine, surface or light."""
     shot: str
     """Absolute path of the shot folder."""
     params: dict[str, Any] = field(default_factory=dict[str, Any])
@@ -150,6 +150,7 @@ WORK = {
     "freeze": "The freeze",
     "mattes": "The job of the mattes",
     "surface": "The job of the surface",
+    "light": "The job of the light",
     "combine": "The job that combines takes",
 }
 """Kind of job -> what a sentence calls it."""

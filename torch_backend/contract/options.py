@@ -9,6 +9,7 @@ from typing import Any
 from .errors import UserError
 from .files import frame_number, is_json_object
 from .hosts import host_names
+from .light_facts import point_text
 from .option_table import MASK_FOUND, SWITCH, Limit, Option, ignored_path, limits_of, mask_path, option, overscan
 
 LAST_FRAME = 1_048_574
@@ -707,6 +708,31 @@ class SurfaceParams:
     """Name of the take's folder in takes/."""
 
 
+@dataclass
+class LightParams:
+    """The light of a take's frozen scene at a point, as a panorama."""
+
+    take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
+    """Name of the take's folder in takes/."""
+    position: str = option(
+        "0,0,0",
+        flag="--position",
+        metavar="X,Y,Z",
+        parse=point_text,
+        help="point that the light falls on, in the axes and units of Blender's scene; with an equals sign where it "
+        "begins with a minus: `--position=-1,2,0.5`",
+    )
+    """Three numbers, separated by commas: the point, in the axes and units of Blender's scene."""
+    placement: str = option(
+        "",
+        **{
+            **PLACEMENT,
+            "help": "JSON that says where the solve stands in the scene whose axes and units `--position` has",
+        },
+    )
+    """JSON file of a `Placement`; empty: the shot's own, else upright, in solve units."""
+
+
 STEP_PARAMS: dict[str, type] = {
     "import": ImportParams,
     "solve": SolveParams,
@@ -714,7 +740,13 @@ STEP_PARAMS: dict[str, type] = {
     "freeze": FreezeParams,
 }
 """Kind of job on the way from a clip to frozen frames -> the dataclass of its parameters."""
-PARAMS: dict[str, type] = {**STEP_PARAMS, "mattes": MatteParams, "combine": CombineParams, "surface": SurfaceParams}
+PARAMS: dict[str, type] = {
+    **STEP_PARAMS,
+    "mattes": MatteParams,
+    "combine": CombineParams,
+    "surface": SurfaceParams,
+    "light": LightParams,
+}
 """Kind of job -> the dataclass of its parameters."""
 LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.values()}
 """The numbers of each kind of parameters, by field."""

@@ -56,6 +56,8 @@ TAKE_PREVIEW_FOLDER, WARP_FOLDER, TAKE_NEXT_FOLDER = "preview", "warp", ".next"
 CONTACT_SHEET_FILE, VIDEO_FILE, PLY_FILE = "contact_sheet.png", "video.mp4", "frozen.ply"
 USD_FILE, SURFACE_FILE = "frozen.usdc", "surface.ply"
 """Of a take: the splats and the animated camera; the frozen scene as a mesh."""
+LIGHT_FOLDER = "panorama"
+"""In a take's folder: panoramas of its light by their keys, and what is said of each."""
 TAKE_REDISTORT = Path("stmap") / "redistort.exr"
 """Of a take with overscan: the way back through the lens."""
 TAKE_UNDISTORT = Path("stmap") / "undistort.exr"
@@ -396,6 +398,14 @@ class TakeFolder:
     def surface(self) -> Path:
         """The frozen scene as a mesh."""
         return self.root / SURFACE_FILE
+
+    def light(self, key: str) -> Path:
+        """A panorama of the frozen scene's light; ValueError if its key could leave the folder."""
+        return self.root / LIGHT_FOLDER / f"{checked_name(key, 'light')}{LAYERS}"
+
+    def light_facts(self, key: str) -> Path:
+        """What is said of a panorama; ValueError as `light`."""
+        return self.root / LIGHT_FOLDER / f"{checked_name(key, 'light')}.json"
 
     @property
     def redistort(self) -> Path:

@@ -37,6 +37,8 @@ def words_for(one, told) -> tuple[str, ...]:
         return (told.flag,)
     if told.choices:
         return told.flag, next(choice for choice in told.choices if choice != one.default)
+    if one.name == "position":
+        return told.flag, "1,2,3"
     return told.flag, "48" if "str" not in str(one.type) else "word"
 
 
@@ -97,6 +99,7 @@ def read_of(files, names: tuple[str, ...]) -> set[str]:
         ("freeze", "freeze"),
         ("mattes", "freeze"),
         ("surface", "freeze"),
+        ("light", "freeze"),
     ],
 )
 def test_no_parameter_of_a_step_is_passed_over_by_its_station(kind, station):

@@ -1,0 +1,75 @@
+"""The buttons that make the light of a take the scene's world, and that give the world of before back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ...torch_backend import contract
+from ..access import Outcome, scene_in, settings_of
+from ..process import begin
+from ..shot import scene_objects, selection
+from ..translations import tr
+from ..ui import step_operator
+from . import lights, takes
+
+
+class SPLANNEQUIN_OT_add_light(step_operator.StepOperator, bpy.types.Operator):
+    """Render the chosen take's frozen scene from the 3D cursor into a panorama, and light the scene with it as its
+    world, as bright as the plate is. An estimate: what no plate saw is filled smoothly. Your own world comes back
+    when the light is removed"""
+
+    bl_idname = "splannequin.add_light"
+    bl_label = "Add Light from the Shot"
+    bl_options = {"REGISTER"}
+    step = "freeze"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a take, and while a step of this shot runs."""
+        if not takes.has_chosen(context):
+            cls.poll_message_set(tr("Freeze first"))
+            return False
+        return super().poll(context)
+
+    def perform(self, context: bpy.types.Context) -> Outcome:
+        """Has the panorama made, and makes it the world at the end."""
+        scene = scene_in(context)
+        scene_objects.check_root(scene, begin.needed(scene, self.step))
+        return super().perform(context)
+
+    def params(self, scene: bpy.types.Scene) -> contract.LightParams:
+        """The take that is chosen, and where the 3D cursor is."""
+        position = ",".join(repr(float(value)) for value in scene.cursor.location)
+        return contract.LightParams(take=settings_of(scene).take_name, position=position)
+
+
+class SPLANNEQUIN_OT_remove_light(bpy.types.Operator):
+    """Remove the light of this shot. The scene has the world again that it had before"""
+
+    bl_idname = "splannequin.remove_light"
+    bl_label = "Remove Light"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a light."""
+        scene = scene_in(context)
+        folder = selection.shot_folder(scene)
+        if folder is None or lights.find(scene, folder) is None:
+            cls.poll_message_set(tr("This shot lights nothing here"))
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> Outcome:
+        """Gives the world of before back."""
+        return step_operator.edit(self, context, "freeze", _removed)
+
+
+def _removed(scene: bpy.types.Scene, shot: Path) -> list[str]:
+    lights.remove(scene, shot)
+    return ["The light was removed."]
+
+
+CLASSES = (SPLANNEQUIN_OT_add_light, SPLANNEQUIN_OT_remove_light)
