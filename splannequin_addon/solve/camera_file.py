@@ -266,4 +266,23 @@ def _fbx() -> Callable[[str], Any] | None:
     if "fbx_import" in dir(wm):
         return lambda path: wm.fbx_import(filepath=path, anim_offset=0.0)
     scene: Any = bpy.ops.import_scene
-    return (lambda path: scene.fbx(filepath=path, anim_offset=0.0)) if "fbx" in dir(scene) else None
+    if "fbx" not in dir(scene):
+        return None
+
+    def read(path: str) -> Any:
+        done = scene.fbx(filepath=path, anim_offset=0.0)
+        _correct_rate()
+        return done
+
+    return read
+
+
+def _correct_rate() -> None:
+    """Moves all keys to where a file's rate puts them: the importer in Python takes the rate of 23.976 for 24."""
+    base = bpy.data.scenes[0].render.fps_base
+    actions: Any = bpy.data.actions
+    for curve in [curve for action in actions for curve in action.fcurves]:
+        for key in curve.keyframe_points:
+            for point in (key.co, key.handle_left, key.handle_right):
+                point.x /= base
+        curve.update()
