@@ -19,8 +19,8 @@ import bpy
 from ...torch_backend import contract
 from ..access import camera_of
 from ..process import backend, children
-from ..shot import inventory
-from . import scene_camera
+from ..shot import inventory, seen_camera
+from . import camera_samples
 
 KINDS = {".abc": "Alembic", ".fbx": "FBX", ".usd": "USD", ".usda": "USD", ".usdc": "USD", ".usdz": "USD"}
 """Ending of a file's name -> what it is."""
@@ -54,7 +54,7 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
     """
     if not file.is_file():
         raise contract.JobError(f"{file} does not exist.", "Choose another file.", contract.ExitCode.SOLVE)
-    _, size = scene_camera.frames_of(shot)
+    _, size = camera_samples.frames_of(shot)
     render = scene.render
     fps = float(inventory.read(shot).info.get("fps", 0.0)) or render.fps / render.fps_base
     wanted = {
@@ -110,7 +110,7 @@ def main(words: str) -> int:
     try:
         scene = _new_file(wanted["size"], wanted["fps"], wanted["aspect"])
         data = read(scene, Path(wanted["file"]), tuple(wanted["size"]))
-        scene_camera.write(Path(wanted["shot"]), data)
+        camera_samples.write(Path(wanted["shot"]), data)
     except contract.JobError as error:
         print(f"Error: {error.message} {error.hint}".rstrip(), file=sys.stderr)
         return error.exit_code
@@ -148,7 +148,7 @@ def read(scene: bpy.types.Scene, file: Path, size: tuple[int, int]) -> dict[str,
     cameras = sorted((o for o in scene.objects if o.type == "CAMERA"), key=lambda o: o.name)
     if not cameras:
         raise contract.JobError(f"{file.name} holds no camera.", "Choose another file.", contract.ExitCode.SOLVE)
-    for camera in [c for c in cameras if scene_camera.is_perspective(c)]:
+    for camera in [c for c in cameras if camera_of(c).type == "PERSP"]:
         data = camera_of(camera)
         if data.sensor_fit == "AUTO":  # files tell apertures, and their width is the pictures'
             data.sensor_fit = "HORIZONTAL"
@@ -159,21 +159,27 @@ def read(scene: bpy.types.Scene, file: Path, size: tuple[int, int]) -> dict[str,
                 "Export the frames of the clip alone.",
                 contract.ExitCode.SOLVE,
             )
-        samples = [scene_camera.sample(scene, camera.name, number, size) for number in frames]
-        if len(samples) > 1 and scene_camera.moves(samples):
+        samples = [_sample(scene, camera.name, number, size) for number in frames]
+        if len(samples) > 1 and camera_samples.moves(samples):
             notes = [*_choice(file, camera, len(cameras)), *_film_back(scene, file, camera, size)]
-            return scene_camera.transforms(samples, size, notes=notes)
-    if not any(scene_camera.is_perspective(camera) for camera in cameras):
+            return camera_samples.transforms(samples, size, notes=notes)
+    if not any(camera_of(camera).type == "PERSP" for camera in cameras):
         kinds = "The camera" if len(cameras) == 1 else f"Each of the {len(cameras)} cameras"
         message = f"{kinds} of {file.name} is orthographic or a panorama."
     else:
         message = f"No camera of {file.name} moves."
-    raise contract.JobError(message, scene_camera.ANOTHER, contract.ExitCode.SOLVE)
+    raise contract.JobError(message, camera_samples.ANOTHER, contract.ExitCode.SOLVE)
+
+
+def _sample(scene: bpy.types.Scene, name: str, number: int, size: tuple[int, int]) -> camera_samples.Sample:
+    """A camera of the file at a frame."""
+    matrix, window, _ = seen_camera.evaluated(scene, name, number, size, camera_samples.ANOTHER)
+    return camera_samples.sample_of(number, matrix, window, size)
 
 
 def _frames_of(scene: bpy.types.Scene, camera: bpy.types.Object) -> range:
     """Frames of a file that a camera has: those of its keys, and of the file where it is read on from there."""
-    span, owner = scene_camera.keyed(camera), camera
+    span, owner = camera_samples.keyed(camera), camera
     spans = [span] if span is not None else []
     while owner is not None:
         if any(c.type == "TRANSFORM_CACHE" for c in owner.constraints):
@@ -181,7 +187,7 @@ def _frames_of(scene: bpy.types.Scene, camera: bpy.types.Object) -> range:
         owner = owner.parent
     if not spans:
         return range(0)
-    return scene_camera.whole_frames((min(first for first, _ in spans), max(last for _, last in spans)))
+    return camera_samples.whole_frames((min(first for first, _ in spans), max(last for _, last in spans)))
 
 
 def _choice(file: Path, camera: bpy.types.Object, count: int) -> list[tuple[str, str]]:

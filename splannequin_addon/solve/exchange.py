@@ -20,8 +20,9 @@ import bpy
 from ...torch_backend import contract
 from ..access import present, settings_of, size_of
 from ..process import backend, children, job_timer
+from ..scene import same_footage
 from ..shot import scene_objects
-from . import camera_file, scene_camera
+from . import camera_file, camera_samples, scene_camera
 
 LEAST_TRACKED = 8
 """Frames that a tracked camera has to be solved for."""
@@ -68,7 +69,7 @@ def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> 
                 pass
     elif props.cameras_from == "TRACKING":
         data = transforms(props.tracking_clip)
-        asked.cameras = str(scene_camera.write(_imported(shot), data))
+        asked.cameras = str(camera_samples.write(_imported(shot), data))
     return asked
 
 
@@ -174,7 +175,7 @@ def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
             "Press Solve Camera Motion in the Movie Clip editor first.",
             contract.ExitCode.USAGE,
         )
-    first = first_number(clip)
+    first = same_footage.first_number(clip)
     return {
         **lens(clip),
         "frames": [
@@ -186,22 +187,6 @@ def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
             if first + camera.frame > 0  # an offset may begin before the footage does
         ],
     }
-
-
-def first_number(clip: bpy.types.MovieClip) -> int:
-    """Our number of what a clip calls its frame 1."""
-    number = _file_number(Path(bpy.path.abspath(clip.filepath))) if clip.source == "SEQUENCE" else 1
-    return number + clip.frame_offset
-
-
-def _file_number(path: Path) -> int:
-    """Frame number of a picture among its neighbours, as the import reads it; 1 if its name has none."""
-    try:
-        names = os.listdir(path.parent)
-    except OSError:
-        names = []
-    found = contract.numbered_files({path.name, *names})
-    return next((n for s in found for n, name in s.files.items() if name == path.name), 1)
 
 
 def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:

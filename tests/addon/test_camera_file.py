@@ -24,8 +24,10 @@ def animated(scene, name, film=(24.0, 18.0), end=1.0):
 
 
 def seen(addon, scene, camera):
-    """What `scene_camera` samples of it, which `test_scene_camera` holds against Blender's projection."""
-    return [addon("solve.scene_camera").sample(scene, camera.name, n, (16, 12)) for n in range(FIRST, LAST + 1)]
+    """Its samples, which `test_scene_camera` holds against Blender's projection."""
+    evaluated, sample_of = addon("shot.seen_camera").evaluated, addon("solve.camera_samples").sample_of
+    numbers = range(FIRST, LAST + 1)
+    return [sample_of(n, *evaluated(scene, camera.name, n, (16, 12))[:2], (16, 12)) for n in numbers]
 
 
 def export(path):

@@ -142,10 +142,10 @@ def test_cameras_that_cannot_be_the_clips_are_refused(addon, contract, chosen, s
 
 def test_frames_that_nobody_tracked_are_left_out(addon, scene):
     """Beyond the keys Blender holds a camera; a camera that pauses between its keys was tracked there."""
-    module = addon("solve.scene_camera")
+    module, evaluated = addon("solve.camera_samples"), addon("shot.seen_camera").evaluated
 
     def left(camera, frames, span):
-        samples = [module.sample(scene, camera.name, n, (16, 12)) for n in frames]
+        samples = [module.sample_of(n, *evaluated(scene, camera.name, n, (16, 12))[:2], (16, 12)) for n in frames]
         return [s.number for s in module.without_ends(samples, span)]
 
     camera = moving_camera(scene, (5, 7))
