@@ -123,12 +123,14 @@ def transforms(
         is_numbered_as_shot: a frame number is that of the shot for certain; else the backend finds out.
         notes: (sentence, hint) for the artist.
     """
-    lenses = [dict(zip(("fl_x", "fl_y", "cx", "cy"), s.K, strict=True)) for s in samples]
-    is_one = all(lens == lenses[0] for lens in lenses)
+    lenses: list[dict[str, Any]] = [dict(zip(("fl_x", "fl_y", "cx", "cy"), s.K, strict=True)) for s in samples]
+    shared: dict[str, Any] = {}
+    if all(lens == lenses[0] for lens in lenses):
+        shared, lenses = lenses[0], [{} for _ in lenses]
     return {
         "w": size[0],
         "h": size[1],
-        **(lenses[0] if is_one else {}),
+        **shared,
         "camera_model": "PINHOLE",
         contract.OWN_FACTS: {
             "world": contract.SCENE_WORLD,
@@ -136,7 +138,7 @@ def transforms(
             "notes": [list(note) for note in notes],
         },
         "frames": [
-            {"file_path": f"{s.number}.png", "transform_matrix": s.stands.tolist(), **({} if is_one else lens)}
+            {"file_path": f"{s.number}.png", "transform_matrix": s.stands.tolist(), **lens}
             for s, lens in zip(samples, lenses, strict=True)
         ],
     }

@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,7 +236,7 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
     lenses: dict[Lens, int] = {}
     cameras: list[ForeignCamera] = []
     said: Any = data.get(OWN_FACTS)
-    facts: dict[str, Any] = said if isinstance(said, dict) else {}
+    facts = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
     for n, frame in enumerate(data["frames"]):
         name = frame.get("file_path")
         matrix = np.array(frame.get("transform_matrix", []), np.float64)
@@ -256,12 +256,10 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
 def _notes(facts: dict[str, Any]) -> list[tuple[str, str]]:
     """What Blender wrote beside the cameras for the artist; rows of another form are left out."""
     rows: Any = facts.get("notes")
-    notes: list[tuple[str, str]] = []
-    for row in rows[:_MOST_NOTES] if isinstance(rows, list) else []:
-        sentence, hint = row if isinstance(row, list) and len(row) == 2 else (None, None)
-        if isinstance(sentence, str) and isinstance(hint, str):
-            notes.append((printable(sentence, 300), printable(hint, 300)))
-    return notes
+    rows = cast("list[Any]", rows) if isinstance(rows, list) else []
+    pairs = [cast("list[Any]", row) for row in rows[:_MOST_NOTES] if isinstance(row, list)]
+    pairs = [row for row in pairs if len(row) == 2 and all(isinstance(text, str) for text in row)]
+    return [(printable(sentence, 300), printable(hint, 300)) for sentence, hint in pairs]
 
 
 def _transforms_lens(file: Path, values: dict[str, Any]) -> Lens:
