@@ -86,11 +86,7 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
 
 def written(asked: children.Question, file: Path, shot: Path) -> Path:
     """The transforms.json that such a Blender has written. JobError with its own sentence if it wrote none."""
-    asked.answer(
-        f"Blender could not read {file.name}: {{}}",
-        "Import the file, and choose Scene Camera.",
-        contract.ExitCode.SOLVE,
-    )
+    asked.answer(f"Blender could not read {file.name}: {{}}", "Import the file, and choose Scene Camera.")
     return contract.ShotFolder(shot).tracking
 
 
