@@ -68,7 +68,8 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
     words = ["--", json.dumps(wanted)]
     if bpy.app.binary_path:
         quiet = ("--background", "--factory-startup", "--disable-autoexec", "-noaudio")
-        words = [bpy.app.binary_path, *quiet, "--python", script, *words]
+        fails = ("--python-exit-code", str(int(contract.ExitCode.INTERNAL)))  # else a script that raises ends well
+        words = [bpy.app.binary_path, *quiet, *fails, "--python", script, *words]
     else:  # Blender as a module
         words = [sys.executable, "-P", script, *words]
     piped: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
