@@ -199,6 +199,8 @@ def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
         since = time.perf_counter()
         kind = steps.STEPS[step].kind
         params = requests[kind]
+        if step == "solve":
+            params = exchange.with_file_read(scene, params, shot)
         results[kind], notes = begin.run(scene, step, params, console)
         stages[kind] = round(time.perf_counter() - since, 2)
         for note in notes:
@@ -327,6 +329,8 @@ def _one_step(args: argparse.Namespace, console: Console, step: str, shot: str) 
     (params,) = asked(args).values()
     scene = scene_in(bpy.context)
     settings_of(scene).shot_path = str(Path(shot).absolute())
+    if step == "solve":
+        params = exchange.with_file_read(scene, params, Path(shot).absolute())
     job = begin.begin(scene, step, params)
     result = begin.wait(job, console)
     if console.as_json:

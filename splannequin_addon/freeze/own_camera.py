@@ -30,7 +30,7 @@ def sample_path(
     Raises:
         contract.JobError: the camera is gone, or is no perspective camera.
     """
-    uid, before = scene.session_uid, scene.frame_current
+    uid = scene.session_uid
     size = scene_setup.render_size(scene)
     width = width or size[0]
     height = max(1, round(size[1] * width / size[0]))
@@ -38,14 +38,10 @@ def sample_path(
     numbers = sorted({*numbers[::every], *numbers[-1:]})
     del scene
     frames: list[contract.CameraFrame] = []
-    try:
+    with seen_camera.frame_kept(uid):
         for number in numbers:
             frames.append(seen_camera.sampled(session.scene_of(uid), name, shot, number, (width, height)))
             yield len(frames)
-    finally:
-        back = session.scene_of(uid)
-        if back is not None:
-            back.frame_set(before)
     return contract.CameraPath(width, height, frames)
 
 

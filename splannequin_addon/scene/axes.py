@@ -83,13 +83,17 @@ def in_solve(
         viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
         K: fx, fy, cx, cy in pixels.
     """
-    (width, height), window = size, np.array(window_matrix, dtype=np.float64)
     to_view = FLIP @ np.array(view_matrix, dtype=np.float64) @ placed
     to_view[:3] /= scale
-    K = [
+    return to_view.ravel().tolist(), k_from_window(window_matrix, size)
+
+
+def k_from_window(window_matrix: Matrix, size: tuple[int, int]) -> list[float]:
+    """fx, fy, cx, cy in pixels, pixel centres at +0.5, of a perspective projection [4, 4] onto a picture of `size`."""
+    (width, height), window = size, np.array(window_matrix, dtype=np.float64)
+    return [
         0.5 * width * window[0, 0],
         0.5 * height * window[1, 1],
         0.5 * width * (1.0 - window[0, 2]),
         0.5 * height * (1.0 + window[1, 2]),
     ]
-    return to_view.ravel().tolist(), K

@@ -94,3 +94,19 @@ def _place(path: Path) -> str:
         return os.path.normcase(os.path.realpath(path))
     except (OSError, ValueError):
         return os.path.normcase(os.path.normpath(path))
+
+
+def first_number(clip: bpy.types.MovieClip) -> int:
+    """Our number of what a clip calls its frame 1."""
+    number = _file_number(Path(bpy.path.abspath(clip.filepath))) if clip.source == "SEQUENCE" else 1
+    return number + clip.frame_offset
+
+
+def _file_number(path: Path) -> int:
+    """Frame number of a picture among its neighbours, as the import reads it; 1 if its name has none."""
+    try:
+        names = os.listdir(path.parent)
+    except OSError:
+        names = []
+    found = contract.numbered_files({path.name, *names})
+    return next((n for s in found for n, name in s.files.items() if name == path.name), 1)

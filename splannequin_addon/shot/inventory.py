@@ -164,6 +164,14 @@ def floor(shot: Path) -> tuple[list[float], float] | None:
     return normal, height
 
 
+def solve_world(shot: Path) -> str:
+    """What the coordinates of the solve are: `contract.SCENE_WORLD`, or empty for a world of the solve's own.
+
+    OSError without a solve; ValueError if its file is damaged.
+    """
+    return contract.SCENE_WORLD if contract.read_json(ShotFolder(shot).solve_record).get("world") else ""
+
+
 def burnt_in(shot: Path) -> Path | None:
     """Mask of what the import found to be burnt into the clip; None if it found nothing."""
     mask = ShotFolder(shot).burnt_in

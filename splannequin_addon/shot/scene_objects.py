@@ -44,6 +44,11 @@ class SPLANNEQUIN_PG_made(bpy.types.PropertyGroup):
     plate = PointerProperty(
         name="Plate", description="The camera that shows the clip until it is solved", type=bpy.types.Object
     )
+    world = StringProperty(
+        name="World",
+        description="What the coordinates of the loaded solve are: scene, or empty for a world of its own",
+        options={"HIDDEN"},
+    )
     scaled = BoolProperty(name="Scaled", description="Its scale was set from a known distance", options=set())
     guessed_scale = FloatProperty(
         name="Guessed Scale",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from mathutils import Matrix
 
 from ...torch_backend import contract
 from ..access import camera_of, named, present
-from ..scene import axes
+from ..scene import axes, session
 from . import scene_objects
 
 
@@ -50,6 +52,35 @@ def sampled(
     scene: bpy.types.Scene | None, name: str, shot: Path, number: int, size: tuple[int, int]
 ) -> contract.CameraFrame:
     """A camera at one frame, as `sample_path` reads it; without a name the scene's own, as markers switch it."""
+    stands, window, graph = evaluated(scene, name, number, size)
+    view = stands.normalized().inverted()
+    scene = present(scene)
+    return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size, graph), "blender")
+
+
+def evaluated(
+    scene: bpy.types.Scene | None,
+    name: str,
+    number: int,
+    size: tuple[int, int],
+    hint: str = "Choose another camera to freeze from.",
+) -> tuple[Matrix, Matrix, bpy.types.Depsgraph]:
+    """A camera of a scene at a frame, which the scene shows then.
+
+    Args:
+        scene: the scene; None: it is gone.
+        name: of the camera object; empty: the scene's own, as markers switch it.
+        number: of the frame.
+        size: width and height in pixels of the picture; its pixels have the aspect of the scene's.
+        hint: what to do if it is no perspective camera of the scene.
+
+    Returns:
+        Camera-to-world as it is evaluated, Blender's camera axes, [4, 4]; perspective projection, [4, 4]; and the
+        dependency graph that both are of.
+
+    Raises:
+        contract.JobError: the camera is gone, is no perspective camera, or is not evaluated.
+    """
     if scene is not None:
         scene.frame_set(number)
     camera = None if scene is None else named(scene.objects, name) if name else scene.camera
@@ -57,7 +88,7 @@ def sampled(
         name = name or (camera.name if camera is not None else "The scene's camera")
         raise contract.JobError(
             f"{name} is not a perspective camera of this scene.",
-            "Choose another camera to freeze from.",
+            hint,
             contract.ExitCode.USAGE,
         )
     # The context's may be another scene's, where the camera stands still.
@@ -71,8 +102,20 @@ def sampled(
         )
     aspect = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
     window = seen.calc_matrix_camera(graph, x=size[0], y=size[1], scale_x=aspect[0], scale_y=aspect[1])
-    view = seen.matrix_world.normalized().inverted()
-    return contract.CameraFrame(number, *in_solve(scene, shot, view, window, *size, graph), "blender")
+    return seen.matrix_world.copy(), window, graph
+
+
+@contextlib.contextmanager
+def frame_kept(scene_uid: int) -> Generator[None]:
+    """Within it the scene of this number may show other frames; at the end it shows the one that it did."""
+    scene = session.scene_of(scene_uid)
+    before = (scene.frame_current, scene.frame_subframe) if scene is not None else None
+    try:
+        yield
+    finally:
+        back = session.scene_of(scene_uid)
+        if back is not None and before is not None:
+            back.frame_set(before[0], subframe=before[1])
 
 
 def _layer(scene: bpy.types.Scene, camera: bpy.types.Object) -> bpy.types.ViewLayer:

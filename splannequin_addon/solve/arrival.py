@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..footage import arrival, plate
+from ..process import steps
 from ..scene import rollback
-from ..shot import inventory, selection
+from ..shot import inventory, scene_objects, selection
 from . import cameras, motion_overlay, scale
 
 if TYPE_CHECKING:
@@ -19,10 +20,14 @@ def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
     state = inventory.read(shot)
     selection.see(scene, state)
     is_new = cameras.find(scene, shot, "EMPTY") is None
+    entry, size = scene_objects.of(scene, shot), scene_objects.depth_scale(scene, shot)
+    is_other = not is_new and entry is not None and entry.world != inventory.solve_world(shot)
     with rollback.scene_of(scene):
         motion_overlay.hide(scene, shot)  # it is of the mattes of before
         camera = cameras.build(scene, shot)
-        notes = scale.guess_scale(scene, shot, is_new)
+        notes = scale.guess_scale(scene, shot, is_new or is_other)
+        if is_other and abs(scene_objects.depth_scale(scene, shot) / size - 1.0) > 1e-6:
+            notes += [note for step in steps.STEPS.values() for note in step.scaled(scene, shot)]
         changes = arrival.fit(scene, state, force_k=True)
     plate.remove(scene, shot)
     return [f"{camera.name} is the scene's camera, with the plate behind it.", *notes, *changes]

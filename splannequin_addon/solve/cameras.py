@@ -68,7 +68,8 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     """Brings the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
 
     What an earlier call made for the same shot shows the new solve from then on: the objects stay, with all that the
-    artist hung on them, led to them or set in them. So does the root's transform.
+    artist hung on them, led to them or set in them. So does the root's transform, unless the solve is the first in the
+    scene's world, or the first in one of its own again.
 
     Args:
         scene: the scene to build in; its camera is set, nothing else of it is changed.
@@ -87,11 +88,15 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     name = scene_objects.name_of(shot)
     with rollback.scene_of(scene):
         # All that can fail comes before what is there is changed.
-        stands, size, plate = scene_from_solve(path, xyz, floor), _extent(path), _plate(shot)
+        world, size, plate = inventory.solve_world(shot), _extent(path), _plate(shot)
+        stands = np.eye(4) if world else scene_from_solve(path, xyz, floor)
         mesh = _point_mesh(f"{name} points", xyz, rgb)
         kept = {n: item for n in ("camera", "points") if (item := _editable(scene, shot, n)) is not None}
         _clear(scene, shot, but=("root", *kept))  # what the artist hung on the root, and where it stands, stays
         root = _root(scene, shot, stands, size)
+        if present(scene_objects.of(scene, shot)).world != world:
+            present(scene_objects.of(scene, shot)).world = world
+            root.matrix_world = Matrix(stands.tolist())
         camera = kept.get("camera") or _new_camera(name, size)
         cloud = kept.get("points") or _new_points(name, mesh)
         _place(scene, shot, root, [item for item in (camera, cloud) if item not in kept.values()])

@@ -19,7 +19,6 @@ from .. import compat
 from ..access import present
 from ..scene import same_footage, session
 from ..shot import inventory, places
-from . import exchange
 
 
 def render(mask: bpy.types.Mask, shot: Path, kind: str) -> Path:
@@ -147,4 +146,4 @@ def _shift(folder: contract.ShotFolder) -> int:
     shown = next((clip for clip in bpy.data.movieclips if same_footage.shows(clip, sources)), None)
     if shown is None:
         return 0
-    return int(shown.frame_start) - exchange.first_number(shown) - state.shift
+    return int(shown.frame_start) - same_footage.first_number(shown) - state.shift

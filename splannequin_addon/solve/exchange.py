@@ -1,12 +1,17 @@
 """Cameras from elsewhere and for elsewhere, on Blender's side.
 
-In: a file is handed on to the backend as it is; what Blender's own tracker solved is read here and written as a
-nerfstudio transforms.json, whose camera axes are Blender's. Out: the backend writes.
+In: a file that the backend reads is handed on as it is; what Blender's own tracker solved, a camera of the scene, and
+the camera of a file that Blender reads are written as a nerfstudio transforms.json, whose camera axes are Blender's.
+Out: the backend writes.
 """
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import os
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +19,24 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import present, settings_of, size_of
-from ..process import backend, children
+from ..process import backend, children, job_timer
+from ..scene import same_footage
+from ..shot import scene_objects
+from . import camera_file, camera_samples, scene_camera
 
 LEAST_TRACKED = 8
 """Frames that a tracked camera has to be solved for."""
+_READING_SECONDS = 0.02
+"""Of each turn of the timer, in which a camera of the scene is sampled."""
 
 
-def params(scene: bpy.types.Scene, shot: Path | None) -> contract.SolveParams:
-    """What the solve is asked for, from what the artist set; writes Blender's tracking into the shot if it is chosen.
+def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> contract.SolveParams:
+    """What the solve is asked for, from what the artist set; writes cameras that Blender reads into the shot.
+
+    Args:
+        scene: the scene.
+        shot: shot folder, None without one.
+        is_read: what `reads_in_turns` says is written already, or will be.
 
     JobError names what is missing. OSError if the shot cannot be written.
     """
@@ -41,16 +56,95 @@ def params(scene: bpy.types.Scene, shot: Path | None) -> contract.SolveParams:
                 contract.ExitCode.USAGE,
             )
         asked.cameras = os.path.abspath(bpy.path.abspath(props.cameras_path))
+        if camera_file.is_one(asked.cameras):
+            file, folder = Path(asked.cameras), _imported(shot)
+            asked.cameras = str(contract.ShotFolder(folder).tracking)
+            if not is_read:
+                camera_file.read_now(scene, file, folder)
+    elif props.cameras_from == "SCENE":
+        name, folder = _scene_camera(scene), _imported(shot)
+        asked.cameras = str(contract.ShotFolder(folder).tracking)
+        if not is_read:
+            for _ in scene_camera.write_in_turns(scene, name, folder):
+                pass
     elif props.cameras_from == "TRACKING":
         data = transforms(props.tracking_clip)
-        if shot is None or not contract.ShotFolder(shot).info_path.is_file():
-            raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
-        backend.python()  # before anything is written: without a backend nothing would read it
-        file = contract.ShotFolder(shot).tracking
-        contract.ShotFolder(shot).own(file.parent)
-        contract.write_json(file, data, parents=False)
-        asked.cameras = str(file)
+        asked.cameras = str(camera_samples.write(_imported(shot), data))
     return asked
+
+
+def _imported(shot: Path | None) -> Path:
+    """The shot folder, with a backend to read what will be written into it. JobError without either."""
+    if shot is None or not contract.ShotFolder(shot).info_path.is_file():
+        raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
+    backend.python()
+    return shot
+
+
+def _scene_camera(scene: bpy.types.Scene) -> str:
+    """Name of the chosen camera of the scene. JobError without one that can be the clip's."""
+    camera = settings_of(scene).scene_camera
+    if camera is None or scene_objects.is_plate(camera):
+        raise contract.JobError(
+            "No camera of the scene is chosen.",
+            "Choose an animated camera, or set Cameras From to Solve.",
+            contract.ExitCode.USAGE,
+        )
+    return str(camera.name)
+
+
+def has_file_for_blender(asked: contract.SolveParams) -> bool:
+    """True if a solve is asked to take the cameras of a file that Blender reads."""
+    return camera_file.is_one(asked.cameras)
+
+
+def with_file_read(scene: bpy.types.Scene, asked: contract.SolveParams, shot: Path) -> contract.SolveParams:
+    """What a command line asks of a solve, with the cameras of a file that Blender reads written into the shot.
+
+    JobError if they cannot be.
+    """
+    if not has_file_for_blender(asked):
+        return asked
+    read = camera_file.read_now(scene, Path(os.path.abspath(asked.cameras)), _imported(shot))
+    return dataclasses.replace(asked, cameras=str(read))
+
+
+def reads_in_turns(scene: bpy.types.Scene) -> bool:
+    """True if cameras are chosen that Blender reads for longer than a turn of the timer."""
+    props = settings_of(scene)
+    return props.cameras_from == "SCENE" or (props.cameras_from == "FILE" and camera_file.is_one(props.cameras_path))
+
+
+def read_in_turns(scene: bpy.types.Scene, shot: Path) -> Iterator[job_timer.Progress]:
+    """Writes such cameras into the shot, a part of a turn of the timer each. Nothing of bpy is kept between two.
+
+    JobError and OSError as `params`.
+    """
+    if settings_of(scene).cameras_from == "SCENE":
+        turns = scene_camera.write_in_turns(scene, _scene_camera(scene), _imported(shot))
+        del scene
+        yield from _sampled(turns)
+        return
+    file, folder = Path(os.path.abspath(bpy.path.abspath(settings_of(scene).cameras_path))), _imported(shot)
+    asked, began = camera_file.begin(scene, file, folder), time.monotonic()
+    del scene
+    try:
+        while not asked.ended and time.monotonic() - began < camera_file.LONGEST_SECONDS:
+            yield job_timer.Progress(f"Reading the cameras of {file.name}", 0, 1)
+    finally:
+        if not asked.ended:  # given up
+            asked.process.kill()
+    camera_file.written(asked, file, folder)
+
+
+def _sampled(turns: Iterator[tuple[int, int]]) -> Iterator[job_timer.Progress]:
+    """The frames of a camera read, as many a turn as there is time for."""
+    with contextlib.closing(turns):  # pyright: ignore[reportArgumentType]  -- a generator, which may be given up
+        for done, total in turns:
+            until = time.monotonic() + _READING_SECONDS
+            while time.monotonic() < until:
+                done, total = next(turns, (total, total))
+            yield job_timer.Progress(f"Reading the camera, frame {done} of {total}", done, total)
 
 
 def _said(value: float) -> float:
@@ -81,7 +175,7 @@ def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
             "Press Solve Camera Motion in the Movie Clip editor first.",
             contract.ExitCode.USAGE,
         )
-    first = first_number(clip)
+    first = same_footage.first_number(clip)
     return {
         **lens(clip),
         "frames": [
@@ -93,22 +187,6 @@ def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
             if first + camera.frame > 0  # an offset may begin before the footage does
         ],
     }
-
-
-def first_number(clip: bpy.types.MovieClip) -> int:
-    """Our number of what a clip calls its frame 1."""
-    number = _file_number(Path(bpy.path.abspath(clip.filepath))) if clip.source == "SEQUENCE" else 1
-    return number + clip.frame_offset
-
-
-def _file_number(path: Path) -> int:
-    """Frame number of a picture among its neighbours, as the import reads it; 1 if its name has none."""
-    try:
-        names = os.listdir(path.parent)
-    except OSError:
-        names = []
-    found = contract.numbered_files({path.name, *names})
-    return next((n for s in found for n, name in s.files.items() if name == path.name), 1)
 
 
 def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:

@@ -20,13 +20,13 @@ _WORDS = {"NONE": "", "ALPHA": contract.MASK_ALPHA, "FOUND": contract.MASK_FOUND
 
 
 def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolveParams:
-    """What the solve is asked for, from what the artist set. A drawn mask is rendered into the shot first, unless it is
-    `rendered` or will be.
+    """What the solve is asked for, from what the artist set. Drawn masks and cameras of the scene are written into the
+    shot first, unless they are `rendered` or will be.
 
     JobError names what is not chosen, or cannot be written.
     """
     shot = selection.shot_folder(scene)
-    asked = exchange.params(scene, shot)
+    asked = exchange.params(scene, shot, rendered)
     asked.ignore_mask, asked.people_mask = (_source(scene, shot, kind, rendered) for kind in contract.MASK_KINDS)
     return asked
 

@@ -95,7 +95,7 @@ class SPLANNEQUIN_OT_solve_camera(step_operator.StepOperator, bpy.types.Operator
     step = "solve"
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Runs the step. In a window drawn masks are rendered a frame per turn of the timer."""
+        """Runs the step. In a window drawn masks are rendered and cameras read a frame per turn of the timer."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         turns = steps.STEPS[self.step].in_turns(scene, folder) if folder is not None else None

@@ -72,6 +72,8 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
             layout.prop(props, "cameras_path", text="")
         elif props.cameras_from == "TRACKING":
             layout.prop(props, "tracking_clip", text="")
+        elif props.cameras_from == "SCENE":
+            layout.prop(props, "scene_camera", text="")
         for name in ("splannequin.export_cameras", "splannequin.write_stmaps"):
             layout.operator(name, icon=icons.of(name))
 

@@ -74,7 +74,7 @@ def guess_scale(scene: bpy.types.Scene, shot: Path, is_new: bool) -> list[str]:
     """
     entry = present(scene_objects.of(scene, shot))
     if is_new:
-        entry.scaled, entry.guessed_scale = False, 0.0
+        entry.scaled, entry.guessed_scale = entry.world == contract.SCENE_WORLD, 0.0  # the scene's own is no guess
     before = entry.guessed_scale
     if scaled(scene, shot) or not (is_new or before):
         return []

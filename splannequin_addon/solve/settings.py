@@ -65,8 +65,17 @@ class SolveSettings:
         description="Solve the camera here, or take cameras that another program found for the same clip",
         items=[
             ("SOLVE", "Solve", "Find the camera from the clip"),
-            ("FILE", "File", "A COLMAP folder, a nerfstudio transforms.json or a camera path"),
+            (
+                "FILE",
+                "File",
+                "A COLMAP folder, a nerfstudio transforms.json, a camera path, or an Alembic, FBX or USD file",
+            ),
             ("TRACKING", "Blender Tracking", "The solved camera of a movie clip of this file"),
+            (
+                "SCENE",
+                "Scene Camera",
+                "An animated camera of this scene, such as a matchmove: frame by frame, with its lens",
+            ),
         ],
         options=set(),
     )
@@ -107,6 +116,13 @@ class SolveSettings:
         name="Drawn Mask of People",
         description="What is inside may move",
         type=bpy.types.Mask,
+        options=set(),
+    )
+    scene_camera = PointerProperty(
+        name="Scene Camera",
+        description="Animated camera that stands where the clip's was; frame n of the scene is frame n of the clip",
+        type=bpy.types.Object,
+        poll=lambda _, item: getattr(item, "type", "") == "CAMERA",
         options=set(),
     )
     tracking_clip = PointerProperty(

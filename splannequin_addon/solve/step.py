@@ -21,6 +21,7 @@ from . import (
     arrival,
     cameras,
     drawn_masks,
+    exchange,
     guesses,
     masks,
     matte_operators,
@@ -53,8 +54,9 @@ class Solve(Step):
         return masks.params(scene)
 
     def in_turns(self, scene: bpy.types.Scene, shot: Path) -> Iterator[Any] | None:
-        """Renders drawn masks first, if any are chosen."""
-        return solve_in_turns(scene.session_uid, shot) if masks.drawn(scene) else None
+        """Renders drawn masks and reads cameras first, if any are chosen that Blender has to."""
+        has_work = masks.drawn(scene) or exchange.reads_in_turns(scene)
+        return solve_in_turns(scene.session_uid, shot) if has_work else None
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
         """Camera: how good the solve is."""
@@ -97,8 +99,13 @@ class Solve(Step):
 
 
 def solve_in_turns(scene_uid: int, shot: Path) -> Iterator[job_timer.Progress | None]:
-    """The drawn masks of a scene rendered, a frame a turn of the timer; then its solve is begun."""
+    """The drawn masks of a scene rendered and its cameras read, a frame a turn of the timer; then its solve begun."""
     chosen = _chosen(scene_uid)
+    scene = session.scene_of(scene_uid)
+    if scene is not None and exchange.reads_in_turns(scene):
+        reading = exchange.read_in_turns(scene, shot)
+        del scene
+        yield from reading
     for kind, (mask_uid, name) in chosen.items():
         now = None
         with contextlib.closing(drawn_masks.in_turns(mask_uid, name, shot, kind)) as turns:
@@ -115,7 +122,7 @@ def solve_in_turns(scene_uid: int, shot: Path) -> Iterator[job_timer.Progress | 
         return
     if selection.shot_folder(scene) != shot:
         raise contract.JobError(
-            "Another shot was chosen while the masks were rendered.", "Choose this one and solve again."
+            "Another shot was chosen while this one was made ready.", "Choose this one and solve again."
         )
     job_timer.follow("solve", begin.begin(scene, "solve", masks.params(scene, rendered=True)))
 

@@ -92,7 +92,7 @@ ANSWERS = (
         3,
         "a camera is read frame by frame",
         "splannequin_addon",
-        "sampled",
+        "evaluated",
         "scene.frame_set(number)",
         "",
         f"{TEST}cameras.py::test_an_artists_camera_is_read_in_solve_units",

@@ -46,6 +46,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     values |= {"layer": "left", "pixel_aspect": 2.0, "matrix": "bt2020", "levels": "full"}
     values |= {"ignore_from": "FILE", "ignore_path": "//logo.png", "people_from": "DRAWN", "people_path": "//m.png"}
     values |= {"ignore_drawn": bpy.data.masks.new("a"), "people_drawn": bpy.data.masks.new("b")}
+    values |= {"scene_camera": scene.objects["Camera"]}
     values |= {"st_map": "//lens.exr", "st_map_way": "redistort", "st_map_layer": "left"}
     values |= {"focal_mm": 24.0, "sensor_mm": 13.5, "refine_focal": False, "retry": False}
     for name, value in values.items():

@@ -104,13 +104,13 @@ def test_numbers_are_read_as_the_import_reads_them(addon, tmp_path, pictures, te
     for n in range(101, 105):
         pictures.write(tmp_path / template.format(n), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     clip = bpy.data.movieclips.load(str(tmp_path / template.format(101)))
-    assert addon("solve.exchange").first_number(clip) == 101
+    assert addon("scene.same_footage").first_number(clip) == 101
 
 
 def test_numbers_are_those_of_the_files(addon, clip):
-    assert addon("solve.exchange").first_number(clip) == 101
+    assert addon("scene.same_footage").first_number(clip) == 101
     clip.frame_offset = 3
-    assert addon("solve.exchange").first_number(clip) == 104
+    assert addon("scene.same_footage").first_number(clip) == 104
 
 
 def test_pixels_that_are_not_square_have_two_focal_lengths(addon, clip):

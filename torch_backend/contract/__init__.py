@@ -38,6 +38,8 @@ row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame number
 """
 
 from .camera_path import (
+    OWN_FACTS,
+    SCENE_WORLD,
     CameraFrame,
     CameraPath,
 )
@@ -439,6 +441,7 @@ __all__ = [
     "MOTION_UNFINISHED_FILE",
     "NEXT_FOLDER",
     "NO_DEPTH",
+    "OWN_FACTS",
     "PAINTED_FOLDER",
     "PARAMS",
     "PICTURE",
@@ -454,6 +457,7 @@ __all__ = [
     "RULES_VARIABLE",
     "RUNS_FOLDER",
     "SCENE_FILE",
+    "SCENE_WORLD",
     "SETUP_BEGUN",
     "SETUP_NOTES",
     "SETUP_STAMP",

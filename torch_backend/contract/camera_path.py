@@ -13,6 +13,13 @@ from .errors import UserError
 from .files import read_json
 from .typed import CONTRACT_VERSION, check_version, from_dict
 
+OWN_FACTS = "splannequin"
+"""Key of a transforms.json under which Blender says of cameras what nerfstudio's format has no words for: `world`;
+`is_numbered_as_shot`, true if the number of a picture is that of the shot's frame for certain; `notes`, a list of
+[sentence, hint] for the artist."""
+SCENE_WORLD = "scene"
+"""The `world` of cameras that are in the axes and units of a Blender scene."""
+
 
 @dataclass
 class CameraFrame:

@@ -11,12 +11,23 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contract import LONGEST_ARRAYS, CameraPath, ExitCode, JobError, numbered_files, open_regular, read_json
+from ..contract import (
+    LONGEST_ARRAYS,
+    OWN_FACTS,
+    SCENE_WORLD,
+    CameraPath,
+    ExitCode,
+    JobError,
+    numbered_files,
+    open_regular,
+    printable,
+    read_json,
+)
 from ..footage.pairing import Counted, Pairing, pair, pairing_words
 from ..footage.sources import frame_words
 from .colmap_files import ColmapModel, model_files, read_model
@@ -32,6 +43,9 @@ RIGID_SLACK = 1e-2
 MODEL_FOLDERS = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
 """Where a COLMAP model is looked for below the folder that was named."""
 _ANGLE_POINTS = 2000
+_MOST_NOTES = 8
+_BLENDERS = (".abc", ".fbx", ".usd", ".usda", ".usdc", ".usdz")
+"""Endings of files whose cameras Blender's importers read, see `splannequin_addon/solve/camera_file.py`."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +79,7 @@ class ForeignCamera:
     lens: int
     """Index into the solve's lenses."""
     number: int | None = None
-    """Frame number, where the file gives one and not only a name."""
+    """Frame number of the shot, where the file gives it for certain and not only a name."""
 
 
 @dataclass
@@ -83,6 +97,10 @@ class ForeignSolve:
     points: dict[str, Any] | None = None
     """xyz float64 [P, 3], rgb uint8 [P, 3], error float64 [P] px (negative: unknown), seen: P arrays of indices into
     `cameras`, empty where unknown. None if the file holds no points."""
+    world: str = ""
+    """What its coordinates are: `contract.SCENE_WORLD`, or empty for a world of its own."""
+    notes: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    """(sentence, hint) that the file has for the artist."""
 
 
 @dataclass
@@ -108,6 +126,11 @@ def find(path: str | Path) -> tuple[str, list[Path]]:
     if path.is_file():
         if path.suffix.lower() == ".json":
             return "json", [path]
+        if path.suffix.lower() in _BLENDERS:
+            raise _refusal(
+                f"{path.name} is read by Blender alone.",
+                "Solve in Blender, or with `blender --background --command splannequin`.",
+            )
         path = path.parent  # one file of a model was chosen
     for below in MODEL_FOLDERS:
         files = model_files(path / below)
@@ -212,6 +235,8 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
     """nerfstudio's format: camera-to-world, OpenGL axes; what a frame does not say of its lens stands at the top."""
     lenses: dict[Lens, int] = {}
     cameras: list[ForeignCamera] = []
+    said: Any = data.get(OWN_FACTS)
+    facts = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
     for n, frame in enumerate(data["frames"]):
         name = frame.get("file_path")
         matrix = np.array(frame.get("transform_matrix", []), np.float64)
@@ -222,8 +247,19 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
         turned = _rigid(whole, name) * [1.0, -1.0, -1.0, 1.0]  # OpenGL camera axes to OpenCV's
         pose = np.concatenate([turned[:, :3].T, -(turned[:, :3].T @ turned[:, 3:])], axis=1)
         lens = lenses.setdefault(_transforms_lens(file, {**data, **frame}), len(lenses))
-        cameras.append(ForeignCamera(name, pose, lens))
-    return ForeignSolve(file, "transforms.json", list(lenses), cameras)
+        number = int(Path(name).stem) if facts.get("is_numbered_as_shot") is True else None
+        cameras.append(ForeignCamera(name, pose, lens, number))
+    world = SCENE_WORLD if facts.get("world") == SCENE_WORLD else ""
+    return ForeignSolve(file, "transforms.json", list(lenses), cameras, None, world, _notes(facts))
+
+
+def _notes(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    """What Blender wrote beside the cameras for the artist; rows of another form are left out."""
+    rows: Any = facts.get("notes")
+    rows = cast("list[Any]", rows) if isinstance(rows, list) else []
+    pairs = [cast("list[Any]", row) for row in rows[:_MOST_NOTES] if isinstance(row, list)]
+    pairs = [row for row in pairs if len(row) == 2 and all(isinstance(text, str) for text in row)]
+    return [(printable(sentence, 300), printable(hint, 300)) for sentence, hint in pairs]
 
 
 def _transforms_lens(file: Path, values: dict[str, Any]) -> Lens:
@@ -281,7 +317,7 @@ def match(solve: ForeignSolve, counted: Counted, size: tuple[int, int], solved: 
     needed = list(frames if solved is None else solved)
     least = max(min(LEAST_CAMERAS, len(needed)), LEAST_SHARE * len(needed))
     tables = _tables(solve)
-    shifts = solve.kind != "camera path"  # which has the numbers of frames, not of pictures
+    shifts = any(c.number is None for c in solve.cameras)  # else these are numbers of frames, not of pictures
     paired = [(name, table, pair(sorted(table), counted, may_shift=shifts)) for name, table in tables.items()]
     fitting = [one for one in paired if sum(n in one[2].numbers for n in needed) >= least]
     fitting = [one for one in fitting if one[2].by_own_number] or fitting
@@ -338,7 +374,7 @@ def _tables(solve: ForeignSolve) -> dict[str, dict[int, ForeignCamera]]:
 
 def remarks(solve: ForeignSolve, matched: Matched) -> list[tuple[str, str]]:
     """(sentence, hint) of what the artist should know about the matching."""
-    remarks = list(matched.said)
+    remarks = [*solve.notes, *matched.said]
     if matched.missing:
         remarks.append(
             (

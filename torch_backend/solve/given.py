@@ -74,7 +74,8 @@ def take_over(
         report: hears of progress.
 
     Returns:
-        The worker's answer as after a solve; "given" says that it is none, and holds the kind of file.
+        The worker's answer as after a solve; "given" says that it is none, and holds the kind of file; "world" is that
+        of the file's cameras.
 
     Raises:
         JobError: the worker broke off, or not one point agrees with the cameras.
@@ -106,6 +107,7 @@ def take_over(
     return {
         **answer,
         "given": given.kind,
+        "world": given.world,
         "registered": len(registered),
         "camera_model": lenses[0].model,
         "focal_px": 0.5 * (fx + fy),

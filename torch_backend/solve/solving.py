@@ -427,6 +427,7 @@ def _finish(
         "triangulation_angle_deg": answer["triangulation_angle_deg"],
         "quality": result["quality"],
         "cameras_from": answer.get("given", "solve"),
+        "world": answer.get("world", ""),
         "rung": answer.get("rung"),
         "tries": answer.get("tries", []),
         "agreement": answer.get("agreement"),

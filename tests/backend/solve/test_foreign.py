@@ -299,6 +299,33 @@ def test_points_without_tracks_count_the_pictures_they_lie_in():
     assert foreign.own_points(fake_solve(3), matched, (200, 200)) is None
 
 
+def test_what_blender_says_of_a_camera_of_its_scene_is_believed(tmp_path):
+    """Its numbers are the shot's though another count fits as well; its remarks are the artist's."""
+    facts = {"world": "scene", "is_numbered_as_shot": True, "notes": [["One of two.", "Choose."], ["half"], 3]}
+    names = [f"{n}.png" for n in range(1, 11)]
+    counted = Counted(list(range(1, 13)), (1, 12), shift=-1)
+    file = transforms(tmp_path / "transforms.json", some_poses(), names, **PLAIN, splannequin=facts)
+    solve = foreign.read(file)
+    matched = foreign.match(solve, counted, (640, 480))
+    assert solve.world == "scene" and {n: c.name for n, c in matched.cameras.items()} == dict(enumerate(names, 1))
+    said = [sentence for sentence, _ in foreign.remarks(solve, matched)]
+    assert said[0] == "One of two." and len(said) == 2 and "11-12" in said[1]
+    data = json.loads(file.read_text())
+    for strange in ({"world": 3, "notes": "x"}, [], "scene"):
+        file.write_text(json.dumps({**data, "splannequin": strange}))
+        assert (foreign.read(file).world, foreign.read(file).notes) == ("", [])
+    file.write_text(json.dumps({**data, "frames": [{**data["frames"][0], "file_path": "five.png"}]}))
+    with pytest.raises(JobError, match="cannot be used"):
+        foreign.read(file)
+
+
+@pytest.mark.parametrize("ending", ["abc", "FBX", "usdc"])
+def test_files_that_blender_reads_are_said_to_be_blenders(tmp_path, ending):
+    (tmp_path / f"set.{ending}").write_bytes(b"x")
+    with pytest.raises(JobError, match=f"set.{ending} is read by Blender alone"):
+        foreign.read(tmp_path / f"set.{ending}")
+
+
 # ------------------------------------------------------------------------------------------------- whole solves
 
 
@@ -320,7 +347,7 @@ def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
     shot = again(solved, tools, tmp_path)
     report = tools.recorder()
     poses = solved.poses[:18]
-    file = transforms(tmp_path / "transforms.json", poses, **the_lens(2))
+    file = transforms(tmp_path / "transforms.json", poses, **the_lens(2), splannequin={"world": "scene"})
     result = solve_shot(shot, SolveConfig(features=1500), report, str(file))
     path = CameraPath.load(shot.solve / "cameras.json")
     assert [f.frame for f in path.frames] == list(range(101, 122))
@@ -339,6 +366,7 @@ def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
     assert np.sqrt(((got - ideal) ** 2).mean()) < 0.5 * np.sqrt(((off - ideal) ** 2).mean()) + 2.0
     record = read_json(shot.solve / "solve.json")
     assert (record["camera_model"], record["focal_px"], record["cameras_from"]) == ("OPENCV", 300.0, "transforms.json")
+    assert record["world"] == "scene" and read_json(solved.shot.solve / "solve.json")["world"] == ""
     assert result["quality"].startswith("Fair: cameras given for 18 of 21 frames, ")
     assert result["reprojection_error_px"] < 0.8
     assert (shot.solve / "colmap" / "images.bin").is_file()

@@ -1,0 +1,157 @@
+"""Samples of an animated camera, and what a transforms.json says of them in the world of a Blender scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...torch_backend import contract
+from ..scene import axes
+
+if TYPE_CHECKING:
+    import bpy
+    from mathutils import Matrix
+
+ANOTHER = "Choose a camera that moves as the clip's did."
+"""What to do with a camera that cannot be the clip's."""
+_STILL = 1e-6
+"""Largest change of a pose's numbers, relative to its position, that is none: Blender's matrices are float32."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A camera at one frame."""
+
+    number: int
+    """Frame number."""
+    stands: np.ndarray
+    """Camera-to-world, [4, 4] float64, Blender's camera axes, rigid but for shear and mirroring."""
+    K: tuple[float, ...]
+    """fx, fy, cx, cy in pixels, pixel centres at +0.5."""
+
+
+def frames_of(shot: Path) -> tuple[list[int], tuple[int, int]]:
+    """Frame numbers of an imported shot, ascending, and width and height of its frames in pixels.
+
+    JobError without them.
+    """
+    try:
+        listing = contract.read_json(contract.ShotFolder(shot).listing)
+        numbers = [int(row["frame"]) for row in listing["frames"]]
+        return numbers, (int(listing["width"]), int(listing["height"]))
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE) from error
+
+
+def sample_of(number: int, matrix: Matrix, window: Matrix, size: tuple[int, int]) -> Sample:
+    """A camera at a frame.
+
+    Args:
+        number: of the frame.
+        matrix: camera-to-world, Blender's camera axes, [4, 4]; its scale does not matter.
+        window: perspective projection, [4, 4].
+        size: width and height of the picture in pixels.
+    """
+    stands = np.array(matrix, dtype=np.float64)
+    stands[:3, :3] /= np.maximum(np.sqrt((stands[:3, :3] ** 2).sum(axis=0)), 1e-30)
+    return Sample(number, stands, tuple(axes.k_from_window(window, size)))
+
+
+def moves(samples: Sequence[Sample]) -> bool:
+    """True if a camera is not everywhere as it is at first."""
+    poses = np.array([s.stands for s in samples])
+    reach = max(1.0, float(np.abs(poses[:, :3, 3]).max()))
+    return bool(np.abs(poses - poses[0]).max() > _STILL * reach)
+
+
+def keyed(camera: bpy.types.Object) -> tuple[float, float] | None:
+    """First and last frame of the keys of a camera, its lens and its parents; None without any."""
+    spans: list[tuple[float, float]] = []
+    owner: bpy.types.Object | None = camera
+    while owner is not None:
+        for block in (owner, owner.data):
+            spans += _spans(block.animation_data if block is not None else None)
+        owner = owner.parent
+    return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
+
+
+def _spans(data: bpy.types.AnimData | None) -> list[tuple[float, float]]:
+    """First and last frame of the action and of each strip of some animation."""
+    if data is None:
+        return []
+    action: Any = data.action
+    own = [tuple(action.curve_frame_range)] if action is not None else []
+    return own + [(s.frame_start, s.frame_end) for track in data.nla_tracks for s in track.strips]
+
+
+def without_ends(samples: Sequence[Sample], span: tuple[float, float] | None) -> list[Sample]:
+    """Samples of a camera but those at both ends where it only stands as it did before: nobody tracked it there.
+
+    Args:
+        samples: by frame; the camera moves between some of them.
+        span: first and last frame of its keys, which all stay; None: it is moved by something else.
+    """
+    first, last = 0, len(samples) - 1
+    while _alike(samples[first], samples[first + 1]) and not (span and samples[first].number >= span[0]):
+        first += 1
+    while _alike(samples[last], samples[last - 1]) and not (span and samples[last].number <= span[1]):
+        last -= 1
+    return list(samples[first : last + 1])
+
+
+def _alike(one: Sample, other: Sample) -> bool:
+    """True if a camera is at two frames the same to the last bit, as it is where nothing moves it."""
+    return one.K == other.K and bool((one.stands == other.stands).all())
+
+
+def transforms(
+    samples: Sequence[Sample],
+    size: tuple[int, int],
+    is_numbered_as_shot: bool = False,
+    notes: Sequence[tuple[str, str]] = (),
+) -> dict[str, Any]:
+    """Samples of a camera as the content of a transforms.json in the world of a scene.
+
+    Args:
+        samples: by frame.
+        size: width and height in pixels of the pictures that the lens is of.
+        is_numbered_as_shot: a frame number is that of the shot for certain; else the backend finds out.
+        notes: (sentence, hint) for the artist.
+    """
+    lenses: list[dict[str, Any]] = [dict(zip(("fl_x", "fl_y", "cx", "cy"), s.K, strict=True)) for s in samples]
+    shared: dict[str, Any] = {}
+    if all(lens == lenses[0] for lens in lenses):
+        shared, lenses = lenses[0], [{} for _ in lenses]
+    return {
+        "w": size[0],
+        "h": size[1],
+        **shared,
+        "camera_model": "PINHOLE",
+        contract.OWN_FACTS: {
+            "world": contract.SCENE_WORLD,
+            "is_numbered_as_shot": is_numbered_as_shot,
+            "notes": [list(note) for note in notes],
+        },
+        "frames": [
+            {"file_path": f"{s.number}.png", "transform_matrix": s.stands.tolist(), **lens}
+            for s, lens in zip(samples, lenses, strict=True)
+        ],
+    }
+
+
+def write(shot: Path, data: dict[str, Any]) -> Path:
+    """Writes a transforms.json into a shot, where the solve takes it from. OSError if it cannot be written."""
+    file = contract.ShotFolder(shot).tracking
+    contract.ShotFolder(shot).own(file.parent)
+    contract.write_json(file, data, parents=False)
+    return file
+
+
+def whole_frames(span: tuple[float, float]) -> range:
+    """The whole frames of a span of time; times in seconds are rounded where files are written."""
+    return range(math.ceil(span[0] - 0.01), math.floor(span[1] + 0.01) + 1)

@@ -1,0 +1,70 @@
+"""An animated camera of a Blender scene as the cameras of a clip: sampled, and written as a transforms.json.
+
+The world of the file is the scene's, so that what is solved with it stands where the camera stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...torch_backend import contract
+from ..access import named
+from ..scene import scene_setup, session
+from ..shot import seen_camera
+from . import camera_samples
+
+if TYPE_CHECKING:
+    import bpy
+
+_ASPECT_SLACK = 0.01
+"""Of the ratio of width to height: what rounding to whole pixels may change."""
+
+
+def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[tuple[int, int], None, Path]:
+    """Samples a camera at every frame of a shot, a frame a turn; yields how many are done, and of how many.
+
+    Frame n of the scene is frame n of the clip. Returns SHOT/tracking/transforms.json. Frames before the camera's
+    first key and after its last, where it stands still, are left out. Nothing of bpy is kept between two turns, and
+    the scene's frame is put back.
+
+    Args:
+        scene: the scene, whose pixel aspect is believed.
+        name: of the camera object.
+        shot: shot folder.
+
+    Raises:
+        contract.JobError: the shot is not imported, the scene renders another shape than its frames, or the camera is
+            gone, is no perspective camera or does not move.
+    """
+    uid, (numbers, size) = scene.session_uid, camera_samples.frames_of(shot)
+    _refuse_other_shape(scene, size)
+    samples: list[camera_samples.Sample] = []
+    with seen_camera.frame_kept(uid):
+        for number in numbers:
+            seen = seen_camera.evaluated(session.scene_of(uid), name, number, size, camera_samples.ANOTHER)
+            samples.append(camera_samples.sample_of(number, seen[0], seen[1], size))
+            del seen
+            yield len(samples), len(numbers)
+    if not camera_samples.moves(samples):
+        raise contract.JobError(
+            f"{name} stands still from frame {numbers[0]} to {numbers[-1]}.",
+            camera_samples.ANOTHER,
+            contract.ExitCode.USAGE,
+        )
+    found = session.scene_of(uid)
+    camera = named(found.objects, name) if found is not None else None
+    covered = camera_samples.without_ends(samples, camera_samples.keyed(camera) if camera is not None else None)
+    return camera_samples.write(shot, camera_samples.transforms(covered, size, is_numbered_as_shot=True))
+
+
+def _refuse_other_shape(scene: bpy.types.Scene, size: tuple[int, int]) -> None:
+    """JobError if a scene renders pictures of another shape: its cameras are of those pictures."""
+    width, height = scene_setup.render_size(scene)
+    if abs((width / height) / (size[0] / size[1]) - 1.0) > _ASPECT_SLACK:
+        raise contract.JobError(
+            f"The scene renders {width} x {height} pixels, the clip has another shape, {size[0]} x {size[1]}.",
+            "Set the scene's resolution and pixel aspect to the clip's.",
+            contract.ExitCode.USAGE,
+        )
