@@ -128,7 +128,7 @@ def _fill_colors(mesh: bpy.types.Mesh, shape: Shape) -> None:
     mesh.update()
 
 
-def _set(mesh: bpy.types.Mesh, attribute: str, field: str, values: np.ndarray[Any, Any]) -> None:
+def _set(mesh: bpy.types.Mesh, attribute: str, field: str, values: np.ndarray) -> None:
     made: Any = mesh.attributes[attribute]
     made.data.foreach_set(field, values.ravel())
 
