@@ -58,6 +58,9 @@ class LightConfig:
     inside: float = 3.0
     """Splats that the point lies in, nearer than so many standard deviations, are left out: a projection that is linear
     about their middle would smear them across a whole face."""
+    wide: float = 0.3
+    """Splats whose largest standard deviation is more than this share of their distance, 17 degrees, are left out: they
+    reach over several faces, each of which would draw another shape of them."""
     cone: float = 0.34
     """Cosine of the largest angle between a face's axis and a splat that it shows, 70 degrees: of splats beyond, the
     linear projection is no estimate, and their middles lie in other faces."""
@@ -172,6 +175,7 @@ def seen_from(
     quats, log_scales = from_numpy(splats.quats), from_numpy(splats.log_scales).double() - np.log(unit)
     within = (means[:, None] @ rotation_matrices(quats.double()))[:, 0] / log_scales.exp().clamp_min(1e-12)
     share = (apart / config.near - 1.0).clamp(0.0, 1.0) * (norm(within, -1) > config.inside)
+    share = share * (log_scales.exp().amax(-1) < config.wide * apart)
     opacity = torch.sigmoid(from_numpy(splats.opacity_logits).double()) * share
     rows = share > 0.0
     towards = (from_numpy(cameras) - from_numpy(point)) / unit
