@@ -72,7 +72,7 @@ def material_of(name: str, colour: tuple[float, ...], metal: float, rough: float
 
 
 def put(eye: Eye) -> None:
-    """Suzannes and ball on the desk, and a lamp."""
+    """Suzannes and ball on the desk, in the light of the shot and of a lamp."""
     scene = bpy.context.scene
     middle, up = plane_of([eye.at(place) for place in DESK], eye.place)
 
@@ -101,16 +101,13 @@ def put(eye: Eye) -> None:
     ball.data.materials.append(material_of("Chrome", (0.9, 0.9, 0.9), 1.0, 0.02))
     bpy.ops.object.shade_smooth()
     lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "SUN"))
-    lamp.data.energy, lamp.data.angle = 3.0, 0.1
+    lamp.data.energy, lamp.data.angle = 2.0, 0.1
     lamp.rotation_mode = "QUATERNION"
     lamp.rotation_quaternion = (up + 0.35 * front - 0.5 * up.cross(front)).to_track_quat("Z", "Y")
     scene.collection.objects.link(lamp)
-    scene.world = bpy.data.worlds.new("Hall")
-    if scene.world.node_tree is None:
-        scene.world.use_nodes = True
-    sky = next((n for n in scene.world.node_tree.nodes if n.bl_idname == "ShaderNodeBackground"), None)
-    if sky is not None:
-        sky.inputs["Color"].default_value, sky.inputs["Strength"].default_value = (0.9, 0.95, 1.0, 1.0), 0.4
+    scene.cursor.location = middle + up * radius
+    scene.splannequin.take_name = cube.TAKE
+    assert bpy.ops.splannequin.add_light() == {"FINISHED"}
     scene.render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.device, scene.cycles.seed = 64, False, "CPU", 0
 
