@@ -31,7 +31,6 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         props = settings_of(scene_in(context))
         watch, plan = self._watch(context), self._plan(context)
         self._presets(context, layout, watch.state if watch is not None else None)
-        layout.prop(props, "depth")
         if watch is None or watch.running() is not None:
             return
         if plan.kind == "extend":
@@ -120,8 +119,10 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
                 wrap(body, context, told, "ERROR")
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The run's name."""
-        layout.prop(settings_of(scene_in(context)), "run_name")
+        """The run's name, and depth maps."""
+        props = settings_of(scene_in(context))
+        layout.prop(props, "run_name")
+        layout.prop(props, "depth")
 
 
 CLASSES = (SPLANNEQUIN_PT_train,)
