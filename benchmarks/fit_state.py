@@ -5,9 +5,9 @@
 SCENE is a folder of benchmarks/synthetic; seeds 0 to 9 are for tuning. Its shot and an `auto` run for every training
 seed are made in DIR if they are not there. For every instant and pose with a truth the evidence is computed as a frozen
 frame computes it, and regressed (logistic) on whether plate and truth differ. `--masks` adds pixels painted by hand
-(`benchmarks.other_state`) at the instants `--t-star` of a real, trained shot. Then the bias alone is chosen by the PSNR of
-frames mixed of plate and fill (the frame with that plate withheld). Prints the weights, and PSNR of frames mixed by them. `--cross` judges each scene by weights that were fitted on
-the others.
+(`benchmarks.other_state`) at the instants `--t-star` of a real, trained shot. Then the bias alone is chosen by the PSNR
+of frames mixed of plate and fill (the frame with that plate withheld). Prints the weights, and PSNR of frames mixed by
+them. `--cross` judges each scene by weights that were fitted on the others.
 """
 
 from __future__ import annotations
@@ -157,7 +157,8 @@ def judged(case: Case, weights: StateWeights) -> dict[str, float]:
     for name, picture in {"mixed": mixed, "plate": case.plate, "fill": case.filled}.items():
         error = (picture - case.truth).square().mean(-1)
         figures[f"{name} whole"] = _db([float(each.mean()) for each in error])
-        figures[f"{name} moving"] = _db([float(e[m].mean()) for e, m in zip(error, case.moving, strict=True) if m.any()])
+        moving = [float(e[m].mean()) for e, m in zip(error, case.moving, strict=True) if m.any()]
+        figures[f"{name} moving"] = _db(moving)
     return figures
 
 

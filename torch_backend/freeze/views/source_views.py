@@ -259,11 +259,13 @@ class SourceViews:
 
 
 def motion_mattes(shot: Shot) -> MovingOf:
-    """The motion mattes of a shot as `MovingOf`: 0 still, `DOUBT` unknown, 1 moving."""
+    """The motion mattes of a shot as `MovingOf`: 0 still, `DOUBT` unknown or likely to move, 1 moving."""
 
     def moving(frame: int) -> Tensor | None:
-        stored = load_motion(shot, frame)
-        return None if stored is None else matte_of(stored)
+        stored, likely = (load_motion(shot, frame, each) for each in (False, True))
+        if stored is None or likely is None:
+            return None
+        return matte_of(np.where(stored == likely, stored, np.uint8(UNKNOWN)))
 
     return moving
 
