@@ -3,8 +3,8 @@
 Every pixel has a posterior probability. Its log-odds are a weighted sum of evidence (logistic regression): the plate's
 motion matte, the model's scene flow, how far plate, frozen render and the model's render of the plate differ in units
 of noise, and how well the plate correlates with plate t*. `python -m benchmarks.fit_state` fits the weights to
-synthetic scenes with truth and to painted pixels of a real clip. One of them is more than evidence: `plate_matte` also holds that
-a pixel which moves while it is looked at costs more than one that only differs from t*.
+synthetic scenes with truth and to painted pixels of a real clip. One of them is more than evidence: `plate_matte` also
+holds that a pixel which moves while it is looked at costs more than one that only differs from t*.
 
 Related: Granados et al. 2012, "Background Inpainting for Videos with Dynamic Objects and a Free-moving Camera", also
 choose between plates by an expected error.
