@@ -28,16 +28,17 @@ from ..views.visibility import Visibility
 class StateWeights:
     """Weight of each piece of evidence in the log-odds that a plate shows another state; see `evidence` for units."""
 
-    bias: float = -2.77
+    bias: float = -3.2
     """Log-odds where no evidence says anything."""
-    plate_matte: float = 3.2
+    plate_matte: float = 3.4
     """Weight of the plate's own motion matte: 0.6 by the fit, the rest is the cost of keeping what moves. Flow left on
     `sitting` at t* 30: 3 px with 0.6, 1.1 px with 2.5, 0.1 px with 4.0; 3.2 and 4.0 are alike in its worst frames."""
-    scene_flow: float = 1.66
+    scene_flow: float = 1.79
     """Weight of how far the model moves the surface from t* to the plate."""
-    change: float = 1.17
-    """Weight of the difference between the plate and the frozen render."""
-    model_change: float = 0.75
+    change: float = 1.64
+    """Weight of the difference between the plate and the frozen render, less what the render misses of plate t* there:
+    what the model shows wrongly at all times is no change."""
+    model_change: float = 0.5
     """Weight of the difference between the model's render of the plate at its own time and the frozen render."""
     agreement: float = -0.67
     """Weight of what the plate tells of plate t*, carried to it: texture that both show alike."""
@@ -81,17 +82,19 @@ def evidence(
     """
     h, w = target.depth.shape
     view, unit = source_views.view(frame), source_views.unit
-    render = resized(target.image.color, w, h)
+    render = resized(target.image.color, w, h).clamp(0.0, 1.0)  # beyond white a highlight's value says nothing
     inside = (seen.depth > 0.0).float()[..., None]
-    plate, own = (torch.lerp(render, look_up(of.float(), seen.pixels), inside) for of in (view.picture, view.render))
-    agreement = torch.zeros_like(target.depth)
+    plate, own = (torch.lerp(render, _shown(of, seen.pixels), inside) for of in (view.picture, view.render))
+    missed, agreement = torch.zeros_like(render), torch.zeros_like(target.depth)
     if instant is not None:
-        carried = look_up(source_views.view(target.t).picture.float(), instant.pixels)
+        of_t = source_views.view(target.t)
+        carried, its_render = (_shown(of, instant.pixels) for of in (of_t.picture, of_t.render))
+        missed = instant.visible[..., None] * (carried - its_render)
         agreement = instant.visible * shared(plate.mean(-1), carried.mean(-1), config.window * unit, config.noise)
     return {
         "plate_matte": seen.moving,
         "scene_flow": torch.log1p(_travel(source_views, target, frame) / config.travel),
-        "change": torch.log1p(source_views.difference(plate, render) / config.noise),
+        "change": torch.log1p(source_views.difference(plate - missed, render) / config.noise),
         "model_change": torch.log1p(source_views.difference(own, render) / config.noise),
         "agreement": agreement,
     }
@@ -107,6 +110,11 @@ def log_odds(of: Evidence, config: StateConfig, unit: float) -> Tensor:
 def let_go(odds: Tensor, config: StateConfig) -> Tensor:
     """[h, w] in 0..1: the share of each pixel that the plate does not give, of log-odds [h, w]."""
     return (0.5 + 0.5 * odds / config.softness).clamp(0.0, 1.0)
+
+
+def _shown(picture: Tensor, pixels: Tensor) -> Tensor:
+    """[h, w, 3] what a display shows of a picture at pixels [h, w, 2] of it."""
+    return look_up(picture.float().clamp(0.0, 1.0), pixels)
 
 
 def shared(a: Tensor, b: Tensor, sigma: float, noise: float) -> Tensor:

@@ -50,7 +50,7 @@ def test_each_piece_of_evidence_is_large_where_it_should_be(found):
     alike = told["agreement"].numpy()
     assert alike[still].mean() > 0.5 and alike[gone].mean() < 0.25 * alike[still].mean()
     assert not alone["agreement"].any(), "plate t* may not be used"
-    assert torch.equal(alone["change"], told["change"])
+    assert torch.equal(alone["model_change"], told["model_change"])
 
 
 def test_agreement_is_the_information_of_correlated_pictures_whatever_the_exposure():

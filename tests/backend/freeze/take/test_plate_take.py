@@ -233,7 +233,7 @@ def bright(tmp_path_factory, world, quiet):
 
 
 def test_light_beyond_white_and_below_black_is_the_plates(bright, quiet):
-    facts = freeze_shot(bright, FreezeParams(t_star=108, first=103, last=104, develop="off"), quiet())
+    facts = freeze_shot(bright, FreezeParams(t_star=103, first=103, last=104, develop="off"), quiet())
     assert (facts["width"], facts["height"]) == (128, 96)
     for n in (103, 104):
         source = oiio.ImageBuf(str(bright.root.parent / "source" / f"a.{n}.exr")).get_pixels(oiio.FLOAT)
