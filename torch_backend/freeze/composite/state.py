@@ -28,7 +28,7 @@ from ..views.visibility import Visibility
 class StateWeights:
     """Weight of each piece of evidence in the log-odds that a plate shows another state; see `evidence` for units."""
 
-    bias: float = -3.2
+    bias: float = -3.0
     """Log-odds where no evidence says anything."""
     plate_matte: float = 3.4
     """Weight of the plate's own motion matte: 0.6 by the fit, the rest is the cost of keeping what moves. Flow left on
