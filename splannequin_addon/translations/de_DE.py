@@ -315,6 +315,7 @@ MESSAGES: dict[str, str] = {
     "Blur the frames by the move of your camera, with the shutter of the scene's render settings. A frame takes as many times as long as its blur is pixels long, 33 times at most": "Die Bilder durch die Fahrt der eigenen Kamera verwischen, mit dem Verschluss aus den Rendereinstellungen der Szene. Ein Bild dauert so viele Male so lange, wie seine Unschärfe Pixel lang ist, höchstens 33-mal",
     "No motion blur is added on the clip's own camera path: its plates have that of the camera.": "Auf der eigenen Kamerafahrt des Clips kommt keine Bewegungsunschärfe hinzu: seine Plates haben die der Kamera.",
     "Choose a camera of your own to blur its move.": "Eine eigene Kamera wählen, um deren Fahrt zu verwischen.",
+    "CG Softness": "CG-Weichheit",
     "Passes": "Passes",
     "Write motion vectors of the camera's move (Blender's Vector layout), normals and positions as further layers of the frames, in the scene's axes and units": "Bewegungsvektoren der Kamerafahrt (wie in Blenders Vektor-Pass), Normalen und Positionen als weitere Layer der Bilder schreiben, in den Achsen und Einheiten der Szene",
     "Developing": "Entwickeln",
