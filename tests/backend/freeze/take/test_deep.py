@@ -8,10 +8,11 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from torch_backend.contract import NO_DEPTH, CameraPath, FreezeParams, JobError, Placement, is_whole_picture
+from tests.backend.freeze.test_deep_exr import samples_of
+from torch_backend.contract import NO_DEPTH, CameraPath, FreezeParams, JobError, Placement
 from torch_backend.freeze import freeze_shot
-from torch_backend.freeze.deep_exr import DEEP_CHANNELS, write_deep_exr
-from torch_backend.freeze.exr import FrameMetadata, read_frozen_exr
+from torch_backend.freeze.deep_exr import DEEP_CHANNELS
+from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take.deep import DeepConfig, DeepSamples
 from torch_backend.shot import write_json
 
@@ -29,18 +30,6 @@ def flattened(image):
     return np.asarray(flat.get_pixels(oiio.FLOAT), np.float32).reshape(flat.spec().height, flat.spec().width, -1)[
         ..., :4
     ]
-
-
-def samples_of(path):
-    """[H, W] lists of (R, G, B, A, Z) of a deep file."""
-    file = oiio.ImageInput.open(str(path))
-    spec, data = file.spec(), file.read_native_deep_image()
-    assert spec.deep and spec.channelnames == DEEP_CHANNELS
-    each = [
-        [tuple(data.deep_value(p, c, s) for c in range(5)) for s in range(data.samples(p))]
-        for p in range(spec.width * spec.height)
-    ]
-    return np.array([*each, None], dtype=object)[:-1].reshape(spec.height, spec.width), spec
 
 
 def card(spec, depth, rgba):
@@ -146,21 +135,3 @@ def test_blurred_takes_have_none(trained_copy, quiet, tmp_path):
     with pytest.raises(JobError, match="no deep EXRs"):
         freeze_shot(trained_copy.shot, asked, quiet())
     assert not trained_copy.shot.take("blurred").exists()
-
-
-def test_a_deep_file_that_is_cut_off_is_no_whole_picture(tmp_path):
-    rng = np.random.default_rng(1)
-    rgba, depth = rng.random((2, 70, 20, 4)).astype(np.float32), rng.random((2, 70, 20)).astype(np.float32)
-    rgba[1, 10:30, :, 3] = 0.0
-    rgba[:, :3] = 0.0
-    facts = FrameMetadata(7, 5.0, np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), key="k")
-    file = write_deep_exr(tmp_path / "deep.exr", (70, 20), lambda rows: (rgba[:, rows], depth[:, rows]), facts, (2, 5))
-    assert is_whole_picture(file)
-    samples, spec = samples_of(file)
-    assert (spec.x, spec.y, spec.full_width, spec.full_height) == (-2, -5, 16, 60)
-    assert [len(samples[n, 4]) for n in (2, 9, 10, 29, 30, 69)] == [0, 2, 1, 1, 2, 2]
-    np.testing.assert_allclose(samples[69, 4][1], [*rgba[1, 69, 4], depth[1, 69, 4]], atol=5e-4)
-    data = file.read_bytes()
-    for end in (len(data) - 1, len(data) // 2, 600):
-        (tmp_path / "cut.exr").write_bytes(data[:end])
-        assert not is_whole_picture(tmp_path / "cut.exr")
