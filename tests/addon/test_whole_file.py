@@ -1,14 +1,25 @@
 """A file with all that a freeze brings into a scene: undone step by step, moved, and opened without the add-on."""
 
+import importlib.util
 import shutil
+import types
+from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
-import test_lights
-import test_splats
-import test_surfaces
 from mathutils import Vector
+
+
+def beside(name: str) -> types.ModuleType:
+    """A test file of this folder, for what it writes into a take; no import finds it in Blender."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+test_lights, test_splats, test_surfaces = (beside(f"test_{name}") for name in ("lights", "splats", "surfaces"))
 
 
 @pytest.fixture
