@@ -77,7 +77,7 @@ def judge(truth: SyntheticTruth, run: str, t_star: int) -> dict[str, dict[str, f
             viewmat = one.viewmat.double().numpy().copy()  # in metres about the solve's own origin:
             viewmat[:3, 3] = viewmat[:3, 3] / scale - viewmat[:3, :3] @ take.scene.centre
             cameras.append((viewmat, one.K.double().numpy()))
-        found = off_truth(truth.depth(t_star, pose, width, height).numpy(), *cameras, made)
+        found = off_truth(truth.depth(t_star, pose, width, height).numpy(), cameras[0], cameras[1], made)
         moves = frame.motion > 0.5
         off["still"].append(found[~moves & np.isfinite(found)])
         off["moving"].append(found[moves & np.isfinite(found)])
