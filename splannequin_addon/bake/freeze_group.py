@@ -14,7 +14,7 @@ from ...torch_backend import contract
 from .. import compat
 from ..access import named, present, set_value, value_of
 from ..scene.ownership import TAG
-from .node_names import AS_WARP, DEPTH, FROZEN, GRAIN, GROUP_NAME, INVENTED
+from .node_names import AS_WARP, DEPTH, FROZEN, GRAIN, GROUP_NAME, INVENTED, SOFTNESS
 
 BEFORE = "splannequin_before"
 _WARPS = "splannequin_warps"
@@ -84,6 +84,16 @@ def shown(scene: bpy.types.Scene) -> tuple[Path, float] | None:
     return file.parent, float(value_of(depth.inputs[1]))
 
 
+def cg_softness(scene: bpy.types.Scene) -> bpy.types.NodeSocket | None:
+    """Input of the freeze group that mixes CG with what is frozen; None where no CG is led in, or by a link."""
+    tree = compat.compositor_tree(scene)
+    node = group_node(tree) if tree else None
+    if node is None or not node.inputs["CG"].is_linked:
+        return None
+    socket = node.inputs.get(SOFTNESS)  # a group of an earlier version has none until it is updated
+    return None if socket is None or socket.is_linked else socket
+
+
 def set_depth_scale(scene: bpy.types.Scene, scale: float) -> None:
     """Has the freeze group multiply depth by another scale. Only where `shown` says that there is one."""
     node = present(group_node(own_tree(scene)))
@@ -122,6 +132,10 @@ _LOOKS = (
     (INVENTED, 0.0, "1: what splats made up is tinted, what comes from a plate is not"),
 )
 """Factors of what only takes with detail can show."""
+_SOFTNESS_TIP = (
+    "Distance in scene units, before and behind a frozen surface, over which objects fade from in front to behind: for "
+    "hair, smoke and what touches. 0: a clean cut"
+)
 _OUT = tuple(layer for layer in contract.FRAME_LAYERS if layer.output and layer.part != "passes")
 _PASSES = tuple(layer for layer in contract.layers_of("passes") if layer.output)
 
@@ -157,6 +171,9 @@ def give_sockets(group: bpy.types.NodeTree) -> set[str]:
     far = new("CG Depth", "INPUT", "NodeSocketFloat", "Depth pass of the rendered objects")
     if far is not None:
         far.default_value = contract.NO_DEPTH
+    soft = new(SOFTNESS, "INPUT", "NodeSocketFloat", _SOFTNESS_TIP)
+    if soft is not None:
+        soft.default_value, soft.min_value, soft.subtype = 0.0, 0.0, "DISTANCE"
     for layer in _OUT:
         new(layer.output, "OUTPUT", layer.socket, layer.tip)
     return given
@@ -192,6 +209,8 @@ def set_defaults(node: bpy.types.CompositorNodeGroup, names: set[str]) -> None:
         set_value(node.inputs["CG"], (0.0, 0.0, 0.0, 0.0))
     if "CG Depth" in names:
         set_value(node.inputs["CG Depth"], contract.NO_DEPTH)
+    if SOFTNESS in names:
+        set_value(node.inputs[SOFTNESS], 0.0)
 
 
 def new_node(tree: bpy.types.NodeTree, before: dict[str, bool]) -> bpy.types.CompositorNodeGroup:

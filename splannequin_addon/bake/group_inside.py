@@ -9,7 +9,7 @@ from .. import compat
 from ..access import named, present
 from ..scene import sequences
 from . import fitting, warp_nodes
-from .node_names import AS_WARP, DEPTH, FROZEN, GAP, GRAIN, INVENTED
+from .node_names import AS_WARP, DEPTH, FROZEN, GAP, GRAIN, INVENTED, SOFTNESS
 from .take_files import Take
 
 _NOTHING = 0.1 * contract.NO_DEPTH
@@ -54,7 +54,7 @@ def fill(
             layers.pop(layer.name, None)  # nothing behind this reads it
     fitted = fitting.fitted(scene, group, take.size, take.margin, layers)
     share = _share(group, enter, fitted)
-    nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0])
+    nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0], enter.outputs[SOFTNESS])
     group.links.new(share, factor)
     # CG stands in both: Mix, Wipe and mattes choose between stream and frozen frame, not whether an object is there.
     group.links.new(_among(group, enter, enter.outputs["Image"], nearer, "CG in your stream"), first)
@@ -182,26 +182,41 @@ def _cg_depth(group: bpy.types.NodeTree, enter: bpy.types.Node) -> bpy.types.Nod
     return depth.outputs[0]
 
 
-def _nearer(group: bpy.types.NodeTree, cg: bpy.types.NodeSocket, frozen: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Socket of how much CG is in front: 1 up to `_EVEN` behind the frozen depth, 0 from `_SOFT` more, smooth."""
+def _nearer(
+    group: bpy.types.NodeTree, cg: bpy.types.NodeSocket, frozen: bpy.types.NodeSocket, softness: bpy.types.NodeSocket
+) -> bpy.types.NodeSocket:
+    """Socket of how much CG is in front: 1 up to `_EVEN` behind the frozen depth, 0 from `_SOFT` more, smooth.
+
+    Softness, in scene units, makes the way from 1 to 0 longer by itself at both ends. At 0 each step with it changes
+    no bit.
+    """
     ratio = compat.new_math_node(group, "DIVIDE")
     group.links.new(cg, ratio.inputs[0])
     group.links.new(frozen, ratio.inputs[1])
     rise = compat.new_math_node(group, "MULTIPLY_ADD")
     rise.inputs[1].default_value, rise.inputs[2].default_value = -1.0 / _SOFT, 1.0 + (1.0 + _EVEN) / _SOFT
-    rise.use_clamp = True
-    group.links.new(ratio.outputs[0], rise.inputs[0])
+    # (rise + k) / (1 + 2 k), k = softness / (frozen depth * _SOFT)
+    longer, raised, length, eased = (
+        compat.new_math_node(group, o) for o in ("DIVIDE", "MULTIPLY_ADD", "MULTIPLY_ADD", "DIVIDE")
+    )
+    raised.inputs[1].default_value = 1.0 / _SOFT
+    length.inputs[1].default_value, length.inputs[2].default_value = 2.0 / _SOFT, 1.0
+    eased.use_clamp = True
     # t * t * (3 - 2 * t)
     square, slope, smooth = (compat.new_math_node(group, o) for o in ("MULTIPLY", "MULTIPLY_ADD", "MULTIPLY"))
     slope.inputs[1].default_value, slope.inputs[2].default_value = -2.0, 3.0
     smooth.label = "CG is nearer"
+    group.links.new(softness, longer.inputs[0])
+    group.links.new(frozen, longer.inputs[1])
     for source, target in (
-        (rise, square.inputs[0]), (rise, square.inputs[1]), (rise, slope.inputs[0]),
+        (ratio, rise.inputs[0]), (longer, raised.inputs[0]), (rise, raised.inputs[2]), (longer, length.inputs[0]),
+        (raised, eased.inputs[0]), (length, eased.inputs[1]),
+        (eased, square.inputs[0]), (eased, square.inputs[1]), (eased, slope.inputs[0]),
         (square, smooth.inputs[0]), (slope, smooth.inputs[1]),
     ):  # fmt: skip
         group.links.new(source.outputs[0], target)
-    for column, node in enumerate((ratio, rise, square, slope, smooth)):
-        node.location = (GAP * (column - 3), -1300.0)
+    for column, node in enumerate((ratio, rise, longer, raised, length, eased, square, slope, smooth)):
+        node.location = (GAP * (column - 5), -1300.0)
     return smooth.outputs[0]
 
 

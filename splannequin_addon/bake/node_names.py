@@ -8,7 +8,8 @@ FROZEN, DEPTH = "Frozen", "Depth in scene units"
 GAP = 200.0
 GRAIN = "Grain"
 INVENTED = "Show What Is Invented"
-
+SOFTNESS = "CG Softness"
+"""Name of the group's input for the depth over which CG and frozen mix, in scene units."""
 
 AS_WARP = "As Warp"
 """Name of the group's input that fades between the take's own frames and the warped plate."""

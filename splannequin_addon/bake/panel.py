@@ -6,6 +6,7 @@ import bpy
 
 from ..access import scene_in, settings_of
 from ..ui import icons, step_panel
+from . import freeze_group
 
 
 class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
@@ -29,6 +30,9 @@ class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
         """Colours, and the parts of the step one by one."""
         layout.prop(settings_of(scene_in(context)), "keep_colours")
         layout.prop(settings_of(scene_in(context)), "insert_at")
+        softness = freeze_group.cg_softness(scene_in(context))
+        if softness is not None:
+            layout.prop(softness, "default_value", text="CG Softness")
         name = "splannequin.insert_freeze"
         layout.operator(name, text="Insert in Compositor Only", icon=icons.of(name))
         for name in (

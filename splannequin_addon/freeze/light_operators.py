@@ -15,7 +15,7 @@ from ..ui import step_operator
 from . import lights, takes
 
 
-class SPLANNEQUIN_OT_add_light(step_operator.StepOperator, bpy.types.Operator):
+class SPLANNEQUIN_OT_add_light(takes.NeedsTake, step_operator.StepOperator, bpy.types.Operator):
     """Render the chosen take's frozen scene from the 3D cursor into a panorama, and light the scene with it as its
     world, as bright as the plate is. An estimate: what no plate saw is filled smoothly. Your own world comes back
     when the light is removed"""
@@ -24,14 +24,6 @@ class SPLANNEQUIN_OT_add_light(step_operator.StepOperator, bpy.types.Operator):
     bl_label = "Add Light from the Shot"
     bl_options = {"REGISTER"}
     step = "freeze"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a take, and while a step of this shot runs."""
-        if not takes.has_chosen(context):
-            cls.poll_message_set(tr("Freeze first"))
-            return False
-        return super().poll(context)
 
     def perform(self, context: bpy.types.Context) -> Outcome:
         """Has the panorama made, and makes it the world at the end."""

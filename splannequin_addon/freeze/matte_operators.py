@@ -17,20 +17,12 @@ from ..ui import step_operator
 from . import mattes, takes
 
 
-class SPLANNEQUIN_OT_draw_matte(bpy.types.Operator):
+class SPLANNEQUIN_OT_draw_matte(takes.NeedsTake, bpy.types.Operator):
     """Show the frozen frames in an Image Editor, to draw a mask around a person or a thing"""
 
     bl_idname = "splannequin.draw_matte"
     bl_label = "Draw on Frozen Frame"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a take."""
-        if not takes.has_chosen(context):
-            cls.poll_message_set(tr("Freeze first"))
-            return False
-        return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Loads the frames, and a mask where none is chosen; in a window an editor shows both."""
@@ -63,7 +55,7 @@ def _editor(context: bpy.types.Context) -> Any:
     return areas[0].spaces.active
 
 
-class SPLANNEQUIN_OT_matte_from_mask(step_operator.StepOperator, bpy.types.Operator):
+class SPLANNEQUIN_OT_matte_from_mask(takes.NeedsTake, step_operator.StepOperator, bpy.types.Operator):
     """Make a matte for every frame of the take from what the mask surrounds at the current frame. It has the mask's
     name; drawn again at another frame, it adds to it"""
 
@@ -71,14 +63,6 @@ class SPLANNEQUIN_OT_matte_from_mask(step_operator.StepOperator, bpy.types.Opera
     bl_label = "Matte from Mask"
     bl_options = {"REGISTER"}
     step = "freeze"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a take, and while a step of this shot runs."""
-        if not takes.has_chosen(context):
-            cls.poll_message_set(tr("Freeze first"))
-            return False
-        return super().poll(context)
 
     def params(self, scene: bpy.types.Scene) -> contract.MatteParams:
         """The lassos of the mask."""

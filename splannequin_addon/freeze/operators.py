@@ -167,21 +167,13 @@ class SPLANNEQUIN_OT_remove_take(pick_operators.Remove, bpy.types.Operator):
     name = StringProperty(name="Take", description="Name of the take to delete", options={"SKIP_SAVE"})
 
 
-class SPLANNEQUIN_OT_add_splats(bpy.types.Operator):
+class SPLANNEQUIN_OT_add_splats(takes.NeedsTake, bpy.types.Operator):
     """Bring the frozen splats of the chosen take into the scene, under the shot's root, to place things among them.
     They are not rendered unless you switch that on"""
 
     bl_idname = "splannequin.add_splats"
     bl_label = "Add Frozen Splats"
     bl_options = {"REGISTER"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a take."""
-        if not takes.has_chosen(context):
-            cls.poll_message_set(tr("Freeze first"))
-            return False
-        return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Adds them; in a window the timer reads the file, and the panel tells when they are there."""

@@ -134,7 +134,7 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The take's name, what it is made of, its size, and where it is seen from."""
         props = settings_of(scene_in(context))
-        for name in ("take_name", "detail", "develop", "freeze_width", "overscan", "passes"):
+        for name in ("take_name", "detail", "develop", "freeze_width", "overscan", "passes", "deep"):
             layout.prop(props, name)
         if props.overscan == "PERCENT":
             layout.prop(props, "overscan_percent")

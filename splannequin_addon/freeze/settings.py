@@ -81,6 +81,10 @@ class FreezeSettings:
         **contract.panel(contract.FreezeParams, "passes"),
         options=set(),
     )
+    deep = BoolProperty(
+        **contract.panel(contract.FreezeParams, "deep"),
+        options=set(),
+    )
     freeze_width = IntProperty(
         **contract.panel(contract.FreezeParams, "width"),
         min=0,

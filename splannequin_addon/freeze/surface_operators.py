@@ -8,12 +8,11 @@ from ...torch_backend import contract
 from ..access import Outcome, scene_in, settings_of
 from ..process import begin, job_timer
 from ..shot import scene_objects
-from ..translations import tr
 from ..ui import step_operator
 from . import surfaces, takes
 
 
-class SPLANNEQUIN_OT_add_surface(step_operator.StepOperator, bpy.types.Operator):
+class SPLANNEQUIN_OT_add_surface(takes.NeedsTake, step_operator.StepOperator, bpy.types.Operator):
     """Make meshes of the chosen take's frozen room and people, and bring them into the scene under the shot's root.
     They catch the shadows of what you place, hide what is behind them, and are seen in reflections"""
 
@@ -21,14 +20,6 @@ class SPLANNEQUIN_OT_add_surface(step_operator.StepOperator, bpy.types.Operator)
     bl_label = "Add Frozen Surface"
     bl_options = {"REGISTER"}
     step = "freeze"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a take, and while a step of this shot runs."""
-        if not takes.has_chosen(context):
-            cls.poll_message_set(tr("Freeze first"))
-            return False
-        return super().poll(context)
 
     def perform(self, context: bpy.types.Context) -> Outcome:
         """Makes the surface if the take has none, and adds it; in a window the timer does both."""

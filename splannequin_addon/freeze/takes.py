@@ -14,10 +14,11 @@ import bpy
 
 from ...torch_backend import contract
 from .. import compat
-from ..access import scene_in, settings_of
+from ..access import OperatorBase, scene_in, settings_of
 from ..process import backend, begin, job_timer, steps
 from ..scene import session
 from ..shot import inventory, seen_camera, selection
+from ..translations import tr
 from . import own_camera
 
 READING_SECONDS = 0.02
@@ -30,6 +31,19 @@ def has_chosen(context: bpy.types.Context) -> bool:
     folder = selection.shot_folder(scene)
     state = job_timer.watch_of(folder).state if folder else None
     return state is not None and settings_of(scene).take_name in state.takes
+
+
+class NeedsTake(OperatorBase):
+    """What operators share that work on the chosen take. It stands before their other bases."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off without a take, and where another base of the operator says so."""
+        if not has_chosen(context):
+            cls.poll_message_set(tr("Freeze first"))
+            return False
+        other = getattr(super(), "poll", None)
+        return other is None or bool(other(context))
 
 
 def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
@@ -45,6 +59,7 @@ def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
         detail="on" if props.detail else "off",
         develop="on" if props.develop else "off",
         passes=props.passes,
+        deep=props.deep,
         shutter=own_camera.shutter_of(scene),
         only_missing=True,
         device=backend.device(),
@@ -115,6 +130,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
         detail="on" if facts.get("detail") else "off",
         develop="on" if facts.get("developed") is not None else "off",
         passes=bool(facts.get("passes")),
+        deep=bool(facts.get("deep")),
         shutter=float(facts.get("shutter", 0.0)),
     )
 

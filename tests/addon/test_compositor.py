@@ -172,7 +172,7 @@ def test_group_offers_what_a_compositor_needs(addon, scene, take, contract):
     node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     assert [s.name for s in node.inputs] == [
         "Image", "Mix", "Wipe", "Only Supported", "Only Moving", "Splat", "Show What Is Invented", "Grain", "CG",
-        "CG Depth",
+        "CG Depth", "CG Softness",
     ]  # fmt: skip
     always = [layer.output for layer in contract.FRAME_LAYERS if layer.output and layer.part != "passes"]
     assert [s.name for s in node.outputs] == always
@@ -478,25 +478,28 @@ def over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
     return front + (1.0 - front[..., 3:]) * back
 
 
-def in_front(cg: float | np.ndarray, frozen: np.ndarray) -> np.ndarray:
-    """[H, W, 1]: 1 for CG up to half a hundredth of the frozen depth behind it, 0 from a hundredth more."""
-    t = np.clip(1.0 - (cg / frozen - 1.005) / 0.01, 0.0, 1.0)
+def in_front(cg: float | np.ndarray, frozen: np.ndarray, softness: float = 0.0) -> np.ndarray:
+    """[H, W, 1]: 1 for CG up to half a hundredth of the frozen depth behind it, 0 from a hundredth more; with softness
+    by itself further at both ends."""
+    begin, end = 1.005 * frozen - softness, 1.015 * frozen + softness
+    t = np.clip((end - cg) / (end - begin), 0.0, 1.0)
     return (t * t * (3.0 - 2.0 * t))[..., None]
 
 
-@pytest.mark.parametrize("alpha", [1.0, 0.5])
-def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, layers, pictures, alpha):
+@pytest.mark.parametrize(("alpha", "softness"), [(1.0, 0.0), (0.5, 0.0), (0.5, 6.0)])
+def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, layers, pictures, alpha, softness):
     """A wall of CG at depth 12 among frames whose depth grows downwards: pixel by pixel the nearer is in front."""
     compositor, compat = addon("bake.compositor"), addon("compat")
     compositor.insert(scene, addon("bake.take_files").take_of(take.folder, depth_scale=2.0))
     node = addon("bake.freeze_group").group_node(compat.compositor_tree(scene))
     wall = np.array([0.5, 0.25, 0.0, 1.0], np.float32) * alpha
     node.inputs["CG"].default_value, node.inputs["CG Depth"].default_value = tuple(wall), 24.0
+    node.inputs["CG Softness"].default_value = softness
     render(addon, scene, tmp_path / "out")
     for frame in (5, 7):
         data = layers(frame)
         cg = np.broadcast_to(wall, data["rgba"].shape)
-        nearer = in_front(24.0, 2.0 * data["depth"])
+        nearer = in_front(24.0, 2.0 * data["depth"], softness)
         assert 0.1 < nearer.mean() < 0.9
         expected = nearer * over(cg, data["rgba"]) + (1.0 - nearer) * over(data["rgba"], cg)
         found = pictures.read(tmp_path / "out" / f"{frame:06d}.png")

@@ -39,7 +39,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
     values |= {"choose_t_star": True, "path_camera": own, "freeze_width": 640, "live_show": "motion"}
     values |= {"take_name": "x", "camera_model": "OPENCV", "overscan": "LENS", "extend_steps": 77}
     values |= {"overscan_percent": 4.0, "lut": "//look.cube", "use_start": True, "start": 1001}
-    values |= {"detail": False, "develop": False, "passes": True, "motion_blur": True, "depth": "//depth"}
+    values |= {"detail": False, "develop": False, "passes": True, "deep": True, "motion_blur": True, "depth": "//depth"}
     values |= {"matte_mask": bpy.data.masks.new("c")}
     values |= {"cameras_from": "FILE", "cameras_path": "//model", "tracking_clip": tracked}
     values |= {"shot_seen": "//first.splannequin", "solve_step": 2, "fps": 25.0, "colour_space": "x"}

@@ -625,6 +625,17 @@ class FreezeParams:
         "layers of the frames, in the scene's axes and units",
     )
     """Write the layers of `FRAME_LAYERS` whose part is passes."""
+    deep: bool = option(
+        False,
+        flag="--deep",
+        switch=True,
+        help="also a deep EXR for each frame, for Nuke, Fusion and Houdini: two samples where two surfaces meet in a "
+        "pixel",
+        label="Deep EXR",
+        tip="Write a deep EXR beside each frame, with two samples where two surfaces meet in a pixel, for deep "
+        "compositing in Nuke, Fusion or Houdini. Blender reads none. Not with Motion Blur",
+    )
+    """Write takes/NAME/deep/NNNNNN.exr: the frame as deep samples in the scene's units."""
     shutter: float = option(
         0.0,
         flag="--shutter",

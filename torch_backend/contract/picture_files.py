@@ -103,10 +103,11 @@ def _exr(file: BinaryIO, size: int) -> bool:
             break
     offsets = struct.unpack(f"<{sum(counts)}Q", file.read(8 * sum(counts)))
     before = (4 if is_multipart else 0) + (16 if flags & 0x200 else 4)  # part, and line or tile, of a chunk
+    lengths = struct.Struct("<QQ8x" if flags & 0x800 else "<i")  # deep: table of counts, samples, and those unpacked
     for start in offsets:
         file.seek(start + before)
-        length = struct.unpack("<i", file.read(4))[0]
-        if start < 16 or length <= 0 or start + before + 4 + length > size:
+        packed = lengths.unpack(file.read(lengths.size))
+        if start < 16 or packed[0] <= 0 or start + before + lengths.size + sum(packed) > size:
             return False
     return bool(offsets)
 

@@ -52,7 +52,7 @@ DEPTH_FILE = "depth.safetensors"
 PREVIEWS_FOLDER, NEXT_FOLDER, DEVELOPED_FOLDER = "previews", "next", "developed"
 """In a run's folder: pictures of the training, trainings that will take the run's place, developed instants."""
 TAKE_FILE, TAKE_STATE_FILE = "take.json", "state.json"
-TAKE_PREVIEW_FOLDER, WARP_FOLDER, TAKE_NEXT_FOLDER = "preview", "warp", ".next"
+TAKE_PREVIEW_FOLDER, WARP_FOLDER, DEEP_FOLDER, TAKE_NEXT_FOLDER = "preview", "warp", "deep", ".next"
 CONTACT_SHEET_FILE, VIDEO_FILE, PLY_FILE = "contact_sheet.png", "video.mp4", "frozen.ply"
 USD_FILE, SURFACE_FILE = "frozen.usdc", "surface.ply"
 """Of a take: the splats and the animated camera; the frozen scene as a mesh."""
@@ -342,6 +342,14 @@ class TakeFolder:
     def warp(self, number: int) -> Path:
         """How the plate of a frame is warped to its frozen frame."""
         return self.warps / frame_file(number, LAYERS)
+
+    @property
+    def deeps(self) -> Path:
+        return self.root / DEEP_FOLDER
+
+    def deep(self, number: int) -> Path:
+        """A frozen frame as a deep picture."""
+        return self.deeps / frame_file(number, LAYERS)
 
     @property
     def mattes(self) -> Path:

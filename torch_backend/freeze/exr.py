@@ -52,7 +52,8 @@ _PARTS = ("", "grain", "detail")
 """Parts whose layers have arguments of their own here; layers of any other go by the table alone (`more`)."""
 _MORE = {layer.name: layer for layer in FRAME_LAYERS if layer.part not in _PARTS}
 _CHANNELS_OF = {"rgba": (4,), "splat": (4,), "grain": (3,)}
-_ROWS = 64
+ROWS = 64
+"""Rows of a picture that are made and written at a time."""
 _PLATE_STEPS = 256.0
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -188,7 +189,7 @@ def write_frozen_exr(
         names, formats = names + row.channels, formats + (_STORAGE[row.stored],) * len(row.channels)
     matrix = light_matrix(metadata.light)
     parts = [_stored(name, layer, matrix) for name, layer in _checked(layers).items()]
-    spec = _spec(parts[0].shape[1], parts[0].shape[0], names, formats, metadata)
+    spec = frame_spec(parts[0].shape[1], parts[0].shape[0], names, formats, metadata)
     set_margin(spec, margin)
     return write_exr(path, spec, parts)
 
@@ -214,17 +215,29 @@ def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[Rows]) -> Path:
     """
     kinds = [spec.channelformat(channel).basetype for channel in range(spec.nchannels)]
     most = np.array([HALF_MAX if kind == oiio.HALF else np.inf for kind in kinds], np.float32)
+
+    def rows(output: Any, top: int) -> bool:
+        values = _rows_of(parts, slice(top, min(top + ROWS, spec.height)), spec.width)
+        np.clip(values, -most, most, out=values)
+        begin = spec.y + top
+        return bool(output.write_scanlines(begin, begin + len(values), 0, values))
+
+    return write_beside(path, spec, rows)
+
+
+def write_beside(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bool]) -> Path:
+    """Writes a picture whole or not at all. `rows` writes `ROWS` of it from a given one, False if it cannot.
+
+    OSError with the system's reason, as `write_frozen_exr`.
+    """
     with atomic_path(path) as beside:
         output = oiio.ImageOutput.create(str(beside))
         if output is None:
             raise OSError(errno.EIO, f"OpenImageIO cannot write EXR: {oiio.geterror()}", str(path))
         good = bool(cast(Any, output).open(str(beside), spec))
         try:
-            for top in range(0, spec.height, _ROWS) if good else ():
-                rows = _rows_of(parts, slice(top, min(top + _ROWS, spec.height)), spec.width)
-                np.clip(rows, -most, most, out=rows)
-                begin = spec.y + top
-                good = good and output.write_scanlines(begin, begin + len(rows), 0, rows)
+            for top in range(0, spec.height, ROWS) if good else ():
+                good = good and rows(output, top)
         except BaseException:
             output.close()  # a file that is open cannot be removed everywhere
             raise
@@ -396,9 +409,10 @@ def check_finite(name: str, layer: NDArray[np.float32], top: int = 0) -> None:
         raise ValueError(f"{name} has {count} NaN or infinite values, the first at {place}")
 
 
-def _spec(
+def frame_spec(
     width: int, height: int, names: tuple[str, ...], formats: tuple[oiio.BASETYPE, ...], metadata: FrameMetadata
 ) -> oiio.ImageSpec:
+    """What the EXR of a frame begins with, ZIP-compressed. ValueError on matrices or an instant that are none."""
     viewmat = np.asarray(metadata.viewmat, dtype=np.float32)
     intrinsics = np.asarray(metadata.K, dtype=np.float32)
     for name, matrix, shape in (("viewmat", viewmat, (4, 4)), ("K", intrinsics, (3, 3))):

@@ -84,6 +84,8 @@ def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, An
     base = _opened(shot, params.base)
     sources = {name: None if name == LIVE_SOURCE else _opened(shot, name) for name in dict.fromkeys(things.values())}
     frames = _check(base, things, sources)
+    if base.facts.get("deep"):
+        report.warning("A combined take has no deep EXRs.", "Combine those of its takes by their mattes.")
     folder = TakeFolder(shot.own(shot.take(checked_name(params.take, "take"))))
     _refuse_frozen(folder, params)
     live = Plates(shot, (int(base.facts["width"]), int(base.facts["height"]))) if None in sources.values() else None
@@ -291,7 +293,7 @@ def _finish(
     note = write_video(folder.video, (read_png(path) for path in previews), shot.info().fps or 24.0)
     if note:
         report.warning(note)
-    own = ("detail", "warp_dir", "verdict", "ply", "usd", "redistort")
+    own = ("deep", "detail", "warp_dir", "verdict", "ply", "usd", "redistort")
     facts = {
         **{name: value for name, value in base.facts.items() if name not in own},
         "take": params.take,

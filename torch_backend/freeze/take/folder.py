@@ -22,7 +22,7 @@ from ...contract import (
 )
 from ...shot import make_folder, write_json
 from ..exr import read_key
-from .plan import PlannedTake
+from .plan import FrameSpec, PlannedTake
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
 
     One that is not asked for now is among them: a part of the range does not undo the rest of the take.
     """
-    folder, with_warps = take.folder, take.spec.has_warps
-    make_folders(folder, with_warps)
-    keys = stored_keys(folder, with_warps) if params.only_missing else {}
+    folder, spec = take.folder, take.spec
+    make_folders(folder, spec)
+    keys = stored_keys(folder, spec) if params.only_missing else {}
     here, beside, of_before = right_frames(take, keys), folder.next, "" in keys.values()
     there = set[int]()
     if params.only_missing and beside.root.is_dir():
-        there = right_frames(take, stored_keys(beside, with_warps))
+        there = right_frames(take, stored_keys(beside, spec))
     for n in set(_numbers(beside)) - there:
         for file in files_of(beside, n):
             remove_file(file)
@@ -62,7 +62,7 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
         if beside.root.is_dir():  # killed while it took over
             take_over(take, place)
         return Place(folder, None, here | there, set(), of_before)
-    _prepare(beside, with_warps)
+    _prepare(beside, spec)
     return Place(beside, beside, here, there, of_before)
 
 
@@ -71,17 +71,19 @@ def right_frames(take: PlannedTake, keys: dict[int, str | None]) -> set[int]:
     return {n for n, key in keys.items() if key is not None and key == take.keys.get(n)}
 
 
-def stored_keys(folder: TakeFolder, with_warps: bool) -> dict[int, str | None]:
+def stored_keys(folder: TakeFolder, spec: FrameSpec) -> dict[int, str | None]:
     """Frame -> `stored_key`, of all frames of a take's folder."""
-    return {n: stored_key(folder, n, with_warps) for n in frames_of(folder)}
+    return {n: stored_key(folder, n, spec) for n in frames_of(folder)}
 
 
-def stored_key(folder: TakeFolder, frame: int, with_warps: bool) -> str | None:
+def stored_key(folder: TakeFolder, frame: int, spec: FrameSpec) -> str | None:
     """The key that all files of a frame carry. Empty if one carries none: an earlier version wrote it.
 
     None if one lacks, is cut off, or is of another frame or take than the rest: a process was killed between them.
     """
-    files = [folder.frame(frame), folder.preview(frame), *([folder.warp(frame)] if with_warps else [])]
+    files = [folder.frame(frame), folder.preview(frame)]
+    files += [folder.warp(frame)] if spec.has_warps else []
+    files += [folder.deep(frame)] if spec.deep is not None else []
     if not all(map(is_whole_picture, files)):  # a copy may have been cut off
         return None
     keys = {read_key(file) for file in files}
@@ -120,11 +122,11 @@ def take_over(take: PlannedTake, place: Place) -> None:
 
 
 def files_of(folder: TakeFolder, frame: int) -> list[Path]:
-    """All files that a frame of a take has: EXR, warp, preview."""
-    return [folder.frame(frame), folder.warp(frame), folder.preview(frame)]
+    """All files that a frame of a take has: EXR, deep EXR, warp, preview."""
+    return [folder.frame(frame), folder.deep(frame), folder.warp(frame), folder.preview(frame)]
 
 
-def make_folders(folder: TakeFolder, with_warps: bool) -> None:
+def make_folders(folder: TakeFolder, spec: FrameSpec) -> None:
     """Makes a take's folder. JobError if it holds frames of someone else's."""
     if not folder.state.is_file() and _numbers(folder):
         raise JobError(
@@ -132,12 +134,13 @@ def make_folders(folder: TakeFolder, with_warps: bool) -> None:
             "Name another take, or move them away.",
             ExitCode.FREEZE,
         )
-    _prepare(folder, with_warps)
+    _prepare(folder, spec)
 
 
-def _prepare(folder: TakeFolder, with_warps: bool) -> None:
+def _prepare(folder: TakeFolder, spec: FrameSpec) -> None:
     """Makes the folders of a take's frames, and removes what was half written to them."""
-    for used in (folder.root, folder.previews, *([folder.warps] if with_warps else [])):
+    warps, deeps = [folder.warps] if spec.has_warps else [], [folder.deeps] if spec.deep is not None else []
+    for used in (folder.root, folder.previews, *warps, *deeps):
         make_folder(used)
         sweep_half_written(used)
 
@@ -149,7 +152,8 @@ def frames_of(folder: TakeFolder) -> list[int]:
 
 def _numbers(folder: TakeFolder) -> list[int]:
     """Those of all files of frames."""
-    files = folder.root.glob("*" + LAYERS), folder.previews.glob("*" + PICTURE), folder.warps.glob("*" + LAYERS)
+    folders = folder.root, folder.warps, folder.deeps
+    files = [folder.previews.glob("*" + PICTURE), *(each.glob("*" + LAYERS) for each in folders)]
     return sorted({n for found in files for n in _frames_in(found)})
 
 

@@ -15,7 +15,7 @@ from ...contract import (
     Reporter,
     TakeFolder,
 )
-from ...footage.color import on_straight_colour
+from ...footage.color import in_light, light_matrix, on_straight_colour
 from ...footage.display import PLAIN, Display
 from ...footage.images import write_png
 from ...scene import Scene
@@ -26,10 +26,12 @@ from ..composite.compositor import CompositeFrame
 from ..composite.grain import Brush, Grain
 from ..composite.transfer import to_display
 from ..composite.warp import WarpMetadata, write_warp
+from ..deep_exr import write_deep_exr
 from ..exr import DetailLayers, FrameMetadata, Made, write_frozen_exr
 from ..frozen import FrozenGaussians, FrozenImage, OutputFrame, render_frozen
 from ..views.reproject import resized
 from .debug_terms import origin_terms, write_terms
+from .deep import DeepSamples, deep_samples
 from .motion_blur import MotionBlur, kept_grain
 from .plan import FrameSpec, PlannedTake
 from .write_beside import WriteBeside
@@ -41,7 +43,13 @@ def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], rep
     each = (
         spec.whole[0]
         * spec.whole[1]
-        * (20.0 + (6.0 if spec.grain else 0.0) + (24.0 if spec.detail else 0.0) + (26.0 if spec.passes else 0.0))
+        * (
+            20.0
+            + (6.0 if spec.grain else 0.0)
+            + (24.0 if spec.detail else 0.0)
+            + (26.0 if spec.passes else 0.0)
+            + (14.0 if spec.deep else 0.0)
+        )
     )
     need_disk(take.folder.root, len(missing) * each, "the take")
     spec.instants.prepare((f.t_star for f in missing), report)
@@ -77,13 +85,14 @@ def _render_all(
             if output.frame in done:
                 continue
             image = _render(output, scene, spec, report)
+            deep = None if spec.deep is None else _deep(output, image, scene, spec, report)
             if isinstance(image, CompositeFrame):
                 shares[output.frame] = small_share(image.plate, image.support)
             if before_each is not None:
                 before_each()
-            write = functools.partial(_write, folder, output, image, scene, spec, keys[output.frame])
+            write = functools.partial(_write, folder, output, image, deep, scene, spec, keys[output.frame])
             out.write(write, sum(value.nbytes for value in vars(image).values() if isinstance(value, Tensor)))
-            del image, write  # at 4K the next frame needs their gigabyte
+            del image, deep, write  # at 4K the next frame needs their gigabyte
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
     return shares
 
@@ -159,6 +168,7 @@ def _write(
     folder: TakeFolder,
     output: OutputFrame,
     image: FrozenImage | CompositeFrame,
+    deep: DeepSamples | None,
     scene: Scene,
     spec: FrameSpec,
     key: str,
@@ -170,6 +180,8 @@ def _write(
             write_terms(spec.debug_terms, output.frame, image.terms)
         if spec.has_warps:
             _write_warp(folder, output, image, spec, key)
+    if deep is not None:
+        _write_deep(folder, output, image, deep, scene, spec, key)
     _write_frame(folder, output, image, scene, spec, key)
 
 
@@ -183,18 +195,10 @@ def _write_frame(
 ) -> None:
     """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
     write_png(folder.preview(output.frame), _preview(image, spec), key)
-    viewmat = output.viewmat.double().clone()
-    viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ from_numpy(scene.centre)
     size = tuple(image.alpha.shape)
-    alpha = image.alpha.numpy()
 
     def depth(rows: slice) -> np.ndarray:
         return torch.where(image.depth[rows] < NO_DEPTH, image.depth[rows] / scene.scale, NO_DEPTH).numpy()
-
-    def rgba(rows: slice) -> np.ndarray:
-        if isinstance(image, CompositeFrame):
-            return np.concatenate([image.linear[rows].numpy(), alpha[rows][..., None]], axis=2)
-        return scene_linear(image.color[rows].numpy(), alpha[rows], scene.display)
 
     layers = None
     if isinstance(image, CompositeFrame):
@@ -208,14 +212,14 @@ def _write_frame(
         more |= spec.passes.of(output, whole_camera(output, spec), image.depth)
     write_frozen_exr(
         folder.frame(output.frame),
-        Made((*size, 4), rgba),
+        Made((*size, 4), functools.partial(_rgba, image, scene)),
         Made(size, depth),
         image.support.numpy(),
         image.motion.numpy(),
         FrameMetadata(
             output.frame,
             output.t_star,
-            viewmat.float().numpy(),
+            _solve_viewmat(output, scene).float().numpy(),
             output.K.numpy(),
             timecode=spec.timecode(output.frame),
             key=key,
@@ -226,6 +230,55 @@ def _write_frame(
         layers,
         more,
     )
+
+
+def _rgba(image: FrozenImage | CompositeFrame, scene: Scene, rows: slice) -> NDArray[np.float32]:
+    """[h, W, 4] some rows of a frame, scene-linear, premultiplied."""
+    alpha = image.alpha[rows].numpy()
+    if isinstance(image, CompositeFrame):
+        return np.concatenate([image.linear[rows].numpy(), alpha[..., None]], axis=2)
+    return scene_linear(image.color[rows].numpy(), alpha, scene.display)
+
+
+def _deep(
+    output: OutputFrame, image: FrozenImage | CompositeFrame, scene: Scene, spec: FrameSpec, report: Reporter
+) -> DeepSamples:  # fmt: skip
+    """The deep samples of a frame whose depth is settled."""
+    exposure, exposed_at = spec.run.model.exposure, scene.time_of_frame(output.exposed_like)
+    frozen, K = spec.instants.at(output.t_star, report), whole_camera(output, spec)
+    return deep_samples(frozen, output, K, spec.beyond, exposure, exposed_at, scene.display, image.depth)
+
+
+def _write_deep(
+    folder: TakeFolder, output: OutputFrame, image: FrozenImage | CompositeFrame, deep: DeepSamples, scene: Scene,
+    spec: FrameSpec, key: str,
+) -> None:  # fmt: skip
+    """The deep EXR of a frame, in the axes and units of the scene."""
+    assert spec.deep is not None
+    matrix, units = light_matrix(spec.light), spec.deep.scale / scene.scale
+
+    def samples(rows: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        rgba, depth = deep.rows(rows, _rgba(image, scene, rows))
+        return in_light(rgba, matrix), np.where(depth < NO_DEPTH, depth * units, NO_DEPTH).astype(np.float32)
+
+    viewmat = spec.deep.viewmats(_solve_viewmat(output, scene).numpy()[None])[0]
+    write_deep_exr(
+        folder.deep(output.frame),
+        tuple(image.alpha.shape),
+        samples,
+        FrameMetadata(
+            output.frame, output.t_star, viewmat.astype(np.float32), output.K.numpy(), spec.timecode(output.frame),
+            "scene units", key=key, light=spec.light,
+        ),
+        spec.beyond,
+    )  # fmt: skip
+
+
+def _solve_viewmat(output: OutputFrame, scene: Scene) -> Tensor:
+    """[4, 4] a frame's world-to-camera in the units of the solve, float64."""
+    viewmat = output.viewmat.double().clone()
+    viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ from_numpy(scene.centre)
+    return viewmat
 
 
 def _grain(

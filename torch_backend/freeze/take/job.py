@@ -135,6 +135,7 @@ def _finish(
         "fps": shot.info().fps,
         "scale": scene.scale,
         "passes": spec.passes is not None,
+        "deep": spec.deep is not None,
         "shutter": 0.0 if spec.blur is None else spec.blur.shutter,
         "grain": None if spec.grain is None else spec.grain.to_json(),
         "footage": footage_facts(shot, folder.root),

@@ -37,11 +37,11 @@ def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, A
     Returns {t_star, first, last, frames}: what parts are to be made of. JobError in words if it cannot be done.
     """
     take = planned(shot, params, report)
-    make_folders(take.folder, take.spec.has_warps)
+    make_folders(take.folder, take.spec)
     take.spec.instants.prepare((f.t_star for f in take.whole), report)
     _refuse_undeveloped(take)
     chosen = in_range(take.whole, params)
-    keys = stored_keys(take.folder, take.spec.has_warps)
+    keys = stored_keys(take.folder, take.spec)
     if "" in keys.values():
         report.warning(*made_before(params.take))
     if set(keys) - right_frames(take, keys):
@@ -98,8 +98,7 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
 
 def _right_of(take: PlannedTake, frames: list[OutputFrame]) -> set[int]:
     """Those of some frames that are on disk as they would be rendered now."""
-    with_warps = take.spec.has_warps
-    return right_frames(take, {f.frame: stored_key(take.folder, f.frame, with_warps) for f in frames})
+    return right_frames(take, {f.frame: stored_key(take.folder, f.frame, take.spec) for f in frames})
 
 
 def _all_keys(take: PlannedTake) -> str:

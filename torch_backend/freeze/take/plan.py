@@ -47,6 +47,8 @@ TAKE_VERSION = 3
 """Rises when frames rendered before must not stand beside new ones."""
 COMPOSITE_VERSION = 21
 """The same, of frames made of plates."""
+DEEP_VERSION = 1
+"""The same, of deep pictures."""
 
 
 @dataclass
@@ -81,6 +83,8 @@ class FrameSpec:
     """Makes motion vectors, normals and positions; None: they are not written."""
     blur: MotionBlur | None = None
     """The camera's motion blur; None: there is none."""
+    deep: Similarity | None = None
+    """From solve units to the scene's, in which deep pictures leave; None: none are written."""
     debug_terms: Path | None = None
     """Folder that gets the terms behind each frame's decisions; None: they are not written."""
     start: tuple[str, int, float] = ("", 0, 0.0)
@@ -123,6 +127,7 @@ class FrameSpec:
             *([self.detail_key] if self.detail_key else []),
             *([] if self.passes is None else self.passes.facts(output)),
             *([] if self.blur is None else ["blur", self.blur.facts(output)]),
+            *([] if self.deep is None else ["deep", DEEP_VERSION, self.deep.matrix.flatten().tolist()]),
             *([self.light] if self.light != LIGHTS[0] else []),
             *([self.instants.keys[output.t_star]] if output.t_star in self.instants.keys else []),
         )
@@ -172,11 +177,17 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
         find_motion(shot, report, static_model=static_views)  # of shots solved before the solve looked for it
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
+    blur, placed = _motion_blur(whole, params, report), Similarity.of(placement_for(shot, params.placement))
+    if params.deep and blur is not None:
+        raise JobError(
+            "A motion-blurred take has no deep EXRs: what is blurred lies at no one depth.",
+            "Switch motion blur off, or Deep EXR.",
+            ExitCode.USAGE,
+        )
     spec = FrameSpec(
         run, instants, params.query, (width, height), beyond, grain, plate, FrameDepths(run, scene),
         MeasuredDepths(run, scene), detail, detail_key(shot, detail), footage_light(shot),
-        Passes(whole, scene, Similarity.of(placement_for(shot, params.placement))) if params.passes else None,
-        _motion_blur(whole, params, report),
+        Passes(whole, scene, placed) if params.passes else None, blur, placed if params.deep else None,
         Path(params.debug_terms) if params.debug_terms else None, _start(shot),
     )  # fmt: skip
     keys = {f.frame: spec.key(f) for f in whole}

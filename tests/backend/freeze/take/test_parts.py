@@ -12,7 +12,7 @@ from torch_backend.contract import FreezeParams, JobError
 from torch_backend.freeze import finish_take, freeze_part, freeze_shot, open_take
 from torch_backend.shot import write_json
 
-ASK = dict(t_star=104, first=103, last=108, only_missing=True)
+ASK = dict(t_star=104, first=103, last=108, only_missing=True, deep=True)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_frames_made_in_parts_are_those_made_at_once(own, quiet):
     facts = finish_take(own, params, quiet())
     assert (facts["first"], facts["last"], facts["frames"]) == (103, 109, 7)
     at_once, apart = files(own.take("whole")), files(own.take("parts"))
-    assert len(at_once) == 18
+    assert len(at_once) == 24
     assert all(apart[name] == data for name, data in at_once.items())
 
 

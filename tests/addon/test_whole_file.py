@@ -1,0 +1,120 @@
+"""A file with all that a freeze brings into a scene: undone step by step, moved, and opened without the add-on."""
+
+import importlib.util
+import shutil
+import types
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Vector
+
+
+def beside(name: str) -> types.ModuleType:
+    """A test file of this folder, for what it writes into a take; no import finds it in Blender."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+test_lights, test_splats, test_surfaces = (beside(f"test_{name}") for name in ("lights", "splats", "surfaces"))
+
+
+@pytest.fixture
+def full(scene, shot, addon, contract):
+    """Writes splats, a surface and a light of the take for where the shot stands; the shot is in the scene."""
+    scene.splannequin.shot_path = str(shot)
+    assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
+    fill(scene, shot, addon, contract)
+    return shot
+
+
+def fill(scene, shot, addon, contract):
+    placed = test_splats.placed_take(shot, addon, scene)
+    test_surfaces.write_surface(shot, contract)
+    test_lights.write_light(shot, contract, placed)
+    addon("process.job_timer").watch_of(shot).state = addon("shot.inventory").read(shot)
+
+
+def bring_in(scene, shot, addon):
+    assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
+    assert bpy.ops.splannequin.add_surface() == {"FINISHED"}
+    test_lights.add(addon, scene, shot)
+    addon("bake.insertion").insert_freeze(scene, shot, "freeze")
+    addon("bake.insertion").combine_cg(scene, shot)
+
+
+def rendered(path):
+    """[H, W, 3] what the scene renders at frame 6, through its compositor."""
+    scene = bpy.context.scene
+    scene.frame_set(6)
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(str(path))
+    pixels = np.array(image.pixels[:]).reshape(image.size[1], image.size[0], -1)[..., :3]
+    bpy.data.images.remove(image)
+    return pixels
+
+
+def test_moved_and_without_the_addon_it_renders_as_before(full, scene, addon, package, tmp_path):
+    scene.render.engine, scene.cycles.device, scene.cycles.samples = "CYCLES", "CPU", 4
+    scene.cycles.use_denoising = False  # Debian's Blender is built without it
+    scene.render.resolution_x, scene.render.resolution_y = 16, 12
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "artist.blend"))
+    bring_in(scene, full, addon)
+    ahead = scene.camera.matrix_world @ Vector((0.0, 0.0, -2.0))
+    bpy.ops.mesh.primitive_cube_add(size=0.4, location=ahead)
+    addon("bake.freeze_group").cg_softness(scene).default_value = 0.5
+    before = rendered(tmp_path / "before.exr")
+    bpy.ops.wm.save_mainfile()
+    moved = tmp_path.with_name(tmp_path.name + "-moved")
+    tmp_path.rename(moved)
+    package.unregister()
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(moved / "artist.blend"))
+        after = rendered(moved / "after.exr")
+    finally:
+        package.register()
+    assert before.std() > 0.01
+    np.testing.assert_allclose(after, before, atol=1e-4)
+
+
+@pytest.mark.parametrize("button", ["add_splats", "insert_freeze", "combine_cg"])
+def test_what_a_button_brought_in_is_undone_and_done_again(full, scene, addon, button):
+    if button == "combine_cg":
+        assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
+
+    def counts():
+        return {name: len(getattr(bpy.data, name)) for name in ("objects", "images", "node_groups")} | {
+            "nodes": [len(group.nodes) for group in bpy.data.node_groups],
+            "links": len(getattr(addon("compat").compositor_tree(bpy.context.scene), "links", ())),
+        }
+
+    bpy.ops.ed.undo_push(message="before")
+    before = counts()
+    assert getattr(bpy.ops.splannequin, button)() == {"FINISHED"}
+    after = counts()
+    assert after != before
+    bpy.ops.ed.undo_push(message="after")
+    bpy.ops.ed.undo()
+    assert counts() == before
+    bpy.ops.ed.redo()
+    assert counts() == after
+
+
+def test_two_shots_of_a_file_have_their_own_splats(full, scene, addon, contract, tmp_path):
+    assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
+    other = tmp_path / "other.splannequin"
+    shutil.copytree(full, other)
+    scene.splannequin.shot_path = str(other)
+    assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
+    fill(scene, other, addon, contract)
+    assert bpy.ops.splannequin.add_splats() == {"FINISHED"}
+    find = addon("freeze.splats").find
+    first, second = find(scene, full, "freeze"), find(scene, other, "freeze")
+    assert first is not None and second is not None and first != second
+    addon("process.begin").remove_all(scene, other)
+    assert find(scene, full, "freeze") == first and find(scene, other, "freeze") is None
