@@ -5,9 +5,9 @@ for each training seed are made in DIR if they are missing; each instant is froz
 surface is made as *Add Frozen Surface* makes it. Only exact cameras: solve units are metres.
 
 Judged is the distance from the nearest point of the true surface, as a share of that point's depth in the plate nearest
-to it. A vertex counts if two of the clip's plates see that point: what no plate saw is guessed, not measured. Vertices of
-the room and of people (what moves in the clip) apart; and the points of the frames' own depth, which tell what fusing adds.
-DIR gets surface-NAME.json.
+to it. A vertex counts if two of the clip's plates see that point: what no plate saw is guessed, not measured. The room
+and people (what moves in the clip) are judged apart, and so are the points of the frames' own depth: they tell what
+fusing adds. DIR gets surface-NAME.json.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ PLATES = 2
 
 
 def off_truth(places: NDArray[np.float64], truth: RayScene, views: Sequence[View]) -> NDArray[np.float64]:
-    """[V] distance of places from the true surface, as a share of its depth; inf where fewer than `PLATES` views see it.
+    """[V] distance from the true surface, as a share of its depth; inf where fewer than `PLATES` views see that.
 
     Args:
         places: [V, 3] in metres.
@@ -75,8 +75,10 @@ def figures(off: NDArray[np.float64]) -> dict[str, float]:
     return told
 
 
-def judge(truth: SyntheticTruth, scene: SyntheticScene, run: str, t_star: int, every: int) -> dict[str, dict[str, float]]:
-    """Part -> `figures`: the surface's room and people, then those of the depth of the frames that it was fused from."""
+def judge(
+    truth: SyntheticTruth, scene: SyntheticScene, run: str, t_star: int, every: int
+) -> dict[str, dict[str, float]]:
+    """Part -> `figures`: room and people of the surface, then those of the frames that it was fused from."""
     shot, take = truth.shot, f"surface-{run}-{t_star}"
     folder = TakeFolder(shot.take(take))
     params = FreezeParams(run=run, take=take, t_star=t_star, step=every, only_missing=True)

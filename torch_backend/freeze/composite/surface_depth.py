@@ -12,17 +12,17 @@ the depth behind them is taken. What stands still is measured instead, once for 
    around it whose deviations are what their variances explain: a window that reaches over an edge is none (Kuwahara et
    al. 1976). Of those that are, large ones know more.
 
-A frame takes that depth from the key views nearest to it: of what they and the splats say, that with which most agree.
-What moves, and what they do not show, is the splats'. Planes are fitted once more in small windows, and each pixel takes
-those of its neighbours that are about as deep as the splats there and have its own colour in the frame's picture: a joint
-bilateral filter of planes.
+A frame takes that depth from the key views nearest to it: of what they and the splats say, that on which most agree.
+What moves, and what they do not show, is the splats'. Planes are fitted once more in small windows, and each pixel
+takes those of its neighbours that are about as deep as the splats there and have its own colour in the frame's picture:
+a joint bilateral filter of planes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -41,10 +41,10 @@ from ..frozen import FrozenGaussians, fade, freeze_at, render_frozen, span_of
 Array = NDArray[Any]
 """float32 unless it says otherwise."""
 
-_LEAST = 1e-4
+LEAST_INVERSE = 1e-4
 """Least inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so what is farther than
 10,000 of them has no parallax."""
-_TO_SIGMA = 1.4826
+TO_SIGMA = 1.4826
 """Standard deviation over median deviation, of Gaussian errors."""
 _QUANTUM = 1.0 / 255.0
 """Least standard deviation of a plate's brightness: a step of 8 bits."""
@@ -66,20 +66,15 @@ class SurfaceDepthConfig:
     """Radii in pixels of the windows in which planes are fitted to what the plates tell."""
     detail: float = 1.5
     """Standard deviation in pixels of the blur that is subtracted from plates, so that light and exposure cancel."""
-    prior: float = 1.0
-    """Standard deviation of the splats' inverse depth, as a share of it, where plates tell more: large, so that splats
-    count only where plates tell nothing."""
-    noise: float = 0.03
-    """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.7 % on the
-    tuning scenes arm-000 and arm-001. What is farther off is another surface."""
+    noise: float = 0.025
+    """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.8 % on the
+    tuning scenes arm-000 and arm-001."""
     uneven: float = 0.1
     """Mean square deviation of a window from its plane, in variances, from which on it counts less."""
     shared: float = 10.0
     """Number of pixels whose errors are the same: plates are blurred, and all views are compared with one."""
     occluded: float = 1.15
     """Ratio of inverse depths from which on a key view shows something in front of a point."""
-    alike: float = 0.003
-    """Difference of inverse depth, as a share of it, within which key views agree however sure they are."""
     nearest: int = 4
     """Number of key views from which a frame takes its depth."""
     taps: tuple[int, ...] = (-3, 0, 3)
@@ -146,7 +141,7 @@ def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
 def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig) -> tuple[Array, Array]:
     """Inverse depth [h, w] of a key view at which plates agree, and its standard deviation [h, w]."""
     start, inverse = key.inverse, key.inverse.copy()
-    prior = 1.0 / np.square(config.prior * start)
+    prior = 1.0 / np.square(start)  # off by as much as it is: splats count only where plates tell nothing
     variance = 1.0 / prior
     for _ in range(config.steps if others else 1):
         information, pull, parallax = gauss_newton(key, others, inverse, config)
@@ -154,7 +149,7 @@ def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig)
         step = (pull + prior * (start - inverse)) / weight
         pixel = 1.0 / np.maximum(parallax, 1e-3)  # a linear step is not believed beyond that
         inverse, variance = smoothed(inverse + np.clip(step, -pixel, pixel), weight, config)
-        inverse = np.maximum(inverse, _LEAST).astype(np.float32)
+        inverse = np.maximum(inverse, LEAST_INVERSE).astype(np.float32)
     return inverse, np.sqrt(variance).astype(np.float32)
 
 
@@ -174,7 +169,7 @@ def gauss_newton(
         seen = weight > 0.5
         if not seen.any():
             continue
-        noise = max(_TO_SIGMA * float(np.median(np.abs(shift[seen]))), _QUANTUM)
+        noise = max(TO_SIGMA * float(np.median(np.abs(shift[seen]))), _QUANTUM)
         # Three deviations: from there on two plates show two points.
         weight /= np.square(noise * (1.0 + np.square(shift / (3.0 * noise))))
         information += weight * slope * slope
@@ -238,8 +233,7 @@ def _slope(picture: Array, axis: int) -> Array:
     return cv2.Sobel(picture, cv2.CV_32F, axis, 1 - axis, ksize=3, scale=0.125)
 
 
-@dataclass
-class Planes:
+class Planes(NamedTuple):
     """Inverse depth around each pixel as a plane: value + along * (x - its column) + down * (y - its row)."""
 
     value: Array
@@ -252,11 +246,6 @@ class Planes:
     """[h, w] mean square of what the window's values are off the plane, in their variances."""
     information: Array
     """[h, w] 1 / variance of the value, if the window's values are a plane."""
-
-    def where(self, mask: Array, other: Planes) -> Planes:
-        """Those of `other` in `mask`, bool [h, w]."""
-        fields = ("value", "along", "down", "chi", "information")
-        return Planes(*(np.where(mask, getattr(other, name), getattr(self, name)) for name in fields))
 
     def fits(self, uneven: float) -> Array:
         """[h, w] in 0..1: how well a window is a plane; `uneven` is a `chi` that is no fault."""
@@ -282,7 +271,7 @@ def smoothed(values: Array, weight: Array, config: SurfaceDepthConfig) -> tuple[
 
 
 def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
-    """The planes that fit `values` [h, w], each weighted by 1 / its variance [h, w], in the windows around all pixels."""
+    """The planes that fit `values` [h, w], weighted by 1 / their variance [h, w], in the windows around all pixels."""
     rows, columns = _grid(values.shape)
     near = weight.astype(np.float64)
     terms = [near * f for f in (1.0, columns, rows, columns**2, columns * rows, rows**2)]
@@ -365,9 +354,9 @@ def frame_depth(
         whole = np.where(splats.moving > 0.5, whole * factor, whole)
     values, sigma = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, noise * inverse))
     # What moves and what stands still are surfaces of their own, however near they are.
-    weight = 1.0 / np.square(np.maximum(sigma, _LEAST * config.noise))
+    weight = 1.0 / np.square(np.maximum(sigma, LEAST_INVERSE * config.noise))
     still, moved = (fit_planes(values, weight * (of + 1e-9), config.frame_radius) for of in (~mover, mover))
-    planes = still.where(mover, moved)
+    planes = Planes(*(np.where(mover, *each) for each in zip(moved, still, strict=True)))
     guide = np.concatenate([picture, (4.0 * config.color * (splats.moving > 0.5))[..., None]], axis=2, dtype=np.float32)
     small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
     small = np.concatenate([small, (4.0 * config.color * mover)[..., None]], axis=2, dtype=np.float32)
@@ -379,7 +368,7 @@ def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
 
     `view` has the splats' inverse depth and its standard deviation. Splats say alone what moves.
     """
-    rays, splats = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, _LEAST).astype(np.float32)
+    rays, splats = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
     seen = [(splats, view.sigma)]
     for key in surfaces.near(view.viewmat):
         start = points_in(key, view)
@@ -387,13 +376,16 @@ def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
     values, sigmas = (np.stack(each) for each in zip(*seen, strict=True))
     known = sigmas > 0
     known[1:] &= view.still > 0
-    variances = np.square(np.maximum(sigmas, surfaces.config.alike * splats))
+    variances = np.square(np.maximum(sigmas, 1e-4 * splats))
 
     def agree(with_value: Array, with_variance: Array) -> Array:
         return known * np.exp(-0.5 * np.square(values - with_value) / (variances + with_variance))
 
-    votes = np.stack([agree(*each).sum(0) for each in zip(values, variances, strict=True)]) * known
-    best = votes.argmax(0)[None]
+    def density(at: Array) -> Array:
+        return (known * np.exp(-0.5 * np.square(values - at) / variances) / np.sqrt(variances)).sum(0)
+
+    # The densest of all values: one that knows little agrees with everything, and shall not win by that.
+    best = (np.stack([density(each) for each in values]) * known).argmax(0)[None]
     chosen = agree(*(np.take_along_axis(each, best, 0) for each in (values, variances)))
     weight = chosen / variances
     total = np.maximum(weight.sum(0), 1e-12)
@@ -426,8 +418,8 @@ def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[A
         place = Place.of(view, key, rays, inverse)
         depth = place.look(key.inverse)
         better = depth * ahead / np.maximum(1.0 - depth * shift[2], 1e-3)
-        better = np.maximum(np.where(depth > 0, better, inverse), _LEAST).astype(np.float32)
-        return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, _LEAST), 0.0)
+        better = np.maximum(np.where(depth > 0, better, inverse), LEAST_INVERSE).astype(np.float32)
+        return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, LEAST_INVERSE), 0.0)
 
     return once(once(inverse)[0])
 
@@ -475,7 +467,8 @@ def _from_windows(
     at = border + down.astype(np.int64)
     y = (down - 0.5 - 0.5 * h)[:, None]
     x = ((np.arange(width, dtype=np.float32) + 0.5) * (w / width) - 0.5 - 0.5 * w)[None]
-    near = 1.0 / np.maximum(config.noise * rough, config.noise * _LEAST)
+    # Twice their noise: where splats are farther off than that, as beside edges, colour decides.
+    near = 1.0 / (2.0 * config.noise * np.maximum(rough, LEAST_INVERSE))
     total = np.full_like(rough, 1e-20)
     mean, square, spread = np.zeros_like(rough), np.zeros_like(rough), np.zeros_like(rough)
     for dy in config.taps:
@@ -534,11 +527,11 @@ class FrameDepths:
             measured: what the artist's depth maps say of the instant, if anything.
         """
         there = depth < NO_DEPTH
-        inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / _LEAST), 0.0)
+        inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE), 0.0)
         splats = Splats(viewmat.double().numpy(), K.double().numpy(), inverse.numpy(), motion.numpy())
         shown = picture.clamp(0.0, 1.0).numpy()
         found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, shown, measured))
-        refined = torch.where(there, 1.0 / found.clamp_min(_LEAST), NO_DEPTH)
+        refined = torch.where(there, 1.0 / found.clamp_min(LEAST_INVERSE), NO_DEPTH)
         return refined, torch.where(there, sigma * refined.square(), 0.0)
 
     def _key(self, shot: Shot, frame: int, still: FrozenGaussians) -> KeyView:
@@ -549,7 +542,7 @@ class FrameDepths:
         height = max(8, round(scene.height * width / scene.width))
         K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
         image = render_frozen(still, scene.viewmats[i], K, width, height)
-        inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / _LEAST)).numpy()
+        inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
         plate = read_image(shot.plate(frame), width, height, scene.display).numpy()
         moving = load_motion(shot, frame)
         clear = np.ones((height, width), np.float32)
