@@ -345,7 +345,8 @@ def frame_depth(
     K = splats.K.copy()
     K[0] *= w / width
     K[1] *= h / height
-    still, mover = np.clip(1.0 - 2.0 * moving, 0.0, 1.0), moving > 0.5
+    # Where anything of a mover is seen, key views know the background alone.
+    still, mover = (moving < 0.05).astype(np.float32), moving > 0.5
     whole, noise = splats.inverse, np.full_like(inverse, config.noise)
     if measured is not None:
         factor, noise = measured.correction(KeyView(splats.viewmat, K, inverse, still, inverse, inverse), mover)
