@@ -75,7 +75,7 @@ class SurfaceDepthConfig:
     """Number of pixels whose errors are the same: plates are blurred, and all views are compared with one."""
     occluded: float = 1.15
     """Ratio of inverse depths from which on a key view shows something in front of a point."""
-    nearest: int = 4
+    nearest: int = 6
     """Number of key views from which a frame takes its depth."""
     taps: tuple[int, ...] = (-3, 0, 3)
     """Offsets, along rows and columns, of the windows from which a pixel of a frame chooses."""
