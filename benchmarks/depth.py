@@ -11,7 +11,8 @@ left out. Figures pool the pixels of all frames of a scene:
 - Median of |depth - truth| / truth, and the share of pixels beyond 1 %, inside surfaces: at least `INSIDE` pixels from
   every occlusion boundary and from the border of the region.
 - F-score of occlusion boundaries at a tolerance of one pixel: see `occlusion_edges`.
-- The share of pixels inside surfaces whose error is below two of the standard deviations that the frame gives.
+- The shares of pixels inside surfaces whose error is below one and two of the standard deviations that the frame gives:
+  68 and 95 % of Gaussian errors are.
 
 DIR gets depth-NAME.json.
 """
@@ -87,8 +88,8 @@ class Pooled:
 
     errors: list[Tensor] = field(default_factory=list[Tensor])
     """Relative errors of depth, [P] per frame."""
-    within: list[Tensor] = field(default_factory=list[Tensor])
-    """bool [P] per frame: error below two standard deviations; empty if frames have none."""
+    deviations: list[Tensor] = field(default_factory=list[Tensor])
+    """[P] per frame: errors in standard deviations; empty if frames have none."""
     found: int = 0
     """Boundary pixels of the frames that have one of the truth within `TOLERANCE`,"""
     shown: int = 0
@@ -114,12 +115,13 @@ class Pooled:
         off = (depth[inside] - truth[inside]).abs()
         self.errors.append(off / truth[inside])
         if sigma is not None:
-            self.within.append(off < 2.0 * sigma[inside])
+            self.deviations.append(off / sigma[inside].clamp_min(1e-9))
 
     def figures(self) -> dict[str, float | None]:
-        """median and beyond (shares), boundary_f, precision, recall, within_2_sigma; None where nothing is known."""
+        """median and beyond (shares), boundary_f, precision, recall, within_1_sigma, within_2_sigma; None where nothing
+        is known."""
         errors = torch.cat(self.errors) if self.errors else torch.empty(0)
-        within = torch.cat(self.within) if self.within else torch.empty(0)
+        deviations = torch.cat(self.deviations) if self.deviations else torch.empty(0)
         precision = self.found / self.shown if self.shown else None
         recall = self.recalled / self.true if self.true else None
         both = None if precision is None or recall is None else precision + recall
@@ -131,7 +133,9 @@ class Pooled:
             else (2.0 * (precision or 0.0) * (recall or 0.0) / both if both else 0.0),
             "precision": precision,
             "recall": recall,
-            "within_2_sigma": float(within.float().mean()) if len(within) else None,
+            **{
+                f"within_{n}_sigma": float((deviations < n).float().mean()) if len(deviations) else None for n in (1, 2)
+            },
         }
 
 
@@ -172,16 +176,19 @@ def _text(of: dict[str, float | None]) -> str:
         return "–" if value is None else f"{unit * value:.{digits}f}"
 
     cells = said("median", 100.0, 2), said("beyond", 100.0, 1), said("boundary_f", 1.0, 3), said("precision", 1.0, 3)
-    return " | ".join((*cells, said("recall", 1.0, 3), said("within_2_sigma", 100.0, 1)))
+    told = said("within_1_sigma", 100.0, 1), said("within_2_sigma", 100.0, 1)
+    return " | ".join((*cells, said("recall", 1.0, 3), *told))
 
 
 def table(found: dict[str, dict[str, dict[str, float | None]]]) -> list[str]:
     """Figures by scene and region in Markdown."""
-    head = "| scene | region | median error, % | beyond 1 %, % | boundary F | precision | recall | within 2 sigma, % |"
+    head = (
+        "| scene | region | median error, % | beyond 1 %, % | boundary F | precision | recall | in 1 sigma, % | in 2 |"
+    )
     lines = [
         f"| {scene} | {region} | {_text(of)} |" for scene, regions in found.items() for region, of in regions.items()
     ]
-    return [head, "|---|---|---:|---:|---:|---:|---:|---:|", *lines]
+    return [head, "|---|---|---:|---:|---:|---:|---:|---:|---:|", *lines]
 
 
 def mean_of(found: Sequence[dict[str, dict[str, float | None]]]) -> dict[str, dict[str, float | None]]:

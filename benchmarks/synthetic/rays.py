@@ -33,6 +33,13 @@ def _cast(
         face[i] = -1
 
 
+@wp.kernel(enable_backward=False)
+def _nearest(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), found: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    result = wp.mesh_query_point_no_sign(mesh, points[i], 1.0e6)
+    found[i] = wp.mesh_eval_position(mesh, result.face, result.u, result.v)
+
+
 @dataclass
 class Hits:
     """What R rays met first."""
@@ -72,6 +79,14 @@ class RayScene:
         wp.launch(_cast, dim=count, inputs=[self._mesh.id, *arrays], outputs=outputs, device="cpu")
         hits.distance /= length[:, 0].astype(np.float32)
         return hits
+
+    def nearest(self, points: NDArray) -> NDArray[np.float64]:
+        """[P, 3] the points of the triangles that are nearest to `points` [P, 3]."""
+        found = np.empty((len(points), 3), np.float32)
+        places = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
+        output = wp.array(found, dtype=wp.vec3, device="cpu", copy=False)
+        wp.launch(_nearest, dim=len(points), inputs=[self._mesh.id, places], outputs=[output], device="cpu")
+        return found.astype(np.float64)
 
     def sees(self, eye: NDArray, points: NDArray) -> NDArray[np.bool_]:
         """[P] whether nothing lies between `eye` [3] and `points` [P, 3]."""

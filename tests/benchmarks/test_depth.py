@@ -35,6 +35,7 @@ def test_figures_of_known_errors() -> None:
     assert still["median"] == pytest.approx(0.004, rel=1e-3) and still["beyond"] == 0.0
     assert moving["median"] == pytest.approx(0.02, rel=1e-3) and moving["beyond"] == 1.0
     assert moving["boundary_f"] == 1.0 and moving["within_2_sigma"] == 1.0
+    assert moving["within_1_sigma"] == 0.0, "0.03 off, and sure to 0.02"
     assert "2.00 | 100.0 | 1.000" in table({"box": mean_of([pooled_figures(pooled), pooled_figures(pooled)])})[-1]
 
 

@@ -2,28 +2,32 @@
 
 import numpy as np
 
-from benchmarks.surface import off_truth
+from benchmarks.surface import figures, off_truth
+from benchmarks.synthetic.rays import RayScene
+from benchmarks.synthetic.regions import View
 
 
-def view(x, wall, size=(48, 64)):
-    """A camera at (x, 0, 0) that looks along z at a wall."""
+def square(z, half):
+    """(vertices [4, 3], triangles [2, 3]) of a square that faces along z."""
+    corners = [(-half, -half, z), (half, -half, z), (half, half, z), (-half, half, z)]
+    return np.array(corners, np.float32), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def camera(x):
+    """At (x, 0, 0), looking along z."""
     viewmat = np.eye(4)
     viewmat[0, 3] = -x
-    return viewmat, np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), np.full(size, wall, np.float64)
+    return View(viewmat, np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48)
 
 
-def test_it_is_the_second_best_of_the_poses_that_see_a_place():
-    before = view(0.2, 5.0)
-    before[2][:, :40] = 2.0  # something stands in front of the wall, for this camera alone
-    views = [view(-0.1, 5.0), view(0.0, 5.0), before]
-    places = np.array([[0.0, 0.0, 5.05], [0.0, 0.0, 4.0], [2.7, 0.0, 5.0], [0.0, 0.0, -3.0]])
-    off = off_truth(places, views)
-    np.testing.assert_allclose(off[:2], [0.01, 0.2], atol=1e-9)
-    assert off[2] == np.inf, "one camera sees it"
-    assert off[3] == np.inf, "behind all"
-
-
-def test_sky_is_no_surface():
-    views = [view(0.0, np.inf), view(0.1, 5.0), view(-0.1, 5.0)]
-    assert off_truth(np.array([[0.0, 0.0, 5.0]]), views[:2])[0] == np.inf
-    assert off_truth(np.array([[0.0, 0.0, 5.0]]), views)[0] == 0.0
+def test_a_place_is_as_far_off_as_from_the_nearest_surface_that_two_plates_see():
+    (wall, faces), (card, _) = square(5.0, 9.0), square(2.0, 0.5)
+    truth = RayScene(np.concatenate([wall, card]), np.concatenate([faces, faces + 4]))
+    views = [camera(-0.1), camera(0.0), camera(0.1)]
+    places = np.array([[1.8, 0, 5.05], [1.8, 0, 4.5], [0.1, 0, 2.04], [0.3, 0, 4.9], [-2.85, 0, 5.0], [2.0, 1.0, 5.0]])
+    off = off_truth(places, truth, views)
+    np.testing.assert_allclose(off[[0, 1, 2, 5]], [0.01, 0.1, 0.02, 0.0], atol=1e-6)
+    assert off[3] == np.inf, "the card hides the wall there"
+    assert off[4] == np.inf, "one camera sees it"
+    told = figures(off)
+    assert told["seen"] == 4 / 6 and np.isclose(told["median"], 0.015) and told["beyond"] in (0.5, 0.75)

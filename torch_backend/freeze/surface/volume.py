@@ -160,7 +160,7 @@ def resolved(views: Sequence[View], space: Contraction) -> float:
     """Width of a pixel of the views in the contracted space, the median: what depth resolves."""
     widths: list[NDArray[Any]] = []
     for view in views:
-        points, rows, columns = _points(view)
+        points, rows, columns = unprojected(view)
         widths.append(view.depth[rows, columns] / view.K[0, 0] / space.scale(points))
     return float(np.median(np.concatenate(widths)))
 
@@ -201,7 +201,7 @@ def fuse(
     return Volume(keys, distance.reshape(-1, SIDE, SIDE, SIDE), voxel, cut, space)
 
 
-def _points(view: View, off: NDArray[Any] | float = 0.0) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def unprojected(view: View, off: NDArray[Any] | float = 0.0) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """(points [N, 3] that a view shows, their rows, their columns); `off` [N] is added to their depth."""
     rows, columns = np.nonzero(view.depth > 0)
     depth = view.depth[rows, columns].astype(np.float64)
@@ -221,9 +221,9 @@ def _near_surfaces(views: Sequence[View], voxel: float, cut: float, space: Contr
     found: list[NDArray[np.int64]] = []
     steps = np.linspace(-cut, cut, 1 + 2 * math.ceil(2 * cut / (SIDE * voxel)))  # half a block at most
     for view in views:
-        scale = space.scale(_points(view)[0])
+        scale = space.scale(unprojected(view)[0])
         for off in steps:
-            points = space.into(_points(view, off * scale)[0])
+            points = space.into(unprojected(view, off * scale)[0])
             # Half a voxel: the middles of a block's first voxels lie on its edge.
             found.append(np.unique(block_keys(np.floor((points / voxel + 0.5) / SIDE))))
     return np.unique(np.concatenate(found))
