@@ -71,15 +71,15 @@ class Ablation:
         self, case: Case, instants: Instants, scene_off: frozenset[str], group: dict[str, frozenset[str]]
     ) -> None:
         t_star, made = instants.t_star, instants.make(scene_off)
-        done = {name: self._judged(case, t_star, made.key, of_frames(off)) for name, off in group.items()}
-        left = {name: of_frames(off) for name, off in group.items() if done[name] is None}
-        if left:
-            poses = [] if case.truth is None else poses_of(case.truth, t_star, self.args.every)
-            pairs = [] if case.truth is not None else pairs_of(case, t_star, self.args.pairs, self.args.draw)
-            done |= judge(case, FrameMaker(case.clip, t_star, made), left, poses, pairs)
-        for name, row in done.items():
-            assert row is not None
-            facts = {"scene": made.key, "frame_rules": sorted(of_frames(group[name])), "seconds": made.seconds}
+        poses = [] if case.truth is None else poses_of(case.truth, t_star, self.args.every)
+        pairs = [] if case.truth is not None else pairs_of(case, t_star, self.args.pairs, self.args.draw)
+        maker = FrameMaker(case.clip, t_star, made)
+        for name, rules in group.items():
+            off = of_frames(rules)
+            row = self._judged(case, t_star, made.key, off)
+            if row is None:
+                row = judge(case, maker, {name: off}, poses, pairs)[name]
+            facts = {"scene": made.key, "frame_rules": sorted(off), "seconds": made.seconds}
             self.store.save(case.name, t_star, name, row | facts)
 
     def _judged(self, case: Case, t_star: int, key: str, off: frozenset[str]) -> Row | None:

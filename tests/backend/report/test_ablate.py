@@ -53,7 +53,10 @@ def test_a_rule_is_off_and_on_again(rule):
 def test_groups_of_variants():
     assert COMBINATIONS["motion alone"] < variants(("combinations",))["mattes alone"]
     frame, scene = variants((FRAME,)), variants(("scene",))
-    assert not frame.keys() & scene.keys() - {"today"} and len(frame) + len(scene) == len(RULES) + 2
+    swept = variants(("sweep-frame", "sweep-scene"))
+    assert not frame.keys() & scene.keys() - {"today"} and swept.keys() & scene.keys() == {"today"}
+    assert len(frame) + len(scene) + len(swept) == len(RULES) + 3
+    assert detail_config(swept["twice doubt"]).doubt == 2.0 * detail_config(swept["today"]).doubt
     with pytest.raises(ValueError, match="no group or variant 'bent'"):
         variants(("bent",))
 

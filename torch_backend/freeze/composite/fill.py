@@ -68,23 +68,22 @@ def fillers_of(
         return None
     chosen = _chosen(source_views, config, target, matte, primary, usable)
     moved = displacements(source_views, target, chosen)
-    shown = _shown(source_views, config, target, chosen, moved)
+    shown = _shown(source_views, target, chosen, moved)
     agreed = _agreed(source_views, config, target, chosen, moved)
     residuals = [source_views.residual(frame) for frame in chosen]
     most = max(source_views.scene.display.most, *(source_views.most(frame) for frame in chosen))
     return Fillers(chosen, moved, shown, agreed, residuals, most)
 
 
-def _shown(
-    source_views: SourceViews, config: CompositeConfig, target: TargetView, chosen: list[int], moved: list[Tensor]
-) -> list[Tensor]:
+def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
     """[h, w] in 0..1 for each plate: it shows what is seen and what is around that; of use where something moves."""
-    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 4 * config.rough + 1)  # elsewhere it is not asked for
+    # Depth is rough there: what a plate is seen to show changes from pixel to pixel, and single ones would stand out.
+    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 5)  # elsewhere it is not asked for
     points, out = target.points[near], list[Tensor]()
     for frame, way in zip(chosen, moved, strict=True):
         visible = torch.ones_like(target.depth)
         visible[near] = source_views.seen(frame, points if frame == target.t else points + way[near]).visible
-        out.append(blurred(erode(visible, config.rough), float(config.rough)))
+        out.append(blurred(erode(visible, 1), 1.0))
     return out
 
 
@@ -111,8 +110,8 @@ def _agreed(
         visibility = source_views.seen(frame, points + way[::2, ::2])
         says = look_up(source_views.view(frame).picture.float(), visibility.pixels)
         both = (truth.visible * visibility.visible)[..., None]
-        off = source_views.difference(says * both, shown_at_t * both, 0.5)
-        out.append(resized(torch.exp(-(off / config.agreement).square()), w, h))
+        off = source_views.difference(says * both, shown_at_t * both)
+        out.append(resized(torch.exp(-0.5 * (off / config.state.noise).square()), w, h))
     return out
 
 
@@ -151,7 +150,7 @@ def fill(
         around = torch.minimum(visibility.visible, look_up(fillers.shown[n], small))
         visibility.visible = torch.lerp(visibility.visible, around, uneasy)
         agreed = look_up(fillers.agreed[n], small)
-        unmoved = _unmoved(source_views, config, frame, points, visibility) * agreed
+        unmoved = _unmoved(source_views, frame, points, visibility) * agreed
         sway = config.sway_trust * unmoved * untold
         still = 1.0 - doubt * (1.0 - agreed)
         if frame != target.t:
@@ -204,8 +203,8 @@ def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetVi
     """[...] in 0..1: how nearly plate t* sees points [..., 3] from the frame's side."""
     a, b = points - source_views.centres[source_views.index[target.t]], points - target.centre
     cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
-    first, last = config.beside
-    return ((last - torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))) / (last - first)).clamp(0.0, 1.0)
+    angle = torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
+    return (2.0 - 2.0 * angle / config.beside).clamp(0.0, 1.0)
 
 
 def _exposed(source_views: SourceViews, target: TargetView, frame: int) -> tuple[Tensor, Tensor]:
@@ -223,13 +222,11 @@ def _doubted(visibility: Visibility, doubt: Tensor) -> Visibility:
     return replace(visibility, moving=torch.maximum(visibility.moving, doubt * (1.0 - visibility.explained)))
 
 
-def _unmoved(
-    source_views: SourceViews, config: CompositeConfig, frame: int, points: Tensor, visibility: Visibility
-) -> Tensor:
+def _unmoved(source_views: SourceViews, frame: int, points: Tensor, visibility: Visibility) -> Tensor:
     """[...] in 0..1: what moves is in plate `frame` nearly as at t*: the model agrees, and moved it little."""
     view = source_views.view(frame)
     travel = norm(project(points, view.viewmat, view.K)[0] - visibility.pixels, -1)
-    trust = torch.exp(-travel / (config.sway * source_views.unit))
+    trust = torch.exp(-travel / (source_views.config.margin * source_views.unit))
     return visibility.explained * trust
 
 
@@ -272,7 +269,8 @@ def _chosen(
     need = 1.0 - resized(matte, w, h)[::4, ::4]
     points, motion, doubt = (of[::4, ::4] for of in (target.points, target.motion, target.doubt))
     k = source_views.frames.index(primary)
-    around = {k + side * step for step in config.reach for side in (-1, 1)} | {k}
+    steps = [2**n for n in range(config.reach.bit_length())]
+    around = {k + side * step for step in steps for side in (-1, 1)} | {k}
     reach = {source_views.frames[i] for i in around if 0 <= i < len(source_views.frames)} | {target.t}
     zero = torch.zeros_like(motion)
     gains = {
@@ -287,14 +285,11 @@ def _chosen(
         have = have + gains[frame]
     while len(chosen) < min(config.sources, len(gains)):
         # Diminishing returns: a second plate of the same wall helps less than a first one of another.
-        worth = {
-            frame: float((torch.log1p(10.0 * (have + gain)) - torch.log1p(10.0 * have)).sum())
-            for frame, gain in gains.items()
-            if frame not in chosen
-        }
+        left = {frame: gain for frame, gain in gains.items() if frame not in chosen}
+        worth = {frame: float(((have + gain).sqrt() - have.sqrt()).sum()) for frame, gain in left.items()}
         candidates = sorted(worth, key=lambda candidate: abs(candidate - primary))
         frame = candidates[int(first_best(torch.tensor([worth[each] for each in candidates], device="cpu")))]
-        if worth[frame] < 1e-3 * float(need.sum()):
+        if worth[frame] <= 0.0:
             break
         chosen.append(frame)
         have = have + gains[frame]
