@@ -5,8 +5,10 @@ one of a tuple), and those written in the code. A number counts as tuned unless 
 
 - trivial: 0, 1, 2, 3, 4 and one half in the code, which are dimensions, centres of pixels, windows and even odds;
 - a guard, but for fields: at most 1e-3, or from 1e4 on, which keeps a quotient or a logarithm finite;
-- in `UNTUNED`: a resource (bytes, rows, what is kept), a format (steps of a file, transfer functions, versions), a unit,
-  or mathematics that somebody proved.
+- in `UNTUNED`: a resource (bytes, rows, what is kept), a format (steps of a file, transfer functions, versions), a
+  unit, or mathematics that somebody proved.
+
+What a number costs halved and doubled is measured by the variants `sweep-frame` and `sweep-scene` of benchmarks.ablate.
 """
 
 from __future__ import annotations
@@ -103,7 +105,8 @@ def numbers_of(file: str, text: str) -> Iterator[Number]:
                 continue
             kind = UNTUNED.get(f"{file}:{name}")
             if kind is None:
-                kind = "guard" if "Config." not in name and not GUARDS[0] < value < GUARDS[1] else "tuned"
+                is_field = is_named and "." in name
+                kind = "tuned" if is_field or GUARDS[0] < value < GUARDS[1] else "guard"
             yield Number(file, each.lineno, name, each.value, kind)
 
 
@@ -151,6 +154,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"{each.file}:{each.line}  {each.name} = {each.value:g}  {each.kind}")
     tuned = Counter(each.file for each in found if each.kind == "tuned")
     print("\n".join(f"{count:4d} {file}" for file, count in tuned.items()))
+    for name in sorted(UNTUNED.keys() - {f"{each.file}:{each.name}" for each in found}):
+        print(f"There is no {name} any more.")
     kinds = Counter(each.kind for each in found)
     print("Tuned: {}. Not tuned: {}.".format(
         kinds.pop("tuned", 0), ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()))

@@ -27,6 +27,7 @@ from ...torch_types import backward, integers
 from ...train import LoadedRun
 from ...train.adam import FusedAdam
 from ...train.average import ParameterMean
+from ...train.config import TrainConfig
 from ...train.losses import photometric
 from ...train.model import render
 from ..frozen import FrozenGaussians
@@ -35,13 +36,15 @@ from ..views.source_views import LENGTHS_OF, MovingOf
 from ..views.working_plates import WorkingPlates, showing, spread
 from .undersampled import undersampled
 
+_TRAINING = TrainConfig()
+"""Loss, weights and rates of a training of 3000 steps: those of an instant are derived from them."""
 Check = Callable[[int, int], None]
 """Called with (steps done, steps in all); raises to cancel."""
 
 
 @dataclass(frozen=True)
 class DevelopConfig:
-    """How an instant is developed. Loss, rates and weights are those of the run's own training."""
+    """How an instant is developed. Loss, weights and rates are those of a training: see `_TRAINING`."""
 
     steps: int = 120
     """Training steps, of one frame each. Of 75 to 300 the delivered frames differ by 0.06 dB at most on three clips."""
@@ -140,7 +143,7 @@ class _FineTuning:
         for n in range(steps):
             check(n)
             for group in self.optimizer.param_groups:
-                group["lr"] = group["first"] * self.trained.config.lr_end ** (0.5 * n / steps)
+                group["lr"] = group["first"] * _TRAINING.lr_end ** (0.5 * n / steps)
             if float(torch.rand(1, generator=self.generator, device="cpu")) < instant_share:
                 frame = self.instants[n % len(self.instants)]
             else:
@@ -207,10 +210,10 @@ class _FineTuning:
     def _step(self, frame: int) -> None:
         shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
         target = torch.where(learnt[..., None], self.plates.picture(frame), shown.detach())
-        loss = photometric(shown, target, self.trained.config.dssim)
+        loss = photometric(shown, target, _TRAINING.dssim)
         # What may be taught by no frame would only fade.
         shares = torch.sigmoid(self.params["opacity_logits"]) * (1.0 - self.afar)
-        total = loss + self.trained.config.opacity_weight * shares.mean()
+        total = loss + _TRAINING.opacity_weight * shares.mean()
         self.optimizer.zero_grad(set_to_none=True)
         backward(total)
         for parameter in self.params.values():
@@ -243,8 +246,8 @@ class _FineTuning:
         return learnt if ignored is None else learnt & ~ignored
 
     def _optimizer(self) -> FusedAdam:
-        """At the rates that the run had halfway down, or for means, which are nearly right, at its end."""
-        c, p = self.trained.config, self.params
+        """At the rates of the middle of a training, or for means, which are nearly right, of its end."""
+        c, p = _TRAINING, self.params
         rates = {
             "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities, "sh0": c.lr_sh0,
             "shN": c.lr_sh_rest,
