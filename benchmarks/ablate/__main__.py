@@ -29,7 +29,7 @@ from benchmarks.ablate.instants import Instants
 from benchmarks.ablate.masks import judge_masks
 from benchmarks.ablate.measures import FrameMaker, Row, judge, poses_of
 from benchmarks.ablate.switches import of_frames, variants
-from benchmarks.ablate.table import CLIPS, MASKS, TRUTH, Store, case_table, code_version, table
+from benchmarks.ablate.table import CLIPS, MASKS, TRUTH, Store, case_table, code_version, sweep_table, table
 from torch_backend.contract import JobError
 from torch_backend.native import default_threads
 
@@ -108,6 +108,8 @@ def tables(store: Store) -> list[str]:
         lines += ["", f"{title}: difference to `today`, mean ± standard deviation over instants, scenes and seeds", ""]
         lines += table(records, columns)
         lines += ["", *case_table(records, columns, SHOWN_BY_CASE)]
+    swept = sweep_table(records)
+    lines += ["", "Numbers halved and doubled: difference to `today`", "", *swept] if swept else []
     drawn = sorted({(record["case"], record["t_star"]) for record in records})
     return [*lines, "", "Instants: " + ", ".join(f"{case} {t_star}" for case, t_star in drawn) + "."]
 
