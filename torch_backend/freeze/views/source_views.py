@@ -21,6 +21,7 @@ from ...solve.motion import MOVING, UNKNOWN, load_motion
 from ...torch_types import from_numpy
 from ...train import LoadedRun
 from ..frozen import FrozenGaussians, FrozenImage, render_frozen
+from . import decisions
 from .ignored import ignore_mattes
 from .reproject import blurred, dilate, look_up, pixel_centres, resized
 from .scene_flow import MovingScene
@@ -28,7 +29,7 @@ from .visibility import Visibility, visible_pixels
 
 MovingOf = Callable[[int], "Tensor | None"]
 """Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
-DOUBT = 0.4
+DOUBT = 0.5 - decisions.MARGIN
 """How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
 LENGTHS_OF = 640
 """Width in pixels of the pictures in which lengths are configured."""
