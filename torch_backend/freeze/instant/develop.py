@@ -113,8 +113,7 @@ class _FineTuning:
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
         self.afar = undersampled(run, scene, frozen.state["means"], t_star, config.afar).float()
         # Frames that show such a thing where it moves show it at other times: then nothing of it is learnt.
-        asked = [*self.probes, *self.instants]
-        moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in asked])
+        moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in self.probes or self.instants])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
         self.held = ((self.afar > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
         self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
