@@ -203,7 +203,7 @@ class SourceViews:
     def seen(self, frame: int, points: Tensor) -> Visibility:
         """Where plate `frame` shows world points [..., 3]."""
         view = self.view(frame)
-        c, soft = self.config, max(1.0, self.config.margin * self.unit)
+        c, soft = self.config, float(self.config.margin)  # of decisions: small pictures have no narrower border
         return visible_pixels(points, view.viewmat, view.K, view.surface, view.ignored, c.depth_tolerance, soft)
 
     def _missed(self, frame: int) -> Tensor:
