@@ -9,8 +9,6 @@ with each of its numbers halved and doubled; and the grain that is seen in a pic
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,23 +49,26 @@ def error() -> tuple[float, float]:
     return 100 * float(np.mean(off)), 255 * float(grain.measure(frames(0.0, 0.0)).deviation[:, 1:-1].mean())
 
 
-def changed(name: str, change: Callable[[Any], Any]) -> tuple[float, float]:
-    """`error` with a number of `grain` changed."""
-    before = getattr(grain, name)
-    setattr(grain, name, change(before))
+def cell(name: str = "", factor: float = 1.0) -> str:
+    """`error` with a number of `grain` times a factor, as a cell; – if the softest grain does not fit a block then."""
+    before = getattr(grain, name, None)
     try:
-        return error()
+        if before is not None:
+            setattr(grain, name, type(before)(before * factor))
+        return "{:.1f} %, {:.2f}".format(*error())
+    except ValueError:
+        return "–"
     finally:
-        setattr(grain, name, before)
+        if before is not None:
+            setattr(grain, name, before)
 
 
 def main() -> int:
     """Command line; returns an exit code."""
     print("| number | as it is | half | twice |\n|---|---:|---:|---:|")
-    cells = ["{:.1f} %, {:.2f}".format(*error())] * len(NUMBERS)
-    for name, cell in zip(NUMBERS, cells, strict=True):
-        half, twice = (changed(name, lambda v, by=by: type(v)(v * by)) for by in (0.5, 2.0))
-        print(f"| `{name}` | {cell} | " + " | ".join("{:.1f} %, {:.2f}".format(*of) for of in (half, twice)) + " |")
+    today = cell()
+    for name in NUMBERS:
+        print(f"| `{name}` {getattr(grain, name)} | {today} | {cell(name, 0.5)} | {cell(name, 2.0)} |", flush=True)
     return 0
 
 
