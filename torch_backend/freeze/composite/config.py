@@ -13,10 +13,8 @@ class CompositeConfig:
     """How plates are chosen, weighed and mixed. Lengths are in pixels of pictures 640 wide."""
 
     sources: int = 5
-    """Plates that a frame is made of, at most: its own and that of t* among them."""
-    reach: int = 32
-    """Farthest plate, in frames before and after a pose, that is looked at for what the own one hides; of nearer ones
-    those at powers of two."""
+    """Plates that a frame is made of, at most: its own and that of t* among them. For what the own one hides as many
+    are looked at on either side, each twice as many frames away as the one before: 1 to 16."""
     depth_error: float = 0.15
     """Share of the depth by which surfaces may be wrong: with the baseline, an error in pixels, at 1 of which a plate
     is believed by half. A cautious figure: near plates are right where far ones only look so."""

@@ -220,7 +220,7 @@ def _chosen(
     need = 1.0 - resized(matte, w, h)[::4, ::4]
     points, motion, doubt = (of[::4, ::4] for of in (target.points, target.motion, target.doubt))
     k = source_views.frames.index(primary)
-    steps = [2**n for n in range(config.reach.bit_length())]
+    steps = [2**n for n in range(config.sources)]
     around = {k + side * step for step in steps for side in (-1, 1)} | {k}
     reach = {source_views.frames[i] for i in around if 0 <= i < len(source_views.frames)} | {target.t}
     gains = {
