@@ -52,7 +52,7 @@ _INSTANTS_KEPT = 8
 """Frozen scenes that are kept: going back and forth between keys costs no evaluation of the field."""
 _COARSER = 1.25
 """Plates may be so many times as coarse as a view that is made of them."""
-_DETAIL = CompositeConfig(sources=4, reach=(1, 3, 9), source_views=VisibilityConfig(width=320))
+_DETAIL = CompositeConfig(sources=4, source_views=VisibilityConfig(width=320))
 """A take looks at more plates, more finely: there a plate serves a frame and its neighbours, here perhaps one view."""
 _TINT, _TINTED = (1.0, 0.15, 0.55), 0.75
 """Display-referred colour of what is a guess, and how much of it covers what nobody saw at all."""

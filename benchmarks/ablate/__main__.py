@@ -29,7 +29,7 @@ from benchmarks.ablate.instants import Instants
 from benchmarks.ablate.masks import judge_masks
 from benchmarks.ablate.measures import FrameMaker, Row, judge, poses_of
 from benchmarks.ablate.switches import of_frames, variants
-from benchmarks.ablate.table import CLIPS, MASKS, TRUTH, Store, case_table, code_version, table
+from benchmarks.ablate.table import CLIPS, MASKS, TRUTH, Store, case_table, code_version, sweep_table, table
 from torch_backend.contract import JobError
 from torch_backend.native import default_threads
 
@@ -71,15 +71,15 @@ class Ablation:
         self, case: Case, instants: Instants, scene_off: frozenset[str], group: dict[str, frozenset[str]]
     ) -> None:
         t_star, made = instants.t_star, instants.make(scene_off)
-        done = {name: self._judged(case, t_star, made.key, of_frames(off)) for name, off in group.items()}
-        left = {name: of_frames(off) for name, off in group.items() if done[name] is None}
-        if left:
-            poses = [] if case.truth is None else poses_of(case.truth, t_star, self.args.every)
-            pairs = [] if case.truth is not None else pairs_of(case, t_star, self.args.pairs, self.args.draw)
-            done |= judge(case, FrameMaker(case.clip, t_star, made), left, poses, pairs)
-        for name, row in done.items():
-            assert row is not None
-            facts = {"scene": made.key, "frame_rules": sorted(of_frames(group[name])), "seconds": made.seconds}
+        poses = [] if case.truth is None else poses_of(case.truth, t_star, self.args.every)
+        pairs = [] if case.truth is not None else pairs_of(case, t_star, self.args.pairs, self.args.draw)
+        maker = FrameMaker(case.clip, t_star, made)
+        for name, rules in group.items():
+            off = of_frames(rules)
+            row = self._judged(case, t_star, made.key, off)
+            if row is None:
+                row = judge(case, maker, {name: off}, poses, pairs)[name]
+            facts = {"scene": made.key, "frame_rules": sorted(off), "seconds": made.seconds}
             self.store.save(case.name, t_star, name, row | facts)
 
     def _judged(self, case: Case, t_star: int, key: str, off: frozenset[str]) -> Row | None:
@@ -108,6 +108,8 @@ def tables(store: Store) -> list[str]:
         lines += ["", f"{title}: difference to `today`, mean ± standard deviation over instants, scenes and seeds", ""]
         lines += table(records, columns)
         lines += ["", *case_table(records, columns, SHOWN_BY_CASE)]
+    swept = sweep_table(records)
+    lines += ["", "Numbers halved and doubled: difference to `today`", "", *swept] if swept else []
     drawn = sorted({(record["case"], record["t_star"]) for record in records})
     return [*lines, "", "Instants: " + ", ".join(f"{case} {t_star}" for case, t_star in drawn) + "."]
 

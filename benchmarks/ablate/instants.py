@@ -46,8 +46,8 @@ class Instants:
         seconds: dict[str, float] = {}
         run, scene = self.clip.run, self.clip.scene
         field = self.clip.field(self.t_star)
-        config = developed_instants.config_for(run)
         with self._sharing(off, seconds), switched_off(off):
+            config = developed_instants.config_for(run)
             made = developed_instants._make(self.clip.shot, run, scene, self.t_star, field, config)  # pyright: ignore[reportPrivateUsage]
         return Instant(made, digest(made), seconds)
 

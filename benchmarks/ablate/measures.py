@@ -12,7 +12,7 @@ from torch import Tensor
 
 from benchmarks.ablate.cases import Case
 from benchmarks.ablate.instants import Instant
-from benchmarks.ablate.switches import detail_config, replaced, switched_off
+from benchmarks.ablate.switches import RULES, detail_config, replaced, switched_off
 from benchmarks.detail_clip import DetailClip, View, over
 from benchmarks.detail_figures import Flow, textured, unexplained_flow, unsteadiness
 from benchmarks.detail_flow import LEAST, Pair, Shown, lay_over
@@ -32,7 +32,7 @@ class FrameMaker:
 
     def __init__(self, clip: DetailClip, t_star: int, instant: Instant) -> None:
         self.clip, self.t_star, self.instant = clip, t_star, instant
-        self.compositor = Compositor(clip.run, clip.scene, clip.plates)
+        self._compositor: tuple[Any, Compositor] | None = None
         self._images: dict[int, FrozenImage] = {}
 
     def image(self, frame: int) -> FrozenImage:
@@ -42,15 +42,24 @@ class FrameMaker:
             self.make(frame, frozenset())  # what it computes of plates is no variant's cost
         return self._images[frame]
 
+    def _maker(self, off: frozenset[str]) -> Compositor:
+        """A compositor with rules `off`. What it has of plates serves until how plates are looked at changes."""
+        config = detail_config(off)
+        views = {name for name in off if any(each.module.startswith("views.") for each in RULES[name].switches)}
+        key = config.source_views, views
+        if self._compositor is None or self._compositor[0] != key:
+            self._compositor = key, Compositor(self.clip.run, self.clip.scene, self.clip.plates, config)
+        self._compositor[1].config = config
+        return self._compositor[1]
+
     def make(self, frame: int, off: frozenset[str]) -> tuple[CompositeFrame, float, float]:
         """(the frame with rules `off`, CPU seconds of its decisions, CPU seconds of all of it but the splats)."""
         clip, image = self.clip, self.image(frame)
         output = OutputFrame(frame, *clip.camera(frame), float(self.t_star), float(frame))
-        self.compositor.config = detail_config(off)
-        spent = [0.0]
+        spent, compositor = [0.0], self._maker(off)
         with switched_off(off), timed(spent):
             since = time.process_time()
-            made = self.compositor.frame(output, self.instant.frozen, image, clip.width, clip.height)
+            made = compositor.frame(output, self.instant.frozen, image, clip.width, clip.height)
             return made, spent[0], time.process_time() - since
 
 

@@ -20,6 +20,8 @@ from torch import Tensor
 
 from torch_backend.freeze.composite.config import CompositeConfig
 from torch_backend.freeze.frozen import FrozenGaussians
+from torch_backend.freeze.instant.develop import DevelopConfig
+from torch_backend.freeze.instant.static_baseline import StaticBaselineConfig
 
 FRAME = "frame"
 """Stage of the rules that decide each frame; all other stages make the instant."""
@@ -76,8 +78,8 @@ def _developed_as_is(*args: Any, **_: Any) -> FrozenGaussians:
 
 
 def _everywhere(*args: Any, **_: Any) -> list[Tensor]:
-    """Ones for every plate of `(source_views, config, target, chosen, moved)`."""
-    return [torch.ones_like(args[2].depth) for _ in args[3]]
+    """Ones for every plate of `(..., target, chosen, moved)`."""
+    return [torch.ones_like(args[-3].depth) for _ in args[-2]]
 
 
 def _freeze(module: str) -> Any:
@@ -135,22 +137,79 @@ STATE = (
 )
 """Terms that decide what is let go of."""
 _FILL = (
-    Rule(
-        "agreed", "plates of other times need not agree with t*",
-        switches=(Switch("composite.fill", "_agreed", _everywhere),),
-    ),
     Rule("rough", "single pixels of a plate count", switches=(Switch("composite.fill", "_shown", _everywhere),)),
     Rule(
         "plate t*'s pixels", "plate t* gives residuals alone",
         switches=(Switch("composite.fill", "_take_instant", _none),),
     ),
-    _number("sway", "no other time where something moves", sway_trust=0.0),
     _number("depth error", "plates are believed whatever the baseline", depth_error=0.0),
+    _number("explained", "the model contradicts no plate of another time", source_views__unexplained=1e6),
     _number("doubt", "what plates say is believed wholly", doubt=0.0),
     Rule("residuals", "splats alone in the fill", switches=(Switch("composite.fill", "look_up_near", _no_residual),)),
 )  # fmt: skip
 
-RULES = {rule.name: rule for rule in (*_SCENE, *STATE, *_FILL)}
+
+def _scaled(value: Any, factor: float) -> Any:
+    """A number, or each of a tuple, times a factor; whole numbers stay whole."""
+    if isinstance(value, tuple):
+        return tuple(_scaled(each, factor) for each in value)
+    return round(value * factor) if isinstance(value, int) else value * factor
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return all(_is_number(each) for each in value)
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _numbers(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """(path, value) of every number of a configuration, those within it too."""
+    for each in dataclasses.fields(config):
+        value, at = getattr(config, each.name), f"{path}{each.name}"
+        if dataclasses.is_dataclass(value):
+            yield from _numbers(value, f"{at}.")
+        elif _is_number(value) and each.name not in NOT_SWEPT:
+            yield at, value
+
+
+def _swept() -> Iterator[Rule]:
+    """Every number halved and doubled: those of frames, those of the instant, and constants of modules."""
+    for word, factor in SWEEP.items():
+        for path, value in _numbers(CompositeConfig()):
+            yield Rule(f"{word} {path}", f"times {factor}", numbers={path: _scaled(value, factor)})
+        for path, value in _numbers(DevelopConfig()):
+            change = partial(_changed, path, _scaled(value, factor))
+            switch = Switch("instant.instants", "config_for", change, of_original=True)
+            yield Rule(f"{word} develop.{path}", f"times {factor}", STAGES[1], (switch,))
+        for path, value in _numbers(StaticBaselineConfig()):
+            change = partial(_preset, path, _scaled(value, factor))
+            switch = Switch("instant.static_baseline", "StaticBaselineConfig", change, of_original=True)
+            yield Rule(f"{word} baseline.{path}", f"times {factor}", STAGES[0], (switch,))
+        for module, name, stage in CONSTANTS:
+            switch = Switch(module, name, partial(_scaled, factor=factor), of_original=True)
+            yield Rule(f"{word} {module.rsplit('.', 1)[-1]}.{name}", f"times {factor}", stage, (switch,))
+
+
+def _changed(path: str, value: Any, config_for: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda run: dataclasses.replace(config_for(run), **{path: value})
+
+
+def _preset(path: str, value: Any, config: Any) -> Any:
+    return partial(config, **{path: value})
+
+
+SWEEP = {"half": 0.5, "twice": 2.0}
+"""Word -> by what every number is multiplied, one at a time: groups `sweep-scene` and `sweep-frame`."""
+NOT_SWEPT = ("seed",)
+"""Fields that are no amounts."""
+CONSTANTS = (
+    ("views.source_views", "DOUBT", FRAME),
+    ("views.decisions", "MARGIN", FRAME),
+    ("views.working_plates", "SEEN", STAGES[1]),
+)
+"""(module, name, stage) of constants that are swept, too."""
+
+RULES = {rule.name: rule for rule in (*_SCENE, *STATE, *_FILL, *_swept())}
 """Name -> rule."""
 
 COMBINATIONS = {
@@ -162,12 +221,16 @@ COMBINATIONS = {
 
 
 def variants(groups: tuple[str, ...]) -> dict[str, frozenset[str]]:
-    """Name -> rules that are off, of `today` and of `groups`: combinations, scene, frame, or a variant's own name."""
-    every = {**COMBINATIONS, **{f"no {name}": frozenset({name}) for name in RULES}}
+    """Name -> rules that are off, of `today` and of `groups`: combinations, scene, frame, sweep-scene, sweep-frame,
+    or a variant's own name. Those that sweep halve and double every number."""
+    swept = {name: frozenset({name}) for name in RULES if name.split()[0] in SWEEP}
+    every = {**COMBINATIONS, **{f"no {name}": frozenset({name}) for name in RULES if name not in swept}, **swept}
     found = {"today": every["today"]}
     for group in groups:
         if group == "combinations":
             found |= COMBINATIONS
+        elif group in ("sweep-scene", f"sweep-{FRAME}"):
+            found |= {name: off for name, off in swept.items() if bool(of_frames(off)) == group.endswith(FRAME)}
         elif group in ("scene", FRAME):
             of = {name for name, rule in RULES.items() if (rule.stage == FRAME) == (group == FRAME)}
             found |= {name: off for name, off in every.items() if name.startswith("no ") and off <= of}

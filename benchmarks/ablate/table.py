@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.ablate.measures import summary
+from benchmarks.ablate.switches import SWEEP
 from torch_backend.contract import read_json
 from torch_backend.shot import content_key, write_json
 
@@ -96,6 +97,34 @@ def table(records: Iterable[dict[str, Any]], columns: dict[str, str]) -> list[st
         cells = [_cell([_less(a[name], b[name]) for a, b in both], True) for name in columns]
         lines.append(f"| {variant} | {sum(_differs(a, b) for a, b in both)} of {len(both)} | {' | '.join(cells)} |")
     return lines
+
+
+SWEPT = {
+    "delivered whole": "whole", "delivered moving": "moving", "delivered static": "static", "still": "still of clips",
+    "excess": "flow left",
+}  # fmt: skip
+"""Figure of a record -> what a sweep tells of it; dB, but for flow in pixels."""
+
+
+def sweep_table(records: Iterable[dict[str, Any]]) -> list[str]:
+    """Markdown: a row for each number, what it changes halved and doubled, means over instants; [] without a sweep."""
+    found: dict[tuple[str, str], dict[str, list[float]]] = {}
+    by_place: dict[tuple[str, int], dict[str, dict[str, float | None]]] = {}
+    for record in records:
+        by_place.setdefault((record["case"], record["t_star"]), {})[record["variant"]] = figures(record)
+    for of in by_place.values():
+        for variant, changed in of.items():
+            word, _, number = variant.partition(" ")
+            for name in SWEPT if word in SWEEP and "today" in of else ():
+                change = _less(changed.get(name), of["today"].get(name))
+                if change is not None:
+                    found.setdefault((number, word), {}).setdefault(name, []).append(change)
+    heads = [f"{word}: {title}" for word in SWEEP for title in SWEPT.values()]
+    lines = [f"| number | {' | '.join(heads)} |", f"|---|{'---:|' * len(heads)}"]
+    for number in sorted({number for number, _ in found}):
+        of = [found.get((number, word), {}).get(name, []) for word in SWEEP for name in SWEPT]
+        lines.append(f"| {number} | {' | '.join(f'{statistics.fmean(v):+.2f}' if v else '–' for v in of)} |")
+    return lines if found else []
 
 
 def case_table(records: Iterable[dict[str, Any]], columns: dict[str, str], variants: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from benchmarks.ablate.cases import TUNED_AT, Case, drawn, pairs_of
 from benchmarks.ablate.instants import Instants, digest
 from benchmarks.ablate.measures import FrameMaker, summary
 from benchmarks.ablate.switches import COMBINATIONS, FRAME, RULES, detail_config, replaced, switched_off, variants
-from benchmarks.ablate.table import TRUTH, Store, table
+from benchmarks.ablate.table import TRUTH, Store, sweep_table, table
 from benchmarks.detail_ceiling import chosen
 from benchmarks.detail_clip import open_clip
 from benchmarks.other_state import OTHER, Painted, Pair, Polygon
@@ -53,7 +53,10 @@ def test_a_rule_is_off_and_on_again(rule):
 def test_groups_of_variants():
     assert COMBINATIONS["motion alone"] < variants(("combinations",))["mattes alone"]
     frame, scene = variants((FRAME,)), variants(("scene",))
-    assert not frame.keys() & scene.keys() - {"today"} and len(frame) + len(scene) == len(RULES) + 2
+    swept = variants(("sweep-frame", "sweep-scene"))
+    assert not frame.keys() & scene.keys() - {"today"} and swept.keys() & scene.keys() == {"today"}
+    assert len(frame) + len(scene) + len(swept) == len(RULES) + 3
+    assert detail_config(swept["twice doubt"]).doubt == 2.0 * detail_config(swept["today"]).doubt
     with pytest.raises(ValueError, match="no group or variant 'bent'"):
         variants(("bent",))
 
@@ -133,6 +136,9 @@ def test_differences_are_of_instants_that_both_variants_have():
     told = table([*rows, record("no y", 1, 30.0, 2.0)], TRUTH)
     assert told[2].startswith("| **today** | 2 instants | 25.00 ± 7.07 |")
     assert told[3].startswith("| no x | 1 of 1 | +0.50 |") and told[4].startswith("| no y | 0 of 1 | +0.00 |")
+    assert not sweep_table(rows)
+    told = sweep_table([*rows, record("half z", 1, 29.0), record("half z", 2, 20.5), record("twice z", 2, 21.5)])
+    assert told[2:] == ["| z | -0.25 | – | – | – | – | +1.50 | – | – | – | – |"]
 
 
 def test_digests_tell_content_and_not_objects():

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...torch_types import norm
 from ..views.decisions import above, first_best
-from ..views.reproject import blurred, dilate, erode, look_up, look_up_near, project, resized, unproject
+from ..views.reproject import blurred, dilate, erode, look_up, look_up_near, resized, unproject
 from ..views.source_views import SourceViews
 from ..views.target_view import TargetView, displacements, parallax
 from ..views.visibility import Visibility
@@ -29,8 +29,6 @@ class Fillers:
     """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
     shown: list[Tensor]
     """[h, w] in 0..1 each: that plate shows it, and what is around it."""
-    agreed: list[Tensor]
-    """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
     residuals: list[Tensor]
     """[H, W, 3] float16 each, as `SourceViews.residual`."""
     most: float
@@ -68,52 +66,27 @@ def fillers_of(
         return None
     chosen = _chosen(source_views, config, target, matte, primary, usable)
     moved = displacements(source_views, target, chosen)
-    shown = _shown(source_views, config, target, chosen, moved)
-    agreed = _agreed(source_views, config, target, chosen, moved)
+    shown = _shown(source_views, target, chosen, moved)
     residuals = [source_views.residual(frame) for frame in chosen]
     most = max(source_views.scene.display.most, *(source_views.most(frame) for frame in chosen))
-    return Fillers(chosen, moved, shown, agreed, residuals, most)
+    return Fillers(chosen, moved, shown, residuals, most)
 
 
-def _shown(
-    source_views: SourceViews, config: CompositeConfig, target: TargetView, chosen: list[int], moved: list[Tensor]
-) -> list[Tensor]:
+def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
     """[h, w] in 0..1 for each plate: it shows what is seen and what is around that; of use where something moves."""
-    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 4 * config.rough + 1)  # elsewhere it is not asked for
+    # Depth is rough there: what a plate is seen to show changes from pixel to pixel, and single ones would stand out.
+    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 5)  # elsewhere it is not asked for
     points, out = target.points[near], list[Tensor]()
     for frame, way in zip(chosen, moved, strict=True):
         visible = torch.ones_like(target.depth)
         visible[near] = source_views.seen(frame, points if frame == target.t else points + way[near]).visible
-        out.append(blurred(erode(visible, config.rough), float(config.rough)))
+        out.append(blurred(erode(visible, 1), 1.0))
     return out
 
 
 def _uneasy(motion: Tensor, doubt: Tensor) -> Tensor:
     """[...] in 0..1: how far edges of what moves may be near."""
     return torch.maximum(motion, doubt).clamp(0.0, 1.0)
-
-
-def _agreed(
-    source_views: SourceViews, config: CompositeConfig, target: TargetView, chosen: list[int], moved: list[Tensor]
-) -> list[Tensor]:
-    """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
-    h, w = target.depth.shape
-    if target.t not in chosen:
-        return [torch.ones_like(target.depth) for _ in chosen]
-    points = target.points[::2, ::2]  # a quarter of the work: it is low-passed
-    truth = source_views.seen(target.t, points)
-    shown_at_t = look_up(source_views.view(target.t).picture.float(), truth.pixels)
-    out: list[Tensor] = []
-    for frame, way in zip(chosen, moved, strict=True):
-        if frame == target.t:
-            out.append(torch.ones_like(target.depth))
-            continue
-        visibility = source_views.seen(frame, points + way[::2, ::2])
-        says = look_up(source_views.view(frame).picture.float(), visibility.pixels)
-        both = (truth.visible * visibility.visible)[..., None]
-        off = source_views.difference(says * both, shown_at_t * both, 0.5)
-        out.append(resized(torch.exp(-(off / config.agreement).square()), w, h))
-    return out
 
 
 def fill(
@@ -138,10 +111,7 @@ def fill(
     doubt = look_up(target.doubt, small)
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
-    same_state, untold = torch.zeros(count, device="cpu"), torch.ones(count, device="cpu")
     truth = source_views.seen(target.t, points) if target.t in fillers.chosen else None
-    if truth is not None:  # the better plate t* shows it, the less another time is needed
-        untold = 1.0 - _near(source_views, config, target, target.t, truth)
     for n, frame in enumerate(fillers.chosen):
         if truth is not None and frame == target.t:
             visibility = truth
@@ -150,13 +120,7 @@ def fill(
         visibility = _doubted(visibility, doubt)
         around = torch.minimum(visibility.visible, look_up(fillers.shown[n], small))
         visibility.visible = torch.lerp(visibility.visible, around, uneasy)
-        agreed = look_up(fillers.agreed[n], small)
-        unmoved = _unmoved(source_views, config, frame, points, visibility) * agreed
-        sway = config.sway_trust * unmoved * untold
-        still = 1.0 - doubt * (1.0 - agreed)
-        if frame != target.t:
-            same_state = torch.maximum(same_state, unmoved * _near(source_views, config, target, frame, visibility))
-        weights.append(_weight(source_views, config, target, frame, visibility, motion, sway, still))
+        weights.append(_weight(source_views, config, target, frame, visibility, motion))
         places.append(visibility.pixels * larger)
     believed = torch.stack(weights)
     filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[first_best(believed)]
@@ -167,8 +131,7 @@ def fill(
     filling.color += carried * filling.share[:, None]
     if truth is not None:
         at = fillers.chosen.index(target.t)
-        # A plate near in pose that shows the same, a little swayed, has it at its place; plate t* may be a pixel off.
-        around = truth.visible * look_up(fillers.shown[at], small) * (1.0 - same_state)
+        around = truth.visible * look_up(fillers.shown[at], small)
         _take_instant(source_views, config, target, filling, points, small, around, places[at])
     filling.most = fillers.most
     return filling
@@ -204,8 +167,8 @@ def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetVi
     """[...] in 0..1: how nearly plate t* sees points [..., 3] from the frame's side."""
     a, b = points - source_views.centres[source_views.index[target.t]], points - target.centre
     cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
-    first, last = config.beside
-    return ((last - torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))) / (last - first)).clamp(0.0, 1.0)
+    angle = torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
+    return (2.0 - 2.0 * angle / config.beside).clamp(0.0, 1.0)
 
 
 def _exposed(source_views: SourceViews, target: TargetView, frame: int) -> tuple[Tensor, Tensor]:
@@ -223,16 +186,6 @@ def _doubted(visibility: Visibility, doubt: Tensor) -> Visibility:
     return replace(visibility, moving=torch.maximum(visibility.moving, doubt * (1.0 - visibility.explained)))
 
 
-def _unmoved(
-    source_views: SourceViews, config: CompositeConfig, frame: int, points: Tensor, visibility: Visibility
-) -> Tensor:
-    """[...] in 0..1: what moves is in plate `frame` nearly as at t*: the model agrees, and moved it little."""
-    view = source_views.view(frame)
-    travel = norm(project(points, view.viewmat, view.K)[0] - visibility.pixels, -1)
-    trust = torch.exp(-travel / (config.sway * source_views.unit))
-    return visibility.explained * trust
-
-
 def _near(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, frame: int, visibility: Visibility
 ) -> Tensor:
@@ -247,16 +200,11 @@ def _weight(
     frame: int,
     visibility: Visibility,
     motion: Tensor,
-    sway: Tensor,
-    still: Tensor | float = 1.0,
 ) -> Tensor:
-    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*; what stands still in
-    it by `still` at most."""
+    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*: of that plate t*
+    alone is."""
     near = _near(source_views, config, target, frame, visibility)
-    if frame == target.t:
-        return near
-    still = still * (1.0 - motion) * (1.0 - visibility.moving)
-    return near * (still + (1.0 - still) * sway)
+    return near if frame == target.t else near * (1.0 - motion) * (1.0 - visibility.moving)
 
 
 def _chosen(
@@ -267,17 +215,17 @@ def _chosen(
     primary: int,
     usable: list[int],
 ) -> list[int]:
-    """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
+    """The plates to fill with: that of t*, the primary one, and those that see most of the rest."""
     h, w = target.depth.shape
     need = 1.0 - resized(matte, w, h)[::4, ::4]
     points, motion, doubt = (of[::4, ::4] for of in (target.points, target.motion, target.doubt))
     k = source_views.frames.index(primary)
-    around = {k + side * step for step in config.reach for side in (-1, 1)} | {k}
+    steps = [2**n for n in range(config.sources)]
+    around = {k + side * step for step in steps for side in (-1, 1)} | {k}
     reach = {source_views.frames[i] for i in around if 0 <= i < len(source_views.frames)} | {target.t}
-    zero = torch.zeros_like(motion)
     gains = {
         frame: need
-        * _weight(source_views, config, target, frame, _doubted(source_views.seen(frame, points), doubt), motion, zero)
+        * _weight(source_views, config, target, frame, _doubted(source_views.seen(frame, points), doubt), motion)
         for frame in sorted(reach)
         if frame in usable
     }
@@ -287,14 +235,11 @@ def _chosen(
         have = have + gains[frame]
     while len(chosen) < min(config.sources, len(gains)):
         # Diminishing returns: a second plate of the same wall helps less than a first one of another.
-        worth = {
-            frame: float((torch.log1p(10.0 * (have + gain)) - torch.log1p(10.0 * have)).sum())
-            for frame, gain in gains.items()
-            if frame not in chosen
-        }
+        left = {frame: gain for frame, gain in gains.items() if frame not in chosen}
+        worth = {frame: float(((have + gain).sqrt() - have.sqrt()).sum()) for frame, gain in left.items()}
         candidates = sorted(worth, key=lambda candidate: abs(candidate - primary))
         frame = candidates[int(first_best(torch.tensor([worth[each] for each in candidates], device="cpu")))]
-        if worth[frame] < 1e-3 * float(need.sum()):
+        if worth[frame] <= 0.0:
             break
         chosen.append(frame)
         have = have + gains[frame]

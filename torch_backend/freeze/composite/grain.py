@@ -33,13 +33,14 @@ SAMPLED = 8
 _BLOCK = 16
 _FEWEST = 12
 """Blocks that a level or a channel needs to be believed."""
+_LEAST = 0.05
+"""Share of the blocks of a level, the least varying ones, that are taken for grain to begin with."""
 _STANDS_OUT = 3.0
-"""A level with this many times the deviation of most shows no grain but what is in the picture."""
+"""Standard deviations from which on a block, and times the deviation of most from which on a level, show no grain but
+what is in the picture."""
 _MOST = 0.08
 """So does one with this deviation, whatever the others have."""
 _SOFTNESS = np.arange(0.0, 2.01, 0.05)
-_CLIPPED = 1.5 / 255.0
-"""Nearer than this to black or white a pixel has lost part of its grain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,15 +210,15 @@ def _basis() -> NDArray[np.float64]:
 
 
 def _blocks(frame: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Of every block: residual [n, 3, pixels], mean [n, 3], and whether nearly nothing of it is clipped [n, 3]."""
+    """Of every block: residual [n, 3, pixels], mean [n, 3], and whether none of it is clipped [n, 3]."""
     rows, columns = frame.shape[0] // _BLOCK, frame.shape[1] // _BLOCK
     values = frame[: rows * _BLOCK, : columns * _BLOCK].astype(np.float32)
     values /= 255.0 if frame.dtype == np.uint8 else 65535.0
     blocks = values.reshape(rows, _BLOCK, columns, _BLOCK, 3).transpose(0, 2, 4, 1, 3).reshape(-1, 3, _BLOCK**2)
     basis = _basis().astype(np.float32)
-    clipped = ((blocks < _CLIPPED) | (blocks > 1.0 - _CLIPPED)).mean(axis=2)
+    whole = np.asarray(((blocks > 0.0) & (blocks < 1.0)).all(axis=2), np.bool_)
     residual = np.asarray(blocks - (blocks @ basis) @ basis.T, np.float32)
-    return residual, blocks.mean(axis=2), clipped < 0.02
+    return residual, blocks.mean(axis=2), whole
 
 
 @functools.lru_cache(maxsize=64)
@@ -257,15 +258,13 @@ def _only_grain(variance: NDArray[Any], softness: float) -> NDArray[np.bool_]:
     """Which blocks of one level vary no more than grain does, found from the least varying upwards."""
     if len(variance) < _FEWEST:
         return np.zeros(len(variance), bool)
-    spread = np.sqrt(2.0 / _kept(softness)[1])
-    middle = float(np.quantile(variance, 0.05)) / max(0.3, 1.0 - 1.64 * spread)
-    for _ in range(20):
-        chosen = variance <= middle * (1.0 + 2.5 * spread)
-        now = float(np.median(variance[chosen])) if chosen.any() else middle
-        if abs(now - middle) <= 1e-3 * middle:
-            break
-        middle = now
-    return variance <= middle * (1.0 + 2.5 * spread)
+    most = 1.0 + _STANDS_OUT * np.sqrt(2.0 / _kept(softness)[1])  # in units of their mean, which their median is near
+    chosen = variance <= np.quantile(variance, _LEAST)
+    while True:
+        more = variance <= most * float(np.median(variance[chosen]))
+        if more.sum() <= chosen.sum():
+            return chosen
+        chosen = more
 
 
 def _softness(residual: NDArray[np.float32], flat: NDArray[np.bool_]) -> float:
@@ -291,7 +290,7 @@ def _whole_curve(deviation: NDArray[Any]) -> NDArray[np.float32]:
     A level at which the clip shows nothing flat is told too much; grain follows brightness smoothly.
     """
     typical = np.nanmedian(deviation) if not np.isnan(deviation).all() else 0.0
-    known = deviation <= min(_MOST, max(_STANDS_OUT * typical, 1.0 / 255.0))
+    known = deviation <= min(_MOST, _STANDS_OUT * typical)
     curve = np.zeros_like(deviation)
     for c in range(3):
         if known[c].any():

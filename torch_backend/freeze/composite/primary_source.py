@@ -75,9 +75,7 @@ def primary_matte(
     else:
         target.motion = torch.maximum(target.motion, lead.moving) if own else target.motion
     target.moved = target.motion
-    target.unseen = _unseen(
-        source_views, config, target, torch.maximum(target.motion, lead.visible * lead.moving), usable
-    )
+    target.unseen = _unseen(source_views, target, torch.maximum(target.motion, lead.visible * lead.moving), usable)
     st, within = _places(source_views, target, primary, own, size)
     if own and primary != output.frame:  # its own plate is withheld
         return PrimaryMatte(torch.zeros(rows, columns, device="cpu"), st, own)
@@ -101,9 +99,7 @@ def primary_matte(
     return PrimaryMatte(resized(matte, columns, rows) * within, st, own, {**of, "log_odds": odds})
 
 
-def _unseen(
-    source_views: SourceViews, config: CompositeConfig, target: TargetView, moving: Tensor, usable: list[int]
-) -> Tensor:
+def _unseen(source_views: SourceViews, target: TargetView, moving: Tensor, usable: list[int]) -> Tensor:
     """[h, w] in 0..1: how little of what moves (`moving`) plates near t* show; the further from t*, the less they know.
 
     Gaussians that moved but were never opened are seen all along, so their own support does not say it.
@@ -116,7 +112,7 @@ def _unseen(
     points = target.points[at]
     known = torch.zeros(len(points), device="cpu")
     t_star = float(source_views.scene.seconds[source_views.index[target.t]])
-    for offset in config.known_at if len(points) else ():
+    for offset in (0.0, -0.5 * SUPPORT_SECONDS, 0.5 * SUPPORT_SECONDS) if len(points) else ():
         near = min(seconds, key=lambda frame: abs(seconds[frame] - t_star - offset))
         trust = math.exp(-abs(seconds[near] - t_star) / SUPPORT_SECONDS)
         known = torch.maximum(known, trust * source_views.seen(near, points).visible)

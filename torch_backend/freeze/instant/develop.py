@@ -27,74 +27,43 @@ from ...torch_types import backward, integers
 from ...train import LoadedRun
 from ...train.adam import FusedAdam
 from ...train.average import ParameterMean
+from ...train.config import TrainConfig
 from ...train.losses import photometric
 from ...train.model import render
 from ..frozen import FrozenGaussians
 from ..views.scene_flow import SceneFlow
-from ..views.source_views import MovingOf
+from ..views.source_views import LENGTHS_OF, MovingOf
 from ..views.working_plates import WorkingPlates, showing, spread
 from .undersampled import undersampled
 
+_TRAINING = TrainConfig()
+"""Loss, weights and rates of a training of 3000 steps: those of an instant are derived from them."""
 Check = Callable[[int, int], None]
 """Called with (steps done, steps in all); raises to cancel."""
 
 
 @dataclass(frozen=True)
 class DevelopConfig:
-    """How an instant is developed. Rates are in scene units."""
+    """How an instant is developed. Loss, weights and rates are those of a training: see `_TRAINING`."""
 
     steps: int = 120
     """Training steps, of one frame each. Of 75 to 300 the delivered frames differ by 0.06 dB at most on three clips."""
-    width: int = 640
+    width: int = LENGTHS_OF
     """Pixels of the pictures that are trained on, at most; never above the working frames'."""
-    frames: int = 160
-    """Frames that are trained on, at most, evenly over the clip."""
     probes: int = 6
     """Trained frames that are left out, at most, to see whether developing helped."""
     gain: float = 0.2
     """dB that the still pixels of the frames left out must gain: by less, at the size of the run, frozen truth lost
-    half a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it."""
-    alone: float = 0.2
-    """Where they gain less, what moves is trained alone, on plate t*, in so many steps as a share of `steps`;"""
-    near: int = 2
-    """trained frames on either side of t* that are asked about it then:"""
+    half a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it. Where they gain less, what
+    moves is trained alone, on plate t*."""
     worth: float = 3.0
-    """of the way to what it became it goes so far that plate t* gains most beyond so many times what those lose (mean
-    squared errors),"""
-    ways: int = 4
-    """in so many parts."""
+    """What moves is then taken over where plate t* gains more than so many times what the trained frames beside it
+    lose, in mean squared error."""
     instant_share: float = 0.25
     """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training: 30
     steps, as plate t* alone shows what moves."""
     afar: float = 2.0
     """Plate t* teaches nothing of what it sees from more than so many times as far as some trained frame does."""
-    looks: int = 12
-    """Frames, at most, that are asked whether such a thing moves: then nothing of it is learnt, for they show it at
-    other times."""
-    margin: int = 2
-    """Pixels of pictures 640 wide around what moves that are left out with it."""
-    dssim: float = 0.2
-    """As in `TrainConfig`."""
-    lr_means: float = 1e-4
-    """Start rate of means."""
-    lr_quats: float = 2e-3
-    """Of quaternions."""
-    lr_scales: float = 1.2e-2
-    """Of log-scales."""
-    lr_opacities: float = 2e-2
-    """Of opacity logits."""
-    lr_sh0: float = 6e-3
-    """Of the constant colour."""
-    lr_sh_rest: float = 1e-3
-    """Of the other harmonics."""
-    lr_end: float = 0.3
-    """Share of its start that each rate has at the end."""
-    average: float = 0.3
-    """Share of the steps, the last ones, whose mean is kept."""
-    warm: float = 0.15
-    """Share of the steps over which the rates rise: Adam has no memory of the gradients at first."""
-    opacity_weight: float = 1e-3
-    """Weight of the mean opacity."""
     seed: int = 0
     """Of the order of frames."""
 
@@ -132,9 +101,9 @@ class _FineTuning:
     ) -> None:  # fmt: skip
         self.trained, self.scene, self.frozen, self.config, self.t_star = run, scene, frozen, config, t_star
         self.device = frozen.support.device
-        self.plates = WorkingPlates(scene, config.width, moving, config.margin, self.device)
+        self.plates = WorkingPlates(scene, config.width, moving, device=self.device)
         self.instants = showing(run.train_frames, t_star)
-        frames = [frame for frame in spread(run.train_frames, config.frames) if frame not in self.instants]
+        frames = [frame for frame in run.train_frames if frame not in self.instants]
         self.probes = spread(frames[1:-1], min(config.probes, len(frames) // 4))
         self.frames = sorted({*frames, *self.instants} - {*self.probes})
         self.travel = SceneFlow(run, scene, frozen, t_star)
@@ -143,7 +112,8 @@ class _FineTuning:
         self.optimizer = self._optimizer()
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
         self.afar = undersampled(run, scene, frozen.state["means"], t_star, config.afar).float()
-        moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in spread(self.frames, config.looks)])
+        # Frames that show such a thing where it moves show it at other times: then nothing of it is learnt.
+        moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in self.probes or self.instants])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
         self.held = ((self.afar > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
         self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
@@ -172,18 +142,14 @@ class _FineTuning:
         for n in range(steps):
             check(n)
             for group in self.optimizer.param_groups:
-                group["lr"] = (
-                    group["first"]
-                    * self.config.lr_end ** (n / steps)
-                    * min(1.0, (n + 1) / (self.config.warm * steps + 1))
-                )
+                group["lr"] = group["first"] * _TRAINING.lr_end ** (0.5 * n / steps)
             if float(torch.rand(1, generator=self.generator, device="cpu")) < instant_share:
                 frame = self.instants[n % len(self.instants)]
             else:
                 order = order or integers(torch.randperm(len(self.frames), generator=self.generator, device="cpu"))
                 frame = self.frames[order.pop()]
             self._step(frame)
-            if n >= steps - round(self.config.average * steps):
+            if n >= steps // 2:
                 mean.add(self.params)
         mean.put_into(self.params)
 
@@ -197,12 +163,11 @@ class _FineTuning:
         self._show(was)
         self.optimizer = self._optimizer()
         self.held = torch.ones_like(self.mover).index_fill(0, rows, 0.0).index_fill(0, self.held, 1.0).nonzero()[:, 0]
-        steps = max(1, round(self.config.alone * self.config.steps))
+        steps = max(1, round(self.config.instant_share * self.config.steps))
         self._train(steps, 1.0, check)
         developed = {name: p.detach()[rows] for name, p in self.params.items()}
         best, first = 0.0, (0.0, 0.0)
-        for n in range(self.config.ways + 1):
-            part = n / self.config.ways
+        for n, part in enumerate((0.0, 0.5, 1.0)):
             state = {k: v.index_copy(0, rows, torch.lerp(v[rows], developed[k], part)) for k, v in was.items()}
             self._show(state)
             errors = self._error(self.instants, movers=True), self._error(near, movers=True)
@@ -217,11 +182,10 @@ class _FineTuning:
             self.params[name].data = value.clone()
 
     def _near(self) -> list[int]:
-        """Trained frames on either side of those that show t*, without them."""
-        frames, most = self.trained.train_frames, self.config.near
-        before = [frame for frame in frames if frame < min(self.instants)]
-        after = [frame for frame in frames if frame > max(self.instants)]
-        return [*before[len(before) - min(most, len(before)) :], *after[:most]]
+        """Two trained frames on either side of those that show t*, without them."""
+        before = [frame for frame in self.trained.train_frames if frame < min(self.instants)]
+        after = [frame for frame in self.trained.train_frames if frame > max(self.instants)]
+        return [*before[-2:], *after[:2]]
 
     def _judged(self) -> tuple[float, float]:
         """(PSNR in dB of the still pixels of the probes, of plate t* or its neighbours)."""
@@ -245,10 +209,10 @@ class _FineTuning:
     def _step(self, frame: int) -> None:
         shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
         target = torch.where(learnt[..., None], self.plates.picture(frame), shown.detach())
-        loss = photometric(shown, target, self.config.dssim)
+        loss = photometric(shown, target, _TRAINING.dssim)
         # What may be taught by no frame would only fade.
         shares = torch.sigmoid(self.params["opacity_logits"]) * (1.0 - self.afar)
-        total = loss + self.config.opacity_weight * shares.mean()
+        total = loss + _TRAINING.opacity_weight * shares.mean()
         self.optimizer.zero_grad(set_to_none=True)
         backward(total)
         for parameter in self.params.values():
@@ -275,16 +239,18 @@ class _FineTuning:
     def _learnt(self, frame: int, mover: Tensor, afar: Tensor) -> Tensor:
         """bool [H, W]: which pixels of a frame say what the frozen scene should show there."""
         matte, ignored = self.plates.matte(frame), self.plates.ignored(frame)
-        learnt = (matte < 0.5) & (mover < 0.1)
+        learnt = (matte < 0.5) & (mover < 0.5)
         if frame in self.instants:
             learnt = learnt | (afar < 0.5)
         return learnt if ignored is None else learnt & ~ignored
 
     def _optimizer(self) -> FusedAdam:
-        c, p = self.config, self.params
+        """At the rates of the middle of a training, or for means, which are nearly right, of its end."""
+        c, p = _TRAINING, self.params
         rates = {
-            "means": c.lr_means, "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities,
-            "sh0": c.lr_sh0, "shN": c.lr_sh_rest,
+            "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities, "sh0": c.lr_sh0,
+            "shN": c.lr_sh_rest,
         }  # fmt: skip
+        rates = {"means": c.lr_means_end, **{name: rate * math.sqrt(c.lr_end) for name, rate in rates.items()}}
         groups = [{"params": [p[name]], "lr": rate, "first": rate, "rows": True} for name, rate in rates.items()]
         return FusedAdam(groups, eps=1e-15)

@@ -59,7 +59,7 @@ def look_up(picture: Tensor, pixels: Tensor, mode: str = "bilinear") -> Tensor:
     return found[..., 0] if picture.ndim == 2 else found
 
 
-def inside(pixels: Tensor, width: int, height: int, soft: float = 2.0) -> Tensor:
+def inside(pixels: Tensor, width: int, height: int, soft: float) -> Tensor:
     """[...] 0 outside of a picture to 1 within it, over `soft` pixels along its border."""
     size = torch.tensor([width, height], dtype=pixels.dtype, device=pixels.device)
     border = torch.minimum(pixels, size - pixels).amin(dim=-1)

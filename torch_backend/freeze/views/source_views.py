@@ -21,6 +21,7 @@ from ...solve.motion import MOVING, UNKNOWN, load_motion
 from ...torch_types import from_numpy
 from ...train import LoadedRun
 from ..frozen import FrozenGaussians, FrozenImage, render_frozen
+from . import decisions
 from .ignored import ignore_mattes
 from .reproject import blurred, dilate, look_up, pixel_centres, resized
 from .scene_flow import MovingScene
@@ -28,9 +29,12 @@ from .visibility import Visibility, visible_pixels
 
 MovingOf = Callable[[int], "Tensor | None"]
 """Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
-DOUBT = 0.4
+DOUBT = 0.5 - decisions.MARGIN
 """How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
-_LENGTHS_OF = 640.0
+LENGTHS_OF = 640
+"""Width in pixels of the pictures in which lengths are configured."""
+MARGIN = 2
+"""Pixels of those pictures by which an outline may be misplaced: error of flow and depth, motion blur."""
 _VIEWS, _VIEWS_BYTES = 90, 700e6
 """Plates kept at most. Between two uses of a plate, 16 frames apart, 80 others are looked at: with fewer every one was
 made three times on its way through a take."""
@@ -87,18 +91,16 @@ class PlateView:
 class VisibilityConfig:
     """At what size plates are looked at for decisions, and how finely. Lengths are in pixels of pictures 640 wide."""
 
-    width: int = 640
+    width: int = LENGTHS_OF
     """Mattes, depth and visibility are compared at this width at most: they are soft, and the model is no finer."""
     depth_tolerance: float = 0.03
     """Share of the depth by which a point may lie off the surface that a plate shows and still be it."""
-    margin: int = 2
-    """What moves is dilate by this: the flow's own error, motion blur."""
-    lowpass: float = 4.0
-    """Sigma under which plate and render are compared: splats are soft, that alone contradicts nothing."""
+    margin: int = MARGIN
+    """What moves is dilated by this. Pictures are compared under a low-pass of this sigma, or twice that: splats are
+    soft, which contradicts nothing. A difference speaks for twice as many pixels around it: half-rejected movers leave
+    their outlines."""
     unexplained: float = 0.1
     """Low-passed difference, display-referred, at which a plate is believed 1/e."""
-    region: int = 4
-    """A difference speaks for so many pixels around it: half-rejected movers leave their outlines."""
 
 
 class SourceViews:
@@ -128,7 +130,7 @@ class SourceViews:
         """Frames of the clip that have both a plate and a camera, ascending."""
         width = min(plates.width, self.config.width)
         self.size = width, max(8, round(plates.height * width / plates.width))
-        self.unit = width / _LENGTHS_OF
+        self.unit = width / LENGTHS_OF
         """Pixels of decisions to a pixel in which lengths are configured."""
         self.stage = MovingScene(run, scene, frozen, t_star)
         """The model in every frame."""
@@ -183,10 +185,13 @@ class SourceViews:
             self.residual(frame)
         return self._most[frame]
 
-    def difference(self, a: Tensor, b: Tensor, lowpass: float = 0.5) -> Tensor:
-        """[h, w] greatest difference over channels of two pictures [h, w, 3] of decisions, under `lowpass` of ours."""
+    def difference(self, a: Tensor, b: Tensor, margins: int = 1) -> Tensor:
+        """[h, w] greatest difference over channels of two pictures [h, w, 3] of decisions, low-passed.
+
+        `margins`: sigma of the low-pass, in margins of the configuration.
+        """
         h, w = a.shape[:2]
-        sigma = lowpass * self.config.lowpass * self.unit
+        sigma = margins * self.config.margin * self.unit
         if sigma < 1.5:
             return blurred(a - b, sigma).abs().amax(dim=-1)
         half = resized(a - b, (w + 1) // 2, (h + 1) // 2)  # what is left needs no more pixels
@@ -195,7 +200,8 @@ class SourceViews:
     def seen(self, frame: int, points: Tensor) -> Visibility:
         """Where plate `frame` shows world points [..., 3]."""
         view = self.view(frame)
-        return visible_pixels(points, view.viewmat, view.K, view.surface, view.ignored, self.config.depth_tolerance)
+        c, soft = self.config, float(self.config.margin)  # of decisions: small pictures have no narrower border
+        return visible_pixels(points, view.viewmat, view.K, view.surface, view.ignored, c.depth_tolerance, soft)
 
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height
@@ -236,8 +242,8 @@ class SourceViews:
         ignored = self._ignored(frame)
         if ignored is not None:  # there is nothing that the model could miss
             plate = torch.lerp(plate, image.color, ignored)
-        off = self.difference(plate, image.color, 1.0)
-        region = round(self.config.region * self.unit)
+        off = self.difference(plate, image.color, 2)
+        region = round(2 * self.config.margin * self.unit)
         off = blurred(dilate(off, region), 0.5 * region)
         explained = torch.exp(-(off / self.config.unexplained).square()).half().float()
         return PlateView(

@@ -19,8 +19,6 @@ from ...native import INTEGER, POINTER, Snippet
 
 _POINTS = 2048
 """Points of a unit of work."""
-_SOFT = 2.0
-"""As `reproject.inside`."""
 _KERNEL = Path(__file__).with_name("kernels") / "visibility.cpp"
 
 
@@ -55,8 +53,9 @@ def warm_up() -> None:
 
 
 def visible_pixels(
-    points: Tensor, viewmat: Tensor, K: Tensor, surface: Tensor, ignored: Tensor | None, tolerance: float
-) -> Visibility:
+    points: Tensor, viewmat: Tensor, K: Tensor, surface: Tensor, ignored: Tensor | None, tolerance: float,
+    soft: float,
+) -> Visibility:  # fmt: skip
     """How a plate shows world points [..., 3]. All on the CPU, float32; no gradient. ValueError for others.
 
     Args:
@@ -64,12 +63,13 @@ def visible_pixels(
         surface: [h, w, 3] median depth, and in 0..1 what moves and what is explained.
         ignored: [h, w, 1] in 0..1 of what is no part of the scene; None: nothing.
         tolerance: share of its depth by which a point may lie off the surface and still be it.
+        soft: pixels along the border over which points stop being seen.
     """
     shape, height, width = points.shape[:-1], *surface.shape[:2]
     points, surface = points.contiguous(), surface.contiguous()
     ignored = None if ignored is None else ignored.contiguous()
     camera = torch.cat([viewmat[:3].flatten(), torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])]).float().contiguous()
-    settings = torch.tensor([tolerance, _SOFT], device="cpu")
+    settings = torch.tensor([tolerance, soft], device="cpu")
     given = [value for value in (points, surface, ignored, camera) if value is not None]
     if any(value.dtype != torch.float32 or value.device.type != "cpu" for value in given):
         raise ValueError("points, cameras, surface and ignored must be float32 and on the CPU")

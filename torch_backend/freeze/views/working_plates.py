@@ -11,22 +11,24 @@ from ...train.model import gathered
 from ..frozen import FrozenGaussians
 from .ignored import ignore_mattes
 from .reproject import dilate, resized
-from .source_views import MovingOf
+from .source_views import LENGTHS_OF, MARGIN, MovingOf
 
-_SEEN = 0.05
+SEEN = 0.05
 """Pixels that a camera has to see of a Gaussian before it can say whether that moves."""
 
 
 class WorkingPlates:
     """Pictures, cameras and mattes of a shot's frames at `width` pixels, at most the working frames' own."""
 
-    def __init__(self, scene: Scene, width: int, moving: MovingOf, margin: float, device: torch.device) -> None:
-        """`margin`: pixels of pictures 640 wide around what moves that count as moving too."""
+    def __init__(
+        self, scene: Scene, width: int, moving: MovingOf, margin: float = MARGIN, device: torch.device | str = "cpu"
+    ) -> None:
+        """`margin`: pixels of pictures `LENGTHS_OF` wide around what moves that count as moving too."""
         self.scene, self.moving, self.device = scene, moving, device
         self.width = min(scene.width, width)
         self.height = max(16, round(scene.height * self.width / scene.width))
         self.index = {frame: i for i, frame in enumerate(scene.frames)}
-        self.margin = round(margin * self.width / 640)
+        self.margin = round(margin * self.width / LENGTHS_OF)
         self._Ks, self._viewmats = scene.camera_at(self.width, self.height).to(device), scene.viewmats.to(device)
         self._pictures: dict[int, Tensor] = {}
         self._mattes: dict[int, Tensor] = {}
@@ -71,7 +73,7 @@ class WorkingPlates:
         matte = self.matte(frame)
         weights = torch.stack([matte, torch.ones_like(matte)], dim=-1)
         inside, whole = gathered(frozen.state, *self.camera(frame), weights).unbind(1)
-        return torch.where(whole > _SEEN, inside / whole.clamp_min(1e-6), 0.0)
+        return torch.where(whole > SEEN, inside / whole.clamp_min(1e-6), 0.0)
 
 
 def showing(trained: list[int], t_star: int) -> list[int]:

@@ -13,6 +13,7 @@ from torch_backend.footage.images import read_png, write_png
 from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_key
 from torch_backend.freeze.frozen import render_frozen, span_of
+from torch_backend.freeze.instant import develop as develop_module
 from torch_backend.freeze.instant.develop import DevelopConfig, develop
 from torch_backend.freeze.instant.instants import (
     MOST,
@@ -35,6 +36,7 @@ from torch_backend.shot import Shot
 from torch_backend.solve.motion import load_motion
 from torch_backend.train import load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, read_meta, save_checkpoint
+from torch_backend.train.config import TrainConfig
 
 from ...conftest import build_world, paint_motion
 
@@ -334,7 +336,7 @@ def plate_error(run, scene, shot, frozen, frame):
     return float((shown(run, scene, frozen, frame) - plate).square().mean(-1)[moves].mean())
 
 
-def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_neighbours_bear(apart):
+def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_neighbours_bear(apart, monkeypatch):
     """In them what moves looks otherwise."""
     shot, run, scene, frozen = apart
     path = scene.image_path(scene.frames.index(T_STAR))
@@ -342,8 +344,9 @@ def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_ne
     plate[moves] = 255 - plate[moves]
     write_png(path, plate)
     states = {}
+    monkeypatch.setattr(develop_module, "_TRAINING", TrainConfig(lr_sh0=0.2))
     for worth in (0.0, 100.0):
-        config = DevelopConfig(steps=150, gain=99.0, worth=worth, lr_sh0=0.1)
+        config = DevelopConfig(steps=150, gain=99.0, worth=worth)
         states[worth] = develop(run, scene, frozen, T_STAR, motion_mattes(shot), config).state["sh0"]
     deceived, careful = ((sh0 - frozen.state["sh0"]).abs().mean() for sh0 in states.values())
     assert deceived > 0.0 and careful < 0.6 * deceived

@@ -63,7 +63,7 @@ def test_what_lies_behind_the_camera_is_in_no_picture():
     points = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
     K = torch.tensor([[30.0, 0, 18], [0, 30.0, 14], [0, 0, 1]])
     pixels, depth = project(points, torch.eye(4), K)
-    assert inside(pixels, W, H).tolist() == [0.0, 0.0, 1.0]
+    assert inside(pixels, W, H, 2.0).tolist() == [0.0, 0.0, 1.0]
     assert depth.tolist() == [-2.0, 0.0, 2.0]
 
 
@@ -85,7 +85,7 @@ def test_a_look_up_at_the_centres_is_the_picture(picture, mode):
 
 def test_inside_rises_from_the_border_over_two_pixels():
     pixels = torch.tensor([[-0.1, 9.0], [0.0, 9.0], [1.0, 9.0], [9.0, 28.5], [9.0, 9.0], [37.0, 9.0]])
-    np.testing.assert_allclose(inside(pixels, W, H), [0, 0, 0.5, 0.25, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(inside(pixels, W, H, 2.0), [0, 0, 0.5, 0.25, 1, 0], atol=1e-6)
 
 
 def test_a_blur_is_a_gaussian_that_keeps_the_mean_and_the_border(picture):

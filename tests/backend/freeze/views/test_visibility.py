@@ -8,7 +8,7 @@ import torch
 
 from torch_backend.freeze.views.visibility import visible_pixels
 
-WIDTH, HEIGHT, TOLERANCE = 37, 21, 0.03
+WIDTH, HEIGHT, TOLERANCE, SOFT = 37, 21, 0.03, 2.0
 
 
 def reference(points, viewmat, K, surface, ignored):
@@ -30,7 +30,7 @@ def reference(points, viewmat, K, surface, ignored):
 
     shown = look_up(surface)
     border = np.minimum(at, np.array([WIDTH, HEIGHT]) - at).min(1)
-    visible = np.exp(-np.square((z - shown[:, 0]) / (TOLERANCE * np.maximum(z, 1e-6)))) * np.clip(border / 2, 0, 1)
+    visible = np.exp(-np.square((z - shown[:, 0]) / (TOLERANCE * np.maximum(z, 1e-6)))) * np.clip(border / SOFT, 0, 1)
     visible *= 1 - look_up(ignored)[:, 0]
     return at, z, visible, shown[:, 1], shown[:, 2]
 
@@ -67,7 +67,7 @@ def test_it_is_what_float64_says(plate, with_ignored):
     given = given if with_ignored else [*given[:-1], None]
     # Rounded to float32 first: what is tested is the arithmetic.
     rounded = [np.asarray(v, np.float32).astype(float) for v in (points, viewmat, K, surface, ignored)]
-    found, expected = visible_pixels(*given, TOLERANCE), reference(*rounded)
+    found, expected = visible_pixels(*given, TOLERANCE, SOFT), reference(*rounded)
     clear = np.abs(expected[1]) > 1e-3  # where the camera's plane is, rounding decides what is in front
     assert (expected[2] > 0.5).sum() > 100 and (expected[1] < 0).sum() > 500
     for name, mine, theirs in zip(("depth", "moving", "explained"), (found.depth, found.moving, found.explained),
@@ -81,20 +81,20 @@ def test_it_is_what_float64_says(plate, with_ignored):
 
 def test_one_thread_or_many_and_any_shape_are_the_same(plate):
     points, *camera = single(*plate)
-    whole = visible_pixels(points, *camera, TOLERANCE)
+    whole = visible_pixels(points, *camera, TOLERANCE, SOFT)
     for part in (slice(0, 1), slice(5, 22), slice(8000, 10007)):
-        some = visible_pixels(points[part], *camera, TOLERANCE)
+        some = visible_pixels(points[part], *camera, TOLERANCE, SOFT)
         assert torch.equal(some.visible, whole.visible[part]) and torch.equal(some.pixels, whole.pixels[part])
-    square = visible_pixels(points[:10000].reshape(100, 100, 3)[::2, ::3], *camera, TOLERANCE)
+    square = visible_pixels(points[:10000].reshape(100, 100, 3)[::2, ::3], *camera, TOLERANCE, SOFT)
     assert square.pixels.shape == (50, 34, 2)
     assert torch.equal(square.depth, whole.depth[:10000].reshape(100, 100)[::2, ::3])
-    assert visible_pixels(points[:0], *camera, TOLERANCE).depth.shape == (0,)
+    assert visible_pixels(points[:0], *camera, TOLERANCE, SOFT).depth.shape == (0,)
 
 
 def test_what_is_no_number_is_seen_nowhere_and_reads_nothing_beyond_the_picture(plate):
     _, *camera = single(*plate)
     odd = torch.tensor([[math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0], [0.0, -math.inf, 1.0], [1e30, 1e30, 1e30]])
-    found = visible_pixels(odd, *camera, TOLERANCE)
+    found = visible_pixels(odd, *camera, TOLERANCE, SOFT)
     assert not bool((found.visible > 0.0).any())
     assert bool(found.moving.isfinite().all()) and bool(found.explained.isfinite().all())
 
@@ -102,4 +102,4 @@ def test_what_is_no_number_is_seen_nowhere_and_reads_nothing_beyond_the_picture(
 def test_other_numbers_than_float32_are_refused(plate):
     points, *camera = single(*plate)
     with pytest.raises(ValueError, match="float32"):
-        visible_pixels(points.double(), *camera, TOLERANCE)
+        visible_pixels(points.double(), *camera, TOLERANCE, SOFT)
