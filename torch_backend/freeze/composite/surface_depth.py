@@ -5,24 +5,21 @@ the depth behind them is taken. What stands still is measured instead, once for 
 
 1. Key views, spread over the clip, start from the splats' inverse depth of what stands still.
 2. Each plate is compared with the plates of the key views around it. Inverse depth takes Gauss-Newton steps that make
-   them agree (Lucas and Kanade 1981, along epipolar lines). What mattes call moving takes no part. How much two plates
-   differ where they show the same is measured, so that each pixel's inverse depth has a variance.
-3. After each step inverse depth is fitted by planes in windows of several sizes, weighted by how much the plates tell.
-   Inverse depth of a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows
-   around it whose deviations are what their variances explain: a window that reaches over an edge is none (Kuwahara et
-   al. 1976). Of those that are, large ones know more.
+   them agree (Lucas and Kanade 1981, along epipolar lines). What mattes call moving takes no part.
+3. After each step inverse depth is fitted by planes in windows, weighted by how much the plates tell. Inverse depth of
+   a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows around it that fit
+   best: a window that reaches over an edge does not (Kuwahara et al. 1976).
 
-A frame takes that depth from the key views nearest to it: of what they and the splats say, that on which most agree.
-What moves, and what they do not show, is the splats'. Planes are fitted once more in small windows, and each pixel
-takes those of its neighbours that are about as deep as the splats there and have its own colour in the frame's picture:
-a joint bilateral filter of planes.
+A frame takes that depth from the key views nearest to it, and the splats' for what moves or what they do not show.
+Planes are fitted once more in small windows, and each pixel takes those of its neighbours that are about as deep as the
+splats there and have its own colour in the frame's picture: a joint bilateral filter of planes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -41,13 +38,9 @@ from ..frozen import FrozenGaussians, fade, freeze_at, render_frozen, span_of
 Array = NDArray[Any]
 """float32 unless it says otherwise."""
 
-LEAST_INVERSE = 1e-4
+_LEAST = 1e-4
 """Least inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so what is farther than
 10,000 of them has no parallax."""
-TO_SIGMA = 1.4826
-"""Standard deviation over median deviation, of Gaussian errors."""
-_QUANTUM = 1.0 / 255.0
-"""Least standard deviation of a plate's brightness: a step of 8 bits."""
 
 
 @dataclass(frozen=True)
@@ -60,22 +53,25 @@ class SurfaceDepthConfig:
     """Number of key views, spread evenly over the clip."""
     reach: int = 6
     """Each key view is compared with this many before and after it."""
-    steps: int = 6
+    steps: int = 4
     """Number of Gauss-Newton steps."""
-    radii: tuple[int, ...] = (3, 6, 12)
-    """Radii in pixels of the windows in which planes are fitted to what the plates tell."""
+    radius: int = 6
+    """Radius in pixels of the windows in which planes are fitted to what the plates tell."""
     detail: float = 1.5
     """Standard deviation in pixels of the blur that is subtracted from plates, so that light and exposure cancel."""
-    noise: float = 0.025
-    """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.8 % on the
-    tuning scenes arm-000 and arm-001."""
-    uneven: float = 0.1
-    """Mean square deviation of a window from its plane, in variances, from which on it counts less."""
-    shared: float = 10.0
-    """Number of pixels whose errors are the same: plates are blurred, and all views are compared with one."""
+    contrast: float = 0.1
+    """Difference of two plates, display-referred, at which they no longer count as showing the same point."""
+    prior: float = 1.0
+    """Standard deviation of the splats' inverse depth, as a share of it, where plates tell more: large, so that splats
+    count only where plates tell nothing."""
+    noise: float = 0.03
+    """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.7 % on the
+    tuning scenes arm-000 and arm-001. What is farther off is another surface."""
+    flat: float = 0.01
+    """Deviation from its plane, as a share of the median inverse depth, from which on a window counts less."""
     occluded: float = 1.15
     """Ratio of inverse depths from which on a key view shows something in front of a point."""
-    nearest: int = 6
+    nearest: int = 4
     """Number of key views from which a frame takes its depth."""
     taps: tuple[int, ...] = (-3, 0, 3)
     """Offsets, along rows and columns, of the windows from which a pixel of a frame chooses."""
@@ -141,41 +137,39 @@ def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
 def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig) -> tuple[Array, Array]:
     """Inverse depth [h, w] of a key view at which plates agree, and its standard deviation [h, w]."""
     start, inverse = key.inverse, key.inverse.copy()
-    prior = 1.0 / np.square(start)  # off by as much as it is: splats count only where plates tell nothing
-    variance = 1.0 / prior
+    flat = config.flat * float(np.median(start))
+    sigma = config.prior * start
     for _ in range(config.steps if others else 1):
-        information, pull, parallax = gauss_newton(key, others, inverse, config)
+        information, pull = gauss_newton(key, others, inverse, config)
+        prior = 1.0 / np.square(config.prior * start)
         weight = information + prior
-        step = (pull + prior * (start - inverse)) / weight
-        pixel = 1.0 / np.maximum(parallax, 1e-3)  # a linear step is not believed beyond that
-        inverse, variance = smoothed(inverse + np.clip(step, -pixel, pixel), weight, config)
-        inverse = np.maximum(inverse, LEAST_INVERSE).astype(np.float32)
-    return inverse, np.sqrt(variance).astype(np.float32)
+        wanted = (information * inverse + pull + prior * start) / weight
+        wanted = np.clip(wanted, 0.9 * inverse, 1.1 * inverse)  # a linear step is not believed beyond that
+        planes = fit_planes(wanted, weight / np.median(weight), config.radius)
+        inverse, spread = planes.around(flat, config.radius)
+        inverse = np.maximum(inverse, _LEAST).astype(np.float32)
+        known = key.still * _means([information], config.radius)[0] * (2 * config.radius + 1)
+        sigma = np.sqrt(spread + 1.0 / np.maximum(known, 1e-6))
+    return inverse, sigma.astype(np.float32)
 
 
 def gauss_newton(
     key: KeyView, others: Sequence[KeyView], inverse: Array, config: SurfaceDepthConfig
-) -> tuple[Array, Array, Array]:
-    """What the plates of `others` tell of a key view's inverse depth, [h, w] each: how much (1 / variance), that times
-    the step by which they would agree, and the pixels by which a point moves in any of them with inverse depth."""
-    information, pull, parallax = np.zeros_like(inverse), np.zeros_like(inverse), np.zeros_like(inverse)
+) -> tuple[Array, Array]:
+    """What the plates of `others` tell of a key view's inverse depth, [h, w] each: how much (1 / variance), and that
+    times the step by which they would agree."""
+    information, pull = np.zeros_like(inverse), np.zeros_like(inverse)
     rays = rays_of(key.K, inverse.shape)
     for other in others:
         place = Place.of(key, other, rays, inverse)
         shift = place.look(other.picture) - key.picture
         slope = place.look(_slope(other.picture, 1)) * place.dx + place.look(_slope(other.picture, 0)) * place.dy
+        seen = place.look(other.still) * key.still
         clear = place.look(other.inverse) < config.occluded * place.inverse
-        weight = place.look(other.still) * key.still * clear
-        seen = weight > 0.5
-        if not seen.any():
-            continue
-        noise = max(TO_SIGMA * float(np.median(np.abs(shift[seen]))), _QUANTUM)
-        # Three deviations: from there on two plates show two points.
-        weight /= np.square(noise * (1.0 + np.square(shift / (3.0 * noise))))
+        weight = seen * clear / np.square(1.0 + np.square(shift / config.contrast))
         information += weight * slope * slope
         pull -= weight * slope * shift
-        np.maximum(parallax, np.where(seen, np.hypot(place.dx, place.dy), 0.0), out=parallax)
-    return information, pull, parallax
+    return information / config.contrast**2, pull / config.contrast**2
 
 
 @dataclass
@@ -233,7 +227,8 @@ def _slope(picture: Array, axis: int) -> Array:
     return cv2.Sobel(picture, cv2.CV_32F, axis, 1 - axis, ksize=3, scale=0.125)
 
 
-class Planes(NamedTuple):
+@dataclass
+class Planes:
     """Inverse depth around each pixel as a plane: value + along * (x - its column) + down * (y - its row)."""
 
     value: Array
@@ -242,36 +237,35 @@ class Planes(NamedTuple):
     """[h, w] change per pixel to the right."""
     down: Array
     """[h, w] change per pixel downwards."""
-    chi: Array
-    """[h, w] mean square of what the window's values are off the plane, in their variances."""
-    information: Array
-    """[h, w] 1 / variance of the value, if the window's values are a plane."""
+    variance: Array
+    """[h, w] mean square of what the window's values are off the plane."""
 
-    def fits(self, uneven: float) -> Array:
-        """[h, w] in 0..1: how well a window is a plane; `uneven` is a `chi` that is no fault."""
-        return np.square(np.square(uneven / (uneven + self.chi)))
+    def where(self, mask: Array, other: Planes) -> Planes:
+        """Those of `other` in `mask`, bool [h, w]."""
+        return Planes(
+            np.where(mask, other.value, self.value),
+            np.where(mask, other.along, self.along),
+            np.where(mask, other.down, self.down),
+            np.where(mask, other.variance, self.variance),
+        )
 
+    def fits(self, flat: float) -> Array:
+        """[h, w] in 0..1: how well a window is a plane; `flat` is a deviation that is no fault."""
+        return np.square(np.square(flat * flat / (flat * flat + self.variance)))
 
-def smoothed(values: Array, weight: Array, config: SurfaceDepthConfig) -> tuple[Array, Array]:
-    """(inverse depth [h, w], variance [h, w]) of the planes of all windows that hold a pixel, those that fit.
-
-    `values` [h, w] is inverse depth, `weight` [h, w] 1 / its variance.
-    """
-    rows, columns = _grid(values.shape)
-    total, level, along, down, variance = (np.zeros(values.shape) for _ in range(5))
-    for radius in config.radii:
-        planes = fit_planes(values, weight, radius)
-        fit = np.maximum(planes.fits(config.uneven) * planes.information, 1e-20)
-        offset = planes.value - planes.along * columns - planes.down * rows
-        spread = config.shared * (1.0 + planes.chi) / planes.information
-        terms = [fit, fit * offset, fit * planes.along, fit * planes.down, fit * spread]
-        for into, mean in zip((total, level, along, down, variance), _means(terms, radius), strict=True):
-            into += mean
-    return (level + along * columns + down * rows) / total, variance / total
+    def around(self, flat: float, radius: int) -> tuple[Array, Array]:
+        """(inverse depth [h, w], variance [h, w]) of the planes of all windows that hold a pixel, those that fit."""
+        rows, columns = _grid(self.value.shape)
+        fit = np.maximum(self.fits(flat), 1e-20)
+        level = self.value - self.along * columns - self.down * rows
+        total, level, along, down, variance = _means(
+            [fit, fit * level, fit * self.along, fit * self.down, fit * self.variance], radius
+        )
+        return (level + along * columns + down * rows) / total, variance / total
 
 
 def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
-    """The planes that fit `values` [h, w], weighted by 1 / their variance [h, w], in the windows around all pixels."""
+    """The planes that fit `values` [h, w], each weighted by `weight` [h, w], in the windows around all pixels."""
     rows, columns = _grid(values.shape)
     near = weight.astype(np.float64)
     terms = [near * f for f in (1.0, columns, rows, columns**2, columns * rows, rows**2)]
@@ -284,9 +278,9 @@ def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
     vx, vy, vv = vx - v * x, vy - v * y, vv - v * v
     determinant = xx * yy - xy * xy
     along, down = (yy * vx - xy * vy) / determinant, (xx * vy - xy * vx) / determinant
-    chi = np.maximum(vv - along * vx - down * vy, 0.0) * total
+    variance = np.maximum(vv - along * vx - down * vy, 0.0)
     value = v + along * (columns - x) + down * (rows - y)
-    return Planes(*(a.astype(np.float32) for a in (value, along, down, chi, total * (2 * radius + 1) ** 2)))
+    return Planes(*(a.astype(np.float32) for a in (value, along, down, variance)))
 
 
 def _grid(size: tuple[int, ...]) -> tuple[Array, Array]:
@@ -345,66 +339,49 @@ def frame_depth(
     K = splats.K.copy()
     K[0] *= w / width
     K[1] *= h / height
-    # Where anything of a mover is seen, key views know the background alone.
-    still, mover = (moving < 0.05).astype(np.float32), moving > 0.5
+    still, mover = np.clip(1.0 - 2.0 * moving, 0.0, 1.0), moving > 0.5
     whole, noise = splats.inverse, np.full_like(inverse, config.noise)
     if measured is not None:
         factor, noise = measured.correction(KeyView(splats.viewmat, K, inverse, still, inverse, inverse), mover)
         inverse = np.asarray(inverse * factor, np.float32)
         factor = np.asarray(cv2.resize(factor, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
         whole = np.where(splats.moving > 0.5, whole * factor, whole)
-    values, sigma = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, noise * inverse))
+    values, sigma, weight = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, inverse), noise)
     # What moves and what stands still are surfaces of their own, however near they are.
-    weight = 1.0 / np.square(np.maximum(sigma, LEAST_INVERSE * config.noise))
-    still, moved = (fit_planes(values, weight * (of + 1e-9), config.frame_radius) for of in (~mover, mover))
-    planes = Planes(*(np.where(mover, *each) for each in zip(moved, still, strict=True)))
+    weight = weight / float(np.median(weight))
+    still, moved = (fit_planes(values, weight * of + 1e-9, config.frame_radius) for of in (~mover, mover))
+    planes = still.where(mover, moved)
     guide = np.concatenate([picture, (4.0 * config.color * (splats.moving > 0.5))[..., None]], axis=2, dtype=np.float32)
     small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
     small = np.concatenate([small, (4.0 * config.color * mover)[..., None]], axis=2, dtype=np.float32)
     return selected(planes, sigma, small, whole, guide, config)
 
 
-def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
-    """(inverse depth, its standard deviation), [h, w] each: that on which most of the key views and the splats agree.
-
-    `view` has the splats' inverse depth and its standard deviation. Splats say alone what moves.
-    """
-    rays, splats = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
-    seen = [(splats, view.sigma)]
+def combined(surfaces: StillSurfaces, view: KeyView, noise: Array) -> tuple[Array, Array, Array]:
+    """(inverse depth, its standard deviation, weight), [h, w] each: the key views' where they agree with the splats,
+    whose own relative standard deviation is `noise` [h, w]."""
+    config, radius = surfaces.config, surfaces.config.frame_radius
+    rough = fit_planes(view.inverse, np.ones_like(view.inverse), radius)
+    smooth = rough.around(config.noise * float(np.median(view.inverse)), radius)[0]
+    smooth = np.maximum(smooth, _LEAST).astype(np.float32)
+    rays = rays_of(view.K, view.inverse.shape)
+    total, mean, square = np.zeros_like(smooth), np.zeros_like(smooth), np.zeros_like(smooth)
     for key in surfaces.near(view.viewmat):
-        start = points_in(key, view)
-        seen.append(seen_in(key, view, rays, np.where(start > 0, start, splats)))
-    values, sigmas = (np.stack(each) for each in zip(*seen, strict=True))
-    known = sigmas > 0
-    known[1:] &= view.still > 0
-    variances = np.square(np.maximum(sigmas, 1e-4 * splats))
-
-    def agree(with_value: Array, with_variance: Array) -> Array:
-        return known * np.exp(-0.5 * np.square(values - with_value) / (variances + with_variance))
-
-    def density(at: Array) -> Array:
-        return (known * np.exp(-0.5 * np.square(values - at) / variances) / np.sqrt(variances)).sum(0)
-
-    # The densest of all values: one that knows little agrees with everything, and shall not win by that.
-    best = (np.stack([density(each) for each in values]) * known).argmax(0)[None]
-    chosen = agree(*(np.take_along_axis(each, best, 0) for each in (values, variances)))
-    weight = chosen / variances
-    total = np.maximum(weight.sum(0), 1e-12)
-    value = (weight * values).sum(0) / total
-    # Those that disagree may be right: as likely as they are many.
-    spread = (known * np.square(values - value) * np.where(chosen > 0.5, weight / total, 1.0 / len(seen))).sum(0)
-    return value.astype(np.float32), np.sqrt(spread + 1.0 / total).astype(np.float32)
-
-
-def points_in(key: KeyView, view: KeyView) -> Array:
-    """Inverse depth [h, w] of the nearest of a key view's points in each of a view's pixels, 0 where none is."""
-    height, width = view.inverse.shape
-    place = Place.of(key, view, rays_of(key.K, key.inverse.shape), key.inverse)
-    x, y = np.rint(place.x).astype(int), np.rint(place.y).astype(int)
-    within = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    nearest = np.zeros(height * width, np.float32)
-    np.maximum.at(nearest, y[within] * width + x[within], place.inverse[within])
-    return nearest.reshape(height, width)
+        found, sigma = seen_in(key, view, rays, smooth)
+        off = (found - smooth) / (config.noise * smooth)
+        weight = view.still * np.exp(-0.5 * np.square(off)) * (sigma > 0) / np.maximum(np.square(sigma), 1e-12)
+        total += weight
+        mean += weight * (found - smooth)
+        square += weight * np.square(found - smooth)
+    known = np.maximum(total, 1e-12)
+    spread = np.maximum(square / known - np.square(mean / known), 0.0)
+    # Key views that disagree know little, however sure each of them is.
+    information = total / (1.0 + total * spread)
+    splats = 1.0 / np.square(config.prior * smooth)
+    share = information / (information + splats)
+    variance = share * share / np.maximum(information, 1e-12) + np.square((1.0 - share) * noise * smooth)
+    value = smooth + share * mean / known + (1.0 - share) * (view.inverse - smooth)
+    return value, np.sqrt(variance), information + splats
 
 
 def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[Array, Array]:
@@ -419,8 +396,8 @@ def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[A
         place = Place.of(view, key, rays, inverse)
         depth = place.look(key.inverse)
         better = depth * ahead / np.maximum(1.0 - depth * shift[2], 1e-3)
-        better = np.maximum(np.where(depth > 0, better, inverse), LEAST_INVERSE).astype(np.float32)
-        return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, LEAST_INVERSE), 0.0)
+        better = np.maximum(np.where(depth > 0, better, inverse), _LEAST).astype(np.float32)
+        return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, _LEAST), 0.0)
 
     return once(once(inverse)[0])
 
@@ -440,7 +417,7 @@ def selected(
     height, width = splats.shape
     rows, columns = (axis.astype(np.float32) for axis in _grid(planes.value.shape))
     level = planes.value - planes.along * columns - planes.down * rows
-    fit = planes.fits(config.uneven)
+    fit = planes.fits(config.flat * float(np.median(planes.value)))
     maps = [level, planes.along, planes.down, fit, np.square(sigma), *np.moveaxis(small, -1, 0)]
     windows = [np.pad(m.astype(np.float32), max(config.taps), mode="edge") for m in maps]
     rough = np.asarray(cv2.medianBlur(splats, 3), np.float32)
@@ -468,8 +445,7 @@ def _from_windows(
     at = border + down.astype(np.int64)
     y = (down - 0.5 - 0.5 * h)[:, None]
     x = ((np.arange(width, dtype=np.float32) + 0.5) * (w / width) - 0.5 - 0.5 * w)[None]
-    # Twice their noise: where splats are farther off than that, as beside edges, colour decides.
-    near = 1.0 / (2.0 * config.noise * np.maximum(rough, LEAST_INVERSE))
+    near = 1.0 / np.maximum(config.noise * rough, config.noise * _LEAST)
     total = np.full_like(rough, 1e-20)
     mean, square, spread = np.zeros_like(rough), np.zeros_like(rough), np.zeros_like(rough)
     for dy in config.taps:
@@ -528,11 +504,11 @@ class FrameDepths:
             measured: what the artist's depth maps say of the instant, if anything.
         """
         there = depth < NO_DEPTH
-        inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE), 0.0)
+        inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / _LEAST), 0.0)
         splats = Splats(viewmat.double().numpy(), K.double().numpy(), inverse.numpy(), motion.numpy())
         shown = picture.clamp(0.0, 1.0).numpy()
         found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, shown, measured))
-        refined = torch.where(there, 1.0 / found.clamp_min(LEAST_INVERSE), NO_DEPTH)
+        refined = torch.where(there, 1.0 / found.clamp_min(_LEAST), NO_DEPTH)
         return refined, torch.where(there, sigma * refined.square(), 0.0)
 
     def _key(self, shot: Shot, frame: int, still: FrozenGaussians) -> KeyView:
@@ -543,7 +519,7 @@ class FrameDepths:
         height = max(8, round(scene.height * width / scene.width))
         K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
         image = render_frozen(still, scene.viewmats[i], K, width, height)
-        inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
+        inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / _LEAST)).numpy()
         plate = read_image(shot.plate(frame), width, height, scene.display).numpy()
         moving = load_motion(shot, frame)
         clear = np.ones((height, width), np.float32)
