@@ -29,7 +29,7 @@ from torch_backend.freeze.instant.static_baseline import StaticBaselineConfig, a
 from torch_backend.freeze.instant.undersampled import undersampled
 from torch_backend.freeze.views.scene_flow import MovingScene, SceneFlow
 from torch_backend.freeze.views.source_views import motion_mattes
-from torch_backend.freeze.views.working_plates import WorkingPlates
+from torch_backend.freeze.views.working_plates import WorkingPlates, spread
 from torch_backend.live import LiveSession
 from torch_backend.scene import load_scene, read_image
 from torch_backend.shot import Shot
@@ -234,15 +234,16 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(tr
     """A face that is closed, and that one frame calls moving: others teach it what they see beside it."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
-    frozen, once = field(run, scene), run.train_frames[-2]
+    frames = [frame for frame in run.train_frames if frame != T_STAR]
+    frozen, once = field(run, scene), spread(frames[1:-1], len(frames) // 4)[-1]  # a probe
 
     def moving(frame: int) -> torch.Tensor:
         return torch.full((scene.height, scene.width), float(frame == once))
 
-    config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005, probes=0, looks=1000)
+    config = dataclasses.replace(config_for(run), steps=40, gain=-100.0, afar=1.005, probes=1000)
     made = develop(run, scene, frozen, T_STAR, moving, config)
     changed = (made.state["sh0"] - frozen.state["sh0"]).abs().amax((1, 2)) > 0
-    plates = WorkingPlates(scene, config.width, moving, config.margin, frozen.support.device)
+    plates = WorkingPlates(scene, config.width, moving, device=frozen.support.device)
     moves = plates.moving_share(frozen, once) > 0.5
     afar = undersampled(run, scene, frozen.state["means"], T_STAR, 1.005)
     closed = frozen.motion < 0.5
