@@ -66,6 +66,8 @@ UNTUNED = {
     "composite/measured_depth.py:_TO_SIGMA": "mathematics",
     "composite/primary_source.py:_places": "guard",
     "composite/surface_depth.py:_slope": "mathematics",
+    "composite/surface_depth.py:frame_depth": "guard",
+    "composite/surface_depth.py:FrameDepths._key": "guard",
     "composite/transfer.py:to_linear": "format",
     "composite/transfer.py:to_display": "format",
     "composite/warp.py:WARP_VERSION": "format",

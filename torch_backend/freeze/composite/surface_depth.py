@@ -29,11 +29,13 @@ from torch import Tensor
 from ...contract import NO_DEPTH
 from ...scene import Scene, evenly_spaced, read_image, resize_intrinsics
 from ...shot import Shot
-from ...solve.motion import load_motion
+from ...solve.motion import UNKNOWN, load_motion
 from ...torch_types import from_numpy
 from ...train import LoadedRun
 from ..bands import bands
 from ..frozen import FrozenGaussians, fade, freeze_at, render_frozen, span_of
+from ..views.source_views import MARGIN
+from ..views.working_plates import MEASURED_WIDTH, VIEWS
 
 Array = NDArray[Any]
 """float32 unless it says otherwise."""
@@ -47,9 +49,9 @@ _LEAST = 1e-4
 class SurfaceDepthConfig:
     """How the depth of surfaces is found. Pixels are those of pictures `width` wide."""
 
-    width: int = 320
+    width: int = MEASURED_WIDTH
     """Width in pixels at which surfaces are measured; less for smaller plates."""
-    keys: int = 12
+    keys: int = VIEWS
     """Number of key views, spread evenly over the clip."""
     reach: int = 6
     """Each key view is compared with this many before and after it."""
@@ -61,9 +63,6 @@ class SurfaceDepthConfig:
     """Standard deviation in pixels of the blur that is subtracted from plates, so that light and exposure cancel."""
     contrast: float = 0.1
     """Difference of two plates, display-referred, at which they no longer count as showing the same point."""
-    prior: float = 1.0
-    """Standard deviation of the splats' inverse depth, as a share of it, where plates tell more: large, so that splats
-    count only where plates tell nothing."""
     noise: float = 0.03
     """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.7 % on the
     tuning scenes arm-000 and arm-001. What is farther off is another surface."""
@@ -73,8 +72,8 @@ class SurfaceDepthConfig:
     """Ratio of inverse depths from which on a key view shows something in front of a point."""
     nearest: int = 4
     """Number of key views from which a frame takes its depth."""
-    taps: tuple[int, ...] = (-3, 0, 3)
-    """Offsets, along rows and columns, of the windows from which a pixel of a frame chooses."""
+    tap: int = 3
+    """Offset in pixels, along rows and columns, of the nine windows from which a pixel of a frame chooses."""
     frame_radius: int = 2
     """Radius in pixels of the windows in which planes are fitted in a frame."""
     outlier: float = 1e-6
@@ -138,10 +137,10 @@ def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig)
     """Inverse depth [h, w] of a key view at which plates agree, and its standard deviation [h, w]."""
     start, inverse = key.inverse, key.inverse.copy()
     flat = config.flat * float(np.median(start))
-    sigma = config.prior * start
+    sigma = start
     for _ in range(config.steps if others else 1):
         information, pull = gauss_newton(key, others, inverse, config)
-        prior = 1.0 / np.square(config.prior * start)
+        prior = 1.0 / np.square(start)  # off by as much as it is: splats count where plates tell nothing
         weight = information + prior
         wanted = (information * inverse + pull + prior * start) / weight
         wanted = np.clip(wanted, 0.9 * inverse, 1.1 * inverse)  # a linear step is not believed beyond that
@@ -273,8 +272,8 @@ def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
     total, *moments = _means(terms, radius)
     total = np.maximum(total, 1e-12)
     x, y, xx, xy, yy, v, vx, vy, vv = (moment / total for moment in moments)
-    # A third of a pixel squared keeps slopes finite where all the weight lies in one pixel.
-    xx, xy, yy = xx - x * x + 0.1, xy - x * y, yy - y * y + 0.1
+    least = 0.1  # a third of a pixel, squared: slopes stay finite where all the weight lies in one pixel
+    xx, xy, yy = xx - x * x + least, xy - x * y, yy - y * y + least
     vx, vy, vv = vx - v * x, vy - v * y, vv - v * v
     determinant = xx * yy - xy * xy
     along, down = (yy * vx - xy * vy) / determinant, (xx * vy - xy * vx) / determinant
@@ -377,7 +376,7 @@ def combined(surfaces: StillSurfaces, view: KeyView, noise: Array) -> tuple[Arra
     spread = np.maximum(square / known - np.square(mean / known), 0.0)
     # Key views that disagree know little, however sure each of them is.
     information = total / (1.0 + total * spread)
-    splats = 1.0 / np.square(config.prior * smooth)
+    splats = 1.0 / np.square(smooth)
     share = information / (information + splats)
     variance = share * share / np.maximum(information, 1e-12) + np.square((1.0 - share) * noise * smooth)
     value = smooth + share * mean / known + (1.0 - share) * (view.inverse - smooth)
@@ -419,7 +418,7 @@ def selected(
     level = planes.value - planes.along * columns - planes.down * rows
     fit = planes.fits(config.flat * float(np.median(planes.value)))
     maps = [level, planes.along, planes.down, fit, np.square(sigma), *np.moveaxis(small, -1, 0)]
-    windows = [np.pad(m.astype(np.float32), max(config.taps), mode="edge") for m in maps]
+    windows = [np.pad(m.astype(np.float32), config.tap, mode="edge") for m in maps]
     rough = np.asarray(cv2.medianBlur(splats, 3), np.float32)
     out, deviation = np.zeros_like(splats), np.zeros_like(splats)
     for part in bands(height, width):
@@ -440,7 +439,7 @@ def _from_windows(
     """
     import cv2
 
-    (h, w, height), (rows, width), border = size, rough.shape, max(config.taps)
+    (h, w, height), (rows, width), border = size, rough.shape, config.tap
     down = (np.arange(top, top + rows, dtype=np.float32) + 0.5) * (h / height)
     at = border + down.astype(np.int64)
     y = (down - 0.5 - 0.5 * h)[:, None]
@@ -448,9 +447,9 @@ def _from_windows(
     near = 1.0 / np.maximum(config.noise * rough, config.noise * _LEAST)
     total = np.full_like(rough, 1e-20)
     mean, square, spread = np.zeros_like(rough), np.zeros_like(rough), np.zeros_like(rough)
-    for dy in config.taps:
+    for dy in (-config.tap, 0, config.tap):
         lines = [m[at + dy] for m in windows]
-        for dx in config.taps:
+        for dx in (-config.tap, 0, config.tap):
             columns = slice(border + dx, border + dx + w)
             level, along, below, fit, variance, *there = (
                 cv2.resize(m[:, columns], (width, rows), interpolation=cv2.INTER_NEAREST) for m in lines
@@ -525,6 +524,7 @@ class FrameDepths:
         clear = np.ones((height, width), np.float32)
         if moving is not None:
             moving = cv2.resize(moving, (width, height), interpolation=cv2.INTER_NEAREST)
-            clear[cv2.dilate(moving, np.ones((5, 5), np.uint8)) > 160] = 0.0
+            around = np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)
+            clear[cv2.dilate(moving, around) > UNKNOWN] = 0.0
         pose = scene.viewmats[i].double().numpy(), K.double().numpy()
         return KeyView(*pose, key_picture(plate, self.config), clear, inverse, self.config.noise * inverse)

@@ -31,23 +31,18 @@ from ...train.model import gathered, render
 from ...train.movers import mean_of
 from ..frozen import FrozenGaussians, freeze_at
 from ..views.reproject import project
-from ..views.source_views import MovingOf
-from ..views.working_plates import WorkingPlates, showing, spread
-
-_SEEN = 0.05
-"""Pixels that a plate has to see of a Gaussian before it counts."""
+from ..views.source_views import MARGIN, MovingOf
+from ..views.working_plates import MEASURED_WIDTH, SEEN, VIEWS, WorkingPlates, showing, spread
 
 
 @dataclass(frozen=True)
 class StaticBaselineConfig:
     """How a frozen scene is compared with its static twin."""
 
-    width: int = 320
+    width: int = MEASURED_WIDTH
     """Pixels of the pictures that are compared, at most; never above the working frames'."""
-    plates: int = 12
+    plates: int = VIEWS
     """Trained frames that are looked at beside t*, at most, evenly over the clip."""
-    margin: float = 2.0
-    """Pixels of pictures 640 wide around what moves that do not count as still."""
     neighbours: int = 16
     """So many nearest open Gaussians are asked together."""
     doubted: float = 3.0
@@ -77,7 +72,7 @@ def apply_static_baseline(
     rows = run.model.open_rows()
     if not len(rows):
         return frozen
-    plates = WorkingPlates(scene, config.width, moving, config.margin, frozen.support.device)
+    plates = WorkingPlates(scene, config.width, moving, MARGIN, frozen.support.device)
     movers = (plates.moving_share(frozen, t_star) > 0.5).float()
     shown_at_t_star = showing(run.train_frames, t_star)
     others = [frame for frame in spread(run.train_frames, config.plates) if frame not in shown_at_t_star]
@@ -135,7 +130,7 @@ class _Pair:
         sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
         for frame in frames:
             worse, seen = self._blamed(frame, still).unbind(1)
-            sees = seen[near].mean(1) > _SEEN
+            sees = seen[near].mean(1) > SEEN
             sums, counts = sums + torch.where(sees, worse[near].mean(1), 0.0), counts + sees
         return sums / counts.clamp_min(1.0)
 
@@ -168,7 +163,7 @@ class _Pair:
         near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), -1) <= self.from_near
         told = torch.where(near[:, None], told[:, 0], told[:, 1])
         went = self._travel(then, frame) > self.sways
-        self.went |= went & (told[:, 1] > _SEEN)
+        self.went |= went & (told[:, 1] > SEEN)
         told[:, 0] -= told[:, 2] * (near | went)
         return told[:, :2]
 

@@ -16,6 +16,11 @@ from .source_views import LENGTHS_OF, MARGIN, MovingOf
 SEEN = 0.05
 """Pixels that a camera has to see of a Gaussian before it can say whether that moves."""
 
+MEASURED_WIDTH = 320
+"""Width in pixels of pictures by which scenes are compared and surfaces measured; never above the working frames'."""
+VIEWS = 12
+"""Frames all over the clip that are asked, at most, where all would take too long."""
+
 
 class WorkingPlates:
     """Pictures, cameras and mattes of a shot's frames at `width` pixels, at most the working frames' own."""
