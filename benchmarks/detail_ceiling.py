@@ -159,7 +159,7 @@ def _carried(clip: DetailClip, pose: int, t_star: int, image: FrozenImage) -> tu
     points = unproject(pixel_centres(clip.width, clip.height), image.depth, viewmat, K)
     places, _ = project(points, *clip.camera(t_star))
     at = look_up(clip.plate(t_star), places, "bicubic").clamp(0.0, 1.0)
-    return at, inside(places, clip.width, clip.height) > 0.0
+    return at, inside(places, clip.width, clip.height, 1.0) > 0.0
 
 
 def labels_table(rows: Sequence[dict[str, dict[str, float | None]]]) -> list[str]:

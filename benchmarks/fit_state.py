@@ -1,13 +1,14 @@
 """Fits the weights of `torch_backend/freeze/composite/state.py` on synthetic scenes with truth.
 
-    python -m benchmarks.fit_state SCENE ... --results DIR [--seeds 0 1] [--every K] [--cross] [--masks SHOT --t-star 8]
+    python -m benchmarks.fit_state SCENE ... --results DIR [--seeds 0 1] [--every K] [--cross]
 
 SCENE is a folder of benchmarks/synthetic; seeds 0 to 9 are for tuning. Its shot and an `auto` run for every training
 seed are made in DIR if they are not there. For every instant and pose with a truth the evidence is computed as a frozen
-frame computes it, and regressed (logistic) on whether plate and truth differ. `--masks` adds pixels painted by hand
-(`benchmarks.other_state`) at the instants `--t-star` of a real, trained shot. Then the bias alone is chosen by the PSNR
-of frames mixed of plate and fill (the frame with that plate withheld). Prints the weights, and PSNR of frames mixed by
-them. `--cross` judges each scene by weights that were fitted on the others.
+frame computes it. Two losses are added. One is the mean squared error of a mix of the plate and of what fills it (the
+frame with that plate withheld) by the posterior, in units of the plate's own mean squared error. The other is the
+cross-entropy of the posterior with whether plate and truth differ. Then the bias alone is chosen by the PSNR of mixed
+frames. Prints the weights, and PSNR of frames mixed by them. `--cross` judges each scene by weights that were fitted on
+the others.
 """
 
 from __future__ import annotations
@@ -28,26 +29,24 @@ from torch.nn import functional as F
 
 from benchmarks.detail_clip import DetailClip
 from benchmarks.detail_truth import trained
-from benchmarks.other_state.__main__ import masks_of
-from benchmarks.other_state.masks import OTHER, UNSCORED
-from benchmarks.other_state.scores import judged as judged_masks
 from benchmarks.sources import load_source
-from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go, log_odds
+from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go
 from torch_backend.freeze.frozen import OutputFrame
 from torch_backend.freeze.views.reproject import blurred, resized
 from torch_backend.freeze.views.target_view import target_view
 from torch_backend.native import default_threads
 from torch_backend.report.truth import TruthScene
-from torch_backend.shot import Shot
 from torch_backend.train import load_run
 
 NAMES = [f.name for f in fields(StateWeights) if f.name != "bias"]
 """Names of the evidence, in the order of `Case.evidence`."""
+LABEL_WEIGHT = 0.1
+"""Weight of the cross-entropy beside the squared error."""
 DIFFERS = 0.03, 0.09
 """Difference of plate and truth, display-referred, at which they begin to differ and surely do."""
 SHIFTS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Added to the fitted bias, of which that is kept with which smoothed, mixed frames have the highest PSNR. The
-regression knows neither smoothing nor ramp, and counts a missed pixel no more than a needless one."""
+regression knows neither smoothing nor ramp, and its cross-entropy counts a missed pixel no more than a needless one."""
 ALIKE = 0.02
 """dB of PSNR by which two biases are equally good: the one that lets go of less is taken."""
 STEPS, RATE, DECAY = 150, 0.15, 1e-4
@@ -72,6 +71,11 @@ class Case:
     """[N, h, w] bool: pixels that move."""
     unit: float
     """Pixels of decisions to one of 640."""
+
+    def saving(self) -> Tensor:
+        """[N, h, w] squared error that letting go of the plate saves, over the plate's mean squared error."""
+        kept, gone = ((picture - self.truth).square().mean(-1) for picture in (self.plate, self.filled))
+        return torch.stack([blurred(each, 1.0) for each in kept - gone]) / kept.mean()
 
     def differs(self) -> Tensor:
         """[N, h, w] in 0..1: whether plate and truth differ."""
@@ -110,32 +114,21 @@ def _row(clip: DetailClip, truth: TruthScene, pose: int, t_star: int) -> tuple[T
     )  # fmt: skip
 
 
-def painted(clip: DetailClip, t_stars: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """([P, E] evidence in the order of NAMES, [P] 1 where the plate shows another state) of a shot's painted pixels."""
-    rows: list[tuple[Tensor, Tensor]] = []
-    for row, view, labels in judged_masks(clip, masks_of(clip, None)):
-        if row.t_star in t_stars:
-            found = torch.stack([resized(view.detailed.terms[name], *labels.shape[::-1]) for name in NAMES], -1)
-            rows.append((found[labels != UNSCORED], torch.from_numpy(labels == OTHER)[labels != UNSCORED].float()))
-    evidence, differs = (torch.cat(column) for column in zip(*rows, strict=True))
-    return evidence, differs
-
-
-def fit(cases: Sequence[Case], labelled: tuple[Tensor, Tensor] | None = None) -> StateWeights:
-    """The weights that fit all cases; each case weighs the same, and `labelled` pixels (`painted`) as much as all."""
+def fit(cases: Sequence[Case]) -> StateWeights:
+    """The weights that fit all cases; each case weighs the same."""
     flat = [case.evidence.reshape(-1, len(NAMES)) for case in cases]
-    every = torch.cat(flat if labelled is None else [*flat, labelled[0]])
+    every = torch.cat(flat)
     mean, deviation = every.mean(0), every.std(0).clamp_min(1e-3)
-    told = [((x - mean) / deviation, case.differs().flatten(), 1.0 / len(cases)) for x, case in
+    told = [((x - mean) / deviation, case.saving().flatten(), case.differs().flatten()) for x, case in
             zip(flat, cases, strict=True)]  # fmt: skip
-    if labelled is not None:
-        told.append(((labelled[0] - mean) / deviation, labelled[1], 1.0))
     weights, bias = torch.zeros(len(NAMES), requires_grad=True), torch.tensor(-2.0, requires_grad=True)
     optimizer = torch.optim.Adam([weights, bias], lr=RATE)
     for _ in range(STEPS):
         loss = DECAY * weights.square().sum()
-        for x, differs, weight in told:
-            loss = loss + weight * F.binary_cross_entropy_with_logits(x @ weights + bias, differs)
+        for x, saving, differs in told:
+            odds = x @ weights + bias
+            entropy = F.binary_cross_entropy_with_logits(odds, differs)
+            loss = loss + (LABEL_WEIGHT * entropy - (torch.sigmoid(odds) * saving).mean()) / len(told)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -150,16 +143,16 @@ def fit(cases: Sequence[Case], labelled: tuple[Tensor, Tensor] | None = None) ->
 def judged(case: Case, weights: StateWeights) -> dict[str, float]:
     """dB of frames mixed by weights, whole and moving; and of the plate and the fill alone."""
     config = StateConfig(weights=weights)
-    found = [dict(zip(NAMES, each.unbind(-1), strict=True)) for each in case.evidence]
-    share = torch.stack([let_go(log_odds(each, config, case.unit), config) for each in found])[..., None]
+    values = torch.tensor([getattr(weights, name) for name in NAMES])
+    odds = case.evidence @ values + weights.bias
+    share = torch.stack([let_go(blurred(each, config.smoothing * case.unit), config) for each in odds])[..., None]
     mixed = torch.lerp(case.plate, case.filled, share)
-    figures = {"let go": float(share.mean())}
+    found = {"let go": float(share.mean())}
     for name, picture in {"mixed": mixed, "plate": case.plate, "fill": case.filled}.items():
         error = (picture - case.truth).square().mean(-1)
-        figures[f"{name} whole"] = _db([float(each.mean()) for each in error])
-        moving = [float(e[m].mean()) for e, m in zip(error, case.moving, strict=True) if m.any()]
-        figures[f"{name} moving"] = _db(moving)
-    return figures
+        found[f"{name} whole"] = _db([float(each.mean()) for each in error])
+        found[f"{name} moving"] = _db([float(e[m].mean()) for e, m in zip(error, case.moving, strict=True) if m.any()])
+    return found
 
 
 def _db(errors: Sequence[float]) -> float:
@@ -175,8 +168,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=2, metavar="K", help="only every K-th pose")
     parser.add_argument("--iterations", type=int, default=1500)
     parser.add_argument("--gaussians", type=int, default=10_000)
-    parser.add_argument("--masks", type=Path, metavar="SHOT", help="a trained shot of footage that was painted")
-    parser.add_argument("--t-star", type=int, nargs="+", default=[8], metavar="T", help="its instants to fit to")
     parser.add_argument("--cross", action="store_true", help="judge each scene by weights fitted on the others")
     args = parser.parse_args(argv)
     torch.set_num_threads(default_threads())
@@ -187,11 +178,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         for seed in args.seeds:
             run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
             cases.append(collect(truth, run, f"{truth.name} s{seed}", args.every))
-    labelled = painted(DetailClip(Shot.open(args.masks)), args.t_star) if args.masks else None
-    print(fit(cases, labelled))
+    print(fit(cases))
     for case in cases:
         others = [other for other in cases if other.name.split(" s")[0] != case.name.split(" s")[0]]
-        figures = judged(case, fit(others if args.cross and others else cases, labelled))
+        figures = judged(case, fit(others if args.cross and others else cases))
         print(f"{case.name}: " + ", ".join(f"{name} {value:.2f}" for name, value in figures.items()), flush=True)
     return 0
 

@@ -130,8 +130,8 @@ STATE = (
     _number("plate matte", "the plate's motion matte says nothing", state__weights__plate_matte=0.0),
     _number("scene flow", "the model's travel says nothing", state__weights__scene_flow=0.0),
     _number("change", "plate against frozen render says nothing", state__weights__change=0.0),
-    _number("model change", "the model's own change says nothing", state__weights__model_change=0.0),
-    _number("agreement", "plate against plate t* says nothing", state__weights__agreement=0.0),
+    _number("gain", "plate against its own time says nothing", state__weights__gain=0.0),
+    _number("contradiction", "plate against plate t* says nothing", state__weights__contradiction=0.0),
     _number("smoothing", "log-odds as they are", state__smoothing=0.0),
     _number("softness", "hard borders", state__softness=0.01),
 )
@@ -214,8 +214,8 @@ RULES = {rule.name: rule for rule in (*_SCENE, *STATE, *_FILL, *_swept())}
 
 COMBINATIONS = {
     "today": frozenset[str](),
-    "mattes alone": frozenset(("scene flow", "change", "model change", "agreement")),
-    "motion alone": frozenset(("change", "model change", "agreement")),
+    "mattes alone": frozenset(("scene flow", "change", "gain", "contradiction")),
+    "motion alone": frozenset(("change", "gain", "contradiction")),
 }
 """Name -> rules that are off. `motion alone`: mattes and the model's travel tell the state."""
 

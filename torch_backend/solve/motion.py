@@ -5,8 +5,8 @@ them says which cameras they belong to; mattes of a solve of before are not read
 that lie with them (`surface`). What an artist paints goes before what is found: SHOT/motion_paint/NNNNNN.png, which no
 solve touches.
 
-What is likely to move a training offers its field. To whoever freezes it is unknown: where it was taken for moving,
-delivered frames lost up to 0.7 dB (docs/history/solving.md); where for still, hands held up stayed in them.
+What is likely to move a training offers its field. Whoever freezes takes it for still, so that other plates may say
+what is wrong about it: where it was taken for moving, delivered frames lost up to 0.7 dB (docs/history/solving.md).
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Which pixels of a plate show another state of the scene than the instant t*.
 
-Every pixel has a posterior probability. Its log-odds are a weighted sum of evidence (logistic regression): the plate's
-motion matte, the model's scene flow, how far plate, frozen render and the model's render of the plate differ in units
-of noise, and how well the plate correlates with plate t*. `python -m benchmarks.fit_state` fits the weights to
-synthetic scenes with truth and to painted pixels of a real clip. One of them is more than evidence: `plate_matte` also
-holds that a pixel which moves while it is looked at costs more than one that only differs from t*.
+Every pixel has a posterior probability. Its log-odds are a weighted sum of evidence (logistic regression): motion
+mattes, the model's scene flow, and differences between the plate, the frozen render and plate t*, in units of noise.
+The weights are fitted on synthetic scenes with truth by `python -m benchmarks.fit_state`, to two things: the squared
+error that the plate's pixel costs against what would fill it, and whether the plate differs from the truth at all. No
+weight is set by eye.
 
 Related: Granados et al. 2012, "Background Inpainting for Videos with Dynamic Objects and a Free-moving Camera", also
 choose between plates by an expected error.
@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from ...torch_types import norm
-from ..views.reproject import blurred, look_up, project, resized
-from ..views.source_views import SourceViews
+from ..views.reproject import blurred, dilate, erode, look_up, project, resized
+from ..views.source_views import MARGIN, SourceViews
 from ..views.target_view import TargetView, displacements
 from ..views.visibility import Visibility
 
@@ -28,20 +28,18 @@ from ..views.visibility import Visibility
 class StateWeights:
     """Weight of each piece of evidence in the log-odds that a plate shows another state; see `evidence` for units."""
 
-    bias: float = -3.0
+    bias: float = -6.39
     """Log-odds where no evidence says anything."""
-    plate_matte: float = 3.4
-    """Weight of the plate's own motion matte: 0.6 by the fit, the rest is the cost of keeping what moves. Flow left on
-    `sitting` at t* 30: 3 px with 0.6, 1.1 px with 2.5, 0.1 px with 4.0; 3.2 and 4.0 are alike in its worst frames."""
-    scene_flow: float = 1.79
+    plate_matte: float = 4.3
+    """Weight of the plate's own motion matte."""
+    scene_flow: float = 5.05
     """Weight of how far the model moves the surface from t* to the plate."""
-    change: float = 1.64
-    """Weight of the difference between the plate and the frozen render, less what the render misses of plate t* there:
-    what the model shows wrongly at all times is no change."""
-    model_change: float = 0.5
-    """Weight of the difference between the model's render of the plate at its own time and the frozen render."""
-    agreement: float = -0.67
-    """Weight of what the plate tells of plate t*, carried to it: texture that both show alike."""
+    change: float = 1.82
+    """Weight of the difference between the plate and the frozen render."""
+    gain: float = 2.26
+    """Weight of how much better the model explains the plate at its own time than the frozen render does."""
+    contradiction: float = 1.73
+    """Weight of the difference between the plate and all that plate t*, carried to it, shows nearby."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +50,10 @@ class StateConfig:
     """Standard deviation of a low-passed difference between two renders or plates of one surface, display-referred."""
     travel: float = 0.5
     """Scene flow in pixels of 640 at which its evidence is log(2): below it flow is mostly the field's noise."""
-    window: float = 5.0
-    """Sigma in pixels of 640 of the window in which a plate and plate t* are correlated."""
     smoothing: float = 8.0
-    """Sigma of the low-pass of the log-odds, in pixels of 640: states belong to surfaces."""
-    softness: float = 1.0
+    """Sigma of the low-pass of the log-odds, in pixels of 640: states belong to surfaces. On tuning scenes 4 and 8
+    are equally good, 1 and 2 are worse."""
+    softness: float = 2.0
     """Log-odds on either side of even odds between which a pixel is mixed; beyond them it is wholly one source."""
     weights: StateWeights = field(default_factory=StateWeights)
     """The fitted weights."""
@@ -82,21 +79,24 @@ def evidence(
     """
     h, w = target.depth.shape
     view, unit = source_views.view(frame), source_views.unit
-    render = resized(target.image.color, w, h).clamp(0.0, 1.0)  # beyond white a highlight's value says nothing
-    inside = (seen.depth > 0.0).float()[..., None]
-    plate, own = (torch.lerp(render, _shown(of, seen.pixels), inside) for of in (view.picture, view.render))
-    missed, agreement = torch.zeros_like(render), torch.zeros_like(target.depth)
+    render = resized(target.image.color, w, h)
+    inside = (seen.depth > 0.0).float()
+    plate = torch.lerp(render, look_up(view.picture.float(), seen.pixels), inside[..., None])
+    change = source_views.difference(plate, render)
+    misfit = look_up(view.missed.float()[..., None], seen.pixels)[..., 0] * inside
+    contradiction = torch.zeros_like(change)
     if instant is not None:
-        of_t = source_views.view(target.t)
-        carried, its_render = (_shown(of, instant.pixels) for of in (of_t.picture, of_t.render))
-        missed = instant.visible[..., None] * (carried - its_render)
-        agreement = instant.visible * shared(plate.mean(-1), carried.mean(-1), config.window * unit, config.noise)
+        carried = look_up(source_views.view(target.t).picture.float(), instant.pixels)
+        ours, theirs = (blurred(each * instant.visible[..., None], unit) for each in (plate, carried))
+        reach = max(1, round(MARGIN * unit))  # by which depth may misplace plate t*
+        contradiction = torch.maximum(_beyond(ours, theirs, reach), _beyond(theirs, ours, reach))
+    gain = change - misfit
     return {
         "plate_matte": seen.moving,
         "scene_flow": torch.log1p(_travel(source_views, target, frame) / config.travel),
-        "change": torch.log1p(source_views.difference(plate - missed, render) / config.noise),
-        "model_change": torch.log1p(source_views.difference(own, render) / config.noise),
-        "agreement": agreement,
+        "change": torch.log1p(change / config.noise),
+        "gain": gain.sign() * torch.log1p(2.0 * gain.abs() / config.noise),
+        "contradiction": torch.log1p(contradiction / config.noise),
     }
 
 
@@ -112,21 +112,10 @@ def let_go(odds: Tensor, config: StateConfig) -> Tensor:
     return (0.5 + 0.5 * odds / config.softness).clamp(0.0, 1.0)
 
 
-def _shown(picture: Tensor, pixels: Tensor) -> Tensor:
-    """[h, w, 3] what a display shows of a picture at pixels [h, w, 2] of it."""
-    return look_up(picture.float().clamp(0.0, 1.0), pixels)
-
-
-def shared(a: Tensor, b: Tensor, sigma: float, noise: float) -> Tensor:
-    """[h, w] twice the mutual information in nats per pixel of two grey pictures [h, w], jointly Gaussian in a window.
-
-    It is -log(1 - correlation^2): 0 where one says nothing of the other, whatever the exposure. `noise`: standard
-    deviation of either. Pictures that contradict each other (a negative correlation) share nothing.
-    """
-    mean_a, mean_b, aa, bb, ab = (blurred(each, sigma) for each in (a, b, a * a, b * b, a * b))
-    of_a, of_b = (aa - mean_a.square()).clamp_min(0.0) + noise**2, (bb - mean_b.square()).clamp_min(0.0) + noise**2
-    correlation = (ab - mean_a * mean_b) / (of_a * of_b).sqrt()
-    return -torch.log1p(-correlation.clamp(0.0, 1.0).square())
+def _beyond(picture: Tensor, other: Tensor, reach: int) -> Tensor:
+    """[h, w] by how much a picture [h, w, 3] leaves the range of what another shows within `reach` pixels."""
+    least, most = (torch.stack([of(each, reach) for each in other.unbind(-1)], -1) for of in (erode, dilate))
+    return torch.maximum(least - picture, picture - most).clamp_min(0.0).amax(-1)
 
 
 def _travel(source_views: SourceViews, target: TargetView, frame: int) -> Tensor:

@@ -79,10 +79,12 @@ class PlateView:
     the model shows there what the plate shows, but for detail."""
     picture: Tensor
     """[h, w, 3] float16, the plate, display-referred."""
-    render: Tensor
-    """[h, w, 3] float16, the model's own render of it."""
+    missed: Tensor
+    """[h, w] float16 in 0..1: low-passed difference between plate and the model's own render of it."""
     offsets: Tensor
     """[M, 3] means of the open Gaussians in that frame, scene units."""
+    shown: Tensor | None
+    """[h, w, 3] float16, the model's own render of it, where plates are no larger than decisions; else None."""
     ignored: Tensor | None
     """[h, w, 1] in 0..1: what of it is no part of the scene, as if something stood in front; None: nothing."""
 
@@ -156,7 +158,8 @@ class SourceViews:
         if frame not in self._views:
             self._views[frame] = self._make_view(frame)
             width, height = self.size
-            each = 24.0 * width * height + 12.0 * len(self.rows)
+            shown = 6.0 if self.size == (self.plates.width, self.plates.height) else 0.0
+            each = (20.0 + shown) * width * height + 12.0 * len(self.rows)
             room = _VIEWS_BYTES - 24.0 * self.plates.width * self.plates.height  # frames of 4K need it more
             while len(self._views) > max(12, min(_VIEWS, room / each)):
                 self._views.popitem(last=False)
@@ -206,9 +209,8 @@ class SourceViews:
     def _missed(self, frame: int) -> Tensor:
         width, height = self.plates.width, self.plates.height
         fine = min(1.0, _FINEST / width)
-        if self.size == (width, height):
-            shown = self.view(frame).render
-        else:
+        shown = self.view(frame).shown
+        if shown is None:
             shown = self._own_render(frame, round(width * fine), max(8, round(height * fine)))[1].color
         plate = self.plates.display(frame)
         self._most[frame] = float(plate.max())
@@ -242,6 +244,7 @@ class SourceViews:
         ignored = self._ignored(frame)
         if ignored is not None:  # there is nothing that the model could miss
             plate = torch.lerp(plate, image.color, ignored)
+        missed = self.difference(plate, image.color)
         off = self.difference(plate, image.color, 2)
         region = round(2 * self.config.margin * self.unit)
         off = blurred(dilate(off, region), 0.5 * region)
@@ -250,8 +253,9 @@ class SourceViews:
             *self.camera(frame, width, height),
             torch.stack([image.depth, dilate(moving, round(self.config.margin * self.unit)), explained], dim=-1),
             plate.half(),
-            image.color.half(),
+            missed.half(),
             frozen.state["means"].cpu()[self.rows],
+            image.color.half() if self.size == (self.plates.width, self.plates.height) else None,
             ignored,
         )
 
@@ -265,13 +269,11 @@ class SourceViews:
 
 
 def motion_mattes(shot: Shot) -> MovingOf:
-    """The motion mattes of a shot as `MovingOf`: 0 still, `DOUBT` unknown or likely to move, 1 moving."""
+    """The motion mattes of a shot as `MovingOf`: 0 still, `DOUBT` unknown, 1 moving."""
 
     def moving(frame: int) -> Tensor | None:
-        stored, likely = (load_motion(shot, frame, each) for each in (False, True))
-        if stored is None or likely is None:
-            return None
-        return matte_of(np.where(stored == likely, stored, np.uint8(UNKNOWN)))
+        stored = load_motion(shot, frame)
+        return None if stored is None else matte_of(stored)
 
     return moving
 
