@@ -137,6 +137,10 @@ STATE = (
 )
 """Terms that decide what is let go of."""
 _FILL = (
+    Rule(
+        "agreed", "plates of other times need not agree with t*",
+        switches=(Switch("composite.fill", "_agreed", _everywhere),),
+    ),
     Rule("rough", "single pixels of a plate count", switches=(Switch("composite.fill", "_shown", _everywhere),)),
     Rule(
         "plate t*'s pixels", "plate t* gives residuals alone",

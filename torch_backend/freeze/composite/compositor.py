@@ -245,5 +245,5 @@ def _terms(target: TargetView, fillers: Fillers | None) -> dict[str, Tensor]:
     terms = {name: getattr(target, name) for name in ("motion", "doubt", "moved", "unseen")}
     if fillers is not None:
         for n, frame in enumerate(fillers.chosen):
-            terms[f"shown.{frame}"] = fillers.shown[n]
+            terms |= {f"shown.{frame}": fillers.shown[n], f"agreed.{frame}": fillers.agreed[n]}
     return terms

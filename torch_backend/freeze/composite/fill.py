@@ -29,6 +29,8 @@ class Fillers:
     """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
     shown: list[Tensor]
     """[h, w] in 0..1 each: that plate shows it, and what is around it."""
+    agreed: list[Tensor]
+    """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
     residuals: list[Tensor]
     """[H, W, 3] float16 each, as `SourceViews.residual`."""
     most: float
@@ -67,9 +69,10 @@ def fillers_of(
     chosen = _chosen(source_views, config, target, matte, primary, usable)
     moved = displacements(source_views, target, chosen)
     shown = _shown(source_views, target, chosen, moved)
+    agreed = _agreed(source_views, config, target, chosen, moved)
     residuals = [source_views.residual(frame) for frame in chosen]
     most = max(source_views.scene.display.most, *(source_views.most(frame) for frame in chosen))
-    return Fillers(chosen, moved, shown, residuals, most)
+    return Fillers(chosen, moved, shown, agreed, residuals, most)
 
 
 def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
@@ -87,6 +90,29 @@ def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], mov
 def _uneasy(motion: Tensor, doubt: Tensor) -> Tensor:
     """[...] in 0..1: how far edges of what moves may be near."""
     return torch.maximum(motion, doubt).clamp(0.0, 1.0)
+
+
+def _agreed(
+    source_views: SourceViews, config: CompositeConfig, target: TargetView, chosen: list[int], moved: list[Tensor]
+) -> list[Tensor]:
+    """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
+    h, w = target.depth.shape
+    if target.t not in chosen:
+        return [torch.ones_like(target.depth) for _ in chosen]
+    points = target.points[::2, ::2]  # a quarter of the work: it is low-passed
+    truth = source_views.seen(target.t, points)
+    shown_at_t = look_up(source_views.view(target.t).picture.float(), truth.pixels)
+    out: list[Tensor] = []
+    for frame, way in zip(chosen, moved, strict=True):
+        if frame == target.t:
+            out.append(torch.ones_like(target.depth))
+            continue
+        visibility = source_views.seen(frame, points + way[::2, ::2])
+        says = look_up(source_views.view(frame).picture.float(), visibility.pixels)
+        both = (truth.visible * visibility.visible)[..., None]
+        off = source_views.difference(says * both, shown_at_t * both)
+        out.append(resized(torch.exp(-0.5 * (off / config.state.noise).square()), w, h))
+    return out
 
 
 def fill(
@@ -120,7 +146,8 @@ def fill(
         visibility = _doubted(visibility, doubt)
         around = torch.minimum(visibility.visible, look_up(fillers.shown[n], small))
         visibility.visible = torch.lerp(visibility.visible, around, uneasy)
-        weights.append(_weight(source_views, config, target, frame, visibility, motion))
+        still = 1.0 - doubt * (1.0 - look_up(fillers.agreed[n], small))
+        weights.append(still * _weight(source_views, config, target, frame, visibility, motion))
         places.append(visibility.pixels * larger)
     believed = torch.stack(weights)
     filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[first_best(believed)]

@@ -131,7 +131,7 @@ def test_plates_that_fill_show_nothing_of_it_either(world):
     try:
         mattes = {frame: np.zeros((H, W), bool) for frame in range(1, 14) if frame not in (FRAME, T_STAR)}
         made = make(world, mattes, None)
-        believed = make(world, mattes, VisibilityConfig(unexplained=1e6))
+        believed = make(world, mattes, VisibilityConfig(unexplained=1e6), state=StateConfig(noise=1e6))
     finally:
         world.run.model = before
     assert shows_its_own_board(world, made) < 0.01

@@ -65,7 +65,7 @@ def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
     for n in (103, 108):
         image = oiio.ImageBuf(str(tmp_path / f"{n:06d}.exr"))
         terms = dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), 2, 0), strict=True))
-        assert {"plate_matte", "change", "unseen", "shown.105", "origin.develop"} <= terms.keys()
+        assert {"plate_matte", "change", "unseen", "agreed.105", "origin.develop"} <= terms.keys()
         matte = read_warp(take[0] / "warp" / f"{n:06d}.exr").matte
         kept = 1.0 - let_go(torch.from_numpy(terms["log_odds"]), config)
         assert kept.shape == matte.shape and float(kept.min()) < 0.1 < float(kept.max())
