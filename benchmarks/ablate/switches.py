@@ -146,8 +146,8 @@ _FILL = (
         "plate t*'s pixels", "plate t* gives residuals alone",
         switches=(Switch("composite.fill", "_take_instant", _none),),
     ),
+    _number("sway", "no other time where something moves", sway_trust=0.0),
     _number("depth error", "plates are believed whatever the baseline", depth_error=0.0),
-    _number("explained", "the model contradicts no plate of another time", source_views__unexplained=1e6),
     _number("doubt", "what plates say is believed wholly", doubt=0.0),
     Rule("residuals", "splats alone in the fill", switches=(Switch("composite.fill", "look_up_near", _no_residual),)),
 )  # fmt: skip

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...torch_types import norm
 from ..views.decisions import above, first_best
-from ..views.reproject import blurred, dilate, erode, look_up, look_up_near, resized, unproject
+from ..views.reproject import blurred, dilate, erode, look_up, look_up_near, project, resized, unproject
 from ..views.source_views import SourceViews
 from ..views.target_view import TargetView, displacements, parallax
 from ..views.visibility import Visibility
@@ -137,7 +137,10 @@ def fill(
     doubt = look_up(target.doubt, small)
     uneasy = _uneasy(motion, doubt)
     weights, places = list[Tensor](), list[Tensor]()
+    same_state, untold = torch.zeros(count, device="cpu"), torch.ones(count, device="cpu")
     truth = source_views.seen(target.t, points) if target.t in fillers.chosen else None
+    if truth is not None:  # the better plate t* shows it, the less another time is needed
+        untold = 1.0 - _near(source_views, config, target, target.t, truth)
     for n, frame in enumerate(fillers.chosen):
         if truth is not None and frame == target.t:
             visibility = truth
@@ -146,8 +149,13 @@ def fill(
         visibility = _doubted(visibility, doubt)
         around = torch.minimum(visibility.visible, look_up(fillers.shown[n], small))
         visibility.visible = torch.lerp(visibility.visible, around, uneasy)
-        still = 1.0 - doubt * (1.0 - look_up(fillers.agreed[n], small))
-        weights.append(still * _weight(source_views, config, target, frame, visibility, motion))
+        agreed = look_up(fillers.agreed[n], small)
+        unmoved = _unmoved(source_views, frame, points, visibility) * agreed
+        sway = config.sway_trust * unmoved * untold
+        still = 1.0 - doubt * (1.0 - agreed)
+        if frame != target.t:
+            same_state = torch.maximum(same_state, unmoved * _near(source_views, config, target, frame, visibility))
+        weights.append(_weight(source_views, config, target, frame, visibility, motion, sway, still))
         places.append(visibility.pixels * larger)
     believed = torch.stack(weights)
     filling.source = torch.tensor([float(frame) for frame in fillers.chosen], device="cpu")[first_best(believed)]
@@ -158,7 +166,8 @@ def fill(
     filling.color += carried * filling.share[:, None]
     if truth is not None:
         at = fillers.chosen.index(target.t)
-        around = truth.visible * look_up(fillers.shown[at], small)
+        # A plate near in pose that shows the same, a little swayed, has it at its place; plate t* may be a pixel off.
+        around = truth.visible * look_up(fillers.shown[at], small) * (1.0 - same_state)
         _take_instant(source_views, config, target, filling, points, small, around, places[at])
     filling.most = fillers.most
     return filling
@@ -213,6 +222,14 @@ def _doubted(visibility: Visibility, doubt: Tensor) -> Visibility:
     return replace(visibility, moving=torch.maximum(visibility.moving, doubt * (1.0 - visibility.explained)))
 
 
+def _unmoved(source_views: SourceViews, frame: int, points: Tensor, visibility: Visibility) -> Tensor:
+    """[...] in 0..1: what moves is in plate `frame` nearly as at t*: the model agrees, and moved it little."""
+    view = source_views.view(frame)
+    travel = norm(project(points, view.viewmat, view.K)[0] - visibility.pixels, -1)
+    trust = torch.exp(-travel / (source_views.config.margin * source_views.unit))
+    return visibility.explained * trust
+
+
 def _near(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, frame: int, visibility: Visibility
 ) -> Tensor:
@@ -227,11 +244,16 @@ def _weight(
     frame: int,
     visibility: Visibility,
     motion: Tensor,
+    sway: Tensor,
+    still: Tensor | float = 1.0,
 ) -> Tensor:
-    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*: of that plate t*
-    alone is."""
+    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*; what stands still in
+    it by `still` at most."""
     near = _near(source_views, config, target, frame, visibility)
-    return near if frame == target.t else near * (1.0 - motion) * (1.0 - visibility.moving)
+    if frame == target.t:
+        return near
+    still = still * (1.0 - motion) * (1.0 - visibility.moving)
+    return near * (still + (1.0 - still) * sway)
 
 
 def _chosen(
@@ -242,7 +264,7 @@ def _chosen(
     primary: int,
     usable: list[int],
 ) -> list[int]:
-    """The plates to fill with: that of t*, the primary one, and those that see most of the rest."""
+    """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
     h, w = target.depth.shape
     need = 1.0 - resized(matte, w, h)[::4, ::4]
     points, motion, doubt = (of[::4, ::4] for of in (target.points, target.motion, target.doubt))
@@ -250,9 +272,10 @@ def _chosen(
     steps = [2**n for n in range(config.sources)]
     around = {k + side * step for step in steps for side in (-1, 1)} | {k}
     reach = {source_views.frames[i] for i in around if 0 <= i < len(source_views.frames)} | {target.t}
+    zero = torch.zeros_like(motion)
     gains = {
         frame: need
-        * _weight(source_views, config, target, frame, _doubted(source_views.seen(frame, points), doubt), motion)
+        * _weight(source_views, config, target, frame, _doubted(source_views.seen(frame, points), doubt), motion, zero)
         for frame in sorted(reach)
         if frame in usable
     }

@@ -330,6 +330,34 @@ def test_the_plate_may_stand_where_the_motion_matte_is_black(world, made, frame,
     assert result.motion.mean() < 0.6, "the room stays as it was"
 
 
+def test_stripes_of_what_sways_come_from_other_plates_moved_as_the_model_moves_it(world):
+    """At the end of its way the board moves by 2 pixels from one frame to the next: half a stripe."""
+    output = world.output(12, 13)
+    result = world.make(output, withheld=[13])
+    truth, on = world.truth(output)
+    inner = ~dilate(~on, 6)
+    assert off(result.color, truth, inner) < 0.6 * off(result.splat, truth, inner)
+    assert set(np.unique(result.source.numpy()[inner])) <= {10.0, 11.0, 12.0}
+
+
+def test_far_from_plate_t_star_a_wrong_depth_is_made_up_for_by_the_own_plate(tmp_path, quiet, monkeypatch):
+    """From one end of the path to the other a depth that is 3 % off misplaces stripes of plate t* by a quarter."""
+    monkeypatch.setitem(globals(), "SWAY", 0.003)
+    world = build(tmp_path, quiet())
+    means = world.run.model.gaussians.params["means"]
+    with torch.no_grad():
+        means[world.run.model.open_rows()] *= 1.03
+    output = world.output(13, 1)
+    truth, on = world.truth(output)
+    inner = ~dilate(~on, 6)
+    one, both = (
+        world.make(output, Compositor(world.run, world.scene, world.plates(), CompositeConfig(sway_trust=trust)))
+        for trust in (0.0, CompositeConfig().sway_trust)
+    )
+    assert one.plate.numpy()[inner].min() > 0.5
+    assert off(both.color, truth, inner) < 0.8 * off(one.color, truth, inner)
+
+
 def test_a_masked_logo_is_in_no_frozen_frame_and_what_is_behind_it_comes_from_other_plates(tmp_path, quiet):
     logo = np.zeros((H, W), bool)
     logo[150:170, 40:70] = True
@@ -481,7 +509,10 @@ def test_bars_beside_the_picture_are_the_frames_own_plate_s(world):
     """No part of the scene, so no splat and no other plate has anything to say there."""
     output, bars = world.output(4, 7), np.zeros((H, W), bool)
     bars[:, : W // 2] = True  # also over the board, whose pixels there are no frame's but t*'s
-    compositor = Compositor(world.run, world.scene, world.plates(), bars=lambda frame: bars if frame == 4 else None)
+    config = CompositeConfig(depth_error=0.01)
+    compositor = Compositor(
+        world.run, world.scene, world.plates(), config, bars=lambda frame: bars if frame == 4 else None
+    )
     made, plain = world.make(output, compositor, (3, 2)), world.make(output, None, (3, 2))
     inner = (slice(2, -2), slice(3, -3))
     own = world.plates().linear(4)
