@@ -21,11 +21,12 @@ class CompositeConfig:
     doubt: float = 0.05
     """Sum of weights at which a pixel is half plate, half splats: what plates say is believed in part, as it is wrong
     in part. On truth the best share of a single plate's residual in what moves is 0.4 to 0.65."""
+    sway: float = 3.0
+    """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
     sway_trust: float = 0.15
-    """How far a plate of another time is believed in what moves, where the model explains it and did not move it; 1/e
-    of that at a margin of travel, because longer ones are known less. Depths that are off by a pixel carry plate t*
-    to a wrong place far away in pose; the own plate's residual is at its place, at another time: either alone is worse
-    than both."""
+    """How far a plate of another time is believed in what moves, where the model explains it. Depths that are off by a
+    pixel carry plate t* to a wrong place far away in pose; the own plate's residual is at its place, at another time:
+    either alone is worse than both."""
     beside: float = 20.0
     """Angle in degrees between the frame's and plate t*'s view of a surface from which on that plate's own pixels are
     not believed of what moves; up to half of it they are."""

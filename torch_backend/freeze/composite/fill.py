@@ -150,7 +150,7 @@ def fill(
         around = torch.minimum(visibility.visible, look_up(fillers.shown[n], small))
         visibility.visible = torch.lerp(visibility.visible, around, uneasy)
         agreed = look_up(fillers.agreed[n], small)
-        unmoved = _unmoved(source_views, frame, points, visibility) * agreed
+        unmoved = _unmoved(source_views, config, frame, points, visibility) * agreed
         sway = config.sway_trust * unmoved * untold
         still = 1.0 - doubt * (1.0 - agreed)
         if frame != target.t:
@@ -222,11 +222,13 @@ def _doubted(visibility: Visibility, doubt: Tensor) -> Visibility:
     return replace(visibility, moving=torch.maximum(visibility.moving, doubt * (1.0 - visibility.explained)))
 
 
-def _unmoved(source_views: SourceViews, frame: int, points: Tensor, visibility: Visibility) -> Tensor:
+def _unmoved(
+    source_views: SourceViews, config: CompositeConfig, frame: int, points: Tensor, visibility: Visibility
+) -> Tensor:
     """[...] in 0..1: what moves is in plate `frame` nearly as at t*: the model agrees, and moved it little."""
     view = source_views.view(frame)
     travel = norm(project(points, view.viewmat, view.K)[0] - visibility.pixels, -1)
-    trust = torch.exp(-travel / (source_views.config.margin * source_views.unit))
+    trust = torch.exp(-travel / (config.sway * source_views.unit))
     return visibility.explained * trust
 
 

@@ -34,7 +34,7 @@ from ..frozen import FrozenGaussians
 from ..views.scene_flow import SceneFlow
 from ..views.source_views import LENGTHS_OF, MovingOf
 from ..views.working_plates import WorkingPlates, showing, spread
-from .undersampled import undersampled
+from .undersampled import AFAR, undersampled
 
 _TRAINING = TrainConfig()
 """Loss, weights and rates of a training of 3000 steps: those of an instant are derived from them."""
@@ -62,7 +62,7 @@ class DevelopConfig:
     instant_share: float = 0.25
     """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training: 30
     steps, as plate t* alone shows what moves."""
-    afar: float = 2.0
+    afar: float = AFAR
     """Plate t* teaches nothing of what it sees from more than so many times as far as some trained frame does."""
     seed: int = 0
     """Of the order of frames."""

@@ -33,6 +33,7 @@ from ..frozen import FrozenGaussians, freeze_at
 from ..views.reproject import project
 from ..views.source_views import MARGIN, MovingOf
 from ..views.working_plates import MEASURED_WIDTH, SEEN, VIEWS, WorkingPlates, showing, spread
+from .undersampled import AFAR
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class StaticBaselineConfig:
     sways: float = 4.0
     """Pixels of pictures 640 wide from t* to a plate from which on a Gaussian does not only sway: what the run at that
     plate's time shows better than the twin then counts. Held-still people sway by less; their mean is as good."""
-    nearer: float = 0.5
+    nearer: float = 1.0 / AFAR
     """A plate sees a Gaussian from near if its distance is at most so much of that at t*."""
     rounds: int = 2
     """Comparisons: what stays open is held against the twin again without what was closed."""

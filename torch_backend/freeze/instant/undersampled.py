@@ -10,6 +10,9 @@ from ...scene import Scene
 from ...torch_types import norm
 from ...train import LoadedRun
 
+AFAR = 2.0
+"""Times the distance of another frame from which on a frame sees a thing from afar."""
+
 
 @torch.no_grad()
 def undersampled(run: LoadedRun, scene: Scene, means: Tensor, t_star: float, times: float) -> Tensor:
