@@ -216,9 +216,9 @@ def _blocks(frame: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float3
     values /= 255.0 if frame.dtype == np.uint8 else 65535.0
     blocks = values.reshape(rows, _BLOCK, columns, _BLOCK, 3).transpose(0, 2, 4, 1, 3).reshape(-1, 3, _BLOCK**2)
     basis = _basis().astype(np.float32)
-    clipped = ((blocks <= 0.0) | (blocks >= 1.0)).any(axis=2)
+    whole = np.asarray(((blocks > 0.0) & (blocks < 1.0)).all(axis=2), np.bool_)
     residual = np.asarray(blocks - (blocks @ basis) @ basis.T, np.float32)
-    return residual, blocks.mean(axis=2), ~clipped
+    return residual, blocks.mean(axis=2), whole
 
 
 @functools.lru_cache(maxsize=64)
