@@ -51,7 +51,6 @@ UNTUNED = {
     "composite/compositor.py:Compositor._mix_frame": "format",
     "composite/fill.py:WHOLE": "format",
     "composite/fill.py:Filling.most": "format",
-    "composite/fill.py:_shown": "resource",
     "composite/grain.py:SAMPLED": "resource",
     "composite/grain.py:BINS": "format",
     "composite/grain.py:Grain.to_json": "format",

@@ -17,6 +17,9 @@ from .config import CompositeConfig
 
 WHOLE = 1.0 - 0.5 / 1024.0
 """Matte from which on the primary plate gives the whole pixel: it is rounded to 1024 steps, this one to 1."""
+_ROUGH = 1
+"""Pixels of decisions around a place that a plate has to show, too, to fill it where something moves: depth is rough
+there, so what a plate is seen to show changes from pixel to pixel, and single ones would stand out."""
 
 
 @dataclass
@@ -77,13 +80,12 @@ def fillers_of(
 
 def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
     """[h, w] in 0..1 for each plate: it shows what is seen and what is around that; of use where something moves."""
-    # Depth is rough there: what a plate is seen to show changes from pixel to pixel, and single ones would stand out.
-    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 5)  # elsewhere it is not asked for
+    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 4 * _ROUGH + 1)  # as far as what follows reaches
     points, out = target.points[near], list[Tensor]()
     for frame, way in zip(chosen, moved, strict=True):
         visible = torch.ones_like(target.depth)
         visible[near] = source_views.seen(frame, points if frame == target.t else points + way[near]).visible
-        out.append(blurred(erode(visible, 1), 1.0))
+        out.append(blurred(erode(visible, _ROUGH), float(_ROUGH)))
     return out
 
 

@@ -38,6 +38,10 @@ from .undersampled import AFAR, undersampled
 
 _TRAINING = TrainConfig()
 """Loss, weights and rates of a training of 3000 steps: those of an instant are derived from them."""
+_BESIDE = 2
+"""Number of trained frames on either side of t* that are asked whether what moves may be taken over."""
+_PARTS = (0.0, 0.5, 1.0)
+"""Parts of the way to what it became, of which what moves goes the best."""
 Check = Callable[[int, int], None]
 """Called with (steps done, steps in all); raises to cancel."""
 
@@ -167,7 +171,7 @@ class _FineTuning:
         self._train(steps, 1.0, check)
         developed = {name: p.detach()[rows] for name, p in self.params.items()}
         best, first = 0.0, (0.0, 0.0)
-        for n, part in enumerate((0.0, 0.5, 1.0)):
+        for n, part in enumerate(_PARTS):
             state = {k: v.index_copy(0, rows, torch.lerp(v[rows], developed[k], part)) for k, v in was.items()}
             self._show(state)
             errors = self._error(self.instants, movers=True), self._error(near, movers=True)
@@ -182,10 +186,10 @@ class _FineTuning:
             self.params[name].data = value.clone()
 
     def _near(self) -> list[int]:
-        """Two trained frames on either side of those that show t*, without them."""
+        """The trained frames nearest to those that show t*, on either side, without them."""
         before = [frame for frame in self.trained.train_frames if frame < min(self.instants)]
         after = [frame for frame in self.trained.train_frames if frame > max(self.instants)]
-        return [*before[-2:], *after[:2]]
+        return [*before[-_BESIDE:], *after[:_BESIDE]]
 
     def _judged(self) -> tuple[float, float]:
         """(PSNR in dB of the still pixels of the probes, of plate t* or its neighbours)."""

@@ -5,8 +5,8 @@ they are rendered in slabs of depth, front to back, each once, and over each oth
 splats. The frame says how the pixel looks: the samples are scaled so that over each other they are the frame.
 
 Splats of one surface lie some percent of their depth apart. So depth of theirs only tells which of the two surfaces
-they belong to, and away from steps a pixel has one sample: told apart by depth alone, the splats of a preview training
-make two or three samples of 94 % of all pixels, and CG behind a wall shines through it.
+they belong to, and a pixel away from steps has one sample. Where every depth of a splat was a sample of its own, 94 %
+of the pixels of a preview training had two or three, and CG behind a wall showed through it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ..frozen import FrozenGaussians, OutputFrame, render_frozen
 
 @dataclass(frozen=True)
 class DeepConfig:
-    """What is told apart in depth."""
+    """How the surfaces of a pixel are found."""
 
     slabs: int = 16
     """Slabs of depth between the nearest and the farthest hundredth of a frame; two more hold what is beyond."""

@@ -19,7 +19,7 @@ SEEN = 0.05
 MEASURED_WIDTH = 320
 """Width in pixels of pictures by which scenes are compared and surfaces measured; never above the working frames'."""
 VIEWS = 12
-"""Frames all over the clip that are asked, at most, where all would take too long."""
+"""Number of frames, evenly over the clip, by which a scene is judged, where all of them would take too long."""
 
 
 class WorkingPlates:
