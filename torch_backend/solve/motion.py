@@ -6,7 +6,7 @@ that lie with them (`surface`). What an artist paints goes before what is found:
 solve touches.
 
 What is likely to move a training offers its field. Whoever freezes takes it for still, so that other plates may say
-what is wrong about it: where it was taken for moving, delivered frames lost up to 0.7 dB (docs/history/solving.md).
+what is wrong about it: where it was taken for moving, delivered frames lost up to 0.7 dB (docs/decisions.md).
 """
 
 from __future__ import annotations
