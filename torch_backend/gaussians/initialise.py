@@ -3,7 +3,7 @@
 COLMAP leaves walls and skin almost empty. The search for motion knows the depth of most of what stands still, plain or
 not (`solve.surface`), and training starts from a draw of that. Pixels far from any point are lifted to the depth of the
 nearest points in the same image: right to within a furniture's width, which a few hundred steps repair, and better than
-holes that densification must fill from the rims (both measured: docs/benchmarks.md). A guess that is farther off is not
+holes that densification must fill from the rims (both measured: docs/decisions.md). A guess that is farther off is not
 repaired: a man before a plain wall, lifted to the depth of somebody before him, is never found, and taken for motion.
 """
 

@@ -38,7 +38,7 @@ def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruc
     options.triangulation.random_seed = SEED
     # A clip of 75 frames needs no global adjustment every 10 % of growth. Each runs until it has settled, though: with
     # two rounds of it, as with one of the local ones, a start from two frames that show little depth was kept, and a
-    # whole walk was solved wrongly at an error of 0.9 px (docs/benchmarks.md).
+    # whole walk was solved wrongly at an error of 0.9 px (docs/decisions.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
     if request.reuse:  # it has placed frames of a try before
         options.image_names = request.solved

@@ -51,7 +51,7 @@ class SupervisionConfig:
     support_every: int = 4
     """`support` acts every so many iterations."""
     support_weight: float = 0.2
-    """`support`: weight of the whole term (docs/benchmarks.md)."""
+    """`support`: weight of the whole term (docs/decisions.md)."""
     support_samples: int = 1024
     """`support`: (Gaussian, time) pairs drawn each time."""
     support_seconds: float = 4.0

@@ -3,7 +3,7 @@
 Every step follows one frame, and the rates that a short run needs keep its parameters moving about what all frames
 agree on until the very end. Their mean over the last steps is nearer to it than any of them (Polyak and Juditsky,
 "Acceleration of stochastic approximation by averaging", 1992), so rates need not fall as far. Figures:
-docs/benchmarks.md, "Developed instants".
+docs/decisions.md, "Rates, Gaussians and the end of a run".
 """
 
 from __future__ import annotations

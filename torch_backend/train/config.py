@@ -21,7 +21,7 @@ from .stopping import StoppingConfig
 class TrainConfig:
     """One run. Learning rates are per scene unit of camera extent 1; shares are of the run's length.
 
-    The Gaussians' rates are those of 3000 steps, tuned on the bundled clip (docs/benchmarks.md); `config_from_params`
+    The Gaussians' rates are those of 3000 steps, tuned on the bundled clip (docs/decisions.md); `config_from_params`
     scales them to the run's length by the root of the ratio.
     """
 
@@ -200,7 +200,7 @@ def _rates_for(config: TrainConfig) -> None:
 
 _STATIC, _MOST_STATIC = 0.2, 600
 """Share of a run with a gate that stays static, and its most steps. In more of them Gaussians paint what moves as
-ghosts that fit one view each, far behind it, and no field puts them right (docs/benchmarks.md, "Presets")."""
+ghosts that fit one view each, far behind it, and no field puts them right (docs/decisions.md, "Gate and field")."""
 _MOST_PER_DEGREE = 1350
 """Most steps between two raises of the SH degree. A long run needs no more; in a short one each degree has fewer, and
 needs them, or none seems worth its while."""

@@ -49,7 +49,7 @@ def add_field(optimizer: FusedAdam, field: Deformation, model: Gaussians, config
     """Adds a field's parameters, at a `share` of its rates, and those of its own that each Gaussian has.
 
     Rates fall over the run, and a host's are good from a third of it on: a field that joins sooner starts at what they
-    are by then. At 1.7 times that it may come apart (docs/benchmarks.md, "Stability").
+    are by then. At 1.7 times that it may come apart (docs/decisions.md, "Gate and field").
     """
     joins = config.gate.start if config.method == "auto" else _USUAL
     for group in field.parameter_groups():

@@ -3,7 +3,7 @@
 A hand that is farther from where the field has it than Gaussians are wide has nothing that pulls it there, and stays
 where it is most of the time. In pictures of large pixels it overlaps with itself. What stands still is learnt from
 whole pictures all the while, and so is everything before there is a field: a run that began on coarse pictures
-altogether lost 0.2 to 0.9 dB of what stands still (docs/benchmarks.md, "Developed instants").
+altogether lost 0.2 to 0.9 dB of what stands still (docs/decisions.md, "Gate and field").
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 What a frame shows and such a model cannot, moves, or is hard to learn (`solve/fleeting.py` tells them apart). It is as
 the first part of every run, whose residual opened the gate once and was a poor judge of Gaussians; of pixels, held
-against the key frames around, it is a good one (docs/benchmarks.md, "What mattes miss").
+against the key frames around, it is a good one (docs/decisions.md, "Motion mattes").
 """
 
 from __future__ import annotations

@@ -206,7 +206,7 @@ def test_wrong_choices_are_named():
 
 
 def test_the_gate_opens_after_a_fifth_of_the_run_at_most_600_steps_and_what_hangs_on_it_with_it():
-    """Ghosts of movers that a longer static stage makes are never put right (docs/benchmarks.md)."""
+    """Ghosts of movers that a longer static stage makes are never put right (docs/decisions.md)."""
     preview, standard, final = (config_from_params(TrainParams(preset=preset)) for preset in PRESETS)
     opened, degrees = [400, 600, 600], [300, 1350, 1350]
     for c, steps, degree in zip((preview, standard, final), opened, degrees, strict=True):

@@ -10,7 +10,7 @@ A run as sharp as its pictures has nothing to gain where nothing moves, and is l
 blurred all the same. That is trained alone then, and goes part of the way to what plate t* made of it: as far as its
 neighbours in time bear, in which what one plate got wrong would stand in the wrong place.
 
-Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/benchmarks.md, "Developed instants").
+Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/decisions.md, "Developing an instant").
 """
 
 from __future__ import annotations
