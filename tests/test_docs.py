@@ -9,7 +9,9 @@ import pytest
 from torch_backend.contract import BACKEND, BLENDER, COMMANDS, FRAME_LAYERS, VERBS, default_of, options_for
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "examples/README.md")]
+PAGES = [
+    ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md", "examples/README.md")
+]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 MANUAL = ROOT / "docs" / "manual"
 GUIDE = ROOT / "docs" / "user-guide.md"
