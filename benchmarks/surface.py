@@ -7,7 +7,10 @@ surface is made as *Add Frozen Surface* makes it. Only exact cameras: solve unit
 Judged is the distance from the nearest point of the true surface, as a share of that point's depth in the plate nearest
 to it. A vertex counts if two of the clip's plates see that point: what no plate saw is guessed, not measured. The room
 and people (what moves in the clip) are judged apart, and so are the points of the frames' own depth: they tell what
-fusing adds. DIR gets surface-NAME.json.
+fusing adds. So is what the surface shows at their pixels: vertices are spread by area, pixels are not.
+
+A ball is stood on the true surface at three places, under a lamp, and its shadow on the surface is compared with that
+on the truth from the first, middle and last pose: SSIM within the shadows. DIR gets surface-NAME.json.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.detail_truth import scene_arguments, trained
+from benchmarks.shadow import Set, likeness, places_of
 from benchmarks.sources import Log, SyntheticTruth, load_source
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.rays import RayScene
@@ -78,7 +82,10 @@ def figures(off: NDArray[np.float64]) -> dict[str, float]:
 def judge(
     truth: SyntheticTruth, scene: SyntheticScene, run: str, t_star: int, every: int
 ) -> dict[str, dict[str, float]]:
-    """Part -> `figures`: room and people of the surface, then those of the frames that it was fused from."""
+    """Part -> `figures`: room and people of the surface, of it at the frames' pixels, and of the frames themselves.
+
+    And "shadow" -> number of pictures of it, mean and worst likeness.
+    """
     shot, take = truth.shot, f"surface-{run}-{t_star}"
     folder = TakeFolder(shot.take(take))
     params = FreezeParams(run=run, take=take, t_star=t_star, step=every, only_missing=True)
@@ -94,21 +101,42 @@ def judge(
         name: places[np.unique(corners[(triangles["people"] > 0) == people])]
         for name, people in (("room", False), ("people", True))
     }
-    shown, moves = points_of(folder)
-    parts |= {"room, frames": shown[~moves], "people, frames": shown[moves]}
-    return {name: figures(off_truth(of, standing, views)) for name, of in parts.items()}
+    surface = RayScene(places, corners)
+    points, eyes, moves = points_of(folder)
+    reached = surface.cast(eyes, points - eyes).distance[:, None]
+    shown = np.where(np.isfinite(reached), eyes + (points - eyes) * reached, np.nan)
+    for kind, of in (("at pixels", shown), ("frames", points)):
+        known = np.isfinite(of[:, 0])
+        parts |= {f"room, {kind}": of[~moves & known], f"people, {kind}": of[moves & known]}
+    told = {name: figures(off_truth(of, standing, views)) for name, of in parts.items()}
+    return told | {"shadow": shadows(surface, standing, views)}
 
 
-def points_of(folder: TakeFolder) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """(points [P, 3] that a take's frames show by their depth, which of them move): every `THINNED`-th pixel."""
+def points_of(folder: TakeFolder) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """(points [P, 3] that a take's frames show by their depth, from where [P, 3], which move): every `THINNED`-th."""
     points: list[NDArray[np.float64]] = []
+    eyes: list[NDArray[np.float64]] = []
     moves: list[NDArray[np.bool_]] = []
     for number in frames_of(folder):
         view = view_of(folder.frame(number), SurfaceConfig())
         found, rows, columns = unprojected(view)
         points.append(found[::THINNED])
+        eyes.append(np.broadcast_to(-view.viewmat[:3, :3].T @ view.viewmat[:3, 3], points[-1].shape))
         moves.append(view.motion[rows, columns][::THINNED] > 0.5)
-    return np.concatenate(points), np.concatenate(moves)
+    return np.concatenate(points), np.concatenate(eyes), np.concatenate(moves)
+
+
+def shadows(surface: RayScene, truth: RayScene, views: Sequence[View]) -> dict[str, float]:
+    """Number of pictures with a ball's shadow from the first, middle and last view; mean and worst likeness."""
+    middle = len(views) // 2
+    found = [
+        likeness(surface, truth, view, Set.on(place))
+        for place in places_of(truth, views[middle])
+        for view in (views[0], views[middle], views[-1])
+    ]
+    known = [one for one in found if one is not None]
+    told = {"pictures": float(len(known))}
+    return told | ({"mean": float(np.mean(known)), "worst": min(known)} if known else {})
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -120,6 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     torch.set_num_threads(default_threads())
     rows = ["| scene | seed | t* | part | points | seen by two plates | median, % | ninth tenth, % | beyond 1 %, % |"]
     rows.append("|---|---:|---:|---|---:|---:|---:|---:|---:|")
+    ends = [""]
     try:
         if args.cameras != "exact":
             raise ValueError("the surface is judged in metres: only exact cameras have them")
@@ -134,7 +163,13 @@ def main(argv: Sequence[str] | None = None) -> int:
                 run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
                 for t_star in args.t_star or truth.t_stars:
                     found = told[f"seed {seed}, t* {t_star}"] = judge(truth, scene, run, t_star, args.every)
+                    shaded = found["shadow"]
+                    cells = [f"{shaded[k]:.3f}" if k in shaded else "–" for k in ("mean", "worst")]
+                    where = f"{truth.name}, seed {seed}, t* {t_star}"
+                    ends.append(f"{where}: shadows {cells[0]}, worst {cells[1]} of {shaded['pictures']:.0f}")
                     for part, of in found.items():
+                        if part == "shadow":
+                            continue
                         cells = [f"{100 * of[k]:.2f}" if k in of else "–" for k in ("median", "ninth tenth", "beyond")]
                         where = f"{truth.name} | {seed} | {t_star} | {part} | {of['points']:.0f} | {of['seen']:.2f}"
                         rows.append(f"| {where} | {' | '.join(cells)} |")
@@ -143,7 +178,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return 1
-    print("\n".join(["", *rows]))
+    print("\n".join(["", *rows, *ends]))
     return 0
 
 

@@ -153,6 +153,43 @@ def test_the_warp_is_switched_and_removed_without_a_trace(addon, scene, detailed
     assert {(k.from_socket.path_from_id(), k.to_socket.path_from_id()) for k in graded.links} == links
 
 
+def test_freeze_as_warp_is_undone_and_done_again(addon, scene, detailed, graded, tmp_path):
+    """Also in what is rendered: the take's own frames are halves, the warped plate is not."""
+    scene.splannequin.shot_path, scene.splannequin.take_name = str(detailed), "detail"
+    assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
+
+    def shown(name):
+        current = bpy.context.scene
+        node = node_of(addon, current)
+        tree = addon("compat").compositor_tree(current)
+        inputs, images = (
+            {s.name: s.default_value for s in node.inputs if s.type == "VALUE"},
+            set(bpy.data.images.keys()),
+        )
+        (tmp_path / name).mkdir()
+        picture = render(current, tmp_path / name)
+        return {
+            "inputs": inputs,
+            "images": images,
+            "nodes": set(node.node_tree.nodes.keys()),
+            "links": len(tree.links),
+        }, picture
+
+    bpy.ops.ed.undo_push(message="before")
+    before, frames_shown = shown("before")
+    assert bpy.ops.splannequin.freeze_as_warp() == {"FINISHED"}
+    bpy.ops.ed.undo_push(message="after")
+    after, warped = shown("after")
+    assert "As Warp" in after["inputs"] and "As Warp" not in before["inputs"]
+    assert not np.array_equal(frames_shown, warped)
+    bpy.ops.ed.undo()
+    found, picture = shown("undone")
+    assert found == before and np.array_equal(picture, frames_shown)
+    bpy.ops.ed.redo()
+    found, picture = shown("done again")
+    assert found == after and np.array_equal(picture, warped)
+
+
 def test_a_take_without_a_warp_is_refused_in_a_sentence(addon, contract, scene, detailed, graded):
     before = [n.name for n in graded.nodes]
     with pytest.raises(contract.JobError, match="'freeze' has no warp: it was frozen without detail"):

@@ -1,6 +1,7 @@
 """A file with all that a freeze brings into a scene: undone step by step, moved, and opened without the add-on."""
 
 import importlib.util
+import json
 import shutil
 import types
 from pathlib import Path
@@ -118,3 +119,53 @@ def test_two_shots_of_a_file_have_their_own_splats(full, scene, addon, contract,
     assert first is not None and second is not None and first != second
     addon("process.begin").remove_all(scene, other)
     assert find(scene, full, "freeze") == first and find(scene, other, "freeze") is None
+
+
+def add_matte(shot, contract, name):
+    """Writes what a take with one matte holds: its lasso, and pictures in place of its Cryptomattes."""
+    take = contract.TakeFolder(shot / "takes" / "freeze")
+    take.cryptomattes.mkdir(parents=True)
+    for frame in (5, 6, 7):
+        shutil.copy(take.frame(frame), take.cryptomatte(frame))
+    lasso = {"name": name, "frame": 6, "polygon": [[1.0, 1.0], [9.0, 1.0], [9.0, 9.0]]}
+    take.mattes_record.write_text(json.dumps({"version": 1, "mattes": [lasso]}))
+    return str(take.cryptomattes)
+
+
+def matte_nodes(addon):
+    """(name, folder, first frame) of what each Cryptomatte node of the scene picks."""
+    nodes = addon("compat").compositor_tree(bpy.context.scene).nodes
+    return {
+        (node.matte_id, str(Path(bpy.path.abspath(node.image.filepath)).resolve().parent), node.frame_start)
+        for node in nodes
+        if node.bl_idname == "CompositorNodeCryptomatteV2"
+    }
+
+
+def test_the_node_of_a_matte_is_undone_and_done_again(full, scene, addon, contract):
+    folder = add_matte(full, contract, "him")
+    assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
+    bpy.ops.ed.undo_push(message="before")
+    images = set(bpy.data.images.keys())
+    assert bpy.ops.splannequin.insert_matte(name="him") == {"FINISHED"}
+    bpy.ops.ed.undo_push(message="after")
+    after = set(bpy.data.images.keys())
+    assert matte_nodes(addon) == {("him", folder, 5)} and after > images
+    bpy.ops.ed.undo()
+    assert matte_nodes(addon) == set() and set(bpy.data.images.keys()) == images
+    bpy.ops.ed.redo()
+    assert matte_nodes(addon) == {("him", folder, 5)} and set(bpy.data.images.keys()) == after
+
+
+def test_two_shots_of_a_file_have_their_own_mattes(full, scene, addon, contract, tmp_path):
+    """Of the same name, in takes of the same name; asked for again, each is there already."""
+    other = tmp_path / "other.splannequin"
+    shutil.copytree(full, other)
+    folders = {shot: add_matte(shot, contract, "him") for shot in (full, other)}
+    assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
+    for shot in (full, other, full, other):
+        scene.splannequin.shot_path = str(shot)
+        assert bpy.ops.splannequin.insert_matte(name="him") == {"FINISHED"}
+    assert matte_nodes(addon) == {("him", folder, 5) for folder in folders.values()}
+    nodes = [n for n in addon("compat").compositor_tree(scene).nodes if n.bl_idname == "CompositorNodeCryptomatteV2"]
+    assert len(nodes) == 2 and nodes[0].image != nodes[1].image
