@@ -12,22 +12,18 @@ today's mattes with what is likely to move, and of both together.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.movers import frame_row, summary, text
-from benchmarks.sources import Log, load_source
-from torch_backend.contract import JobError
+from benchmarks.movers import frame_row, run
+from benchmarks.sources import Log
 from torch_backend.report.truth import TruthScene
-from torch_backend.shot import write_json
 from torch_backend.solve.fleeting import Sight, seeded
 from torch_backend.solve.flow import FlowConfig, Map, Mask, Matches, neighbours
 from torch_backend.solve.motion import MOVING, load_motion
@@ -152,23 +148,7 @@ def judge(truth: TruthScene, margin: int) -> list[dict[str, Any]]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line; returns an exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
-    parser.add_argument("--results", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
-    parser.add_argument("--margin", type=int, default=1, help="pixels around what moves that may be marked, too")
-    args = parser.parse_args(argv)
-    try:
-        for folder in args.scenes:
-            truth = load_source(f"{args.cameras}:{folder.absolute()}", args.results.absolute())
-            rows = judge(truth, args.margin)
-            write_json(args.results / f"misfit-{truth.name.replace(' ', '-')}.json", {"version": 1, "frames": rows})
-            for label in LABELS:
-                print(f"{truth.name}, {label}: {text(summary(rows, label))}", flush=True)
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return run(argv, __doc__, "misfit", LABELS, judge)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +59,10 @@ def frame_row(
     return row
 
 
-def judge(truth: TruthScene, frames: Sequence[int], margin: int) -> list[dict[str, Any]]:
+def judge(truth: TruthScene, margin: int) -> list[dict[str, Any]]:
     """One row per frame that has a matte, see `frame_row`."""
     rows: list[dict[str, Any]] = []
-    for frame in frames:
+    for frame in (camera.frame for camera in load_cameras(truth.shot).frames):
         matte, likely = load_motion(truth.shot, frame), load_motion(truth.shot, frame, likely=True)
         if matte is None or likely is None:
             continue
@@ -94,9 +94,18 @@ def text(found: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {'–' if value is None else f'{value:.3f}'}" for name, value in found.items())
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def run(
+    argv: Sequence[str] | None, about: str | None, name: str, labels: Sequence[str],
+    judge: Callable[[TruthScene, int], list[dict[str, Any]]],
+) -> int:  # fmt: skip
+    """A command line that judges scenes and prints the summary of each of `labels`; returns an exit code.
+
+    Args:
+        about: its help.
+        name: what its files in DIR begin with.
+        judge: rows of a scene, by its truth and `--margin`.
+    """
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
     parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
@@ -105,15 +114,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         for folder in args.scenes:
             truth = load_source(f"{args.cameras}:{folder.absolute()}", args.results.absolute())
-            rows = judge(truth, [camera.frame for camera in load_cameras(truth.shot).frames], args.margin)
-            name = truth.name.replace(" ", "-")
-            write_json(args.results / f"movers-{name}.json", {"version": 1, "margin": args.margin, "frames": rows})
-            for label in LABELS:
+            rows = judge(truth, args.margin)
+            path = args.results / f"{name}-{truth.name.replace(' ', '-')}.json"
+            write_json(path, {"version": 1, "margin": args.margin, "frames": rows})
+            for label in labels:
                 print(f"{truth.name}, {label}: {text(summary(rows, label))}", flush=True)
     except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    return run(argv, __doc__, "movers", LABELS, judge)
 
 
 if __name__ == "__main__":
