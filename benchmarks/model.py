@@ -203,7 +203,7 @@ def trained(args: argparse.Namespace, shot: Shot, config: TrainConfig) -> tuple[
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
-    images, mattes = load_images(scene, train, width, height), functools.partial(load_motion, shot, likely=True)
+    images, mattes = load_images(scene, train, width, height), functools.partial(load_motion, shot)
     movers = None if args.no_mattes else load_movers(mattes, scene, train, width, height)
     for module in (raster_cpu, ssim, adam, planes):
         module.warm_up()

@@ -1,8 +1,7 @@
 """Motion mattes against rendered truth: `python -m benchmarks.movers SCENE ... --results DIR`.
 
 SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot with exact (or
-solved) cameras and its mattes are made in DIR if they are not there. Printed are, over all frames of the clip, for what
-is moving (as a freeze reads the mattes) and for that with what is likely to move (as a training does):
+solved) cameras and its mattes are made in DIR if they are not there. Printed are, over all frames of the clip:
 
 precision     share of the marked pixels that move, or lie within `--margin` pixels of one that does
 moving, ...   recall: share of the truth's pixels that are marked, of all that moves and of the thing of a hard scene

@@ -182,7 +182,7 @@ def main() -> None:
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, _ = split_frames(scene.solved, config.holdout, config.holdout_phase)
-    movers = load_movers(functools.partial(load_motion, shot, likely=True), scene, train, width, height)
+    movers = load_movers(functools.partial(load_motion, shot), scene, train, width, height)
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train, width, height)
     images = load_images(scene, train, width, height)
     trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)  # type: ignore[arg-type]

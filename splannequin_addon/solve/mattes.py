@@ -1,8 +1,8 @@
 """The motion matte in Blender: what the solve found to move, shown in the Image Editor, and painted over by the artist.
 
-Black stands still, white moves, grey is not known, dark grey is likely to move (a training is offered it). What is
-painted lies in the shot, SHOT/motion_paint/NNNNNN.png, and goes before what the solve finds, now and after another one.
-Until it is saved there, the .blend keeps it: an image is packed, for Blender saves no pixels of one that was generated.
+Black stands still, white moves, grey is not known. What is painted lies in the shot, SHOT/motion_paint/NNNNNN.png, and
+goes before what the solve finds, now and after another one. Until it is saved there, the .blend keeps it: an image is
+packed, for Blender saves no pixels of one that was generated.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _FRAME = "splannequin_matte"
 _PICTURE = "splannequin_picture"
 """Another: digest of the picture that the frame had. Another clip may have been imported into the shot since."""
 MOVING_TINT = (255, 64, 0)
-"""Tint, sRGB, of what moves and, fainter, of what is likely to."""
+"""Tint, sRGB, of what moves."""
 UNKNOWN_TINT = (64, 128, 255)
 """Tint of what is not known."""
 _OPAQUE = 150
 """Of what surely moves, of 255: the plate is seen through it."""
 _FAINT = 70
-"""Of what is likely to move, and of what is not known."""
+"""Of what is not known."""
 
 
 def found_file(shot: Path, frame: int) -> Path:
@@ -262,10 +262,9 @@ def tint_in_turns(shot: Path) -> Iterator[tuple[int, int]]:
 def tinted(matte: np.ndarray) -> np.ndarray:
     """[H, W, 4] uint8 tint and alpha of a matte [H, W] in 0 to 1: still below a tenth, unknown around a half."""
     moves, unknown = matte > 0.75, (matte > 0.35) & (matte <= 0.75)
-    likely = (matte > 0.1) & ~(moves | unknown)
     picture = np.zeros((*matte.shape, 4), np.uint8)
     picture[..., :3] = np.where(unknown[..., None], np.array(UNKNOWN_TINT, np.uint8), np.array(MOVING_TINT, np.uint8))
-    picture[..., 3] = np.where(moves, _OPAQUE, np.where(unknown | likely, _FAINT, 0))
+    picture[..., 3] = np.where(moves, _OPAQUE, np.where(unknown, _FAINT, 0))
     return picture
 
 

@@ -87,24 +87,6 @@ class FlowConfig:
     """So many of these units are nothing yet,"""
     clear: float = 0.8
     """and so many are motion for certain."""
-    unlike: float = 12.0
-    """A colour this far out of the range that another picture shows there is another thing's."""
-    fleeting: tuple[float, float] = (0.5, 0.65)
-    """What is unlike so many of the key frames around belongs to what moves, and is it for certain."""
-    explained: float = 0.6
-    """A depth at which so many of them show the same explains it by a thing that stands still."""
-    need: int = 2
-    """In fewer of them a point says nothing."""
-    depths: int = 64
-    """So many depths are tried."""
-    speck: float = 4.0
-    """What is fleeting and smaller than this squared is noise."""
-    unexplained: tuple[float, float] = (16.0, 32.0)
-    """An area so far from all that a static model of the clip shows there, and somewhere so far, is likely to move,"""
-    borne_out: float = 0.6
-    """unless so many of the key frames around show the same at the still point's depth: the model is poor there."""
-    asked: int = 3
-    """So many of them have to have that point in their picture, hidden or not."""
     reach: int = 2
     """Over so many of the longest baselines a surface's scores are gathered along it."""
     radius: int = 4

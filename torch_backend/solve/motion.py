@@ -1,12 +1,9 @@
 """The motion matte of a shot: per delivered frame what stands still, what moves by itself, and what is not known.
 
-SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size: STILL, LIKELY, UNKNOWN or MOVING. motion.json beside
+SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size: STILL, UNKNOWN or MOVING. motion.json beside
 them says which cameras they belong to; mattes of a solve of before are not read, nor are the points of still surfaces
 that lie with them (`surface`). What an artist paints goes before what is found: SHOT/motion_paint/NNNNNN.png, which no
 solve touches.
-
-What is likely to move a training offers its field. Whoever freezes takes it for still, so that other plates may say
-what is wrong about it: where it was taken for moving, delivered frames lost up to 0.7 dB (docs/decisions.md).
 """
 
 from __future__ import annotations
@@ -41,14 +38,14 @@ from ..footage.images import is_whole_png, too_large
 from ..shot import Shot, content_key, make_folder, need_disk, write_json
 from .flow import FlowConfig, Map
 from .masks import IGNORE, PEOPLE, limited, load_mask, masks_key, write_grey
-from .moving import LIKELY, Clip, StaticViews, mattes
+from .moving import Clip, StaticViews, mattes
 from .still import Evidence
 from .stored import load_cameras
 from .surface import AWAY, NO_SURFACE, KeyEvidence, SurfacePoints, read_surface, surface_points, write_surface
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
 """Values of a matte. Whoever reads one takes those nearer to another for that one."""
-MOTION_VERSION = 6
+MOTION_VERSION = 7
 PAINTED = PAINTED_FOLDER
 """Of painted mattes, in the shot's folder."""
 _RECORD, _UNFINISHED = MOTION_FILE, MOTION_UNFINISHED_FILE
@@ -221,20 +218,11 @@ def _content(path: Path) -> str:
         return hashlib.sha256(source.read()).hexdigest()
 
 
-def load_motion(shot: Shot, frame: int, likely: bool = False) -> NDArray[np.uint8] | None:
+def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
     """The matte of a frame: STILL, UNKNOWN or MOVING, [h, w] of the working frames; None if there is none.
 
     Where an artist painted, that is it. JobError if a file of it is damaged.
-
-    Args:
-        likely: what is likely to move does.
     """
-    found = _matte(shot, frame)
-    return None if found is None else np.where(found == LIKELY, np.uint8(MOVING if likely else STILL), found)
-
-
-def _matte(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
-    """As it lies in the files."""
     path = shot.matte(frame)
     painted = shot.painted_matte(frame)
     found = _read_found(path) if path.is_file() and is_found(shot) else None

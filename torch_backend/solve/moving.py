@@ -6,7 +6,7 @@ through a window of a few seconds, so a clip of any length takes the same memory
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 import cv2
@@ -17,10 +17,10 @@ from ..contract import Reporter
 from ..footage import load_frames
 from ..footage.images import read_frame
 from ..shot import Shot
-from .fleeting import Fleeting, Other, Shades, Sight, seeded
-from .flow import FlowConfig, Map, Mask, Matches, neighbours, sample
+from .flow import FlowConfig, Map, Matches, neighbours, sample
 from .leftover import Leftover
 from .masks import IGNORE, load_mask, painted_over
+from .misfit import MisfitConfig, Sight, misfit, seeded
 from .still import Evidence, Look, StillTest, evidence
 from .stored import load_cameras, load_points
 
@@ -30,11 +30,6 @@ _KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
 _LEFT_EVERY = 2
 """In every so manieth key frame what is left of motion is looked for: sways are slow."""
-_PART = 0.25
-"""A pixel is fleeting if so much of what is around it is."""
-LIKELY = 48
-"""In the files: a static model of the clip cannot show it, but no flow sees it move. Nearest to still, which it is for
-whoever does not know it, and where it is copied into a painted matte."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 
@@ -78,13 +73,14 @@ class Clip:
 
     def picture(self, key: int) -> NDArray[np.uint8]:
         """Grey picture of a key in the flow's size. JobError if the frame is damaged."""
-        return self._key(key)[0]
+        return self.shown(key)[0]
 
     def sight(self, key: int) -> Sight | None:
         """A key in colour, with its camera; None if its pose was not solved."""
-        return None if self.guessed[key] else self._key(key)[1]
+        return None if self.guessed[key] else self.shown(key)[1]
 
-    def _key(self, key: int) -> tuple[NDArray[np.uint8], Sight]:
+    def shown(self, key: int) -> tuple[NDArray[np.uint8], Sight]:
+        """A key, as `frame` returns it."""
         if key not in self._pictures:
             self._pictures[key] = self.frame(self.keys[key])
         return self._pictures[key]
@@ -104,12 +100,20 @@ class Clip:
             pixels = painted_over(pixels, ignored)
         grey = _sized(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8), self.flow_size)
         colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))
-        return grey, Sight(Shades(colors), self._cameras[0][index], self._cameras[1][index])
+        return grey, Sight(colors, self._cameras[0][index], self._cameras[1][index])
 
-    def static(self, index: int) -> Shades | None:
-        """What a static model of the clip shows in a frame, on the grid; None if there is none."""
+    def static(self, index: int) -> NDArray[np.uint8] | None:
+        """[h, w, 3] what a static model of the clip shows in a frame, on the grid; None if there is none."""
         shown = None if self._static is None else self._static(self.frames[index])
-        return None if shown is None else Shades(_sized(shown, (self.flow_size[0] // 2, self.flow_size[1] // 2)))
+        return None if shown is None else _sized(shown, (self.flow_size[0] // 2, self.flow_size[1] // 2))
+
+    def references(self, count: int) -> dict[int, Sight]:
+        """Key -> so many keys of solved poses, evenly spaced; none if there is no static model."""
+        solved = [key for key, guessed in enumerate(self.guessed) if not guessed]
+        if self._static is None or not solved:
+            return {}
+        chosen = {solved[n * (len(solved) - 1) // (count - 1)] for n in range(count)}
+        return {key: self.frame(self.keys[key])[1] for key in sorted(chosen)}
 
     def is_guessed(self, index: int) -> bool:
         """True if the pose of a frame was not solved."""
@@ -149,8 +153,7 @@ def mattes(
     clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter,
     tell: Callable[[int, tuple[Map, Map], Evidence], None] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:  # fmt: skip
-    """(index, labels [H, W] uint8: 0 still, 48 likely to move, 128 unknown, 255 moving) of all frames but the `written`
-    ones, in order.
+    """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order.
 
     `tell` hears each key's evidence and the grid it is on, before the key's matte comes.
     """
@@ -161,7 +164,8 @@ def mattes(
         return
     first, last = wanted.index(True), len(wanted) - 1 - wanted[::-1].index(True)
     matches = Matches(clip.picture, config, clip.unit)
-    fleeting = Fleeting(matches.grid, clip.unit, config)
+    rest = MisfitConfig()
+    references = clip.references(rest.references)
     own: dict[int, tuple[Map, Map, Map]] = {}
     final: dict[int, tuple[Map, Map]] = {}
     start = max(0, first - 1 - reach)
@@ -179,13 +183,13 @@ def mattes(
         final[key] = _followed(matches, key, own, len(keys), reach, config)
         for n in groups[key] if wanted[key] else ():
             if n not in written:
-                picture, sight = (clip.picture(key), clip.sight(key)) if n == keys[key] else clip.frame(n)
+                picture, sight = clip.shown(key) if n == keys[key] else clip.frame(n)
                 if n == keys[key]:
                     score, inverse = final[key], own[key][2]
                 else:
                     score, inverse = _between(clip, matches, picture, key, final, own)
-                gone = _fleeting(clip, fleeting, n, key, sight, inverse, own, config)
-                yield n, _labels(clip, picture, *score, *gone, config)
+                unlike = _misfit(clip, n, sight, inverse, references, matches.grid, rest)
+                yield n, _labels(clip, picture, *score, unlike, config, rest)
         for store in (own, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
@@ -248,46 +252,36 @@ def _between(
     return (total / np.maximum(weight, 1e-6), weight), inverse / count
 
 
-def _fleeting(
-    clip: Clip, fleeting: Fleeting, n: int, key: int, sight: Sight | None, inverse: Map,
-    own: dict[int, tuple[Map, Map, Map]], config: FlowConfig,
-) -> tuple[Mask, Mask]:  # fmt: skip
-    """`Fleeting.masks` of frame `n`, which is key `key` or lies between it and the one before."""
-    if sight is None or clip.is_guessed(n):
-        return np.zeros(inverse.shape, bool), np.zeros(inverse.shape, bool)
-    nearest = {-1: key - 1, 1: key + (n == clip.keys[key])}
-    around: list[Other] = []
-    for side, first in nearest.items():
-        for step in config.baselines:
-            other = first + side * (step - 1)
-            found = clip.sight(other) if 0 <= other < len(clip.keys) else None
-            if found is not None:
-                around.append(Other(side, step, found, own[other][2]))
-    return fleeting.masks(sight, around, inverse, clip.depths[key], clip.static(n))
+def _misfit(
+    clip: Clip, n: int, sight: Sight, inverse: Map, references: Mapping[int, Sight], grid: tuple[Map, Map],
+    config: MisfitConfig,
+) -> Map:  # fmt: skip
+    """`misfit` of frame `n` on the grid; 0 without a static model and where the pose was guessed."""
+    shown = None if clip.is_guessed(n) else clip.static(n)
+    if shown is None:
+        return np.zeros(inverse.shape, np.float32)
+    others = [other for key, other in references.items() if clip.keys[key] != n]
+    return misfit(sight, inverse, shown, others, grid, 0.5 * clip.unit, config)
 
 
 def _labels(
-    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, fleeting: Mask, likely: Mask, config: FlowConfig
+    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, unlike: Map, config: FlowConfig, rest: MisfitConfig
 ) -> NDArray[np.uint8]:
-    """The labels [H, W] of a frame's score and weight on the grid, of what is fleeting there and likely to move."""
+    """The labels [H, W] of a frame's score and weight on the grid, and of its misfit there."""
     grey = cv2.resize(picture, score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
     spread = _Spread(grey, config.radius, config.edge)
     weight = np.minimum(weight, _ENOUGH)
     known = np.maximum(spread(weight), 0.0)
     score = spread(score * weight) / np.maximum(known, 1e-3)
     size = clip.width, clip.height
-    score, known = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (score, known))
+    score, known, unlike = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (score, known, unlike))
     least = round((config.blob * clip.width / 640) ** 2)
-    moving = seeded(score > config.grow, score > config.seed, least, connectivity=4)
-    gone, perhaps = (
-        cv2.resize(p.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > _PART for p in (fleeting, likely)
-    )
-    # Holes are filled in either.
-    perhaps, moving = (~seeded(~p, ~p, least, connectivity=4) for p in (moving | gone | perhaps, moving | gone))
+    moving = seeded(score > config.grow, score > config.seed, least)
+    moving |= seeded(unlike > rest.weak, unlike > rest.strong, least)
+    still = seeded(~moving, ~moving, least)  # holes are filled
     unknown = known < _UNKNOWN
-    unknown = seeded(unknown, unknown, least, connectivity=4)
-    labels = np.where(unknown, np.uint8(128), np.uint8(0))
-    return np.where(moving, np.uint8(255), np.where(perhaps, np.uint8(LIKELY), labels))
+    unknown = seeded(unknown, unknown, least)
+    return np.where(~still, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
 
 
 class _Spread:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contract import SURFACE, atomic_path, frame_number, open_arrays
-from .fleeting import Sight
 from .flow import Map, Mask
+from .misfit import Sight
 from .still import Evidence
 
 LEAST_AGREEING = 3
@@ -81,7 +81,7 @@ def surface_points(
     z, K, V = 1.0 / inverse, sight.K, sight.viewmat
     local = np.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], axis=1)
     xyz = (local - V[:3, 3]) @ V[:3, :3]
-    return xyz.astype(np.float32), sight.shades.colors.reshape(-1, 3)[places]
+    return xyz.astype(np.float32), sight.colors.reshape(-1, 3)[places]
 
 
 def write_surface(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) -> None:

@@ -144,7 +144,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     identity: dict[str, Any] = {"key": key, "solve": solve_key(shot), "motion": motion, "pictures": pictures_key(shot)}
     if depth is not None:
         identity["depth"] = {name: depth.facts[name] for name in ("key", "source")}
-    movers = load_movers(_likely(shot), scene, train, width, height) if motion else None
+    movers = load_movers(functools.partial(load_motion, shot), scene, train, width, height) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, width, height)
     limits = () if plan is None else (plan.gaussians, plan.pieces)
     trainer = Trainer(
@@ -220,7 +220,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     depth = None
     if facts.get("depth"):
         identity["depth"], depth = facts["depth"], load_fitted(folder, str(facts["depth"]["key"]))
-    movers = load_movers(_likely(shot), scene, train, *size) if motion else None
+    movers = load_movers(functools.partial(load_motion, shot), scene, train, *size) if motion else None
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train + test, *size)
     limits = () if plan is None else (plan.gaussians, plan.pieces)
     trainer = Trainer(
@@ -305,11 +305,6 @@ def warm_up(config: TrainConfig, device: torch.device) -> None:
             module.warm_up()
         if config.method != "static":
             host(config.host).warm_up(config.field)
-
-
-def _likely(shot: Shot) -> Mattes:
-    """The motion mattes as a training wants them: its field is offered what is likely to move, too."""
-    return functools.partial(load_motion, shot, likely=True)
 
 
 def planned(

@@ -1,8 +1,7 @@
 """What a static model of a clip shows: the clip learnt in a few hundred steps as a world in which nothing moves.
 
-What a frame shows and such a model cannot, moves, or is hard to learn (`solve/fleeting.py` tells them apart). It is as
-the first part of every run, whose residual opened the gate once and was a poor judge of Gaussians; of pixels, held
-against the key frames around, it is a good one (docs/decisions.md, "Motion mattes").
+What a frame shows and such a model cannot, moves or is hard to learn: `solve/misfit.py` tells them apart by other
+frames.
 """
 
 from __future__ import annotations

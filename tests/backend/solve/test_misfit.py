@@ -1,4 +1,4 @@
-"""The candidate for motion mattes, in pictures drawn here."""
+"""What the world at rest lacks, in pictures drawn here."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.misfit import MisfitConfig, misfit
-from torch_backend.solve.fleeting import Shades, Sight, seeded
+from torch_backend.solve.misfit import MisfitConfig, Sight, misfit, seeded
 
 WIDTH, HEIGHT, UNIT, DEPTH = 160, 120, 0.5, 4.0
 Y, X = np.mgrid[0.5:HEIGHT, 0.5:WIDTH]
@@ -29,7 +28,7 @@ def wall(step: int = 0) -> np.ndarray:
 def sight(picture: np.ndarray, step: int = 0) -> Sight:
     viewmat = np.eye(4)
     viewmat[0, 3] = -step * 2.0 * DEPTH / K[0, 0]
-    return Sight(Shades(picture), viewmat, K)
+    return Sight(picture, viewmat, K)
 
 
 def noisy(picture: np.ndarray, sigma: float, seed: int) -> np.ndarray:
@@ -44,7 +43,7 @@ def disc(radius: float) -> np.ndarray:
 def moving(frame: np.ndarray, shown: np.ndarray, others: list[Sight]) -> np.ndarray:
     config = MisfitConfig()
     unlike = misfit(sight(frame), INVERSE, shown, others, GRID, UNIT, config)
-    return seeded(unlike > config.weak, unlike > config.strong, 12, connectivity=4)
+    return seeded(unlike > config.weak, unlike > config.strong, 12)
 
 
 def around(sigma: float = 0.0, gain: float = 1.0) -> list[Sight]:
@@ -72,7 +71,7 @@ def test_one_witness_that_errs_makes_no_mover() -> None:
     assert not moving(noisy(wall(), 2.0, 1), noisy(poor, 2.0, 2), around(2.0)).any()
     others = around(2.0)
     for other in others:
-        other.shades.colors[disc(16.0)] = 200, 30, 30
+        other.colors[disc(16.0)] = 200, 30, 30
     assert not moving(noisy(wall(), 2.0, 1), noisy(wall(), 2.0, 2), others).any()
 
 
@@ -87,15 +86,15 @@ def test_what_only_four_other_frames_have_in_their_picture_is_not_known() -> Non
     frame[disc(8.0)] = 200, 30, 30
     away = np.eye(4)
     away[0, 3] = 100.0
-    far = [Sight(Shades(wall()), away, K) for _ in STEPS]
-    behind = [Sight(Shades(wall()), np.diag([-1.0, 1.0, -1.0, 1.0]), K) for _ in STEPS]
+    far = [Sight(wall(), away, K) for _ in STEPS]
+    behind = [Sight(wall(), np.diag([-1.0, 1.0, -1.0, 1.0]), K) for _ in STEPS]
     assert not misfit(sight(frame), INVERSE, wall(), [*around()[:4], *far, *behind], GRID, UNIT, MisfitConfig()).any()
 
 
 def test_the_values_are_those_of_double_precision() -> None:
     frame, shown = noisy(wall(), 8.0, 1), noisy(wall(), 2.0, 2)
     others = [sight(noisy(wall(), 8.0, seed)) for seed in (3, 4, 5, 6, 7)]
-    median = np.median([other.shades.colors for other in others], axis=0)
+    median = np.median([other.colors for other in others], axis=0)
     gaps = [np.abs(frame.astype(np.float64) - each).max(-1) for each in (shown, median)]
     taps = np.arange(-8, 9)  # OpenCV's kernel for float pictures reaches four sigmas
     kernel = np.exp(-0.5 * (taps / (4.0 * UNIT)) ** 2)
