@@ -28,9 +28,9 @@ from torch_backend.freeze.frozen import (
 )
 from torch_backend.freeze.instant.instants import developed
 from torch_backend.freeze.take.plan import choose_t_star
+from torch_backend.motion.mattes import load_motion
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.shot import Shot
-from torch_backend.solve.motion import load_motion
 from torch_backend.train import load_run
 
 BACKDROP = 0.5

@@ -131,11 +131,11 @@ def solve(out: Path, model: str) -> dict[str, Any]:
     import tempfile
 
     from benchmarks.solve import Stopwatch, align, rotation_degrees
+    from torch_backend.cameras.poses import camera_centre
     from torch_backend.contract import CameraPath, read_json
     from torch_backend.footage import FootageConfig, import_footage
+    from torch_backend.sfm.solving import SolveConfig, solve_shot
     from torch_backend.shot import Shot
-    from torch_backend.solve import SolveConfig, solve_shot
-    from torch_backend.solve.poses import camera_centre
 
     truth = json.loads((out / "truth.json").read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory() as folder:

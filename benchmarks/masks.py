@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.solve import Stopwatch, align, rotation_degrees
-from tests.backend.solve.conftest import FOCAL, RADIAL, WIDTH, handheld, the_room
+from tests.backend.solved_room import FOCAL, RADIAL, WIDTH, handheld, the_room
+from torch_backend.cameras.poses import camera_centre
 from torch_backend.contract import CameraPath, JobError, read_json
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import write_png
+from torch_backend.sfm.solving import SolveConfig, solve_shot
 from torch_backend.shot import Shot
-from torch_backend.solve import SolveConfig, solve_shot
-from torch_backend.solve.poses import camera_centre
 
 BOARDS = 4
 

@@ -41,13 +41,13 @@ from torch_backend.freeze.frozen import FrozenGaussians, FrozenImage, freeze_at,
 from torch_backend.freeze.instant.instants import config_for, developed
 from torch_backend.freeze.instant.repairs import Moment, repaired, repairs
 from torch_backend.freeze.views.source_views import motion_mattes
+from torch_backend.motion.mattes import load_motion
 from torch_backend.raster import cpu as raster_cpu
 from torch_backend.raster import ssim
 from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 from torch_backend.scene import load_images, load_scene, split_frames
+from torch_backend.sfm.masks import IGNORE, load_mask
 from torch_backend.shot import Shot, write_json
-from torch_backend.solve.masks import IGNORE, load_mask
-from torch_backend.solve.motion import load_motion
 from torch_backend.train import LoadedRun, adam, config_from_params
 from torch_backend.train.checkpoint import CHECKPOINT_FILE, read_meta
 from torch_backend.train.config import TrainConfig, config_from_json, config_to_json

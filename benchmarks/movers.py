@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.sources import load_source
+from torch_backend.cameras.stored import load_cameras
 from torch_backend.contract import JobError
+from torch_backend.motion.mattes import MOVING, load_motion
 from torch_backend.report.truth import THINGS, TruthScene
 from torch_backend.shot import write_json
-from torch_backend.solve.motion import MOVING, load_motion
-from torch_backend.solve.stored import load_cameras
 
 MOVERS = ("moving", *(name for name in THINGS if name not in ("glass", "mirror", "wall")))
 """Regions of truth that mattes should mark."""

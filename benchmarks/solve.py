@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_backend.cameras.poses import camera_centre, fill_poses
 from torch_backend.contract import CameraPath, read_json
 from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.sfm.solving import SolveConfig, solve_shot
 from torch_backend.shot import Shot
-from torch_backend.solve import SolveConfig, solve_shot
-from torch_backend.solve.poses import camera_centre, fill_poses
 
 
 class Stopwatch:

@@ -25,10 +25,9 @@ from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, similarity_to_exact, solved_shot
 from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import JobError, read_json
+from torch_backend.motion_search import find_motion
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key, locked
-from torch_backend.solve.motion import find_motion
-from torch_backend.train import static_views
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -45,7 +44,7 @@ def load_source(source: str, results: Path) -> TruthScene:
         # All runs of a scene train with its motion mattes: otherwise it depends on which of them was judged first.
         # Without readable footage there are none, and plate detail is not judged either (`evaluate_run`).
         with locked(scene.shot.root / "bench" / "motion.lock"), contextlib.suppress(JobError):
-            find_motion(scene.shot, Log(), static_model=static_views)
+            find_motion(scene.shot, Log())
         return scene
     if kind == "shot":
         return RealScene(Shot.open(folder))
@@ -68,7 +67,7 @@ class SyntheticTruth:
         place = shots / f"{self._scene.size}-{self._scene.name}-{cameras}{SHOT_SUFFIX}"
         self.shot = (exact_shot if cameras == "exact" else solved_shot)(self._scene, place, Log())
         # Exact cameras come without; the motion mattes drive the training.
-        find_motion(self.shot, Log(), static_model=static_views)
+        find_motion(self.shot, Log())
         self._pixels = SolvedPixels(self.shot)
         self.t_stars, self._poses = list(self._scene.t_stars), list(self._scene.poses)
         steps = np.diff(self._poses)

@@ -26,6 +26,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from torch_backend.cameras.nuke import Y_UP, chan_text, nk_text
+from torch_backend.cameras.placement import Similarity
+from torch_backend.cameras.stored import load_points
 from torch_backend.contract import NO_DEPTH, CameraPath, TakeFolder, placement_of, read_json
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.placed import placed
@@ -34,9 +37,6 @@ from torch_backend.freeze.usd import CAMERA, SPLATS
 from torch_backend.gaussians.ply import PlyGaussians, read_ply
 from torch_backend.raster import rasterize
 from torch_backend.shot import Shot
-from torch_backend.solve.nuke import Y_UP, chan_text, nk_text
-from torch_backend.solve.placement import Similarity
-from torch_backend.solve.stored import load_points
 
 # usd-core has no types: everything of it is Any.
 Usd, UsdGeom, UsdVol = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdVol"))

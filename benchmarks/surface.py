@@ -33,6 +33,7 @@ from benchmarks.sources import Log, SyntheticTruth, load_source
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.regions import Geometry, View
+from torch_backend.cameras.placement import Similarity
 from torch_backend.contract import FreezeParams, JobError, SurfaceParams, TakeFolder, placement_of, read_json
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.surface.job import make_surface, read_surface, view_of
@@ -40,7 +41,6 @@ from torch_backend.freeze.surface.volume import SurfaceConfig, unprojected
 from torch_backend.freeze.take.folder import frames_of
 from torch_backend.native import default_threads
 from torch_backend.shot import write_json
-from torch_backend.solve.placement import Similarity
 
 BEYOND = 0.01
 """Relative distance that was wanted in the median."""

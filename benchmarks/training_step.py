@@ -26,12 +26,12 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 import torch
 
 from torch_backend.contract import TrainParams
+from torch_backend.motion.mattes import load_motion
 from torch_backend.native import default_threads, torch_threads
 from torch_backend.raster.cpu import warm_up
 from torch_backend.scene import load_images, load_scene, split_frames
+from torch_backend.sfm.masks import IGNORE, load_mask
 from torch_backend.shot import Shot
-from torch_backend.solve.masks import IGNORE, load_mask
-from torch_backend.solve.motion import load_motion
 from torch_backend.train import config_from_params
 from torch_backend.train import trainer as trainer_module
 from torch_backend.train.ignored import load_ignored

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from benchmarks.detail_truth import scene_arguments, trained
 from benchmarks.sources import Log, SyntheticTruth, load_source
+from torch_backend.cameras.placement import Similarity
 from torch_backend.contract import FreezeParams, JobError
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take.frames import whole_camera
 from torch_backend.freeze.take.passes import Passes
 from torch_backend.freeze.take.plan import planned
 from torch_backend.native import default_threads
-from torch_backend.solve.placement import Similarity
 from torch_backend.torch_types import from_numpy
 
 WANTED = 0.25

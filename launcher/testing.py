@@ -27,7 +27,9 @@ NEWS_SECONDS = 60.0
 """Legs whose output is kept until they end say this often how far they are."""
 
 
-BACKEND_APART = ("tests/backend/solve", "tests/backend/raster", "tests/backend/footage", "tests/backend/card")
+BACKEND_APART = tuple(
+    f"tests/backend/{name}" for name in ("cameras", "lens", "sfm", "motion", "raster", "footage", "card")
+)
 """Half of the backend's tests by what they take: a leg of their own, beside which the others run. None of them needs
 the run that the others train once."""
 OTHER_INSTRUCTIONS = {

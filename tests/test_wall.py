@@ -19,7 +19,10 @@ STATIONS = (
     "native",
     "small_tables",
     "footage",
-    "solve",
+    "cameras",
+    "lens",
+    "sfm",
+    "motion",
     "footage.plates",
     "scene",
     "gaussians",
@@ -27,11 +30,13 @@ STATIONS = (
     "raster",
     "supervision",
     "train",
+    "motion_search",
     "freeze",
     "live",
     "report",
 )
-"""In the order of docs/architecture.md: a station imports only stations before it. `footage/plates.py` is late."""
+"""In the order of docs/architecture.md: a station imports only stations before it. `footage/plates.py` and
+`motion_search.py` are late."""
 ROOMS = (
     "access",
     "properties",
@@ -115,7 +120,7 @@ OTHER_FOLDERS = {
     ("splannequin_addon/process/environment.py", "summary.json"),  # of the launcher, in an environment
     ("splannequin_addon/process/environment.py", ".splannequin"),
     ("torch_backend/report/records.py", "summary.json"),  # of a benchmark
-    ("torch_backend/solve/foreign.py", "colmap/sparse/0"),  # of another program
+    ("torch_backend/cameras/foreign.py", "colmap/sparse/0"),  # of another program
 }
 """(file, name) of what is called like something of the shot, and is not."""
 

@@ -326,7 +326,7 @@ def export(args: argparse.Namespace, console: Console) -> int:
 
         written = export_splats(shot, words.format, folder, words.take, words.placement)
     else:
-        from .solve.export import export_cameras
+        from .cameras.export import export_cameras
 
         written = export_cameras(shot, words.format, folder, words.text, words.placement)
     for path in written:
@@ -336,7 +336,7 @@ def export(args: argparse.Namespace, console: Console) -> int:
 
 def stmaps(args: argparse.Namespace, console: Console) -> int:
     """`stmaps SHOT`: ST maps of the lens into SHOT/solve."""
-    from .solve.stmap import write_maps
+    from .lens.stmap import write_maps
 
     facts = write_maps(Shot.open(args.shot), args.width)
     if console.as_json:

@@ -339,26 +339,26 @@ def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
 
 def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
     from .footage import load_frames
-    from .solve import SolveConfig, solve_shot
-    from .solve.progress import OneBar, weights_of
+    from .sfm.progress import OneBar, weights_of
+    from .sfm.solving import SolveConfig, solve_shot
 
     config = SolveConfig(**{name: value for name, value in vars(params).items() if name != "cameras"})
-
-    def static_model(shot: Shot, report: Reporter) -> Any:
-        from .train import static_views
-
-        return static_views(shot, report)
-
     one_bar = OneBar(report, weights_of(load_frames(shot)))
-    return solve_shot(shot, config, one_bar, params.cameras, static_model)
+    solved = solve_shot(shot, config, one_bar, params.cameras)
+    from .motion_search import motion_after_solve  # loads torch, which nobody should wait for before the cameras
+
+    result = {**solved, **(motion_after_solve(shot, one_bar) or {})}
+    one_bar.metric("solve", result)
+    return result
 
 
 def _train(shot: Shot, params: contract.TrainParams, report: Reporter) -> Any:
-    from .solve.motion import find_motion, is_outdated
-    from .train import static_views, train_shot
+    from .motion.mattes import is_outdated
+    from .motion_search import find_motion
+    from .train import train_shot
 
     if is_outdated(shot) and not params.extend:  # without mattes what moves would be guessed
-        find_motion(shot, report, with_points=True, static_model=static_views)
+        find_motion(shot, report, with_points=True)
     return train_shot(shot, params, report)
 
 

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .cameras.stored import damaged, load_cameras, load_points
 from .contract import ExitCode, JobError, Reporter, UserError, frame_file
 from .footage.display import PLAIN, Display, display_of
 from .footage.images import read_frame
 from .footage.importing import load_frames
+from .motion.mattes import load_surface
 from .native import default_threads
 from .shot import Shot, make_folder, need_disk
-from .solve.motion import load_surface
-from .solve.stored import damaged, load_cameras, load_points
 from .torch_types import from_numpy
 
 

@@ -16,7 +16,7 @@ from benchmarks.ablate.switches import COMBINATIONS, RULES, STATE, of_frames, re
 from benchmarks.ablate.table import Store
 from benchmarks.other_state.masks import CLIPS, Painted, Pair, load_masks, plate_labels
 from benchmarks.other_state.scores import LET_GO, count
-from torch_backend.solve.plate_lens import load_plate_lenses
+from torch_backend.lens.plate_lens import load_plate_lenses
 
 
 def variants() -> dict[str, frozenset[str]]:

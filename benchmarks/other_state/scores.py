@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.detail_clip import DetailClip, View, over
 from benchmarks.detail_figures import MOVER_MATTE
-from torch_backend.solve.plate_lens import load_plate_lenses
+from torch_backend.lens.plate_lens import load_plate_lenses
 
 from .masks import OTHER, SAME, Labels, Painted, plate_labels
 

@@ -24,15 +24,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_backend.cameras.poses import camera_centre
 from torch_backend.contract import CameraFrame, CameraPath, Reporter, frame_file, python_child, read_json
 from torch_backend.footage import FootageConfig, import_footage, load_frames
+from torch_backend.lens.undistort import Undistorter
+from torch_backend.sfm.points import LEAST_POINTS, filter_points
+from torch_backend.sfm.solving import SOLVE_VERSION, SolveConfig, SolveResult, solve_shot
+from torch_backend.sfm.verdict import quality_words
 from torch_backend.shot import Shot, atomic_path, content_key, write_atomic, write_json
-from torch_backend.solve import SolveConfig, SolveResult, solve_shot
-from torch_backend.solve.points import LEAST_POINTS, filter_points
-from torch_backend.solve.poses import camera_centre
-from torch_backend.solve.solving import SOLVE_VERSION
-from torch_backend.solve.undistort import Undistorter
-from torch_backend.solve.verdict import quality_words
 
 from .folder import Regions, SyntheticScene
 from .noise import stream

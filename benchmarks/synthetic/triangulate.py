@@ -1,7 +1,7 @@
 """The child process that triangulates a clip with known cameras: `python -m benchmarks.synthetic.triangulate REQUEST`.
 
 COLMAP's features and matches as in the product's solve, its triangulation with the poses held. A process of its own for
-the reasons that torch_backend/solve/worker.py gives. The request is the worker's plus "K" [fx, fy, cx, cy], "width",
+the reasons that torch_backend/sfm/worker.py gives. The request is the worker's plus "K" [fx, fy, cx, cy], "width",
 "height" and "cameras" {file: 4x4 world-to-camera}. Writes points.npz beside it, as the worker does.
 """
 
@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from torch_backend.solve.answers import write_points
-from torch_backend.solve.mapping import triangulate
-from torch_backend.solve.request import SEED, Request
+from torch_backend.sfm.answers import write_points
+from torch_backend.sfm.mapping import triangulate
+from torch_backend.sfm.request import SEED, Request
 
 
 def main(path: str) -> int:

@@ -147,7 +147,7 @@ def picture_of(shot: Path, frame: int) -> str:
 
 
 def floor(shot: Path) -> tuple[list[float], float] | None:
-    """The floor that the solve found (torch_backend/solve/floor.py); None if it found none, or did not look.
+    """The floor that the solve found (torch_backend/cameras/floor.py); None if it found none, or did not look.
 
     OSError without a solve; ValueError if its file is damaged.
     """

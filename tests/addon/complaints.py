@@ -167,7 +167,7 @@ ANSWERS = (
         "needed_margin",
         "across, down = (math.ceil(p) + _FILTER_PX if p > _TOUCHING_PX else 0 for p in past)",
         "across, down = (0 for p in past)",
-        "tests/backend/solve/test_lens.py::test_with_overscan_no_pixel_lacks_data",
+        "tests/backend/lens/test_lens.py::test_with_overscan_no_pixel_lacks_data",
     ),
     Answer(
         8,

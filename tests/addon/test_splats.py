@@ -242,7 +242,7 @@ import json, sys
 from pathlib import Path
 from torch_backend.contract import CameraPath, Placement
 from torch_backend.freeze.usd import write_usd
-from torch_backend.solve.placement import Similarity
+from torch_backend.cameras.placement import Similarity
 shot, placement, out = sys.argv[1:]
 told, path = Placement.load(placement), CameraPath.load(Path(shot) / "solve/cameras.json")
 write_usd(Path(out), None, path, Similarity.of(told), told.metres_per_unit, 12.5)

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.backend.solved_room import again, solved, tools  # noqa: F401 - fixtures
 from torch_backend.contract import CameraFrame, CameraPath
 from torch_backend.footage.images import write_png
+from torch_backend.motion.mattes import MOVING, PAINTED, STILL, write_matte
 from torch_backend.raster import rasterize
 from torch_backend.shot import Shot, write_json
-from torch_backend.solve.motion import MOVING, PAINTED, STILL, write_matte
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 16
 FIRST = 101

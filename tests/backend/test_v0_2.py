@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from torch_backend import cli, contract
+from torch_backend.cameras.stored import load_cameras, load_points, load_record
 from torch_backend.footage.importing import load_frames
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.scene import load_scene
 from torch_backend.shot import Shot
-from torch_backend.solve.stored import load_cameras, load_points, load_record
 from torch_backend.train.run import load_run
 
 OLD = Path(__file__).parents[1] / "data" / "v0_2"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.movers import frame_row, summary
-from torch_backend.solve.motion import MOVING, STILL, UNKNOWN
+from torch_backend.motion.mattes import MOVING, STILL, UNKNOWN
 
 
 def test_recall_precision_and_the_worst_frames() -> None:

@@ -2,7 +2,7 @@
 
 Arrays are RGB, [H, W, 3], uint8 or uint16, display-referred sRGB. OpenImageIO and pycolmap must not be loaded into one
 process: their copies of zlib collide (double free in deflateEnd, seen with 3.2.2 and 4.2.1). Hence pycolmap lives in
-the child process of `solve/worker.py` alone.
+the child process of `sfm/worker.py` alone.
 """
 
 from __future__ import annotations

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..cameras.stored import load_cameras, load_record
 from ..contract import ExitCode, JobError, UserError
+from ..lens.map_lens import MapLens
+from ..lens.plate_lens import PlateLens, load_plate_lenses
+from ..lens.undistort import BandUndistorter
 from ..shot import Shot, content_key
-from ..solve.map_lens import MapLens
-from ..solve.plate_lens import PlateLens, load_plate_lenses
-from ..solve.stored import load_cameras, load_record
-from ..solve.undistort import BandUndistorter
 from ..torch_types import from_numpy
 from . import plate_encoding
 from .bars import recorded_bars

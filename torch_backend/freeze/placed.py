@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..cameras.placement import Similarity
+from ..cameras.poses import rotation_to_quat
 from ..gaussians.ply import PlyGaussians
 from ..raster.reference import sh_basis
-from ..solve.placement import Similarity
-from ..solve.poses import rotation_to_quat
 from ..torch_types import from_numpy
 
 _DIRECTIONS = 64

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.placement import SENSOR_MM, Similarity, camera_to_world, lens_of, path_viewmats
 from ..contract import CameraPath
 from ..gaussians.ply import PlyGaussians
 from ..shot import atomic_path
-from ..solve.placement import SENSOR_MM, Similarity, camera_to_world, lens_of, path_viewmats
 
 ROOT, SPLATS, CAMERA = "/frozen", "/frozen/splats", "/frozen/camera"
 """Paths of the prims."""

@@ -19,10 +19,10 @@ from ..footage.plates import Plates
 from ..freeze.composite.compositor import Compositor
 from ..freeze.frozen import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
 from ..freeze.instant.instants import Instants
+from ..motion_search import find_motion
 from ..scene import Scene, evenly_spaced, load_scene, read_image, split_frames
 from ..shot import Shot
-from ..solve.motion import find_motion
-from ..train import LoadedRun, load_run, static_views
+from ..train import LoadedRun, load_run
 from ..train.checkpoint import load_checkpoint
 from ..train.model import render
 from .colorvideovdp import sequence_jod
@@ -82,7 +82,7 @@ def plate_detail(shot: Shot, run: LoadedRun, scene: Scene, report: Reporter) -> 
 
     JobError if the footage cannot be read.
     """
-    find_motion(shot, report, static_model=static_views)
+    find_motion(shot, report)
     return Compositor(run, scene, Plates(shot, (run.width, run.height)))
 
 

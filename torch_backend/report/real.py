@@ -1,5 +1,5 @@
 """The truth in a real clip: where nothing moves, the plate at pose n shows what the frozen shot must show at pose n,
-whatever t* is. Where nothing moves, the motion matte of the solve says (`solve/motion.py`).
+whatever t* is. Where nothing moves, the motion matte of the solve says (`motion/mattes.py`).
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..motion.mattes import MOVING, STILL, load_motion
+from ..motion_search import find_motion
 from ..shot import Shot
-from ..solve.motion import MOVING, STILL, find_motion, load_motion
 from ..torch_types import from_numpy
-from ..train import static_views
 
 MARGIN = 8.0
 """A still pixel this near to a mover, in pixels of a picture 640 wide, is no truth: outlines of movers are soft, and so
@@ -24,7 +24,7 @@ are their mattes."""
 
 def ensure_motion(shot: Shot) -> None:
     """Finds the motion matte of a shot solved before there was one. JobError if the shot is not solved."""
-    find_motion(shot, _Mute(), static_model=static_views)
+    find_motion(shot, _Mute())
 
 
 def motion_shares(shot: Shot, frame: int, width: int, height: int) -> dict[str, Tensor]:

@@ -21,11 +21,11 @@ from torch import Tensor
 from ..contract import DEPTH_FILE, ExitCode, JobError, Reporter, depth_line
 from ..contract.files import is_json_object
 from ..footage.depth_maps import DepthSequence
+from ..lens.map_lens import MapLens
+from ..lens.plate_lens import PlateLens, load_plate_lenses
 from ..raster import rasterize
 from ..scene import Scene, resize_intrinsics, surface_of
 from ..shot import Shot, content_key, need_disk
-from ..solve.map_lens import MapLens
-from ..solve.plate_lens import PlateLens, load_plate_lenses
 from ..torch_types import floats, from_numpy, integers
 from .checkpoint import load_checkpoint, read_meta, save_checkpoint
 from .depth_fit import KINDS, LEAST_POINTS, SequenceFit, fit_sequence

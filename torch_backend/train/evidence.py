@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..motion.mattes import STILL
 from ..scene import evenly_spaced
-from ..solve.motion import STILL
 from ..torch_types import from_numpy, norm
 from .losses import psnr
 from .model import DynamicModel, render

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..deformation import Deltas, GateConfig, change_of, painted, stays_open
+from ..motion.mattes import MOVING
 from ..scene import Scene, evenly_spaced
-from ..solve.motion import MOVING
 from ..supervision.support import SEEN_WEIGHT
 from ..torch_types import from_numpy
 from .model import DynamicModel, gathered

@@ -33,13 +33,13 @@ from ..deformation import host
 from ..footage import load_frames
 from ..footage.depth_maps import DepthSequence, find_depth
 from ..footage.images import write_png
+from ..motion.mattes import load_motion, motion_key
 from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
 from ..scene import HELD_BYTES, Scene, load_scene, split_frames
+from ..sfm.masks import IGNORE, load_mask, masks_key
 from ..shot import Shot, content_key, make_folder, need_disk, remove_file, write_atomic, write_json
-from ..solve.masks import IGNORE, load_mask, masks_key
-from ..solve.motion import load_motion, motion_key
 from . import adam
 from .anew import SUMMARY_FILE, begun, drop_begun, finish_replacing, folder_for, replace_run
 from .checkpoint import CHECKPOINT_FILE, MISFITS, load_checkpoint, misfit, read_meta

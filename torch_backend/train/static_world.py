@@ -1,6 +1,6 @@
 """What a static model of a clip shows: the clip learnt in a few hundred steps as a world in which nothing moves.
 
-What a frame shows and such a model cannot, moves or is hard to learn: `solve/misfit.py` tells them apart by other
+What a frame shows and such a model cannot, moves or is hard to learn: `motion/misfit.py` tells them apart by other
 frames.
 """
 
@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 
 from ..contract import Reporter, TrainParams
+from ..motion.moving import StaticViews
 from ..scene import evenly_spaced, load_images, load_scene
+from ..sfm.masks import IGNORE, load_mask
 from ..shot import Shot
-from ..solve.masks import IGNORE, load_mask
-from ..solve.moving import StaticViews
 from .config import config_from_params
 from .ignored import load_ignored
 from .pictures import training_size

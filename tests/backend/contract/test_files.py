@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from torch_backend.cameras.colmap_files import read_model
 from torch_backend.contract import UnreadableFile, open_arrays, open_regular, read_json, regular_file
 from torch_backend.footage.images import read_png
 from torch_backend.footage.layers import find_layer
 from torch_backend.freeze.exr import read_frozen_exr, read_key
 from torch_backend.gaussians.ply import read_ply
-from torch_backend.solve.colmap_files import read_model
-from torch_backend.solve.map_reading import fingerprint
+from torch_backend.lens.map_reading import fingerprint
 from torch_backend.train.stored_tensors import open_stored
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has no such files in folders")

@@ -14,9 +14,9 @@ import pytest
 from torch_backend.contract import ExitCode, ImportParams, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.job import new_job, run_job
+from torch_backend.motion.mattes import load_motion
 from torch_backend.replaced import next_name
 from torch_backend.shot import Shot
-from torch_backend.solve.motion import load_motion
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -7,6 +7,7 @@ import OpenImageIO as oiio
 import pytest
 
 from tests.backend.footage.test_plates import solved
+from torch_backend.cameras import foreign
 from torch_backend.contract import MASK_ALPHA, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.images import read_png, write_png
@@ -14,7 +15,6 @@ from torch_backend.footage.masks import read_masks
 from torch_backend.footage.pairing import Counted
 from torch_backend.footage.plates import Plates
 from torch_backend.shot import Shot
-from torch_backend.solve import foreign
 
 COUNT = 14
 

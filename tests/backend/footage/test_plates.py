@@ -15,9 +15,9 @@ from torch_backend.footage.images import read_png, resize_float, write_png
 from torch_backend.footage.opening import open_source
 from torch_backend.footage.plates import Plates
 from torch_backend.footage.sources import Known
+from torch_backend.lens.plate_lens import load_plate_lenses
+from torch_backend.lens.undistort import Undistorter, of_frames
 from torch_backend.shot import Shot, write_json
-from torch_backend.solve.plate_lens import load_plate_lenses
-from torch_backend.solve.undistort import Undistorter, of_frames
 
 
 def solved(shot, radial=0.0, **told):

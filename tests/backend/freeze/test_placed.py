@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from torch_backend.cameras.placement import Similarity
 from torch_backend.contract import Placement
 from torch_backend.freeze.placed import placed, rotated_harmonics
 from torch_backend.gaussians.ply import PlyGaussians
 from torch_backend.raster import rasterize
 from torch_backend.raster.reference import rotation_matrices, sh_basis
-from torch_backend.solve.placement import Similarity
 
 
 def rotation(seed: int) -> np.ndarray:

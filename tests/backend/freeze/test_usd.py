@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdVol
 
+from torch_backend.cameras.placement import Similarity, path_viewmats
 from torch_backend.contract import CameraFrame, CameraPath, Placement
 from torch_backend.freeze import usd
 from torch_backend.freeze.usd import CAMERA, ROOT, SPLATS, write_usd
 from torch_backend.gaussians.ply import PlyGaussians
-from torch_backend.solve.placement import Similarity, path_viewmats
 
 WHERE = Similarity.of(Placement([0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0]))
 

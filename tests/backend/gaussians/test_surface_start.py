@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from torch_backend.gaussians.initialise import InitConfig, initialise
+from torch_backend.motion.surface import write_surface
+from torch_backend.motion_search import find_motion
 from torch_backend.scene import load_images, load_scene, surface_of
 from torch_backend.shot import Shot
-from torch_backend.solve.motion import find_motion
-from torch_backend.solve.surface import write_surface
 
 HELD, FAR, COUNT = 7, 3, 400
 
@@ -20,7 +20,7 @@ def dense(world, tmp_path_factory, quiet):
     """(scene, images) of the tiny shot, whose surface points are replaced by ones whose colour tells what they are: red
     those of a frame that is held out, green those far outside, blue all others."""
     shot = Shot(shutil.copytree(world.shot.root, tmp_path_factory.mktemp("dense") / "a.splannequin"))
-    find_motion(shot, quiet())
+    find_motion(shot, quiet(), static_model=None)
     with np.load(shot.solve / "points.npz") as stored:
         xyz = stored["xyz"]
     rng = np.random.default_rng(0)

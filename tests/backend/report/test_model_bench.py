@@ -7,8 +7,8 @@ import numpy as np
 
 from benchmarks.model import OF_FROZEN, main
 from torch_backend.footage.images import read_png, write_png
+from torch_backend.sfm.masks import write_grey
 from torch_backend.shot import Shot, write_json
-from torch_backend.solve.masks import write_grey
 
 
 def test_a_trained_run_is_judged_frozen_and_developed_on_frames_that_it_has_not_seen(trained, tmp_path):

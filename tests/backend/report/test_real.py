@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from torch_backend.motion.mattes import MOVING, PAINTED, STILL, UNKNOWN, write_matte
 from torch_backend.report.real import far_from, motion_shares, near
 from torch_backend.report.truth import RealScene
 from torch_backend.shot import Shot
-from torch_backend.solve.motion import MOVING, PAINTED, STILL, UNKNOWN, write_matte
 
 
 @pytest.fixture(scope="module")

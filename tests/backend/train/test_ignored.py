@@ -10,8 +10,8 @@ from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world
 from torch_backend.contract import TrainParams, read_json
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.scene import load_images, load_scene
+from torch_backend.sfm.masks import IGNORE, load_mask, write_grey
 from torch_backend.shot import write_json
-from torch_backend.solve.masks import IGNORE, load_mask, write_grey
 from torch_backend.train import config_from_params, train_shot
 from torch_backend.train.evidence import gather_evidence
 from torch_backend.train.ignored import load_ignored

@@ -7,8 +7,8 @@ import torch
 from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, build_world, paint_motion
 from torch_backend.contract import Cancelled, JobError, TrainParams
 from torch_backend.deformation import GateConfig
+from torch_backend.motion.mattes import MOVING, PAINTED, STILL, UNKNOWN, load_motion, write_matte
 from torch_backend.scene import load_images, load_scene
-from torch_backend.solve.motion import MOVING, PAINTED, STILL, UNKNOWN, load_motion, write_matte
 from torch_backend.train import config_from_params, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint
 from torch_backend.train.movers import load_movers, mean_of, moving_frames, on_trial

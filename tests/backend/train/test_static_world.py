@@ -8,9 +8,10 @@ from tests.backend.conftest import FIRST, FRAMES, HEIGHT, WIDTH, World, build_wo
 from torch_backend.contract import Cancelled, JobError, TrainParams, read_json
 from torch_backend.footage.images import read_png
 from torch_backend.job import RUNNERS
+from torch_backend.motion.mattes import is_found, is_outdated
+from torch_backend.motion_search import find_motion
 from torch_backend.raster import rasterize
 from torch_backend.shot import Shot, write_json
-from torch_backend.solve.motion import find_motion, is_found, is_outdated
 from torch_backend.train import static_views
 from torch_backend.train.static_world import STAGE, steps_for
 
@@ -72,7 +73,7 @@ def test_a_shot_that_is_not_solved_is_one_sentence(tmp_path, quiet):
 def test_a_training_finds_mattes_of_an_earlier_version_again(tmp_path, quiet):
     """It would guess what moves without them, and say nothing."""
     shot = build_world(tmp_path).shot
-    find_motion(shot, quiet())
+    find_motion(shot, quiet(), static_model=None)
     record = shot.motion / "motion.json"
     write_json(record, {**read_json(record), "version": 4})
     assert is_outdated(shot)

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...contract import NO_DEPTH
+from ...motion.mattes import UNKNOWN, load_motion
 from ...scene import Scene, evenly_spaced, read_image, resize_intrinsics
 from ...shot import Shot
-from ...solve.motion import UNKNOWN, load_motion
 from ...torch_types import from_numpy
 from ...train import LoadedRun
 from ..bands import bands

@@ -2,7 +2,7 @@
 
     frozen = matte * plate(ST) + fill        scene-linear, premultiplied
 
-`ST` is a picture of coordinates as in `solve/stmap.py` (s to the right, t up, pixel centres at (i + 0.5) / size) over
+`ST` is a picture of coordinates as in `lens/stmap.py` (s to the right, t up, pixel centres at (i + 0.5) / size) over
 the undistorted plate, `matte` how much of a pixel that plate gives, `fill` the rest: other plates and splats. Where
 nothing moves ST is the identity, matte 1 and fill 0, so the plate leaves as it came, whatever was done to it before.
 

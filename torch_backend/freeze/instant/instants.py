@@ -13,9 +13,9 @@ from torch import Tensor
 
 from ...contract import DEVELOPED_FOLDER, JobError, Reporter, frame_file, frame_number, sweep_half_written
 from ...gaussians.model import PARAM_NAMES
+from ...motion.mattes import motion_key
 from ...scene import Scene
 from ...shot import Shot, content_key, path_error
-from ...solve.motion import motion_key
 from ...train import LoadedRun
 from ...train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from ..frozen import FrozenGaussians, freeze_at, span_of

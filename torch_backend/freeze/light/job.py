@@ -12,6 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...cameras.placement import Similarity, camera_to_world, path_viewmats, placement_for
+from ...cameras.stored import load_cameras
 from ...contract import (
     ExitCode,
     JobError,
@@ -32,8 +34,6 @@ from ...raster import RasterSettings, rasterize
 from ...raster.reference import rotation_matrices, sh_basis
 from ...scene import Scene, evenly_spaced, load_scene
 from ...shot import Shot, content_key, disk_error, is_disk_full, write_json
-from ...solve.placement import Similarity, camera_to_world, path_viewmats, placement_for
-from ...solve.stored import load_cameras
 from ...torch_types import from_numpy, norm
 from ...train import LoadedRun, load_run
 from ..exr import linear_spec, write_exr

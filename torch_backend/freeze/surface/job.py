@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...cameras.placement import Similarity
 from ...contract import (
     LIVE_SOURCE,
     NO_DEPTH,
@@ -30,7 +31,6 @@ from ...contract import (
 from ...footage.color import linear_to_srgb8
 from ...scene import evenly_spaced, resize_intrinsics
 from ...shot import Shot, atomic_path, disk_error, is_disk_full
-from ...solve.placement import Similarity
 from ...torch_types import from_numpy
 from ..exr import read_frozen_exr
 from ..take.folder import frames_of

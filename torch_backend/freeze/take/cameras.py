@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...cameras.poses import interpolate_pose
 from ...contract import CameraPath, ExitCode, FreezeParams, JobError
 from ...footage.plates import Plates
 from ...scene import Scene
 from ...shot import Shot
-from ...solve.poses import interpolate_pose
 from ...torch_types import from_numpy
 from ..frozen import OutputFrame
 

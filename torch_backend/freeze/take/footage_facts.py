@@ -11,8 +11,8 @@ from ...footage.color import LIGHTS
 from ...footage.importing import load_frames
 from ...footage.numbering import recorded_shift
 from ...footage.plates import Plates
+from ...lens.stmap import write_plate_map
 from ...shot import Shot, content_key
-from ...solve.stmap import write_plate_map
 
 
 def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...cameras.placement import Similarity, placement_for
 from ...contract import (
     ExitCode,
     FreezeParams,
@@ -23,9 +24,8 @@ from ...contract import (
 )
 from ...footage.images import read_png
 from ...gaussians.ply import write_ply
+from ...lens.stmap import write_take_map
 from ...shot import Shot, disk_error, is_disk_full, remove_file, write_json
-from ...solve.placement import Similarity, placement_for
-from ...solve.stmap import write_take_map
 from ...torch_types import from_numpy
 from ..exr import read_frozen_exr
 from ..frozen import OutputFrame

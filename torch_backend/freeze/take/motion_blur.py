@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...cameras.poses import interpolate_pose
 from ...contract import NO_DEPTH
-from ...solve.poses import interpolate_pose
 from ...torch_types import floats, from_numpy
 from ..frozen import OutputFrame
 from ..views.reproject import project, unproject

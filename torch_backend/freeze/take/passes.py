@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...cameras.placement import Similarity
 from ...contract import NO_DEPTH
 from ...scene import Scene
-from ...solve.placement import Similarity
 from ...torch_types import floats
 from ..exr import Made
 from ..frozen import OutputFrame

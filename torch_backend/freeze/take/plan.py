@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...cameras.placement import Similarity, placement_for
 from ...contract import (
     SUMMARY_FILE,
     ExitCode,
@@ -25,13 +26,13 @@ from ...contract import (
 from ...footage.color import LIGHTS
 from ...footage.importing import load_frames
 from ...footage.plates import Plates
+from ...lens.stmap import margin
+from ...motion.mattes import motion_key
+from ...motion_search import find_motion
 from ...scene import Scene, frame_table, load_scene
 from ...shot import Shot, content_key
-from ...solve.motion import find_motion, motion_key
-from ...solve.placement import Similarity, placement_for
-from ...solve.stmap import margin
 from ...torch_types import floats
-from ...train import LoadedRun, choose_device, load_run, static_views
+from ...train import LoadedRun, choose_device, load_run
 from ..composite.compositor import Compositor
 from ..composite.grain import Grain, measure_plate
 from ..composite.measured_depth import MeasuredDepths
@@ -174,7 +175,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
     # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
     plate = (shot.info().width, round(shot.info().width * height / width))
     if params.detail == "on" or params.develop == "on":
-        find_motion(shot, report, static_model=static_views)  # of shots solved before the solve looked for it
+        find_motion(shot, report)  # of shots solved before the solve looked for it
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
     blur, placed = _motion_blur(whole, params, report), Similarity.of(placement_for(shot, params.placement))

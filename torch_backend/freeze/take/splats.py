@@ -7,6 +7,8 @@ from pathlib import Path
 
 import torch
 
+from ...cameras.placement import Similarity, placement_for
+from ...cameras.stored import load_cameras
 from ...contract import (
     PLY_FILE,
     USD_FILE,
@@ -23,8 +25,6 @@ from ...contract import (
 from ...gaussians.ply import PlyGaussians, read_ply, write_ply
 from ...scene import Scene
 from ...shot import Shot, remove_file
-from ...solve.placement import Similarity, placement_for
-from ...solve.stored import load_cameras
 from ...torch_types import from_numpy
 from ..frozen import FrozenGaussians
 from ..placed import placed

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from torch import Tensor
 
+from ...sfm.masks import IGNORE, given_masks, load_mask
 from ...shot import Shot
-from ...solve.masks import IGNORE, given_masks, load_mask
 from ...torch_types import from_numpy
 
 IgnoredOf = Callable[[int], "Tensor | None"]

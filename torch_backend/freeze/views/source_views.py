@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...motion.mattes import MOVING, UNKNOWN, load_motion
 from ...scene import Scene, read_image, resize_intrinsics
 from ...shot import Shot
-from ...solve.motion import MOVING, UNKNOWN, load_motion
 from ...torch_types import from_numpy
 from ...train import LoadedRun
 from ..frozen import FrozenGaussians, FrozenImage, render_frozen

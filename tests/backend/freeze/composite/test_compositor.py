@@ -22,10 +22,10 @@ from torch_backend.freeze.composite.warp import sample, snap
 from torch_backend.freeze.frozen import OutputFrame, freeze_at, render_frozen
 from torch_backend.gaussians import Gaussians
 from torch_backend.gaussians.model import SH_C0
+from torch_backend.motion.mattes import MOVING, PAINTED, STILL, write_matte
 from torch_backend.scene import Scene
+from torch_backend.sfm.masks import write_grey
 from torch_backend.shot import Shot, write_json
-from torch_backend.solve.masks import write_grey
-from torch_backend.solve.motion import MOVING, PAINTED, STILL, write_matte
 from torch_backend.train import LoadedRun
 from torch_backend.train.config import TrainConfig
 from torch_backend.train.exposure import Exposure, ExposureConfig

@@ -10,9 +10,9 @@ from torch_backend.contract import NO_DEPTH, CameraFrame, CameraPath, FreezePara
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.lens.lens import load_lens
+from torch_backend.lens.stmap import needed_margin, redistort_map
 from torch_backend.shot import write_json
-from torch_backend.solve.lens import load_lens
-from torch_backend.solve.stmap import needed_margin, redistort_map
 
 RANGE = {"t_star": 105, "first": 104, "last": 105, "develop": "off"}
 

@@ -31,9 +31,9 @@ from torch_backend.freeze.views.scene_flow import MovingScene, SceneFlow
 from torch_backend.freeze.views.source_views import motion_mattes
 from torch_backend.freeze.views.working_plates import WorkingPlates, spread
 from torch_backend.live import LiveSession
+from torch_backend.motion.mattes import load_motion
 from torch_backend.scene import load_scene, read_image
 from torch_backend.shot import Shot
-from torch_backend.solve.motion import load_motion
 from torch_backend.train import load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, read_meta, save_checkpoint
 from torch_backend.train.config import TrainConfig

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from torch_backend import contract
+from torch_backend.cameras.placement import Similarity
 from torch_backend.contract import Cancelled, FreezeParams, JobError, SurfaceParams, TakeFolder
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.surface.job import make_surface, read_surface
 from torch_backend.raster import rasterize
-from torch_backend.solve.placement import Similarity
 
 T_STAR = 105
 

@@ -16,8 +16,8 @@ from torch_backend.footage.ocio import BUILT_IN, light_of
 from torch_backend.footage.plates import Plates
 from torch_backend.freeze.composite.warp import sample
 from torch_backend.freeze.take.footage_facts import footage_facts
+from torch_backend.lens.plate_lens import load_plate_lenses
 from torch_backend.shot import Shot
-from torch_backend.solve.plate_lens import load_plate_lenses
 
 
 class Quiet:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from torch_backend.cameras.placement import Similarity
 from torch_backend.contract import NO_DEPTH, FreezeParams, Placement, write_json
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.frozen import OutputFrame
 from torch_backend.freeze.take.passes import Passes
-from torch_backend.solve.placement import Similarity
 
 W, H = 40, 30
 TURNED = Similarity(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), 3.0, np.array([5.0, 1.0, -2.0]))

@@ -24,9 +24,9 @@ from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.composite.state import StateConfig, let_go
 from torch_backend.freeze.composite.warp import apply_warp, read_warp
 from torch_backend.freeze.exr import read_frozen_exr, read_key
+from torch_backend.motion.mattes import PAINTED, STILL, write_matte
 from torch_backend.raster import rasterize
 from torch_backend.shot import Shot
-from torch_backend.solve.motion import PAINTED, STILL, write_matte
 from torch_backend.train import train_shot
 
 ROOT = Path(__file__).resolve().parents[4]

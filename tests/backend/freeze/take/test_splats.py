@@ -7,6 +7,8 @@ import pytest
 import torch
 from pxr import Usd, UsdGeom, UsdVol
 
+from torch_backend.cameras.placement import Similarity
+from torch_backend.cameras.stored import load_cameras
 from torch_backend.contract import FreezeParams, JobError, Placement, UserError, file_digest, write_json
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
@@ -14,8 +16,6 @@ from torch_backend.freeze.take.splats import export_splats, write_stage
 from torch_backend.freeze.usd import CAMERA, SPLATS
 from torch_backend.gaussians.ply import PlyGaussians, read_ply
 from torch_backend.raster import rasterize
-from torch_backend.solve.placement import Similarity
-from torch_backend.solve.stored import load_cameras
 
 TURNED = [0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0]
 """A floor that was turned, moved, and a scale that was set."""

@@ -1,0 +1,529 @@
+"""Cameras from elsewhere, in and out: files against float64, whole solves of the rendered room from given cameras."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torch_backend.cameras import foreign
+from torch_backend.cameras.colmap_files import read_model, write_model
+from torch_backend.cameras.export import export_cameras
+from torch_backend.cameras.stored import load_points
+from torch_backend.contract import CameraFrame, CameraPath, ExitCode, JobError, read_json
+from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.footage.images import read_png
+from torch_backend.footage.pairing import Counted
+from torch_backend.lens.plate_lens import load_plate_lenses
+from torch_backend.lens.undistort import Undistorter
+from torch_backend.sfm.given import doubts, refuse_misfit
+from torch_backend.sfm.solving import SolveConfig, solve_shot
+from torch_backend.shot import Shot
+
+PLAIN = {"w": 640, "h": 480, "fl_x": 500.0, "fl_y": 510.0, "cx": 321.0, "cy": 239.0}
+
+
+def turned(angle, axis=1):
+    c, s = math.cos(angle), math.sin(angle)
+    matrix = np.eye(3)
+    i, j = [n for n in range(3) if n != axis]
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = s, -s
+    return matrix
+
+
+def transforms(path, poses, names=None, **lens):
+    """A transforms.json of [4, 4] world-to-camera poses, OpenCV axes."""
+    names = names or [f"images/frame_{n:05d}.png" for n in range(101, 101 + len(poses))]
+    frames = []
+    for name, pose in zip(names, poses, strict=True):
+        frames.append({"file_path": name, "transform_matrix": (np.linalg.inv(pose) @ np.diag([1, -1, -1, 1])).tolist()})
+    path.write_text(json.dumps({**(lens or PLAIN), "frames": frames}), encoding="utf-8")
+    return path
+
+
+def some_poses(count=10):
+    poses = []
+    for n in range(count):
+        pose = np.eye(4)
+        pose[:3, :3] = turned(0.1 * n) @ turned(0.05 * n, axis=0)
+        pose[:3, 3] = (0.1 * n, -0.2, 0.3)
+        poses.append(pose)
+    return poses
+
+
+def fake_solve(count, first=101, lens=None):
+    lens = lens or foreign.Lens("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    cameras = [foreign.ForeignCamera(f"f_{first + n:04d}.png", np.eye(4)[:3], 0) for n in range(count)]
+    return foreign.ForeignSolve(Path("there"), "COLMAP model", [lens], cameras)
+
+
+# ------------------------------------------------------------------------------------------------- reading
+
+
+def test_transforms_come_out_with_opencv_axes(tmp_path):
+    """nerfstudio looks along -z with y up: a point before its camera is before ours, and up in it is up in ours."""
+    poses = some_poses()
+    solve = foreign.read(transforms(tmp_path / "transforms.json", poses))
+    assert solve.kind == "transforms.json" and len(solve.cameras) == 10
+    for camera, pose in zip(solve.cameras, poses, strict=True):
+        np.testing.assert_allclose(camera.pose, pose[:3], atol=1e-12)
+    assert solve.lenses == [foreign.Lens("PINHOLE", 640, 480, (500.0, 510.0, 321.0, 239.0))]
+
+
+@pytest.mark.parametrize(
+    ("told", "model", "bend"),
+    [
+        ({"k1": 0.1, "k2": -0.02, "p1": 0.001, "p2": 0.002}, "OPENCV", (0.1, -0.02, 0.001, 0.002)),
+        ({"k1": 0.1, "k3": 0.03}, "FULL_OPENCV", (0.1, 0.0, 0.0, 0.0, 0.03, 0.0, 0.0, 0.0)),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4}, "OPENCV_FISHEYE", (0.1, 0.0, 0.0, 0.4)),
+        ({"camera_model": "PINHOLE"}, "PINHOLE", ()),
+    ],
+)
+def test_the_lens_of_transforms(tmp_path, told, model, bend):
+    lens = foreign.read(transforms(tmp_path / "t.json", some_poses(), **PLAIN, **told)).lenses[0]
+    assert (lens.model, lens.params[4:]) == (model, bend)
+
+
+def test_a_lens_can_stand_in_each_frame_and_as_an_angle(tmp_path):
+    file = transforms(tmp_path / "t.json", some_poses(3), w=200, h=100, camera_angle_x=math.pi / 2)
+    data = json.loads(file.read_text())
+    data["frames"][1] |= {"fl_x": 90.0, "cx": 99.0}
+    file.write_text(json.dumps(data))
+    solve = foreign.read(file)
+    assert [c.lens for c in solve.cameras] == [0, 1, 0]
+    assert solve.lenses[0].params == pytest.approx((100.0, 100.0, 100.0, 50.0))
+    assert solve.lenses[1].params == pytest.approx((90.0, 90.0, 99.0, 50.0))
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "expected"),
+    [
+        ("SIMPLE_PINHOLE", (500, 320, 240), ("PINHOLE", (500, 500, 320, 240))),
+        ("SIMPLE_RADIAL", (500, 320, 240, 0.1), ("OPENCV", (500, 500, 320, 240, 0.1, 0, 0, 0))),
+        ("RADIAL", (500, 320, 240, 0.1, 0.2), ("OPENCV", (500, 500, 320, 240, 0.1, 0.2, 0, 0))),
+        ("RADIAL_FISHEYE", (500, 320, 240, 0.1, 0.2), ("OPENCV_FISHEYE", (500, 500, 320, 240, 0.1, 0.2, 0, 0))),
+        ("OPENCV", (500, 501, 320, 240, 0, 0, 0, 0), ("PINHOLE", (500, 501, 320, 240))),
+    ],
+)
+def test_colmap_lenses(model, params, expected):
+    lens = foreign.lens_from_colmap(model, 640, 480, params)
+    assert (lens.model, lens.params) == expected
+
+
+def test_an_ordinary_lens_bends_as_colmap_says(solved, tmp_path):
+    """SIMPLE_RADIAL and what it becomes give the same pixels, asked from COLMAP in a process of its own."""
+    import subprocess
+    import sys
+
+    lens = foreign.lens_from_colmap("SIMPLE_RADIAL", 320, 240, (300.0, 161.0, 119.0, -0.06)).scaled(640, 480)
+    code = (
+        "import pycolmap, numpy as np, json, sys; r = np.array([[.4, -.3, 1], [-.5, .2, 1]]);"
+        "a = pycolmap.Camera(model='SIMPLE_RADIAL', width=320, height=240, params=[300, 161, 119, -.06]);"
+        f"b = pycolmap.Camera(model='{lens.model}', width=640, height=480, params={list(lens.params)});"
+        "print(abs(2 * a.img_from_cam(r) - b.img_from_cam(r)).max())"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert float(ran.stdout) < 1e-9
+
+
+def test_a_colmap_model_reads_as_pycolmap_wrote_it(solved):
+    """solve/colmap is written by COLMAP itself; cameras.json is what came out of it by another way."""
+    solve = foreign.read(solved.shot.solve / "colmap")
+    path = {f.frame: f for f in CameraPath.load(solved.shot.solve / "cameras.json").frames}
+    numbers = [int(c.name.rpartition(".")[0]) for c in solve.cameras]
+    assert sorted(numbers) == list(range(101, 122, 2))
+    for number, camera in zip(numbers, solve.cameras, strict=True):
+        np.testing.assert_allclose(camera.pose, np.reshape(path[number].viewmat, (4, 4))[:3], atol=1e-9)
+    record = read_json(solved.shot.solve / "solve.json")
+    assert solve.lenses[0].params[0] == pytest.approx(record["focal_px"])
+    assert solve.points is not None and solve.points["error"].mean() == pytest.approx(
+        record["reprojection_error_px"], rel=0.2
+    )
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_model_written_is_the_model_read(solved, tmp_path, text):
+    model = read_model(solved.shot.solve / "colmap")
+    write_model(tmp_path / "again", model, text)
+    again = read_model(tmp_path / "again")
+    assert again.cameras == model.cameras
+    assert [(i.number, i.name, i.camera) for i in again.images] == [(i.number, i.name, i.camera) for i in model.images]
+    for one, other in zip(model.images, again.images, strict=True):
+        np.testing.assert_allclose(one.pose, other.pose, atol=1e-14)
+    np.testing.assert_array_equal(again.points.xyz, model.points.xyz)
+    np.testing.assert_array_equal(again.points.rgb, model.points.rgb)
+    np.testing.assert_array_equal(again.points.error, model.points.error)
+
+
+@pytest.mark.parametrize("below", ["", "sparse", "sparse/0"])
+def test_the_model_is_found_below(solved, tmp_path, below):
+    write_model(tmp_path / below, read_model(solved.shot.solve / "colmap"))
+    assert len(foreign.read(tmp_path).cameras) == 11
+    assert len(foreign.read(tmp_path / below / "cameras.bin").cameras) == 11
+
+
+def test_broken_files_are_a_sentence(solved, tmp_path):
+    files = {p.name: p.read_bytes() for p in (solved.shot.solve / "colmap").glob("*.bin")}
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        for cut in (0, 5, len(files[name]) // 2):
+            for other, data in files.items():
+                (tmp_path / other).write_bytes(data[:cut] if other == name else data)
+            with pytest.raises(JobError, match=f"These cameras cannot be used: .*{name}"):
+                foreign.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"w": None}, "has no w"),
+        ({"fl_x": None}, "has no fl_x"),
+        ({"fl_x": -5}, "not above 0"),
+        ({"k4": 0.5}, "k4"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"frames": []}, "lists no frames"),
+        ({"frames": [{"file_path": "1.png", "transform_matrix": [[1, 2], [3, 4]]}]}, "transform_matrix"),
+        ({"frames": [{"file_path": "1.png", "transform_matrix": (2 * np.eye(4)).tolist()}]}, "scaled, sheared"),
+    ],
+)
+def test_unusable_transforms_are_a_sentence(tmp_path, change, words):
+    file = transforms(tmp_path / "t.json", some_poses())
+    data = {k: v for k, v in {**json.loads(file.read_text()), **change}.items() if v is not None}
+    file.write_text(json.dumps(data))
+    with pytest.raises(JobError, match=words) as told:
+        foreign.read(file)
+    assert told.value.exit_code == ExitCode.SOLVE
+
+
+@pytest.mark.parametrize("make", [lambda p: p / "gone", lambda p: p])
+def test_nothing_there_is_a_sentence(tmp_path, make):
+    with pytest.raises(JobError, match="does not exist|holds no cameras"):
+        foreign.read(make(tmp_path))
+
+
+# ------------------------------------------------------------------------------------------------- matching
+
+
+@pytest.mark.parametrize(
+    "template",
+    ["{:06d}.png", "images/frame_{:05d}.jpg", "shot.{:d}.exr", "f_{:04d}_v2.png", "frame-{:04d}.png", "a\\({:d}).png"],
+)
+def test_cameras_are_found_by_the_numbers_in_the_names_of_their_pictures(template):
+    solve = fake_solve(20, first=1001)
+    for n, camera in enumerate(solve.cameras):
+        camera.name = template.format(1001 + n)
+    solve.cameras.append(foreign.ForeignCamera("poster.png", solve.cameras[0].pose, 0))
+    matched = foreign.match(solve, Counted(list(range(1001, 1021))), (640, 480))
+    assert [matched.cameras[n].name for n in range(1001, 1021)] == [template.format(n) for n in range(1001, 1021)]
+    assert not matched.missing and not foreign.remarks(solve, matched)
+
+
+def test_cameras_of_two_clips_are_refused_by_their_names():
+    solve = fake_solve(40)
+    for n, camera in enumerate(solve.cameras):
+        camera.name = f"{'right' if n % 2 else 'left'}/{n // 2:04d}.png"
+    with pytest.raises(JobError, match=r"left/####\.png, right/####\.png"):
+        foreign.match(solve, Counted(list(range(20))), (640, 480))
+    for camera in solve.cameras[1::2]:
+        camera.name = camera.name.replace("/", "/9")
+    matched = foreign.match(solve, Counted(list(range(20))), (640, 480))
+    assert matched.cameras[7].name == "left/0007.png" and not matched.missing
+
+
+def test_a_picture_with_two_cameras_is_refused():
+    solve = fake_solve(20)
+    solve.cameras[3].name = solve.cameras[4].name
+    with pytest.raises(JobError, match=r"f_0105\.png has two cameras"):
+        foreign.match(solve, Counted(list(range(101, 121))), (640, 480))
+
+
+def test_matching_is_by_number_and_says_what_is_missing():
+    solve = fake_solve(20)
+    matched = foreign.match(solve, Counted(list(range(105, 125))), (320, 240))
+    assert sorted(matched.cameras) == list(range(105, 121)) and matched.missing == [121, 122, 123, 124]
+    assert matched.cameras[110].name == "f_0110.png"
+    assert foreign.remarks(solve, matched)[0][0] == "4 frames have no camera in there: frames 121-124."
+
+
+@pytest.mark.parametrize("lost", [[], [19], [3, 4, 11], [0]])
+def test_pictures_counted_from_zero_are_no_frame_late_however_many_have_a_camera(lost):
+    """The last case cannot be told from a count from 1: the first picture has no camera."""
+    solve = fake_solve(20, first=0)
+    solve.cameras = [c for n, c in enumerate(solve.cameras) if n not in lost]
+    matched = foreign.match(solve, Counted(list(range(1, 21)), clip=(1, 20)), (640, 480))
+    step = 0 if lost == [0] else 1
+    assert all(camera.name == f"f_{frame - step:04d}.png" for frame, camera in matched.cameras.items())
+    assert len(matched.cameras) == len(solve.cameras)
+    assert bool(step) == any("numbered 0 to" in words for words, _ in foreign.remarks(solve, matched))
+
+
+def test_too_few_or_another_shape_are_refused():
+    with pytest.raises(JobError, match="Only 0 of the 20 frames.* numbered 500 to 509"):
+        foreign.match(fake_solve(10, first=500), Counted(list(range(1, 21))), (640, 480))
+    with pytest.raises(JobError, match="Only 5 of the 20 frames"):
+        foreign.match(fake_solve(20), Counted(list(range(101, 121))), (640, 480), solved=None) and foreign.match(
+            fake_solve(5), Counted(list(range(101, 121))), (640, 480)
+        )
+    with pytest.raises(JobError, match="640 x 480 pixels, the shot's frames have another shape, 640 x 360"):
+        foreign.match(fake_solve(20), Counted(list(range(101, 121))), (640, 360))
+
+
+def test_frames_that_are_trained_on_are_what_is_counted():
+    frames = list(range(101, 141))
+    solve = fake_solve(40)
+    solve.cameras = solve.cameras[1::2]  # every other frame, and the step keeps the others
+    with pytest.raises(JobError, match="Only 0 of the 20 frames"):
+        foreign.match(solve, Counted(frames), (640, 480), solved=frames[::2])
+
+
+def test_points_without_tracks_count_the_pictures_they_lie_in():
+    lens = foreign.Lens("PINHOLE", 100, 100, (100.0, 100.0, 50.0, 50.0))
+    solve = fake_solve(3, lens=lens)
+    for n, camera in enumerate(solve.cameras):
+        camera.pose = np.concatenate([np.eye(3), [[-1.5 * n], [0.0], [0.0]]], axis=1)
+    solve.points = {
+        "xyz": np.array([[0.0, 0.0, 4.0], [0.0, 0.0, -4.0], [2.0, 0.0, 3.0]]),
+        "rgb": np.zeros((3, 3), np.uint8),
+        "error": np.array([1.0, 2.0, -1.0]),
+        "seen": [np.zeros(0, np.int64)] * 3,
+    }
+    matched = foreign.Matched({n: c for n, c in enumerate(solve.cameras)}, [])
+    points = foreign.own_points(solve, matched, (200, 200))
+    assert points is not None
+    assert points["track"].tolist() == [2, 0, 2]
+    assert points["depth"].tolist() == [4.0, -np.inf, 3.0]
+    assert points["error"].tolist() == [2.0, 4.0, 0.0]
+    solve.points["seen"] = [np.array([0, 2]), np.array([1]), np.zeros(0, np.int64)]
+    told = foreign.own_points(solve, matched, (200, 200))
+    assert told is not None and told["track"].tolist() == [2, 1, 0]
+    assert float(told["angle"]) == pytest.approx(math.degrees(math.atan(0.75)))
+    assert foreign.own_points(fake_solve(3), matched, (200, 200)) is None
+
+
+def test_what_blender_says_of_a_camera_of_its_scene_is_believed(tmp_path):
+    """Its numbers are the shot's though another count fits as well; its remarks are the artist's."""
+    facts = {"world": "scene", "is_numbered_as_shot": True, "notes": [["One of two.", "Choose."], ["half"], 3]}
+    names = [f"{n}.png" for n in range(1, 11)]
+    counted = Counted(list(range(1, 13)), (1, 12), shift=-1)
+    file = transforms(tmp_path / "transforms.json", some_poses(), names, **PLAIN, splannequin=facts)
+    solve = foreign.read(file)
+    matched = foreign.match(solve, counted, (640, 480))
+    assert solve.world == "scene" and {n: c.name for n, c in matched.cameras.items()} == dict(enumerate(names, 1))
+    said = [sentence for sentence, _ in foreign.remarks(solve, matched)]
+    assert said[0] == "One of two." and len(said) == 2 and "11-12" in said[1]
+    data = json.loads(file.read_text())
+    for strange in ({"world": 3, "notes": "x"}, [], "scene"):
+        file.write_text(json.dumps({**data, "splannequin": strange}))
+        assert (foreign.read(file).world, foreign.read(file).notes) == ("", [])
+    file.write_text(json.dumps({**data, "frames": [{**data["frames"][0], "file_path": "five.png"}]}))
+    with pytest.raises(JobError, match="cannot be used"):
+        foreign.read(file)
+
+
+@pytest.mark.parametrize("ending", ["abc", "FBX", "usdc"])
+def test_files_that_blender_reads_are_said_to_be_blenders(tmp_path, ending):
+    (tmp_path / f"set.{ending}").write_bytes(b"x")
+    with pytest.raises(JobError, match=f"set.{ending} is read by Blender alone"):
+        foreign.read(tmp_path / f"set.{ending}")
+
+
+# ------------------------------------------------------------------------------------------------- whole solves
+
+
+def again(solved, tools, folder, step=1):
+    """A fresh shot of the room's raw frames."""
+    shot = Shot.create(folder / "again.splannequin")
+    import_footage(shot, solved.shot.info().source, FootageConfig(step=step), tools.recorder())
+    return shot
+
+
+def the_lens(scale=1):
+    return {
+        "w": 320 * scale, "h": 240 * scale, "fl_x": 300.0 * scale, "cx": 160.0 * scale, "cy": 120.0 * scale, "k1": -0.06
+    }  # fmt: skip
+
+
+def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
+    """The room's own cameras, for pictures of twice the size, without points: poses exact, points on the walls."""
+    shot = again(solved, tools, tmp_path)
+    report = tools.recorder()
+    poses = solved.poses[:18]
+    file = transforms(tmp_path / "transforms.json", poses, **the_lens(2), splannequin={"world": "scene"})
+    result = solve_shot(shot, SolveConfig(features=1500), report, str(file))
+    path = CameraPath.load(shot.solve / "cameras.json")
+    assert [f.frame for f in path.frames] == list(range(101, 122))
+    assert [f.source for f in path.frames] == ["registered"] * 18 + ["interpolated"] * 3
+    for frame, pose in zip(path.frames, poses, strict=False):
+        np.testing.assert_allclose(np.reshape(frame.viewmat, (4, 4)), pose, atol=1e-9)
+    assert any("frames 119-121" in w for w in report.warnings)
+    xyz = load_points(shot)["xyz"]
+    walls = np.minimum(np.abs(xyz - [-2.0, -1.5, -1.0]), np.abs(xyz - [2.0, 1.5, 5.0])).min(1)
+    block = np.minimum(np.abs(xyz - [-0.9, 0.1, 1.8]), np.abs(xyz - [0.1, 1.5, 2.8])).min(1)
+    assert len(xyz) > 300 and np.median(np.minimum(walls, block)) < 0.02
+    # The undistorted frame is what the pinhole sees.
+    ideal = tools.room().render(poses[7], path.frames[7].K).astype(float)
+    off = tools.room().render(poses[7], np.add(path.frames[7].K, (0, 0, 0.5, 0))).astype(float)
+    got = read_png(shot.frames / "000108.png").astype(float)
+    assert np.sqrt(((got - ideal) ** 2).mean()) < 0.5 * np.sqrt(((off - ideal) ** 2).mean()) + 2.0
+    record = read_json(shot.solve / "solve.json")
+    assert (record["camera_model"], record["focal_px"], record["cameras_from"]) == ("OPENCV", 300.0, "transforms.json")
+    assert record["world"] == "scene" and read_json(solved.shot.solve / "solve.json")["world"] == ""
+    assert result["quality"].startswith("Fair: cameras given for 18 of 21 frames, ")
+    assert result["reprojection_error_px"] < 0.8
+    assert (shot.solve / "colmap" / "images.bin").is_file()
+    before = (shot.solve / "solve.json").stat().st_mtime_ns
+    assert solve_shot(shot, SolveConfig(features=1500), tools.recorder(), str(file)) == result
+    assert (shot.solve / "solve.json").stat().st_mtime_ns == before, "taken in once"
+
+
+def test_a_colmap_folder_brings_its_own_points(solved, tools, tmp_path):
+    shot = again(solved, tools, tmp_path, step=2)
+    report = tools.recorder()
+    result = solve_shot(shot, SolveConfig(), report, str(solved.shot.solve / "colmap"))
+    assert "features" not in {stage.removeprefix("solve: ") for stage, _, _ in report.steps}
+    was, now = (CameraPath.load(s.solve / "cameras.json").frames for s in (solved.shot, shot))
+    for one, other in zip(was[::2], now[::2], strict=True):
+        np.testing.assert_allclose(other.viewmat, one.viewmat, atol=1e-9)
+        np.testing.assert_allclose(other.K, one.K, rtol=1e-6)
+    assert [f.source for f in now[1::2]] == ["interpolated"] * 10
+    one, other = load_points(solved.shot), load_points(shot)
+    np.testing.assert_allclose(other["xyz"], one["xyz"])
+    # COLMAP may count an image twice that sees a point twice.
+    assert (other["track"] <= one["track"]).all() and (other["track"] == one["track"]).mean() > 0.9
+    assert result["registered"] == 11 and result["quality"].startswith("Good: cameras given for 11 of 11 frames")
+    difference = read_png(shot.frames / "000105.png").astype(int) - read_png(solved.shot.frames / "000105.png")
+    assert np.abs(difference).max() <= 1
+
+
+def test_two_lenses_in_one_clip(solved, tools, tmp_path):
+    """A zoom that a file tells of frame by frame: every frame is undistorted with its own, and keeps it."""
+    shot = again(solved, tools, tmp_path)
+    file = transforms(tmp_path / "transforms.json", solved.poses, **the_lens())
+    data = json.loads(file.read_text())
+    for frame in data["frames"][10:]:
+        frame["k1"] = -0.0601
+    file.write_text(json.dumps(data))
+    solve_shot(shot, SolveConfig(features=1000), tools.recorder(), str(file))
+    Ks = np.array([f.K for f in CameraPath.load(shot.solve / "cameras.json").frames])
+    assert len({k[0] for k in Ks.tolist()}) == 2 and Ks[9, 0] != Ks[10, 0] and Ks[10, 0] == Ks[20, 0]
+    assert len(load_points(shot)["xyz"]) > 200
+    assert len(read_model(shot.solve / "colmap").cameras) == 21
+    lenses = load_plate_lenses(shot)
+    assert lenses[110].lens.params[4] != lenses[111].lens.params[4]
+    for frame in (105, 115):
+        undistort = Undistorter(lenses[frame].where(320, 240))
+        off = undistort(read_png(shot.frames / f"raw/{frame:06d}.png")).astype(int)
+        assert np.abs(off - read_png(shot.frames / f"{frame:06d}.png")).max() <= 1
+
+
+def test_cameras_of_another_clip_are_refused(solved, tools, tmp_path):
+    shot = again(solved, tools, tmp_path)
+    wrong = [tools.look([3.0 * math.sin(n), n, 2.0 * n], yaw=2.0 * n, pitch=1.1 * n) for n in range(21)]
+    file = transforms(tmp_path / "transforms.json", wrong, **the_lens())
+    with pytest.raises(JobError, match="do not fit these frames"):
+        solve_shot(shot, SolveConfig(features=800), tools.recorder(), str(file))
+    assert not (shot.solve / "cameras.json").exists()
+
+
+@pytest.mark.parametrize(("kind", "text"), [("colmap", False), ("colmap", True), ("nerfstudio", False)])
+def test_what_goes_out_comes_back_in(solved, tools, tmp_path, kind, text):
+    """Exported, then taken in by a fresh shot of the same undistorted frames: the same poses and the same lens."""
+    plates = tmp_path / "plates"
+    plates.mkdir()
+    for file in solved.shot.frames.glob("*.png"):
+        (plates / file.name).write_bytes(file.read_bytes())
+    shot = Shot.create(tmp_path / "fresh.splannequin")
+    import_footage(shot, str(plates / "000101.png"), FootageConfig(step=2), tools.recorder())
+    written = export_cameras(solved.shot, kind, tmp_path / "out" / "é", text)
+    assert all(file.is_file() for file in written)
+    report = tools.recorder()
+    result = solve_shot(shot, SolveConfig(features=1000), report, str(tmp_path / "out" / "é"))
+    one, other = (CameraPath.load(s.solve / "cameras.json") for s in (solved.shot, shot))
+    assert [f.frame for f in other.frames] == [f.frame for f in one.frames]
+    np.testing.assert_allclose([f.viewmat for f in other.frames], [f.viewmat for f in one.frames], atol=1e-6)
+    np.testing.assert_allclose([f.K for f in other.frames], [f.K for f in one.frames], atol=1e-6)
+    assert result["registered"] == 11 and report.warnings == []
+    assert (read_png(shot.frames / "000110.png") == read_png(solved.shot.frames / "000110.png")).all()
+    if kind == "colmap":
+        was, now = (load_points(s)["xyz"] for s in (solved.shot, shot))
+        assert len(now) > 0.98 * len(was)
+        assert {tuple(p) for p in now.tolist()} <= {tuple(p) for p in was.tolist()}
+    else:
+        data = read_json(tmp_path / "out" / "é" / "transforms.json")
+        plate = tmp_path / "out" / "é" / data["frames"][0]["file_path"]
+        assert plate.resolve() == (solved.shot.frames / "000101.png").resolve()
+
+
+def test_colmap_itself_reads_what_is_exported(solved, tmp_path):
+    """pycolmap, in a process of its own: names, poses, pinhole, points that project where the cameras say."""
+    import subprocess
+    import sys
+
+    export_cameras(solved.shot, "colmap", tmp_path / "bin")
+    export_cameras(solved.shot, "colmap", tmp_path / "txt", text=True)
+    code = (
+        "import pycolmap, sys, json; m = pycolmap.Reconstruction(sys.argv[1]);"
+        "i = next(i for i in m.images.values() if i.name == '000107.png'); c = i.camera;"
+        "print(json.dumps([m.num_reg_images(), m.num_points3D(), c.model_name, list(c.params), c.width,"
+        "i.cam_from_world().matrix().tolist(), m.compute_mean_reprojection_error()]))"
+    )
+    frame = next(f for f in CameraPath.load(solved.shot.solve / "cameras.json").frames if f.frame == 107)
+    for folder in ("bin", "txt"):
+        command = [sys.executable, "-c", code, tmp_path / folder]
+        ran = subprocess.run(command, capture_output=True, text=True, check=True)
+        images, points, model, params, width, pose, error = json.loads(ran.stdout)
+        assert (images, points, model, width) == (21, len(load_points(solved.shot)["xyz"]), "PINHOLE", 320)
+        np.testing.assert_allclose(params, frame.K, rtol=1e-12)
+        np.testing.assert_allclose(pose, np.reshape(frame.viewmat, (4, 4))[:3], atol=1e-12)
+        assert error == pytest.approx(float(load_points(solved.shot)["error"].mean()), rel=1e-3)
+
+
+def test_an_export_never_hides_behind_another_model(solved, tmp_path):
+    export_cameras(solved.shot, "colmap", tmp_path)
+    with pytest.raises(JobError, match=r"holds another COLMAP model already \(cameras\.bin\)"):
+        export_cameras(solved.shot, "colmap", tmp_path, text=True)
+    export_cameras(solved.shot, "colmap", tmp_path)
+    with pytest.raises(JobError, match="has no cameras yet"):
+        export_cameras(Shot.create(tmp_path / "new.splannequin"), "colmap", tmp_path / "out")
+
+
+def test_cameras_that_stand_still_are_refused(solved, tools, tmp_path):
+    """No point can be triangulated at all."""
+    shot = again(solved, tools, tmp_path)
+    file = transforms(tmp_path / "transforms.json", [np.eye(4)] * 21, **the_lens())
+    with pytest.raises(JobError, match="do not fit these frames: only 0 points"):
+        solve_shot(shot, SolveConfig(features=300), tools.recorder(), str(file))
+    assert not (shot.solve / "scratch").exists()
+
+
+def test_how_much_agrees_decides():
+    """The error in pixels cannot: with cameras held, what does not fit is left out of it."""
+    answer = {"triangulation_angle_deg": 5.0, "agreement": 0.6}
+    refuse_misfit(answer, 500)
+    assert doubts(answer) == [] and doubts({"triangulation_angle_deg": 5.0}) == []
+    assert "Only 40 %" in doubts({**answer, "agreement": 0.4})[0][0]
+    with pytest.raises(JobError, match="only 500 points of the scene, and 20 % of what was matched agree"):
+        refuse_misfit({**answer, "agreement": 0.2}, 500)
+    with pytest.raises(JobError, match="only 99 points"):
+        refuse_misfit(answer, 99)
+    with pytest.raises(JobError, match="moves too little"):
+        refuse_misfit({**answer, "triangulation_angle_deg": 1.0}, 500)
+
+
+def test_refused_cameras_leave_the_solve_that_is_there(solved, tools, tmp_path):
+    before = (solved.shot.solve / "cameras.json").read_bytes()
+    file = transforms(tmp_path / "t.json", some_poses(10), [f"{n}.png" for n in range(10)], **the_lens())
+    with pytest.raises(JobError, match="Only 5 of the 11 frames"):
+        solve_shot(solved.shot, SolveConfig(features=1500), tools.recorder(), str(file))
+    assert (solved.shot.solve / "cameras.json").read_bytes() == before
+
+
+def test_a_camera_path_comes_in_by_its_frame_numbers(tmp_path):
+    frames = [CameraFrame(n, np.eye(4).ravel().tolist(), [400.0, 400.0, 320.0, 240.0]) for n in range(1, 12)]
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(CameraPath(640, 480, frames).to_json()))
+    solve = foreign.read(file)
+    matched = foreign.match(solve, Counted(list(range(2, 13))), (320, 240))
+    assert solve.kind == "camera path" and matched.missing == [12] and not matched.said
+    assert solve.lenses[0].scaled(320, 240).params == (200.0, 200.0, 160.0, 120.0)

@@ -1,0 +1,129 @@
+"""Which lenses are believed, doubted and refused; a focal length that was given; a fisheye of our own."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from torch_backend.contract import ExitCode, JobError
+from torch_backend.lens.lens_verdict import angle_deg, doubt_of, impossible, lens_remarks, refuse_lens
+from torch_backend.sfm.child import run_worker
+
+FISHEYE = "OPENCV_FISHEYE"
+MIDDLE = 320.0, 240.0
+
+
+def radial(focal, k):
+    return "SIMPLE_RADIAL", 640, 480, (focal, *MIDDLE, k)
+
+
+def fisheye(focal, *k):
+    return FISHEYE, 640, 480, (focal, focal, *MIDDLE, *[*k, 0.0, 0.0, 0.0, 0.0][:4])
+
+
+def test_a_fisheye_is_as_wide_as_its_angles_and_not_as_a_pinhole_s():
+    assert angle_deg(*fisheye(320.0)) == pytest.approx(math.degrees(2.0), abs=0.2)
+    assert angle_deg(*radial(320.0, 0.0)) == pytest.approx(90.0)
+    assert angle_deg(*fisheye(60.0)) > 300 and angle_deg(*fisheye(250.0, -0.5)) == 360.0
+
+
+@pytest.mark.parametrize(
+    ("lens", "expected"),
+    [
+        (radial(600.0, 0.05), ""),
+        (radial(600.0, -0.3), ""),
+        (radial(600.0, 1.2), "strong"),
+        (radial(600.0, -1.2), "strong"),
+        (radial(300.0, -0.4), "folded"),
+        (fisheye(260.0, 0.02, -0.006), ""),
+        (fisheye(260.0, -0.4), "folded"),
+        (fisheye(260.0, 1.3), "strong"),
+        # The picture of a round fisheye ends before the corners, and so may its curve.
+        (fisheye(300.0, -0.1), ""),
+    ],
+)
+def test_bends_that_no_camera_has(lens, expected):
+    assert impossible(*lens) == expected
+    assert bool(doubt_of(*lens)) == bool(expected)
+
+
+def test_a_focal_length_that_was_given_is_not_doubted_unless_the_solve_ran_off_from_it():
+    narrow = radial(9000.0, 0.0)
+    assert doubt_of(*narrow) == "narrow" and doubt_of(*narrow, 8000.0) == ""
+    assert doubt_of(*radial(600.0, 0.0), 800.0) == "off" and doubt_of(*radial(600.0, 0.0), 700.0) == ""
+
+
+def answer(focal=600.0, **lens):
+    told = {"doubt": "", "held": False, "found_px": focal, "width": 640, "height": 480, **lens}
+    return {"focal_px": focal, "distortion": [4.08], "lens": told}
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (answer(5000.0), "7.3 degrees wide (5000 px)"),
+        (answer(80.0), "151.9 degrees wide (80 px)"),
+        (answer(300.0, view_deg=152.0), "152.0 degrees wide (300 px)"),
+        (answer(impossible="folded"), "it folds the picture over before its corners (4.08)"),
+        (answer(impossible="strong"), "it bends the picture out of all measure (4.08)"),
+    ],
+)
+def test_a_lens_that_no_camera_has_is_refused_in_one_sentence(told, words):
+    with pytest.raises(JobError) as error:
+        refuse_lens(told)
+    assert error.value.message == f"The solve found a lens that no camera has: {words}."
+    assert error.value.hint and error.value.exit_code == ExitCode.SOLVE
+
+
+def test_lenses_that_cameras_have_pass_and_so_does_one_that_was_given():
+    for told in (answer(), answer(80.0, view_deg=140.0), answer(5000.0, given_px=5000.0)):
+        refuse_lens(told)
+
+
+def test_a_given_focal_length_that_was_held_or_left_is_said():
+    held = lens_remarks(answer(800.0, held=True, doubt="off", found_px=1200.0, given_px=800.0))
+    assert held[0][0].endswith("(1200 px instead of 800): it was held as given.")
+    left = lens_remarks(answer(1200.0, doubt="off", given_px=800.0))
+    assert left[0][0] == "The focal length came out as 1200 px, and 800 were given."
+
+
+def solved(folder, tools, pictures, **request):
+    """(answer, poses by picture) of COLMAP alone: no frames are undistorted, no mattes found."""
+    told, _ = tools.asked(folder, pictures, **request)
+    names = told["solved"]
+    (folder / "request.json").write_text(json.dumps(told))
+    found = run_worker(folder / "request.json", folder / "log.txt", tools.recorder())["result"]
+    poses = json.loads((folder / "poses.json").read_text())
+    return found, [np.array(poses[name]["pose"]) for name in names if name in poses]
+
+
+def test_a_focal_length_that_is_to_be_held_is_held_to_the_pixel(tmp_path, tools):
+    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0), -0.06) for pose in tools.handheld(9)]
+    found, poses = solved(tmp_path, tools, pictures, focal_px=306.0, hold_focal=True)
+    assert len(poses) == 9 and found["focal_px"] == 306.0 and found["lens"]["given_px"] == 306.0
+    assert found["distortion"] == [pytest.approx(-0.06, abs=0.02)]
+
+
+def test_a_focal_length_of_the_file_is_what_a_clip_gets_that_does_not_tell_its_own(tmp_path, tools):
+    """A wall seen straight on, as in test_solving: no number was given, the file had one."""
+    poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(8)]
+    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0), -0.06) for pose in poses]
+    found, _ = solved(tmp_path, tools, pictures, start_focal_px=310.0)
+    assert found["focal_px"] == 310.0 and found["lens"]["held"] and not found["lens"]["given_px"]
+    ((said, _),) = lens_remarks(found)
+    assert said.endswith("the one that the file names was taken, 55 degrees wide.")
+
+
+def test_a_fisheye_is_solved(tmp_path, tools):
+    """The room, cast ray by ray through a lens 120 degrees wide; nobody tells its focal length."""
+    focal, poses = 160.0, tools.handheld(10)
+    rays = tools.fisheye_rays(focal, 0.02)
+    pictures = [tools.room().cast(pose, rays) for pose in poses]
+    found, solved_poses = solved(tmp_path, tools, pictures, camera_model=FISHEYE)
+    assert len(solved_poses) == 10 and found["focal_px"] == pytest.approx(focal, rel=0.02)
+    assert found["lens"]["view_deg"] == pytest.approx(112.0, abs=4.0) and not found["lens"]["doubt"]
+    turns = [pose[:, :3] for pose in solved_poses]
+    for a, b, true_a, true_b in zip(turns, turns[1:], poses, poses[1:]):
+        between = (b @ a.T) @ (true_b[:3, :3] @ true_a[:3, :3].T).T
+        assert np.degrees(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1))) < 0.2

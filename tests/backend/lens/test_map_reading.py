@@ -1,0 +1,249 @@
+"""ST maps as others write them: which conventions are taken, and in which words the rest is refused."""
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from torch_backend.contract import ExitCode, JobError
+from torch_backend.footage.oiio_types import open_output
+from torch_backend.lens.lens import Lens
+from torch_backend.lens.map_reading import fingerprint, read_lens
+from torch_backend.lens.stmap import redistort_map, undistort_map
+
+WIDTH, HEIGHT = 320, 180
+FRAMES = {"width": WIDTH, "height": HEIGHT, "source_size": [2 * WIDTH, 2 * HEIGHT]}
+TRUTH = Lens(WIDTH, HEIGHT, (240.0, 240.0), (240.0, 240.0), (164.0, 86.0), -0.18, 0.03, 0.002, -0.001)
+
+
+class Heard(list):
+    """Keeps warnings."""
+
+    def warning(self, message, hint=""):
+        self.append(message)
+
+
+def places(width, height, beyond=0.0):
+    """Pixel centres of a picture that goes on by a share of its size on every side, in its own pixels [h, w, 2]."""
+    across, down = round(beyond * width), round(beyond * height)
+    x, y = np.arange(-across, width + across) + 0.5, np.arange(-down, height + down) + 0.5
+    return np.stack(np.meshgrid(x, y), -1)
+
+
+def undistorting(width=WIDTH, height=HEIGHT, beyond=0.0, lens=TRUTH):
+    """[h, w, 2] of s and t, of an undistorted picture that goes on beyond the plate."""
+    ratio = width / WIDTH
+    at = places(width, height, beyond)
+    original = lens.to_original(at.reshape(-1, 2) / ratio).reshape(at.shape)
+    return original / [WIDTH, HEIGHT] * [1, -1] + [0, 1]
+
+
+def redistorting(beyond=0.0):
+    return redistort_map(TRUTH, WIDTH, HEIGHT, (beyond, beyond))[..., :2].astype(float)
+
+
+def written(folder, st, kind=oiio.FLOAT, names=("R", "G", "B"), name="map.exr", **window):
+    """A file of s and t; what more channels are named is 1."""
+    st = np.asarray(st, np.float32)
+    pixels = np.ones((*st.shape[:2], len(names)), np.float32)
+    for n, channel in enumerate("RG"[: st.shape[2]]):
+        where = next((i for i, one in enumerate(names) if one.rpartition(".")[2].upper() == channel), n)
+        pixels[..., where] = st[..., n]
+    spec = oiio.ImageSpec(st.shape[1], st.shape[0], len(names), kind)
+    spec.channelnames = tuple(names)
+    for key, value in window.items():
+        setattr(spec, key, value)
+    output = oiio.ImageOutput.create(str(folder / name))
+    assert open_output(output, folder / name, spec) and output.write_image(pixels) and output.close()
+    return str(folder / name)
+
+
+def read(path, way="undistort", layer="", **frames):
+    heard = Heard()
+    return read_lens(path, way, layer, {**FRAMES, **frames}, heard), heard
+
+
+def error_px(lens, beyond=0.0):
+    """Largest error of the way from the original, all of it, to the map's undistorted picture, pixels of 320 x 180."""
+    at = places(WIDTH, HEIGHT)[::7, ::7].reshape(-1, 2)
+    found = lens.map_of_plate(lens.to_plate(at))
+    found = (found * (1.0 + 2.0 * beyond) - beyond) * [WIDTH, HEIGHT]
+    return float(np.hypot(*(found - TRUTH.to_plate(at)).T).max())
+
+
+def test_both_ways_and_overscan_give_the_same_lens(tmp_path):
+    lens, heard = read(written(tmp_path, undistorting()))
+    assert error_px(lens) < 1e-3, "also in the corners, which are not in this map"
+    assert ["ends before the original picture does" in one for one in heard] == [True]
+    assert lens.window == (1.0, 1.0)
+    wide, heard = read(written(tmp_path, undistorting(beyond=0.2)))
+    assert error_px(wide, 0.2) < 1e-3 and heard == []
+    back, heard = read(written(tmp_path, redistorting()), "redistort")
+    assert error_px(back) < 2e-3 and heard == []
+    over, _ = read(written(tmp_path, redistorting(0.1)), "redistort")
+    assert error_px(over, 0.1) < 2e-3
+    # One lens, one plate: as wide as nothing is missing.
+    at = places(WIDTH, HEIGHT)[::9, ::9].reshape(-1, 2)
+    for other in (back, over):
+        np.testing.assert_allclose(other.to_original(at), wide.to_original(at), atol=0.05)
+
+
+def test_maps_that_this_product_writes_are_read_again(tmp_path):
+    both = [
+        read(written(tmp_path, make(TRUTH, WIDTH, HEIGHT)[..., :2]), way)[0]
+        for make, way in ((undistort_map, "undistort"), (redistort_map, "redistort"))
+    ]
+    assert [error_px(lens) < 2e-3 for lens in both] == [True, True]
+
+
+@pytest.mark.parametrize("size", [(160, 90), (640, 360)])
+def test_maps_of_another_size_are_of_the_same_picture(tmp_path, size):
+    lens, _ = read(written(tmp_path, undistorting(*size, beyond=0.2)))
+    assert error_px(lens, 0.2) < 2e-3
+
+
+def test_overscan_as_a_data_window_beyond_the_picture(tmp_path):
+    """As Nuke writes it: the display window is the plate's, coordinates and sizes are of that."""
+    st = undistorting(beyond=0.1)
+    path = written(tmp_path, st, x=-32, y=-18, full_x=0, full_y=0, full_width=WIDTH, full_height=HEIGHT)
+    lens, heard = read(path)
+    assert error_px(lens) < 1e-3 and heard == []
+    assert 1.01 < lens.window[0] < 1.1, "the plate shows some of what is beyond"
+
+
+def test_t_may_run_down_and_that_is_said(tmp_path):
+    lens, heard = read(written(tmp_path, undistorting(beyond=0.2) * [1, -1] + [0, 1]))
+    assert error_px(lens, 0.2) < 1e-3
+    assert heard == ["The ST map map.exr counts t from the top: it is taken so."]
+
+
+def test_sixteen_bits_are_smoothed(tmp_path):
+    """A half float near 1 is a pixel wide at 2048: 0.3 px of 640 here, and worse beyond the picture."""
+    lens, heard = read(written(tmp_path, undistorting(beyond=0.1), oiio.HALF))
+    assert error_px(lens, 0.1) < 0.1
+    assert "16-bit" in heard[0]
+    lens, _ = read(written(tmp_path, np.clip(undistorting(), 0, 1), oiio.UINT16, name="map.tif"))
+    assert error_px(lens) < 0.02
+
+
+def test_what_is_cut_off_or_empty_or_transparent_says_nothing(tmp_path):
+    st = undistorting(beyond=0.2)
+    inside = ((st > 0) & (st < 1)).all(-1, keepdims=True)
+    for name, path in {
+        "clamped": written(tmp_path, np.clip(st, 0.0, 1.0), name="a.exr"),
+        "black": written(tmp_path, np.where(inside, st, 0.0), name="b.exr"),
+    }.items():
+        lens, _ = read(path)
+        assert error_px(lens, 0.2) < 2e-3, name
+    made = np.concatenate([st, inside.astype(float)], -1)
+    spec = oiio.ImageSpec(*made.shape[1::-1], 3, oiio.FLOAT)
+    spec.channelnames = ("R", "G", "A")
+    made[..., :2][~inside[..., 0]] = 0.7
+    output = oiio.ImageOutput.create(str(tmp_path / "c.exr"))
+    assert open_output(output, tmp_path / "c.exr", spec)
+    assert output.write_image(made.astype(np.float32)) and output.close()
+    assert error_px(read(str(tmp_path / "c.exr"))[0], 0.2) < 2e-3
+
+
+def test_layers(tmp_path):
+    st = undistorting(beyond=0.2)
+    one = written(tmp_path, st, names=("lens.R", "lens.G"), name="one.exr")
+    assert error_px(read(one)[0], 0.2) < 1e-3, "the only pair there is"
+    two = written(tmp_path, st, names=("a.back.R", "a.back.G", "b.x", "b.y"), name="two.exr")
+    with pytest.raises(JobError, match=r"several layers that may be meant: a\.back, b") as refused:
+        read(two)
+    assert "--st-map-layer" in refused.value.hint
+    assert error_px(read(two, layer="Back")[0], 0.2) < 1e-3
+    with pytest.raises(JobError, match="no layer 'front'"):
+        read(two, layer="front")
+    with pytest.raises(JobError, match="no red and green channel"):
+        read(written(tmp_path, st[..., :1], names=("Y",), name="grey.exr"))
+
+
+def test_anamorphic_footage_in_its_own_pixels_or_square_ones(tmp_path):
+    st = undistorting(beyond=0.2)
+    told = {"reading": {"pixel_aspect": 2.0}}
+    for made in (st, 0.5 * (st[:, ::2] + st[:, 1::2])):
+        lens, _ = read(written(tmp_path, made), **told)
+        assert error_px(lens, 0.2) < 0.05 and lens.window[0] == pytest.approx(lens.window[1], abs=0.01)
+    with pytest.raises(JobError, match="another shape"):
+        read(written(tmp_path, st[:, ::2]))
+
+
+def noisy(st):
+    return st + np.random.default_rng(0).normal(0.0, 0.002, st.shape)
+
+
+def holed(st):
+    st = st.copy()
+    st[7, 9] = np.nan
+    return st
+
+
+def folded(st):
+    u = places(WIDTH, HEIGHT) / [WIDTH, HEIGHT] - 0.5
+    r2 = (u**2).sum(-1, keepdims=True)
+    return 0.5 + 1.1 * u * [1, -1] * (1.0 - 2.2 * r2)
+
+
+def four_to_three():
+    lens = Lens(320, 240, (240.0, 240.0), (240.0, 240.0), (160.0, 120.0), -0.1)
+    return undistort_map(lens, 320, 240)[..., :2]
+
+
+def moved(st):
+    at = places(WIDTH, HEIGHT) - 0.5
+    return at / [WIDTH, HEIGHT] * [1, -1] + [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (noisy, r"no smooth map of a lens: at column \d+, row \d+ it is \d\.\d\d pixels off"),
+        (holed, r"holds 1 pixels that are no numbers \(NaN\), the first at column 9, row 7"),
+        (folded, r"folds over: at \d+ % of the width"),
+        (moved, r"bends nothing, but moves the whole picture by -1\.00 and -1\.00 pixels"),
+        (lambda st: st * [WIDTH, HEIGHT], r"holds pixels \(up to 3\d\d\), not shares"),
+        (lambda st: st - moved(st) + 0.001, "holds no places: red grows by"),
+        (lambda st: st[:, ::-1], "is mirrored"),
+        (lambda st: st[..., ::-1], "s and t in each other's place"),
+        (lambda st: np.zeros_like(st), "has coordinates in 0 % of its picture only"),
+        (lambda st: four_to_three(), "is 320 x 240, the footage 640 x 360: it is of a picture of another shape"),
+    ],
+    ids=["noise", "NaN", "fold", "identity with an offset", "pixels", "displacement", "mirrored", "swapped", "black",
+         "shape"],
+)  # fmt: skip
+def test_what_is_no_map_of_this_lens_is_refused_in_a_sentence(tmp_path, change, words):
+    with pytest.raises(JobError, match=words) as refused:
+        read(written(tmp_path, change(undistorting())))
+    assert refused.value.hint and refused.value.exit_code == ExitCode.USAGE
+    assert refused.value.message.startswith("The ST map map.exr ")
+
+
+def test_a_map_of_the_other_picture_s_shape_is_refused_the_other_way_round_too(tmp_path):
+    with pytest.raises(JobError, match="another shape"):
+        read(written(tmp_path, redistorting()[:, 40:280]), "redistort")
+
+
+def test_eight_bits_and_what_is_no_file_are_refused(tmp_path):
+    st = np.clip(undistorting(), 0, 1)
+    with pytest.raises(JobError, match="8 bits a channel"):
+        read(written(tmp_path, st, oiio.UINT8, name="map.png"))
+    (tmp_path / "text.exr").write_text("no picture")
+    for path in (tmp_path / "text.exr", tmp_path / "gone.exr", tmp_path):
+        with pytest.raises(JobError, match="cannot be read") as refused:
+            read(str(path))
+        assert refused.value.exit_code == ExitCode.USAGE
+    with pytest.raises(JobError, match="cannot be read"):
+        fingerprint(str(tmp_path / "gone.exr"))
+
+
+def test_a_map_that_bends_nothing_is_taken_and_said(tmp_path):
+    lens, heard = read(written(tmp_path, places(WIDTH, HEIGHT) / [WIDTH, HEIGHT] * [1, -1] + [0, 1]))
+    assert lens.is_none and lens.window == (1.0, 1.0) and "bends nothing" in heard[0]
+
+
+def test_files_are_told_apart_by_what_is_in_them(tmp_path):
+    one = written(tmp_path, undistorting(), name="a.exr")
+    (tmp_path / "copy.exr").write_bytes((tmp_path / "a.exr").read_bytes())
+    assert fingerprint(one) == fingerprint(str(tmp_path / "copy.exr"))
+    assert fingerprint(one) != fingerprint(written(tmp_path, redistorting(), name="b.exr"))

@@ -1,0 +1,547 @@
+"""The motion matte of small worlds with exact cameras: a textured wall, and a board before it that stands or moves."""
+
+import json
+import os
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from torch_backend.contract import CameraFrame, CameraPath, Cancelled, JobError
+from torch_backend.footage.images import is_whole_png, read_png, write_png
+from torch_backend.motion.mattes import (
+    MOVING,
+    PAINTED,
+    STILL,
+    UNKNOWN,
+    is_found,
+    is_outdated,
+    load_motion,
+    load_surface,
+    motion_key,
+)
+from torch_backend.motion.moving import Clip
+from torch_backend.motion.surface import PER_KEY
+from torch_backend.motion_search import find_motion, motion_after_solve
+from torch_backend.shot import Shot, write_json
+
+WIDTH, HEIGHT, FRAMES, FIRST = 192, 144, 14, 1001
+FOCAL, WALL, BOARD = 180.0, 4.0, 3.0
+NUMBERS = [FIRST + 3 * n for n in range(FRAMES)]
+
+
+def texture(seed: int) -> np.ndarray:
+    noise = np.random.default_rng(seed).random((900, 1200)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 3) + cv2.GaussianBlur(noise, (0, 0), 8)
+    return (255 * (smooth - smooth.min()) / np.ptp(smooth)).astype(np.uint8)
+
+
+def still(n: float) -> tuple[float, float]:
+    return 0.0, 0.0
+
+
+def build(
+    root, where=still, travel=0.8, sway=1.0, wall: np.ndarray | None = None, numbers=NUMBERS, fps=10
+) -> tuple[Shot, np.ndarray]:
+    """A solved shot and where the board is, bool [F, H, W]; `where(share)` is its place in world units at a time."""
+    shot = Shot.create(root / "world.splannequin")
+    wall, board = texture(1) if wall is None else wall, texture(2)
+    y, x = np.mgrid[0.5:HEIGHT, 0.5:WIDTH].astype(np.float32)
+    rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL], -1)
+    cameras, rows, masks = [], [], []
+    for n, number in enumerate(numbers):
+        share = n / (len(numbers) - 1)
+        centre = travel * np.array([share - 0.5, 0.2 * sway * np.sin(5 * share), 0.3 * sway * share])
+        plate = look(wall, rays * (WALL - centre[2]) + centre[:2])
+        at = rays * (BOARD - centre[2]) + centre[:2] - where(share)
+        inside = (np.abs(at) < 0.32).all(-1)
+        masks.append(inside)
+        pixels = np.where(inside, look(board, at), plate)
+        write_png(shot.frames / f"{number:06d}.png", np.repeat(pixels[..., None], 3, -1))
+        viewmat = np.eye(4)
+        viewmat[:3, 3] = -centre
+        cameras.append(
+            CameraFrame(number, viewmat.ravel().tolist(), [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], "registered")
+        )
+        rows.append({"frame": number, "seconds": n / fps, "file": f"raw/{number:06d}.png", "solve": True})
+    write_json(shot.frames / "frames.json", {"version": 1, "width": WIDTH, "height": HEIGHT, "frames": rows})
+    write_json(shot.solve / "cameras.json", CameraPath(WIDTH, HEIGHT, cameras).to_json())
+    points = np.random.default_rng(0).uniform([-1, -0.7, WALL], [1, 0.7, WALL], (200, 3)).astype(np.float32)
+    np.savez(
+        shot.solve / "points.npz",
+        xyz=points,
+        rgb=np.zeros((200, 3), np.uint8),
+        error=np.zeros(200, np.float32),
+        track=np.full(200, 9, np.uint16),
+    )
+    shot.update(width=WIDTH, height=HEIGHT, first=numbers[0], last=numbers[-1])
+    return shot, np.array(masks)
+
+
+def look(picture: np.ndarray, at: np.ndarray) -> np.ndarray:
+    place = (at * 170 + [600, 450]).astype(np.float32)
+    return cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+
+def mattes(shot: Shot, numbers=NUMBERS) -> np.ndarray:
+    found = [load_motion(shot, number) for number in numbers]
+    assert all(f is not None and f.shape == (HEIGHT, WIDTH) and f.dtype == np.uint8 for f in found)
+    return np.array(found)
+
+
+def stamps(shot: Shot) -> dict[Path, int]:
+    return {p: p.stat().st_mtime_ns for p in shot.root.rglob("*") if p.is_file()}
+
+
+def middle(mask: np.ndarray) -> np.ndarray:
+    return np.argwhere(mask).mean(0)
+
+
+def inner(mask: np.ndarray, by: int = 3) -> np.ndarray:
+    """Without a margin; outside of it, `~grown(mask)`, the rest has one too."""
+    return np.array([cv2.erode(m.astype(np.uint8), np.ones((2 * by + 1,) * 2, np.uint8)) > 0 for m in mask])
+
+
+def grown(mask: np.ndarray, by: int) -> np.ndarray:
+    return ~inner(~mask, by)
+
+
+@pytest.fixture(scope="module")
+def swaying(tmp_path_factory, quiet):
+    """The board sways up and down by 0.08 units, 5 pixels."""
+    shot, board = build(tmp_path_factory.mktemp("sway"), lambda share: (0.0, 0.08 * np.sin(7 * share)))
+    return shot, board, find_motion(shot, quiet(), static_model=None)
+
+
+def test_what_moves_is_found_and_the_wall_is_still(swaying):
+    shot, board, result = swaying
+    labels = mattes(shot)
+    assert set(np.unique(labels)) <= {STILL, UNKNOWN, MOVING}
+    assert (labels[inner(board)] == MOVING).mean() > 0.95
+    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
+    assert (labels == UNKNOWN).mean() < 0.1
+    assert result["motion_pixels_share"] == pytest.approx((labels == MOVING).mean(), abs=1e-3)
+    assert result["unknown_share"] == pytest.approx((labels == UNKNOWN).mean(), abs=1e-3)
+
+
+def test_motion_along_epipolar_lines_is_found(tmp_path, quiet):
+    """The camera travels sideways only, and so does the board, to and fro: every match lies on its line."""
+    shot, board = build(tmp_path, lambda share: (0.1 * np.sin(7 * share), 0.0), sway=0.0)
+    find_motion(shot, quiet(), static_model=None)
+    labels = mattes(shot)
+    assert (labels[inner(board)] == MOVING).mean() > 0.9
+    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
+
+
+def test_a_slow_sway_of_half_a_pixel_is_found(tmp_path, quiet):
+    """Between neighbouring frames it is less than any flow can tell from its own noise."""
+    numbers = list(range(1, 31))
+    where = lambda share: (0.004 * np.sin(4 * share), 0.008 * np.sin(6 * share))  # noqa: E731
+    shot, board = build(tmp_path, where, numbers=numbers)
+    find_motion(shot, quiet(), static_model=None)
+    labels = mattes(shot, numbers)
+    assert (labels[inner(board)] == MOVING).mean() > 0.8
+    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
+
+
+def test_a_still_world_is_still(tmp_path, quiet):
+    shot, _ = build(tmp_path)
+    result = find_motion(shot, quiet(), static_model=None)
+    assert result["motion_pixels_share"] < 0.01 and result["unknown_share"] < 0.05
+
+
+def test_a_bare_wall_before_which_something_moves_is_still(tmp_path, quiet):
+    """Flow is smooth: on a bare wall it is that of what moves before it."""
+    rng = np.random.default_rng(3)
+    bare = (128 + rng.normal(0, 1, (900, 1200))).astype(np.uint8)
+    shot, board = build(tmp_path, lambda share: (0.0, 0.08 * np.sin(7 * share)), wall=bare)
+    find_motion(shot, quiet(), static_model=None)
+    labels = mattes(shot)
+    assert (labels[inner(board)] == MOVING).mean() > 0.7
+    assert (labels[~grown(board, 10)] == MOVING).mean() < 0.02
+
+
+def test_a_tripod_has_a_matte_too(tmp_path, quiet):
+    shot, board = build(tmp_path, lambda share: (0.0, 0.08 * np.sin(7 * share)), travel=0.0)
+    find_motion(shot, quiet(), static_model=None)
+    labels = mattes(shot)
+    assert (labels[inner(board)] == MOVING).mean() > 0.95
+    assert (labels[~grown(board, 8)] == MOVING).mean() < 0.01
+
+
+def test_a_frame_whose_pose_was_guessed_does_not_move(tmp_path, quiet):
+    """All of it is off by some pixels."""
+    shot, _ = build(tmp_path)
+    path = CameraPath.load(shot.solve / "cameras.json")
+    path.frames[6].source = "interpolated"
+    path.frames[6].viewmat[7] += 0.08
+    write_json(shot.solve / "cameras.json", path.to_json())
+    assert find_motion(shot, quiet(), static_model=None)["motion_pixels_share"] < 0.01
+
+
+def test_a_picture_that_is_lost_in_blur_does_not_move(tmp_path, quiet):
+    """One frame of a fast pan: everything in it differs from everything else."""
+    shot, _ = build(tmp_path)
+    path = shot.frames / f"{NUMBERS[6]:06d}.png"
+    write_png(path, cv2.blur(read_png(path), (13, 1)))
+    assert find_motion(shot, quiet(), static_model=None)["motion_pixels_share"] < 0.01
+
+
+def test_frames_between_keys_have_a_matte_too(tmp_path, quiet):
+    """At 40 frames a second every second one of so short a clip is a key; the others take theirs by flow."""
+    numbers = list(range(1, 33))
+    shot, board = build(tmp_path, lambda share: (0.0, 0.15 * np.sin(14 * share)), travel=2.4, numbers=numbers, fps=40)
+    assert Clip(shot).keys == [*range(0, 32, 2), 31]
+    find_motion(shot, quiet(), static_model=None)
+    labels = mattes(shot, numbers) == MOVING
+    between = range(7, 25, 2)  # the board is in the picture
+    assert min(labels[n][inner(board)[n]].mean() for n in between) > 0.7
+    # Its key's matte, left where it is, would be 7 pixels off.
+    assert np.mean([np.linalg.norm(middle(labels[n]) - middle(board[n])) for n in between]) < 3.0
+
+
+def test_mattes_that_are_there_are_left_alone(swaying, quiet):
+    shot, _, result = swaying
+    before = stamps(shot)
+    assert find_motion(shot, quiet(), static_model=None) == result
+    assert stamps(shot) == before
+
+
+def test_mattes_whose_search_was_cancelled_are_looked_for_again(swaying, tmp_path, quiet):
+    """Else a training that found the old ones outdated, and was paused, would go on without any."""
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    record = json.loads((shot.motion / "motion.json").read_text())
+    write_json(shot.motion / "motion.json", {**record, "version": record["version"] - 1})
+    assert is_outdated(shot)
+    with pytest.raises(Cancelled):
+        find_motion(shot, quiet(cancel_at=("solve: motion", 0.5)))
+    assert is_outdated(shot) and not is_found(shot)
+    find_motion(shot, quiet(), static_model=None)
+    assert is_found(shot) and not is_outdated(shot)
+
+
+def test_a_clip_that_cannot_be_learnt_is_left_to_flow_with_a_word(swaying, tmp_path, quiet):
+    def refuse(shot, report):
+        raise JobError("The camera hardly moves.", "Walk.")
+
+    shot, report = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin")), quiet()
+    find_motion(shot, report, static_model=refuse)
+    assert not report.events, "mattes that are there need no model"
+    shutil.rmtree(shot.motion)
+    assert find_motion(shot, report, static_model=refuse) == swaying[2]
+    told = [event[1:] for event in report.events if event[0] == "warning"]
+    assert told == [("What moves is told by optical flow alone: The camera hardly moves.", "Walk.")]
+
+
+def test_what_neither_a_static_model_nor_most_frames_show_moves(tmp_path, quiet):
+    """A patch of the wall that is another one in one frame: flow sees it stand."""
+    shot, _ = build(tmp_path)
+    plain = {number: read_png(shot.plate(number)) for number in NUMBERS}
+    pixels = plain[NUMBERS[6]].copy()
+    pixels[10:30, 20:60] = 255 - pixels[10:30, 20:60]
+    write_png(shot.plate(NUMBERS[6]), pixels)
+    find_motion(shot, quiet(), static_model=lambda shot, report: plain.get)
+    labels = mattes(shot)
+    assert (labels[6][14:26, 24:56] == MOVING).mean() > 0.5, "where its greys differ by enough"
+    assert (np.delete(labels, 6, axis=0) == MOVING).mean() < 0.01
+
+
+def test_a_damaged_matte_is_named_and_made_anew(swaying, quiet):
+    shot, *_ = swaying
+    victim = shot.solve / "motion" / f"{NUMBERS[3]:06d}.png"
+    whole = victim.read_bytes()
+    victim.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(JobError, match=r"001010\.png is damaged"):
+        load_motion(shot, NUMBERS[3])
+    find_motion(shot, quiet(), static_model=None)
+    assert victim.read_bytes() == whole
+
+
+def test_mattes_of_other_cameras_are_not_read(swaying, tmp_path, quiet):
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    key = motion_key(shot)
+    path = CameraPath.load(shot.solve / "cameras.json")
+    path.frames[0].K[0] += 1.0
+    write_json(shot.solve / "cameras.json", path.to_json())
+    assert not is_found(shot) and load_motion(shot, NUMBERS[0]) is None and motion_key(shot) != key
+    with pytest.raises(Cancelled):
+        find_motion(shot, quiet(cancel_at=("solve: motion", 0.3)))
+    assert load_motion(shot, NUMBERS[0]) is None  # some are of these cameras, not all
+
+
+KILLED = """
+import os, signal, sys
+from torch_backend.shot import Shot
+from torch_backend.motion_search import find_motion
+
+class Report:
+    def progress(self, stage, done, total, message=""):
+        if done >= 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+    def metric(self, stage, values): pass
+    def image(self, label, path): pass
+    def warning(self, message, hint=""): pass
+    def check_cancelled(self): pass
+
+find_motion(Shot(sys.argv[1]), Report(), static_model=None)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
+def test_a_killed_search_goes_on_where_it_was(swaying, tmp_path, quiet):
+    """What was written is whole and stays; what comes after is as if nobody had been killed."""
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    shutil.rmtree(shot.solve / "motion")
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
+    ran = subprocess.run([sys.executable, "-P", "-c", KILLED, str(shot.root)], env=environment, check=False)
+    assert ran.returncode == -signal.SIGKILL
+    left = sorted((shot.solve / "motion").glob("0*.png"))
+    assert 5 <= len(left) < FRAMES and all(is_whole_png(p) for p in left)
+    assert load_motion(shot, NUMBERS[0]) is None
+    before = {p: p.stat().st_mtime_ns for p in left}
+    report = quiet()
+    assert find_motion(shot, report, static_model=None) == swaying[2]
+    assert {p: p.stat().st_mtime_ns for p in left} == before
+    assert [event[2] for event in report.events if event[0] == "progress"] == list(range(len(left) + 1, FRAMES + 1))
+    assert (mattes(shot) == mattes(swaying[0])).all()
+    names = [f"{n:06d}{suffix}" for n in NUMBERS for suffix in (".png", ".npz")]  # of so few frames each is a key
+    assert {p.name for p in (shot.solve / "motion").iterdir()} == {"motion.json", *names}
+    one, other = load_surface(shot), load_surface(swaying[0])
+    assert (one.xyz == other.xyz).all() and (one.frames == other.frames).all()
+
+
+def test_a_shot_without_cameras_says_so(tmp_path, quiet):
+    shot = Shot.create(tmp_path / "empty.splannequin")
+    with pytest.raises(JobError, match="has no cameras yet"):
+        find_motion(shot, quiet(), static_model=None)
+    assert load_motion(shot, 1) is None
+
+
+# ------------------------------------------------------------------------------------------ points of what stands still
+
+
+def seen_at(shot: Shot, number: int, xyz: np.ndarray) -> np.ndarray:
+    """[S, 2] int64, pixels (x, y) of a frame in which points are seen."""
+    camera = next(c for c in CameraPath.load(shot.solve / "cameras.json").frames if c.frame == number)
+    local = xyz - -np.array(camera.viewmat).reshape(4, 4)[:3, 3]
+    return np.floor(FOCAL * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]).astype(int)
+
+
+def test_points_of_a_still_world_lie_on_its_surfaces_and_cover_them(tmp_path, quiet):
+    shot, board = build(tmp_path)
+    find_motion(shot, quiet(), static_model=None)
+    found = load_surface(shot)
+    assert set(found.frames) == set(NUMBERS) and found.rgb.dtype == np.uint8
+    for n in (2, 7, 11):
+        of = found.frames == NUMBERS[n]
+        xyz = found.xyz[of]
+        x, y = seen_at(shot, NUMBERS[n], xyz).T
+        assert 500 < len(xyz) <= PER_KEY and ((x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)).all()
+        near, far = inner(board)[n][y, x], ~grown(board, 4)[n][y, x]
+        assert near.sum() > 30 and far.sum() > 300
+        assert np.median(np.abs(xyz[near, 2] - BOARD)) < 0.03 and np.median(np.abs(xyz[far, 2] - WALL)) < 0.04
+        assert np.quantile(np.abs(xyz[far, 2] - WALL), 0.95) < 0.2
+        tiles = np.unique(np.stack([x // 24, y // 24]), axis=1).shape[1]
+        assert tiles > 0.7 * (WIDTH // 24) * (HEIGHT // 24)
+        plate = read_png(shot.plate(NUMBERS[n]))[y, x].astype(int)
+        assert np.abs(plate - found.rgb[of]).mean() < 8
+
+
+def test_what_moves_gives_no_points(swaying):
+    """Now and then a still point explains its matches, at a depth at which there is nothing."""
+    shot, board, _ = swaying
+    found = load_surface(shot)
+    for n in range(3, 11):
+        x, y = seen_at(shot, NUMBERS[n], found.xyz[found.frames == NUMBERS[n]]).T
+        assert len(x) > 500 and inner(board)[n][y, x].mean() < 0.01
+
+
+def test_a_camera_that_stands_still_gives_no_points(tmp_path, quiet):
+    shot, _ = build(tmp_path, travel=0.0)
+    find_motion(shot, quiet(), static_model=None)
+    assert not len(load_surface(shot).xyz)
+
+
+def test_what_is_ignored_gives_no_points(tmp_path, quiet):
+    shot, _ = build(tmp_path)
+    covered = np.zeros((HEIGHT, WIDTH), np.uint8)
+    covered[:, : WIDTH // 2] = 255
+    for number in NUMBERS:
+        path = shot.mask("ignore", number)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(cv2.imencode(".png", covered)[1].tobytes())
+    write_json(shot.solve / "solve.json", {"version": 1, "masks": {"ignore": {"key": "half"}}})
+    find_motion(shot, quiet(), static_model=None)
+    found = load_surface(shot)
+    x = np.concatenate([seen_at(shot, n, found.xyz[found.frames == n])[:, 0] for n in NUMBERS])
+    assert len(x) > 2000 and (x >= WIDTH // 2 - 2).all()
+
+
+def test_a_shot_solved_before_points_were_kept_has_them_when_it_is_solved_again(swaying, tmp_path, quiet):
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    for file in shot.motion.glob("*.npz"):
+        file.unlink()
+    key, pictures = motion_key(shot), {p: p.read_bytes() for p in shot.motion.glob("*.png")}
+    assert find_motion(shot, quiet(), static_model=None) == swaying[2] and not len(
+        load_surface(shot).xyz
+    )  # a freeze asks for none
+    assert find_motion(shot, quiet(), with_points=True, static_model=None) == swaying[2]
+    assert (load_surface(shot).xyz == load_surface(swaying[0]).xyz).all()
+    assert motion_key(shot) == key and {p: p.read_bytes() for p in shot.motion.glob("*.png")} == pictures
+    before = stamps(shot)
+    find_motion(shot, quiet(), with_points=True, static_model=None)
+    assert stamps(shot) == before
+
+
+def test_points_go_with_the_mattes_and_a_damaged_file_is_done_without(swaying, tmp_path, quiet):
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    whole = load_surface(shot)
+    shot.surface(NUMBERS[3]).write_bytes(b"PK not a file of arrays")
+    left = load_surface(shot)
+    assert set(whole.frames) - set(left.frames) == {NUMBERS[3]}
+    assert (left.xyz == whole.xyz[whole.frames != NUMBERS[3]]).all()
+    path = CameraPath.load(shot.solve / "cameras.json")
+    path.frames[0].K[0] += 1.0
+    write_json(shot.solve / "cameras.json", path.to_json())
+    assert not len(load_surface(shot).xyz)  # other cameras: they say nothing now
+    find_motion(shot, quiet(), static_model=None)
+    assert len(load_surface(shot).xyz) > 2000 and set(load_surface(shot).frames) == set(NUMBERS)
+
+
+# ------------------------------------------------------------------------------------------------- what artists paint
+
+
+def paint(shot: Shot, pixels: np.ndarray, number: int = NUMBERS[0]) -> None:
+    path = shot.root / PAINTED / f"{number:06d}.png"
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+
+
+@pytest.fixture
+def own(swaying, tmp_path):
+    return Shot(shutil.copytree(swaying[0].root, tmp_path / "own.splannequin"))
+
+
+def ramp(dtype) -> np.ndarray:
+    """Three bands of grey: still, unknown, moving."""
+    top = np.iinfo(dtype).max
+    return np.repeat(np.array([0.32, 0.5, 0.68]) * top, WIDTH // 3).astype(dtype)[None].repeat(HEIGHT, 0)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_paint_of_any_depth_goes_before_what_was_found(own, dtype, channels):
+    key = motion_key(own)
+    pixels = ramp(dtype)
+    if channels > 1:
+        pixels = np.repeat(pixels[..., None], channels, -1)
+        if channels == 4:
+            pixels[..., 3] = np.iinfo(dtype).max
+    paint(own, pixels)
+    labels = load_motion(own, NUMBERS[0])
+    assert labels is not None and motion_key(own) != key
+    assert (labels == np.repeat(np.array([STILL, UNKNOWN, MOVING], np.uint8), WIDTH // 3)[None]).all()
+    assert (load_motion(own, NUMBERS[1]) == load_motion(own, NUMBERS[1])).all()
+
+
+def test_paint_of_another_size_is_fitted_without_in_between_values(own):
+    pixels = np.zeros((190, 251), np.uint8)
+    pixels[:, 125:] = 255
+    paint(own, pixels)
+    labels = load_motion(own, NUMBERS[0])
+    assert labels is not None and labels.shape == (HEIGHT, WIDTH)
+    edge = int(125 * WIDTH / 251)
+    assert (labels[:, :edge] == STILL).all() and (labels[:, edge + 1 :] == MOVING).all()
+    assert set(np.unique(labels)) == {STILL, MOVING}
+
+
+def test_where_paint_is_transparent_the_found_matte_shows(own):
+    found = load_motion(own, NUMBERS[0])
+    pixels = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    pixels[:, 60:, 3] = 120
+    paint(own, pixels)
+    labels = load_motion(own, NUMBERS[0])
+    assert labels is not None and found is not None
+    assert (labels[:, :60] == MOVING).all() and (labels[:, 60:] == found[:, 60:]).all()
+
+
+def test_paint_stays_when_the_shot_is_solved_again(own, quiet):
+    paint(own, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    path = CameraPath.load(own.solve / "cameras.json")
+    path.frames[0].K[0] += 1.0
+    write_json(own.solve / "cameras.json", path.to_json())
+    assert (load_motion(own, NUMBERS[0]) == MOVING).all()  # also while there is nothing else
+    find_motion(own, quiet(), static_model=None)
+    assert (load_motion(own, NUMBERS[0]) == MOVING).all()
+    assert (load_motion(own, NUMBERS[1]) == STILL).any()
+
+
+def test_damaged_paint_is_named(own):
+    (own.root / PAINTED).mkdir()
+    (own.root / PAINTED / f"{NUMBERS[0]:06d}.png").write_bytes(b"\x89PNG\r\n\x1a\nnot more")
+    with pytest.raises(JobError, match=r"painted motion matte .*001001\.png is damaged"):
+        load_motion(own, NUMBERS[0])
+
+
+def test_paint_that_announces_too_many_pixels_is_refused_before_they_are_read(own):
+    paint(own, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    file = own.painted_matte(NUMBERS[0])
+    content = bytearray(file.read_bytes())
+    content[16:24] = struct.pack(">II", 16000, 16000)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    file.write_bytes(content)
+    with pytest.raises(JobError, match=r"001001\.png is 16000 x 16000 pixels, or says so"):
+        load_motion(own, NUMBERS[0])
+
+
+# --------------------------------------------------------------------------------------------------- in one process
+
+
+@pytest.mark.parametrize("order", ["cv2, OpenImageIO, av", "OpenImageIO, av, cv2", "torch, av, cv2, OpenImageIO"])
+def test_opencv_lives_beside_the_other_readers_of_pictures(order, tmp_path):
+    """Each brings its own zlib, libpng or FFmpeg; pycolmap's collide with OpenImageIO's."""
+    clip = Path(__file__).resolve().parents[3] / "examples" / "sitting.mp4"
+    code = f"""
+import {order}
+import av, cv2, numpy as np
+from torch_backend.footage.images import read_png, write_png
+with av.open({str(clip)!r}) as video:
+    frames = [f.to_ndarray(format="rgb24") for f, _ in zip(video.decode(video=0), range(3))]
+dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+for turn in range(3):
+    for n, frame in enumerate(frames):
+        write_png({str(tmp_path)!r} + f"/{{n}}.png", frame)
+        packed = cv2.imencode(".png", frame[..., ::-1])[1]
+        assert (cv2.imdecode(packed, cv2.IMREAD_COLOR)[..., ::-1] == read_png({str(tmp_path)!r} + f"/{{n}}.png")).all()
+    dis.calc(frames[0][..., 0].copy(), frames[1][..., 0].copy(), None)
+print("whole")
+"""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
+    ran = subprocess.run(
+        [sys.executable, "-P", "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (ran.returncode, ran.stdout.strip()) == (0, "whole"), ran.stderr[-2000:]
+
+
+def test_cameras_by_which_everything_moves_are_doubted(tmp_path, quiet):
+    shot, _ = build(tmp_path)
+    good, bad = quiet(), quiet()
+    motion_after_solve(shot, good, static_model=None)
+    assert not [event for event in good.events if event[0] == "warning"]
+    # Nearly on the spot, as a solve without depth has them: what is before the wall and the wall itself both move.
+    cameras = json.loads((shot.solve / "cameras.json").read_text())
+    for n, frame in enumerate(cameras["frames"]):
+        frame["viewmat"][3] *= 0.3
+        frame["viewmat"][7] = 0.05 * (-1) ** n
+    write_json(shot.solve / "cameras.json", cameras)
+    found = motion_after_solve(shot, bad, static_model=None)
+    assert found is not None and found["motion_pixels_share"] > 0.2
+    (warning,) = [event for event in bad.events if event[0] == "warning"]
+    assert "the cameras are wrong" in warning[1]

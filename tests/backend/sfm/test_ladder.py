@@ -1,0 +1,208 @@
+"""What is tried where the first solve fails: by COLMAP, of a rendered room that its first try cannot take."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torch_backend.contract import Cancelled, ExitCode, JobError, read_json
+from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.sfm.ladder import Attempt, climb, next_rung
+from torch_backend.sfm.solving import SolveConfig, _key, solve_shot
+from torch_backend.sfm.verdict import Fault, fault_of
+from torch_backend.shot import Shot
+
+ASKED = {"solved": ["1.png"] * 60, "features": 4096, "camera_model": "SIMPLE_RADIAL"}
+LENS = {"doubt": "", "held": False, "found_deg": 60.0, "view_deg": 60.0, "found_bend": 0.0}
+
+
+def attempt(kind, registered=20, lens=LENS, error=0.8, solved=60):
+    """A try that came to a fault of `kind`, or to none; none registered: a failure."""
+    fault = Fault(kind, JobError(f"It is {kind}.", "Hint.", ExitCode.SOLVE)) if kind else None
+    found = {"registered": registered, "reprojection_error_px": error, "lens": lens}
+    answer = {"result": found} if registered else {"failure": "bare"}
+    return Attempt("first", Path(), answer, fault, solved)
+
+
+def rungs(best, **changes):
+    """(name, changed) of all that is tried while `best` stays the best."""
+    done = ["first"]
+    found = []
+    while (rung := next_rung(best, {**ASKED, **changes}, set(done))) is not None:
+        done.append(rung.name)
+        found.append((rung.name, *rung.changes.values()))
+    return found
+
+
+def test_frames_that_are_matched_widely_already_are_not_matched_so_again():
+    done = {"first", "features"}
+    assert next_rung(attempt("few"), {**ASKED, "wide": True}, done).name == "lens"
+    assert next_rung(attempt("few"), ASKED, done).name == "pairs"
+
+
+MATCHING = [("features", 8192, 0.0025), ("pairs", True)]
+OPENCV, FISHEYE = ("lens", "OPENCV"), ("lens", "OPENCV_FISHEYE")
+
+
+@pytest.mark.parametrize(
+    ("best", "expected"),
+    [
+        (attempt(""), []),
+        (attempt("still", 0), []),
+        (attempt("turning", 0), []),
+        (attempt("turning", 5), []),
+        (attempt("narrow", 60), []),
+        (attempt("bare", 0), MATCHING),
+        (attempt("unmatched", 0), MATCHING),
+        (attempt("few"), [*MATCHING, OPENCV, ("global", "global")]),
+        (attempt("poor", 40), [*MATCHING, OPENCV, ("global", "global")]),
+        # All frames found their place, and fit badly: more matches do not help.
+        (attempt("poor", 60, error=3.0), [OPENCV, ("pairs", True)]),
+        (attempt("lens", 60), [OPENCV, ("pairs", True)]),
+        (attempt("lens", 60, {**LENS, "doubt": "bent", "found_bend": -0.3}), [FISHEYE, ("pairs", True)]),
+        (attempt("lens", 60, {**LENS, "doubt": "bent", "found_bend": 1.3}), [OPENCV, ("pairs", True)]),
+        (attempt("lens", 60, {**LENS, "found_deg": 140.0}), [FISHEYE, ("pairs", True)]),
+        (attempt("bent", 60, {**LENS, "doubt": "bent", "held": True, "found_bend": -0.3}), [FISHEYE]),
+    ],
+)
+def test_only_what_can_help_is_tried(best, expected):
+    assert rungs(best) == expected
+
+
+def test_a_lens_that_was_chosen_gives_way_to_a_fisheye_s_alone():
+    assert rungs(attempt("lens", 60), camera_model="OPENCV") == [("pairs", True)]
+    bent = attempt("lens", 60, {**LENS, "doubt": "bent", "found_bend": -0.3})
+    assert rungs(bent, camera_model="OPENCV") == [FISHEYE, ("pairs", True)]
+    assert rungs(bent, camera_model="OPENCV_FISHEYE") == [("pairs", True)]
+
+
+def test_a_focal_length_that_the_file_names_is_the_first_thing_to_doubt_unless_one_was_given():
+    assert [name for name, *_ in rungs(attempt("few"), start_focal_px=700.0)][:2] == ["focal", "features"]
+    assert rungs(attempt("few"), start_focal_px=700.0, focal_px=650.0) == rungs(attempt("few"))
+    assert rungs(attempt("narrow"), start_focal_px=700.0) == []
+
+
+def test_the_best_is_the_one_that_can_be_used_then_the_one_with_more_frames_then_the_one_that_fits():
+    order = [
+        attempt("bare", 0),
+        attempt("few", 20),
+        attempt("lens", 60, error=0.3),
+        attempt("poor", 40, error=0.5),
+        attempt("poor", 50, error=0.9),
+        attempt("poor", 50, error=0.6),
+        attempt("", 60),
+    ]
+    assert sorted(reversed(order), key=lambda one: one.rank) == order
+
+
+def test_of_two_tries_that_came_to_the_same_the_first_keeps_its_files(tmp_path, monkeypatch, tools):
+    def again(rung, request, frames, last, scratch, log, report):
+        folder = scratch / rung
+        folder.mkdir()
+        for name in ("poses.json", "database.db"):
+            (folder / name).write_text(rung)
+        return replace(attempt("poor"), rung=rung, folder=folder)
+
+    monkeypatch.setattr("torch_backend.sfm.ladder._attempt", again)
+    climbed = climb(ASKED, {"frames": []}, True, tmp_path, tmp_path / "log", tools.recorder())
+    assert climbed.best.rung == "first" and len(climbed.tries) > 2
+    assert (tmp_path / "first" / "poses.json").read_text() == "first"
+    left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == {"first/poses.json", *(f"{told['rung']}/database.db" for told in climbed.tries)}
+
+
+@pytest.fixture(scope="module")
+def fog(tmp_path_factory, tools):
+    """The room through fog, 6 % of its contrast: COLMAP's own threshold finds nothing in it."""
+    folder = tmp_path_factory.mktemp("fog")
+    clip = tools.write_clip(folder, tools.handheld(10), noise=0.3, contrast=0.06)
+    shot = Shot.create(folder / "fog.splannequin")
+    import_footage(shot, str(clip), FootageConfig(step=1), tools.recorder())
+    return shot
+
+
+def test_a_clip_that_the_first_try_cannot_take_is_solved_with_more_features_and_that_is_said(fog, tools):
+    report = tools.recorder()
+    result = solve_shot(fog, SolveConfig(features=1000), report)
+    assert result["registered"] == 10
+    record = read_json(fog.solve_record)
+    assert record["rung"] == "features" and [told["rung"] for told in record["tries"]] == ["first", "features"]
+    assert record["tries"][1]["found"] == record["quality"]
+    assert report.warnings[0].startswith("The frames show too little to match: ")
+    assert report.warnings[0].endswith("Trying again with up to 2000 features a frame, faint ones too.")
+    assert record["focal_px"] == pytest.approx(300.0, rel=0.02)
+    # Both tries' words are in the log, and nothing of either is left besides.
+    assert not (fog.solve / "scratch").exists() and (fog.solve / "colmap.log").stat().st_size
+
+
+def test_without_retrying_it_is_refused_for_what_it_is(fog, tools):
+    report = tools.recorder()
+    with pytest.raises(JobError, match="^The frames show too little to match: about ") as error:
+        solve_shot(fog, SolveConfig(features=1000, retry=False), report)
+    assert report.warnings == [] and "Tried" not in error.value.hint and "more light and texture" in error.value.hint
+
+
+def test_cancelling_ends_the_tries(fog, tools):
+    class Impatient(tools.recorder):
+        def warning(self, message, hint=""):
+            super().warning(message, hint)
+            self.cancelled = True
+
+    report = Impatient()
+    with pytest.raises(Cancelled):
+        solve_shot(fog, SolveConfig(features=999), report)
+    assert len(report.warnings) == 1 and not (fog.solve / "scratch").exists()
+
+
+def test_switching_it_on_again_solves_again_and_solves_of_before_stay():
+    config = SolveConfig(features=1000)
+    frames = {"key": "frames"}
+    assert _key(config, frames, [], {}) != _key(replace(config, retry=False), frames, [], {})
+    assert _key(SolveConfig(), frames, [], {}) == "0eaee751dea72988", "what it was before there were tries"
+
+
+def test_a_fisheye_that_was_taken_for_an_ordinary_lens_is_solved_as_one(tmp_path, tools):
+    focal = 160.0
+    rays = tools.fisheye_rays(focal, 0.02)
+    pictures = [tools.room().cast(pose, rays) for pose in tools.handheld(9)]
+    request, frames = tools.asked(tmp_path, pictures)
+    report = tools.recorder()
+    best = climb(request, frames, True, tmp_path, tmp_path / "log.txt", report).best
+    assert (best.rung, best.fault) == ("lens", None)
+    assert best.answer["result"]["camera_model"] == "OPENCV_FISHEYE"
+    assert best.answer["result"]["focal_px"] == pytest.approx(focal, rel=0.02)
+    assert report.warnings == [
+        "The lens came out as one that folds the picture over, and a usual one was taken. "
+        "Trying again with the lens of a fisheye (OPENCV_FISHEYE)."
+    ]
+    assert {p.name for p in (tmp_path / "first").iterdir()} <= {"database.db"}
+
+
+def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path, tools):
+    """Five frames of a room, and nothing in the other six."""
+    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(14)[:5]]
+    rng = np.random.default_rng(3)
+    pictures += [rng.integers(0, 256, (240, 320, 3), np.uint8) for _ in range(6)]
+    request, frames = tools.asked(tmp_path, pictures, features=250)
+    report = tools.recorder()
+    with pytest.raises(JobError) as error:
+        climb(request, frames, True, tmp_path, tmp_path / "log.txt", report)
+    assert error.value.message.startswith("Cameras were found for only ")
+    assert error.value.hint.endswith(
+        "Tried in vain: more features, more pairs, another lens model and the global mapper."
+    )
+    assert [w.split("Trying again with ")[1].split()[-1] for w in report.warnings] == [
+        "too.",
+        "other.",
+        "(OPENCV).",
+        "mapper).",
+    ]
+
+
+def test_the_global_mapper_and_wider_pairs_find_the_room_as_well(tmp_path, tools):
+    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(10)]
+    request, frames = tools.asked(tmp_path, pictures, mapper="global", wide=True)
+    answer = climb(request, frames, False, tmp_path, tmp_path / "log.txt", tools.recorder()).best.answer
+    assert fault_of(answer, frames) is None and answer["result"]["registered"] == 10
+    assert answer["result"]["focal_px"] == pytest.approx(300.0, rel=0.02)

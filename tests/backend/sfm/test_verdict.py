@@ -1,0 +1,102 @@
+"""Clips that no cameras can be found for, each refused in a sentence of its own.
+
+Real pictures (examples/sitting.mp4) where they make the clip: a tripod and a head that turns show one place, so one
+frame, warped, is what they film. The others are of the rendered room.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import uniform_filter1d
+
+from torch_backend.contract import ExitCode, JobError
+from torch_backend.footage import FootageConfig, import_footage
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.sfm.solving import SolveConfig, solve_shot
+from torch_backend.shot import Shot
+
+SITTING = Path(__file__).resolve().parents[3] / "examples" / "sitting.mp4"
+
+
+@pytest.fixture(scope="module")
+def sitting(tmp_path_factory, tools):
+    """The first nine frames of the example, 320 x 240: 0.8 s, in which the camera has not gone anywhere."""
+    shot = Shot.create(tmp_path_factory.mktemp("sitting") / "short.splannequin")
+    import_footage(shot, str(SITTING), FootageConfig(first=1, last=9, step=1, working_height=240), tools.recorder())
+    return shot
+
+
+def clip(folder, pictures):
+    (folder / "clip").mkdir()
+    for n, pixels in enumerate(pictures, 1):
+        write_png(folder / "clip" / f"f.{n:04d}.png", np.clip(np.rint(pixels), 0, 255).astype(np.uint8))
+    return str(folder / "clip")
+
+
+def refused(tools, folder, source, fps=8.0, **settings):
+    """(sentence, hint, warnings) of what a solve of a clip refuses with."""
+    shot, report = Shot.create(folder / "a.splannequin"), tools.recorder()
+    import_footage(shot, source, FootageConfig(step=1, fps=fps), tools.recorder())
+    return refusal(shot, report, **settings)
+
+
+def refusal(shot, report, **settings):
+    with pytest.raises(JobError) as error:
+        solve_shot(shot, SolveConfig(features=700, **settings), report)
+    assert error.value.exit_code == ExitCode.SOLVE and not (shot.solve / "scratch").exists()
+    return error.value.message, error.value.hint, report.warnings
+
+
+def still(sitting):
+    return read_png(next(sitting.raw.iterdir())).astype(np.float64)
+
+
+def test_a_tripod(tmp_path, tools, sitting):
+    rng, picture = np.random.default_rng(0), still(sitting)
+    source = clip(tmp_path, [picture + rng.normal(0.0, 4.0, picture.shape) for _ in range(9)])
+    message, hint, warnings = refused(tools, tmp_path, source)
+    assert message.startswith("The camera does not move: features shift by at most ")
+    assert "sideways by a step" in hint and warnings == []
+
+
+def test_a_camera_that_pans_on_its_tripod(tmp_path, tools, sitting):
+    """The frame through the homographies of a turning camera, with the sensor's noise of its own in each."""
+    picture, lens = still(sitting), np.array([[287.0, 0.0, 160.0], [0.0, 287.0, 120.0], [0.0, 0.0, 1.0]])
+    rng = np.random.default_rng(0)
+    pictures = []
+    for n in range(9):
+        turn = tools.look([0, 0, 0], yaw=0.03 * (n - 4), pitch=0.01 * n)[:3, :3]
+        moved = cv2.warpPerspective(picture, lens @ turn @ np.linalg.inv(lens), (320, 240), flags=cv2.INTER_CUBIC)
+        pictures.append((moved + rng.normal(0.0, 2.0, moved.shape))[36:204, 48:272])
+    message, _, warnings = refused(tools, tmp_path, clip(tmp_path, pictures))
+    assert message == "The camera only turns on the spot: there is nothing to tell depth by." and warnings == []
+
+
+def test_a_range_that_is_too_short(tools, sitting):
+    message, hint, warnings = refusal(sitting, tools.recorder())
+    assert message.startswith("The range of 9 frames (0.8 s) is too short: ")
+    assert hint == "Import a longer range, in which the camera moves sideways by a step or more." and warnings == []
+
+
+def test_shake(tmp_path, tools):
+    """The first frames are sharp; then whoever holds the camera stumbles."""
+    poses, noise = tools.handheld(11), np.random.default_rng(1)
+    pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)).astype(np.float64) for pose in poses]
+    for n in range(5, 11):
+        wide = min(41, 14 * (n - 4))  # not from one frame to the next: that would be a cut
+        pictures[n] = uniform_filter1d(uniform_filter1d(pictures[n], wide, axis=1), wide, axis=0)
+    source = clip(tmp_path, [picture + noise.normal(0.0, 0.5, picture.shape) for picture in pictures])
+    message, hint, _ = refused(tools, tmp_path, source, retry=False)
+    assert message.startswith("Cameras were found for only 6 of 11 frames")
+    assert message.endswith("; 5 of the other 5 are smeared by shake or fast motion.")
+    assert "without fast pans or blur" in hint
+
+
+def test_a_fisheye_taken_for_an_ordinary_lens(tmp_path, tools):
+    rays = tools.fisheye_rays(120.0, 0.0)
+    source = clip(tmp_path, [tools.room().cast(pose, rays) for pose in tools.handheld(9)])
+    message, hint, _ = refused(tools, tmp_path, source, retry=False)
+    assert message.startswith("The solve found a lens that no camera has: it folds the picture over")
+    assert hint.startswith("Choose Fisheye as the lens (--camera-model OPENCV_FISHEYE) if it is one")

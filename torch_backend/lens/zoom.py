@@ -1,0 +1,134 @@
+"""Whether the lens zooms during the take, by the focal length that each frame would rather have. numpy alone.
+
+A solve has one focal length for all frames. Where the lens zooms, it moves the cameras along their axes instead, and
+the error stays small. Points at different depths tell the two apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.poses import quat_to_rotation
+
+ZOOM = 0.02
+"""Change of focal length within the take, in natural logarithms, from which on the lens zooms."""
+_LEAST_POINTS = 30
+"""Fewer points do not tell the focal length of a frame."""
+_LEAST_FRAMES = 8
+_STEPS = 20
+_MOST = 2.0
+"""Logarithm beyond which the refinement has run off."""
+_OUTLIER_PX = 1.5
+"""Residuals beyond this count less, in pixels."""
+
+
+def focal_change(
+    seen: NDArray[np.float64], points: NDArray[np.float64], pose: NDArray[np.float64], focal: float
+) -> float:
+    """Natural logarithm of the focal length that a frame would rather have, over the one of the solve; nan if unknown.
+
+    Pose and focal length of the frame are refined together, with the points held (Gauss-Newton, Huber weights).
+
+    Args:
+        seen: [N, 2] where the frame shows the points, without the lens: x/z and y/z by the solve's focal length.
+        points: [N, 3] world.
+        pose: [3, 4] world-to-camera.
+        focal: focal length of the solve in pixels.
+    """
+    if len(points) < _LEAST_POINTS:
+        return float("nan")
+    rotation, shift, change = _part(pose[:, :3]), _part(pose[:, 3]), 0.0
+    for _ in range(_STEPS):
+        residual, jacobian = _linearised(seen, points, rotation, shift, focal, change)
+        weight = 1.0 / np.maximum(1.0, np.linalg.norm(residual, axis=1) / _OUTLIER_PX)
+        weighted = _part((jacobian * weight[:, None, None]).reshape(-1, 7))
+        normal = _part(weighted.T @ jacobian.reshape(-1, 7))
+        try:
+            step = _part(-np.linalg.solve(normal, weighted.T @ residual.reshape(-1)))
+            turned = quat_to_rotation(np.array([1.0, *(0.5 * step[:3])]))  # a small turn, to first order
+            rotation, shift = _part(turned @ rotation), _part(turned @ shift + step[3:6])
+            change += float(step[6])
+            if not abs(change) < _MOST:
+                return float("nan")
+            if abs(float(step[6])) < 1e-6:
+                # A flat scene seen head-on does not tell the focal length: its figure would be noise.
+                noise = 1.48 * float(np.median(np.abs(residual)))
+                known = noise * float(np.linalg.inv(normal)[6, 6]) ** 0.5 < 0.25 * ZOOM
+                return change if known else float("nan")
+        except np.linalg.LinAlgError:
+            return float("nan")
+    return float("nan")
+
+
+def _part(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Values whose type numpy leaves open."""
+    return np.asarray(values, np.float64)
+
+
+def _linearised(
+    seen: NDArray[np.float64],
+    points: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    shift: NDArray[np.float64],
+    focal: float,
+    change: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(residuals [N, 2] in pixels, their derivatives [N, 2, 7]) by a turn, a shift of the camera and the logarithm."""
+    at = points @ rotation.T + shift
+    flat = at[:, :2] / at[:, 2:]
+    scale = focal * np.exp(change)
+    by_shift = np.zeros((len(at), 2, 3))
+    by_shift[:, 0, 0] = by_shift[:, 1, 1] = 1.0 / at[:, 2]
+    by_shift[:, :, 2] = -flat / at[:, 2:]
+    by_turn = by_shift @ -_cross(at)  # a turn w moves a point p of the camera by w x p = -[p]x w
+    jacobian = scale * np.concatenate([by_turn, by_shift, flat[:, :, None]], axis=2)
+    return _part(scale * flat - focal * seen), _part(jacobian)
+
+
+def zoom_words(changes: Mapping[int, float]) -> tuple[str, str] | None:
+    """(what is wrong, what to do) where the focal length changes over the take; None where it does not.
+
+    Args:
+        changes: frame number -> `focal_change`.
+    """
+    known = [(frame, change) for frame, change in sorted(changes.items()) if np.isfinite(change)]
+    if len(known) < _LEAST_FRAMES:
+        return None
+    frames, values = [frame for frame, _ in known], np.array([change for _, change in known])
+    padded = np.pad(values, 2, mode="edge")
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)  # one odd frame is no zoom
+    whole = float(smooth.max() - smooth.min())
+    if whole < ZOOM:
+        return None
+    first, last = _steady(smooth)
+    percent = round(100 * (np.exp(whole) - 1.0))
+    hint = f"Import frames {frames[first]} to {frames[last]}, in which it does not, or film without zooming."
+    if last - first + 1 < _LEAST_FRAMES:
+        hint = "Film without zooming, or choose a range in which it does not."
+    return (
+        f"The lens zooms: its focal length changes by {percent} % or more during the take, and this solve has one for "
+        "all frames. Its path is wrong, however small its error is.",
+        hint,
+    )
+
+
+def _steady(values: NDArray[np.float64]) -> tuple[int, int]:
+    """First and last index of the longest run whose values differ by less than half of `ZOOM`."""
+    best, start = (0, 0), 0
+    for end in range(len(values)):
+        while np.ptp(values[start : end + 1]) > 0.5 * ZOOM:
+            start += 1
+        if end - start > best[1] - best[0]:
+            best = (start, end)
+    return best
+
+
+def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[..., 3, 3] that a vector is multiplied by for the cross products of vectors [..., 3] with it."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - np.swapaxes(out, -1, -2)

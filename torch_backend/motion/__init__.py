@@ -1,0 +1,1 @@
+"""What moves by itself in a clip whose cameras are known: motion mattes, and points of what stands still."""

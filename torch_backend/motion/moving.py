@@ -1,0 +1,305 @@
+"""From a solved clip to its motion mattes: key frames are tested, their scores follow surfaces through time, and areas.
+
+Keys are about ten frames a second, more in a short clip; the frames between two keys take theirs by flow. Frames go
+through a window of a few seconds, so a clip of any length takes the same memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras.stored import load_cameras, load_points
+from ..contract import Reporter
+from ..footage import load_frames
+from ..footage.images import read_frame
+from ..sfm.masks import IGNORE, load_mask, painted_over
+from ..shot import Shot
+from .flow import FlowConfig, Map, Matches, neighbours, sample
+from .leftover import Leftover
+from .misfit import MisfitConfig, Sight, misfit, seeded
+from .still import Evidence, Look, StillTest, evidence
+
+_FLOW_WIDTH = 640
+_LARGEST_SCALE = 2.0
+_KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
+_LEAST_SIDE = 64
+_LEFT_EVERY = 2
+"""In every so manieth key frame what is left of motion is looked for: sways are slow."""
+_ENOUGH, _UNKNOWN = 3.0, 0.1
+"""Weights: more than the one adds nothing, below the other nothing is known."""
+
+
+StaticViews = Callable[[int], NDArray[np.uint8] | None]
+"""Frame number -> what a static model of the clip shows from its camera, [h, w, 3] as the frames are; None: nothing."""
+
+
+class Clip:
+    """Frames and cameras of a solved shot, in the flow's size."""
+
+    def __init__(self, shot: Shot, static: StaticViews | None = None) -> None:
+        """JobError if it is not solved."""
+        path = load_cameras(shot)
+        seconds = {int(row["frame"]): float(row["seconds"]) for row in load_frames(shot)["frames"]}
+        self._shot, self._static = shot, static
+        self.frames = [camera.frame for camera in path.frames]
+        """Numbers of the delivered frames, ascending."""
+        self.width, self.height = path.width, path.height
+        scale = min(_LARGEST_SCALE, _FLOW_WIDTH / path.width)
+        width, height = (max(_LEAST_SIDE, round(side * scale / 2) * 2) for side in (path.width, path.height))
+        self.flow_size = width, height
+        self.unit = width / 640.0
+        """Flow pixels in one pixel of a picture 640 wide."""
+        self.keys = _keys([seconds.get(frame, float(n)) for n, frame in enumerate(self.frames)])
+        """Indices into `frames`."""
+        viewmats = np.array([c.viewmat for c in path.frames], np.float64).reshape(-1, 4, 4)
+        Ks = np.array([[[c.K[0], 0, c.K[2]], [0, c.K[1], c.K[3]], [0, 0, 1]] for c in path.frames], np.float64)
+        Ks *= np.array([width / path.width, height / path.height, 1.0])[None, :, None]
+        self.viewmats, self.Ks = viewmats[self.keys], Ks[self.keys]
+        """Of the keys: [K, 4, 4] world-to-camera, solve units, and [K, 3, 3] in flow pixels."""
+        self._cameras = viewmats, Ks
+        self._guessed = [camera.source == "interpolated" for camera in path.frames]
+        self.guessed = [self._guessed[i] for i in self.keys]
+        """Keys whose pose was not solved."""
+        points = load_points(shot)["xyz"].astype(np.float64)
+        self.depths = [_typical_depth(points, viewmat) for viewmat in self.viewmats]
+        """Of the keys: median depth of the sparse points before the camera."""
+        self._pictures: dict[int, tuple[NDArray[np.uint8], Sight]] = {}
+        self._looks: dict[int, Look] = {}
+
+    def picture(self, key: int) -> NDArray[np.uint8]:
+        """Grey picture of a key in the flow's size. JobError if the frame is damaged."""
+        return self.shown(key)[0]
+
+    def sight(self, key: int) -> Sight | None:
+        """A key in colour, with its camera; None if its pose was not solved."""
+        return None if self.guessed[key] else self.shown(key)[1]
+
+    def shown(self, key: int) -> tuple[NDArray[np.uint8], Sight]:
+        """A key, as `frame` returns it."""
+        if key not in self._pictures:
+            self._pictures[key] = self.frame(self.keys[key])
+        return self._pictures[key]
+
+    def look(self, key: int) -> Look:
+        """It, prepared for comparison."""
+        if key not in self._looks:
+            self._looks[key] = Look(self.picture(key))
+        return self._looks[key]
+
+    def frame(self, index: int) -> tuple[NDArray[np.uint8], Sight]:
+        """Any frame: grey in the flow's size, as `picture`, and in colour on the grid, with its camera."""
+        pixels = read_frame(self._shot.plate(self.frames[index]))
+        pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+        ignored = load_mask(self._shot, IGNORE, self.frames[index])
+        if ignored is not None:
+            pixels = painted_over(pixels, ignored)
+        grey = _sized(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8), self.flow_size)
+        colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))
+        return grey, Sight(colors, self._cameras[0][index], self._cameras[1][index])
+
+    def static(self, index: int) -> NDArray[np.uint8] | None:
+        """[h, w, 3] what a static model of the clip shows in a frame, on the grid; None if there is none."""
+        shown = None if self._static is None else self._static(self.frames[index])
+        return None if shown is None else _sized(shown, (self.flow_size[0] // 2, self.flow_size[1] // 2))
+
+    def references(self, count: int) -> dict[int, Sight]:
+        """Key -> so many keys of solved poses, evenly spaced; none if there is no static model."""
+        solved = [key for key, guessed in enumerate(self.guessed) if not guessed]
+        if self._static is None or not solved:
+            return {}
+        chosen = {solved[n * (len(solved) - 1) // (count - 1)] for n in range(count)}
+        return {key: self.frame(self.keys[key])[1] for key in sorted(chosen)}
+
+    def is_guessed(self, index: int) -> bool:
+        """True if the pose of a frame was not solved."""
+        return self._guessed[index]
+
+    def forget(self, before: int) -> None:
+        """Drops the pictures of keys below `before`."""
+        for store in (self._pictures, self._looks):
+            for key in [key for key in store if key < before]:
+                del store[key]
+
+
+def _sized(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """A picture at another size: averaged where it shrinks."""
+    if pixels.shape[1::-1] == size:
+        return pixels
+    how = cv2.INTER_AREA if size[0] < pixels.shape[1] else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(pixels, size, interpolation=how), np.uint8)
+
+
+def _keys(seconds: list[float]) -> list[int]:
+    """Indices of the key frames: evenly spaced, the first and the last frame among them."""
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+    stride = round(1.0 / (_KEYS_PER_SECOND * step)) if step > 0 else 1
+    stride = max(1, min(stride, len(seconds) // _LEAST_KEYS))
+    return sorted({*range(0, len(seconds), stride), len(seconds) - 1})
+
+
+def _typical_depth(points: NDArray[Any], viewmat: NDArray[Any]) -> float:
+    """Median depth of points [P, 3] before a camera [4, 4]; 1 if there are none."""
+    z = points @ viewmat[2, :3] + viewmat[2, 3]
+    z = z[z > 0]
+    return float(np.median(z)) if len(z) else 1.0
+
+
+def mattes(
+    clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter,
+    tell: Callable[[int, tuple[Map, Map], Evidence], None] | None = None,
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:  # fmt: skip
+    """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order.
+
+    `tell` hears each key's evidence and the grid it is on, before the key's matte comes.
+    """
+    keys, reach = clip.keys, config.reach * config.baselines[-1]
+    groups = [range(keys[k - 1] + 1 if k else 0, keys[k] + 1) for k in range(len(keys))]
+    wanted = [any(n not in written for n in group) for group in groups]
+    if not any(wanted):
+        return
+    first, last = wanted.index(True), len(wanted) - 1 - wanted[::-1].index(True)
+    matches = Matches(clip.picture, config, clip.unit)
+    rest = MisfitConfig()
+    references = clip.references(rest.references)
+    own: dict[int, tuple[Map, Map, Map]] = {}
+    final: dict[int, tuple[Map, Map]] = {}
+    start = max(0, first - 1 - reach)
+    left: tuple[Map, Map] | None = None
+    for turn in range(start - start % _LEFT_EVERY, last + reach + 1):
+        report.check_cancelled()
+        if turn < len(keys):
+            left = None if turn % _LEFT_EVERY == 0 else left
+            own[turn], left, found = _own_score(clip, matches, turn, config, left)
+            if tell is not None:
+                tell(turn, matches.grid, found)
+        key = turn - reach
+        if key < max(0, first - 1) or not (wanted[key] or wanted[min(key + 1, last)]):
+            continue
+        final[key] = _followed(matches, key, own, len(keys), reach, config)
+        for n in groups[key] if wanted[key] else ():
+            if n not in written:
+                picture, sight = clip.shown(key) if n == keys[key] else clip.frame(n)
+                if n == keys[key]:
+                    score, inverse = final[key], own[key][2]
+                else:
+                    score, inverse = _between(clip, matches, picture, key, final, own)
+                unlike = _misfit(clip, n, sight, inverse, references, matches.grid, rest)
+                yield n, _labels(clip, picture, *score, unlike, config, rest)
+        for store in (own, final):
+            for old in [k for k in store if k < key - reach + 1]:
+                del store[old]
+        matches.forget(key - config.baselines[-1] + 1, key - config.links * config.baselines[-1])
+        clip.forget(key - config.baselines[-1])
+
+
+def _own_score(
+    clip: Clip, matches: Matches, key: int, config: FlowConfig, before: tuple[Map, Map] | None
+) -> tuple[tuple[Map, Map, Map], tuple[Map, Map], Evidence]:
+    """((score, weight, inverse), what is left, evidence): how surely a key frame's points move, 0 to 1, how much is
+    known of them, and the inverse depths of still points.
+
+    What is left of motion is looked for if there is none of the key `before`; else that is followed to here.
+    """
+    seen = neighbours(matches, key, len(clip.keys), config)
+    test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
+    told = evidence(test, key, seen, clip.depths[key], config)
+    inverse, count = told.inverse, told.on + told.off
+    score = np.clip(told.off / (count + config.doubt) / config.share, 0.0, 1.0)
+    if before is None:
+        left, known = Leftover(clip.picture, test, config).score(key, len(clip.keys), inverse, clip.depths[key])
+    else:
+        last = next(each for each in seen if each.key == key - 1)
+        left, known = (sample(values, last.at) * last.found for values in before)
+    sure = np.minimum(count / config.sure, 1.0) * (count >= 1.0)
+    own = np.maximum(score, left), np.maximum(sure, known * (left > score)), inverse
+    return own, (left, known), told
+
+
+def _followed(
+    matches: Matches, key: int, own: dict[int, tuple[Map, Map, Map]], count: int, reach: int, config: FlowConfig
+) -> tuple[Map, Map]:
+    """Score and weight of a key frame with those of its neighbours followed to it: a surface has one label."""
+    score, sure, _ = own[key]
+    total, weight = 2.0 * score * sure, 2.0 * sure
+    for seen in neighbours(matches, key, count, config):
+        if abs(seen.key - key) <= reach:
+            score, sure, _ = own[seen.key]
+            share = sample(sure, seen.at) * seen.found
+            total = total + share * sample(score, seen.at)
+            weight = weight + share
+    return total / np.maximum(weight, 1e-6), weight
+
+
+def _between(
+    clip: Clip, matches: Matches, picture: NDArray[np.uint8], key: int, final: dict[int, tuple[Map, Map]],
+    own: dict[int, tuple[Map, Map, Map]],
+) -> tuple[tuple[Map, Map], Map]:  # fmt: skip
+    """(score, weight) and inverse depths of still points of a frame between key - 1 and key, by flow to both."""
+    total = np.zeros(picture.shape, np.float32)[::2, ::2]
+    weight, inverse, count = (np.zeros_like(total) for _ in range(3))
+    for other in (key - 1, key):
+        at, found = matches.loose(picture, clip.picture(other))
+        score, sure = final[other]
+        share = sample(sure, at) * found
+        total, weight = total + share * sample(score, at), weight + share
+        near = found + np.float32(1e-3)
+        inverse, count = inverse + near * sample(own[other][2], at), count + near
+    return (total / np.maximum(weight, 1e-6), weight), inverse / count
+
+
+def _misfit(
+    clip: Clip, n: int, sight: Sight, inverse: Map, references: Mapping[int, Sight], grid: tuple[Map, Map],
+    config: MisfitConfig,
+) -> Map:  # fmt: skip
+    """`misfit` of frame `n` on the grid; 0 without a static model and where the pose was guessed."""
+    shown = None if clip.is_guessed(n) else clip.static(n)
+    if shown is None:
+        return np.zeros(inverse.shape, np.float32)
+    others = [other for key, other in references.items() if clip.keys[key] != n]
+    return misfit(sight, inverse, shown, others, grid, 0.5 * clip.unit, config)
+
+
+def _labels(
+    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, unlike: Map, config: FlowConfig, rest: MisfitConfig
+) -> NDArray[np.uint8]:
+    """The labels [H, W] of a frame's score and weight on the grid, and of its misfit there."""
+    grey = cv2.resize(picture, score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+    spread = _Spread(grey, config.radius, config.edge)
+    weight = np.minimum(weight, _ENOUGH)
+    known = np.maximum(spread(weight), 0.0)
+    score = spread(score * weight) / np.maximum(known, 1e-3)
+    size = clip.width, clip.height
+    score, known, unlike = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (score, known, unlike))
+    least = round((config.blob * clip.width / 640) ** 2)
+    moving = seeded(score > config.grow, score > config.seed, least)
+    moving |= seeded(unlike > rest.weak, unlike > rest.strong, least)
+    still = seeded(~moving, ~moving, least)  # holes are filled
+    unknown = known < _UNKNOWN
+    unknown = seeded(unknown, unknown, least)
+    return np.where(~still, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
+
+
+class _Spread:
+    """Spreads values within the areas of a picture, stopping at its edges: a guided filter (He 2010), grey."""
+
+    def __init__(self, picture: Map, radius: int, edge: float) -> None:
+        """`picture` [h, w] 0 to 255; differences below `edge` are none."""
+        self._size = (2 * radius + 1, 2 * radius + 1)
+        self._picture = picture
+        self._mean = self._blur(picture)
+        self._variance = self._blur(picture * picture) - self._mean**2 + np.float32(edge * edge)
+
+    def _blur(self, values: Map) -> Map:
+        return cv2.blur(values, self._size, borderType=cv2.BORDER_REFLECT)
+
+    def __call__(self, values: Map) -> Map:
+        """[h, w] to the same."""
+        mean = self._blur(values)
+        slope = (self._blur(values * self._picture) - mean * self._mean) / self._variance
+        level = mean - slope * self._mean
+        return self._blur(slope) * self._picture + self._blur(level)

@@ -1,0 +1,1 @@
+"""Structure from motion: COLMAP in a child process, its frames, masks and verdict."""

@@ -1,0 +1,198 @@
+"""A solve whose cameras are given: what the worker's answer would be, from a file instead of the mapper."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..array_types import save_arrays
+from ..cameras import foreign
+from ..cameras.colmap_files import ColmapCamera, ColmapImage, ColmapModel, ColmapPoints, write_model
+from ..cameras.poses import camera_centre
+from ..contract import POINTS_FILE, REQUEST_FILE, ExitCode, JobError, Reporter
+from ..footage.pairing import counted_of
+from ..shot import Shot, write_json
+from .child import run_worker
+from .points import LEAST_POINTS, filter_points, refuse_narrow
+
+LEAST_AGREEMENT = 0.25
+"""Share of the keypoints matched between frames that find a point, below which given cameras are of something else.
+Cameras of a rendered room: 0.93 (0.76 a frame off, 0.35 four frames off, 0.05 at random); of a real clip: 0.67."""
+POOR_AGREEMENT = 0.5
+"""Share below which they are doubted aloud."""
+
+
+@dataclass
+class Taken:
+    """Given cameras, matched to a clip."""
+
+    solve: foreign.ForeignSolve
+    """What was read."""
+    matched: foreign.Matched
+    """The frames' cameras."""
+
+
+def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> Taken:
+    """Reads cameras and matches them to the frames of a frames.json; tells `report` which are missing.
+
+    JobError (SOLVE) if they cannot be read, are too few, or are of pictures of another shape.
+    """
+    solve = foreign.read(cameras)
+    listed = frames["frames"]
+    size, solved = (frames["width"], frames["height"]), [f["frame"] for f in listed if f["solve"]]
+    matched = foreign.match(solve, counted_of(frames), size, solved)
+    for message, hint in foreign.remarks(solve, matched):
+        report.warning(message, hint)
+    return Taken(solve, matched)
+
+
+def take_over(
+    shot: Shot,
+    frames: dict[str, Any],
+    taken: Taken,
+    options: dict[str, Any],
+    scratch: Path,
+    report: Reporter,
+) -> dict[str, Any]:
+    """Has the worker do what given cameras leave to do: undistort their lenses, and triangulate points if need be.
+
+    The file's own points are taken if enough of them come with errors and tracks to train from; else points are
+    triangulated with the cameras held, which also tells how well they fit.
+
+    Args:
+        shot: an imported shot.
+        frames: its frames.json.
+        taken: what `prepare` found.
+        options: the worker's overlap and features.
+        scratch: folder that takes poses.json, points.npz, undistort_N.npz and model/, as after a solve.
+        report: hears of progress.
+
+    Returns:
+        The worker's answer as after a solve; "given" says that it is none, and holds the kind of file; "world" is that
+        of the file's cameras.
+
+    Raises:
+        JobError: the worker broke off, or not one point agrees with the cameras.
+    """
+    given, matched = taken.solve, taken.matched
+    size = (frames["width"], frames["height"])
+    used = sorted({camera.lens for camera in matched.cameras.values()})
+    lenses = [given.lenses[n].scaled(*size) for n in used]
+    names = {f["frame"]: Path(f["file"]).name for f in frames["frames"]}
+    poses = {
+        names[n]: {"pose": camera.pose.tolist(), "source": "registered", "lens": used.index(camera.lens)}
+        for n, camera in matched.cameras.items()
+    }
+    registered = [f["frame"] for f in frames["frames"] if f["solve"] and f["frame"] in matched.cameras]
+    points = _own_points(taken, size)
+    known = {
+        "lenses": [vars(lens) for lens in lenses],
+        "images": {name: {"lens": p["lens"], "pose": p["pose"]} for name, p in poses.items()},
+        "triangulate": points is None,
+    }
+    write_json(scratch / REQUEST_FILE, _request(shot, [names[n] for n in registered], known, options))
+    answer = run_worker(scratch / REQUEST_FILE, shot.colmap_log, report)["result"]
+    (scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
+    if points is not None:
+        answer = _keep_own(points, scratch, lenses, poses)
+    if not answer["points"]:  # the worker left nothing to read
+        refuse_misfit(answer, 0)
+    fx, fy, _, _, *bend = lenses[0].params
+    return {
+        **answer,
+        "given": given.kind,
+        "world": given.world,
+        "registered": len(registered),
+        "camera_model": lenses[0].model,
+        "focal_px": 0.5 * (fx + fy),
+        "distortion": bend,
+    }
+
+
+def _own_points(taken: Taken, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
+    """The file's own points for pictures of `size` (w, h) as `foreign.own_points`, if enough to train from."""
+    points = foreign.own_points(taken.solve, taken.matched, size)
+    centres = np.array([camera_centre(camera.pose) for camera in taken.matched.cameras.values()])
+    return points if points is not None and _enough(points, centres) else None
+
+
+def _request(shot: Shot, solved: list[str], known: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """What the worker is asked: `solved` are names of pictures, `known` is what the cameras' file says of them."""
+    return {
+        "images": str(shot.raw),
+        "solved": solved,
+        "others": [],
+        "camera_model": "PINHOLE",
+        "neighbours": 0,
+        "threads": max(1, min(os.cpu_count() or 1, 16)),
+        **options,
+        "known": known,
+    }
+
+
+def _keep_own(
+    points: dict[str, NDArray[Any]], scratch: Path, lenses: list[foreign.Lens], poses: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """Writes the file's own points and a model of them into `scratch`; the answer that the worker gives of its own."""
+    angle = float(points.pop("angle"))
+    save_arrays(scratch / POINTS_FILE, points)
+    _write_model(scratch / "model", lenses, poses, points)
+    known = points["error"][points["error"] > 0]
+    return {
+        "points": len(points["xyz"]),
+        "reprojection_error_px": float(known.mean()),
+        "triangulation_angle_deg": angle,
+    }
+
+
+def refuse_misfit(answer: dict[str, Any], usable: int) -> None:
+    """JobError for given cameras that nothing could be trained on, `usable` points being left to train from."""
+    agreement = answer.get("agreement", 1.0)
+    if usable < LEAST_POINTS or agreement < LEAST_AGREEMENT:
+        share = f", and {100 * agreement:.0f} % of what was matched" if "agreement" in answer else ""
+        raise JobError(
+            f"The given cameras do not fit these frames: only {usable} points of the scene{share} agree with them.",
+            "Are they of this clip and its lens, and numbered as its frames are?",
+            ExitCode.SOLVE,
+        )
+    refuse_narrow(answer["triangulation_angle_deg"])
+
+
+def doubts(answer: dict[str, Any]) -> list[tuple[str, str]]:
+    """(sentence, hint) for cameras that are taken, but fit the frames badly."""
+    if answer.get("agreement", 1.0) >= POOR_AGREEMENT:
+        return []
+    share = f"{100 * answer['agreement']:.0f} %"
+    return [
+        (
+            f"Only {share} of what was matched between the frames agrees with the given cameras.",
+            "Are they of this clip and its lens, and numbered as its frames are?",
+        )
+    ]
+
+
+def _enough(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> bool:
+    """True if points of a file, with errors that were measured, are enough to train from."""
+    table = {name: points[name] for name in ("xyz", "rgb", "error", "track", "depth")}
+    return bool((points["error"] > 0).any()) and len(filter_points(table, centres)["xyz"]) >= LEAST_POINTS
+
+
+def _write_model(
+    folder: Path, lenses: list[foreign.Lens], poses: dict[str, dict[str, Any]], points: dict[str, NDArray[Any]]
+) -> None:
+    """The given model, of the working frames, as a solve would leave its own."""
+    cameras = {n: ColmapCamera(n, x.model, x.width, x.height, x.params) for n, x in enumerate(lenses, start=1)}
+    images = [
+        ColmapImage(n, name, camera["lens"] + 1, np.array(camera["pose"]))
+        for n, (name, camera) in enumerate(sorted(poses.items()), start=1)
+    ]
+    count = len(points["xyz"])
+    xyz, error = points["xyz"].astype(np.float64), points["error"].astype(np.float64)
+    empty = [np.zeros(0, np.int64)] * count
+    write_model(folder, ColmapModel(cameras, images, ColmapPoints(xyz, points["rgb"], error, empty)))

@@ -1,0 +1,198 @@
+"""Cameras and points from the matches: COLMAP's mappers, their lens, and points between cameras that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from ..lens.lens_verdict import doubt_of
+from . import colmap_types as colmap
+from .matching import extract, match
+from .request import SEED, Request, closing_database, say
+
+HELD_SHARE, HELD_WORSE, HELD_ERROR_PX = 0.9, 1.25, 1.0
+"""A usual lens is taken instead of a doubtful one if it places this share of the frames, with errors no more than so
+many times as large, or no more than so many pixels."""
+MASKED_INLIERS = (50, 15)
+"""Matches that a first pair and a further image need where masks leave few, half of COLMAP's: what would mislead is
+masked. A room of which 70 % of 320 x 240 pixels were masked: 26 of 30 images instead of 4."""
+LONG_TRACK = 128
+"""Images of a point's track from which on not all of them are asked for the angle under which it is seen."""
+TRIANGULATE_LEAST_DEG = 1.0
+"""Smallest angle under which a point is triangulated from known cameras."""
+
+
+def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruction]:
+    """Every model that the mapper finds, the largest first: incremental mapping, if the request has no other.
+
+    With `hold_lens` the lens stays as it was before any picture was seen: a usual focal length, no distortion.
+    """
+    if request.mapper == "global":
+        return build_globally(request, hold_lens)
+    options = pycolmap.IncrementalPipelineOptions()
+    # One thread repeats bit for bit, and costs nothing: a clip of 75 frames is below what Ceres shares out.
+    options.num_threads = 1
+    options.random_seed = SEED
+    options.mapper.random_seed = SEED
+    options.triangulation.random_seed = SEED
+    # A clip of 75 frames needs no global adjustment every 10 % of growth. Each runs until it has settled, though: with
+    # two rounds of it, as with one of the local ones, a start from two frames that show little depth was kept, and a
+    # whole walk was solved wrongly at an error of 0.9 px (docs/decisions.md).
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+    if request.reuse:  # it has placed frames of a try before
+        options.image_names = request.solved
+    if request.masks:
+        options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = MASKED_INLIERS
+    if hold_lens or request.hold_focal:
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
+    if hold_lens or request.hold_bend:
+        options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
+    folder = request.scratch / ("models_held" if hold_lens else "models")
+    folder.mkdir()
+    total = len(request.solved)
+    done = 2
+    say(stage="cameras", done=0, total=total)
+
+    def next_image() -> None:
+        nonlocal done
+        done += 1
+        say(stage="cameras", done=min(done, total), total=total)
+
+    found = colmap.incremental_mapping(request.database, request.images, folder, options, next_image)
+    say(stage="cameras", done=total, total=total)
+    return _largest_first(found)
+
+
+def build_globally(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruction]:
+    """Global mapping (GLOMAP): all rotations, then all places at once. As `build`; it wants a focal length beforehand,
+    and where none was told the pairs' own are taken."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.image_names = request.solved
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = SEED
+    options.mapper.rotation_averaging.random_seed = options.mapper.global_positioning.random_seed = SEED
+    options.mapper.retriangulation.random_seed = SEED
+    adjustment = options.mapper.bundle_adjustment
+    options.mapper.global_positioning.use_gpu = adjustment.ceres.use_gpu = False
+    if hold_lens or request.hold_focal:
+        adjustment.refine_focal_length = False
+    if hold_lens or request.hold_bend:
+        adjustment.refine_extra_params = False
+    if not request.start_focal:
+        colmap.calibrate_view_graph(request.database)
+    folder = request.scratch / ("models_held" if hold_lens else "models")
+    folder.mkdir()
+    say(stage="cameras")
+    return _largest_first(colmap.global_mapping(request.database, request.images, folder, options))
+
+
+def _largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    # The first model that the mapper writes is often a fragment: the largest is meant.
+    models = [m for m in found.values() if m.num_reg_images() >= 2]
+    return sorted(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
+
+
+def first_camera(model: pycolmap.Reconstruction) -> pycolmap.Camera:
+    """The lens of a solve of our own: all its images share one."""
+    return next(iter(colmap.cameras(model).values()))
+
+
+def left_bend(model: pycolmap.Reconstruction) -> float:
+    """First radial coefficient that the model of a straightened clip would rather have: 0 if its lens is all out."""
+    freed = pycolmap.Reconstruction(model)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = True
+    options.print_summary = False
+    colmap.adjust(freed, options)
+    camera = first_camera(freed)
+    return float(camera.params[camera.extra_params_idxs()[0]])
+
+
+def posed(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """The images that have a place in the model."""
+    return [image for image in colmap.images(model).values() if image.has_pose]
+
+
+def lens_of(camera: pycolmap.Camera) -> tuple[str, int, int, list[float]]:
+    """Model, width, height and parameters of a camera, as `lens_verdict` wants them."""
+    return camera.model_name, camera.width, camera.height, [float(value) for value in camera.params]
+
+
+def lens_doubt(request: Request, model: pycolmap.Reconstruction) -> str:
+    """`lens_verdict.doubt_of` a model's lens."""
+    return doubt_of(*lens_of(first_camera(model)), request.focal)
+
+
+def as_good(held: pycolmap.Reconstruction, free: pycolmap.Reconstruction) -> bool:
+    """True if a model explains the clip with a usual lens about as well as another with a lens of its own."""
+    if held.num_reg_images() < HELD_SHARE * free.num_reg_images():
+        return False
+    error = held.compute_mean_reprojection_error()
+    return error <= max(HELD_WORSE * free.compute_mean_reprojection_error(), HELD_ERROR_PX)
+
+
+def triangulation_angle(model: pycolmap.Reconstruction) -> float:
+    """Median over points (at most 2000) of the widest angle in degrees under which a point is seen."""
+    centres = {image.image_id: image.projection_center() for image in posed(model)}
+    points = sorted(colmap.points(model).items())
+    angles: list[float] = []
+    for _, point in points[:: max(1, len(points) // 2000)]:
+        track = point.track.elements
+        # Every two of them are compared: a long track is thinned out.
+        seen = np.array([centres[e.image_id] for e in track[:: 1 + len(track) // LONG_TRACK]])
+        rays = seen - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def triangulate(
+    request: Request, lenses: list[pycolmap.Camera], poses: dict[str, tuple[int, NDArray[np.float64]]]
+) -> pycolmap.Reconstruction:
+    """Features and matches of the solved images, then points from known cameras, which are held.
+
+    `poses` gives each image's lens, as an index, and its world-to-camera pose, [3, 4]; all solved images are in it.
+    """
+    single = len(lenses) == 1
+    extract(request, request.solved, None, pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE)
+    known = pycolmap.Reconstruction()
+    with closing_database(request) as database:
+        images = {image.name: image for image in database.read_all_images()}
+        for name in request.solved:
+            lens, pose = poses[name]
+            stored = images[name]
+            if stored.camera_id not in known.cameras:
+                camera = pycolmap.Camera(
+                    model=lenses[lens].model, width=lenses[lens].width, height=lenses[lens].height,
+                    params=lenses[lens].params, camera_id=stored.camera_id,
+                )  # fmt: skip
+                # Pairs are verified without the lens, as in a solve of our own, unless it bends their epipolar lines.
+                camera.has_prior_focal_length = camera.model != pycolmap.CameraModelId.PINHOLE
+                database.update_camera(camera)
+                known.add_camera_with_trivial_rig(camera)
+            image = pycolmap.Image(name=name, camera_id=stored.camera_id, image_id=stored.image_id)
+            known.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    match(request)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.triangulation.min_angle = TRIANGULATE_LEAST_DEG
+    folder = request.scratch / "triangulated"
+    folder.mkdir()
+    say(stage="points")
+    return colmap.triangulate_points(known, request.database, request.images, folder, options)
+
+
+def agreement(request: Request, model: pycolmap.Reconstruction) -> float:
+    """Share of the keypoints matched between frames that found a point: with cameras held, errors alone look good
+    whatever the cameras are, since what does not fit them is left out."""
+    matched: dict[int, list[NDArray[np.uint32]]] = {}
+    with closing_database(request) as database:
+        pairs, geometries = database.read_two_view_geometries()
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        if len(geometry.inlier_matches):
+            for image, side in zip(pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches.T, strict=True):
+                matched.setdefault(image, []).append(side)
+    total = sum(len(np.unique(np.concatenate(sides))) for sides in matched.values())
+    return sum(image.num_points3D for image in colmap.images(model).values()) / max(total, 1)

@@ -1,0 +1,217 @@
+"""Features and matches of the frames in COLMAP's database, and what they tell before any camera is found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from ..lens.lens_verdict import FISHEYE, FISHEYE_START
+from . import colmap_types as colmap
+from .request import SEED, Request, closing_database, say
+from .turning import only_turns
+
+STILL_SHARE = 0.008
+"""Largest median flow between any two frames, as a share of the image width, below which the camera stands still."""
+LEAST_MATCHES = 15
+"""Matches that two frames have to have in common to tell anything; COLMAP's own number."""
+ALL_PAIRS = 40
+"""Frames up to which every two are matched where many pairs are wanted: 780, about 20 a frame, as longer clips get."""
+TURNING_SHARE = 0.8
+"""Share of image pairs explained by a homography above which a failed solve may be put down to a turning camera."""
+GUESSED_FOCAL = 1.2
+"""Focal length that COLMAP begins with, as a share of the longer side."""
+
+
+def extract(
+    request: Request,
+    names: list[str],
+    camera_id: int | None,
+    mode: pycolmap.CameraMode = pycolmap.CameraMode.SINGLE,
+) -> None:
+    """SIFT features of `names` into the database; one camera for all, an existing one if `camera_id` is given."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = request.camera_model
+    reader.camera_params = start_params(request)
+    if request.masks:
+        reader.mask_path = request.masks
+    if camera_id is not None:
+        reader.existing_camera_id = camera_id
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = request.threads
+    options.sift.max_num_features = request.features
+    if request.peak:
+        options.sift.peak_threshold = request.peak
+    # Numbers given beforehand, in the clip's order: else the first thread to finish would choose them.
+    with closing_database(request):
+        pass  # makes the file
+    colmap.import_images(request.database, request.images, mode, names, reader)
+    say(stage="features" if camera_id is None else "other features")
+    colmap.extract_features(request.database, request.images, mode, names, reader, options)
+
+
+def start_params(request: Request) -> str:
+    """The lens before any picture was seen, as COLMAP's parameters in a row; empty: COLMAP's own guess.
+
+    With it pairs are verified through the lens: the epipolar lines of a fisheye are bent.
+    """
+    focal, (width, height) = request.start_focal, request.size
+    if not focal and request.camera_model == FISHEYE:
+        focal = FISHEYE_START * width
+    if not focal:
+        return ""
+    single = request.camera_model == "SIMPLE_RADIAL"
+    params = (
+        [focal, 0.5 * width, 0.5 * height, 0.0] if single else [focal, focal, 0.5 * width, 0.5 * height, *[0.0] * 4]
+    )
+    return ", ".join(repr(value) for value in params)
+
+
+def _matching() -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    # Two threads at once in the sgemm of pycolmap 4.2.1's OpenBLAS get wrong products (18 of 15,000; alone 0 of 6000):
+    # now and then two pairs lose half of their matches, and the cameras differ. One thread matches, one verifies.
+    options.num_threads = 1
+    geometry = pycolmap.TwoViewGeometryOptions()
+    geometry.ransac.random_seed = SEED
+    return options, geometry
+
+
+def match(request: Request) -> None:
+    """Matches each frame with those 1, 2, 4, ... frames after it, `overlap` distances (COLMAP's quadratic overlap)."""
+    if request.reuse or request.wide:
+        match_anew(request)
+        return
+    options, geometry = _matching()
+    pairing = pycolmap.SequentialPairingOptions()
+    pairing.overlap = request.overlap
+    pairing.quadratic_overlap = True
+    pairing.num_threads = request.threads
+    say(stage="matches")
+    colmap.match_sequential(request.database, options, pairing, geometry)
+
+
+def match_anew(request: Request) -> None:
+    """Matches on from what a try before left: pairs that it had are not matched again, but they are verified again
+    where a lens is told beforehand now and was not then, or the other way about."""
+    pairs = wide_pairs(request.solved) if request.wide else {}
+    solved = set(request.solved)
+    with closing_database(request) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        verify = set_lens(request, database)
+        if verify:
+            for pair in database.read_num_matches()[0]:
+                one, two = (names[n] for n in pycolmap.pair_id_to_image_pair(pair))
+                if one in solved and two in solved and two not in pairs.get(one, []):
+                    pairs.setdefault(one, []).append(two)
+            database.clear_two_view_geometries()
+    if pairs:
+        match_pairs(request, pairs, "matches")
+
+
+def set_lens(request: Request, database: pycolmap.Database) -> bool:
+    """Gives the one camera of a database the request's model; True if its focal length is told now and was not before,
+    or the other way about."""
+    old = database.read_all_cameras()[0]
+    told = start_params(request)
+    camera = pycolmap.Camera.create_from_model_name(
+        old.camera_id, request.camera_model, GUESSED_FOCAL * max(old.width, old.height), old.width, old.height
+    )
+    if told:
+        camera.params = [float(value) for value in told.split(",")]
+    camera.has_prior_focal_length = bool(told)
+    database.update_camera(camera)
+    return bool(told) != old.has_prior_focal_length
+
+
+def wide_pairs(names: Sequence[str]) -> dict[str, list[str]]:
+    """Pairs of frames in the clip's order, more than a quadratic overlap has: every two of few frames; of many, those
+    1 to 8 apart and further ones at distances that grow by the root of two, about 20 a frame in any clip."""
+    distances = list(range(1, len(names) if len(names) <= ALL_PAIRS else 9))
+    while distances[-1:] and distances[-1] < len(names):
+        distances.append(round(distances[-1] * 2**0.5))
+    return {name: [names[at + d] for d in distances if at + d < len(names)] for at, name in enumerate(names)}
+
+
+def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str = "other matches") -> None:
+    """Matches each image with those that it is listed with; what the database has of them stays."""
+    lines = [f"{name} {other}" for name, others in pairs.items() for other in others]
+    listing = request.scratch / "pairs.txt"
+    listing.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    options, geometry = _matching()
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listing
+    pairing.block_size = max(4 * request.neighbours, 8)  # COLMAP counts its progress in blocks
+    say(stage=stage)
+    colmap.match_image_pairs(request.database, options, pairing, geometry)
+
+
+@dataclass(frozen=True)
+class Common:
+    """How much the solved frames show of one another."""
+
+    flow_px: float
+    """Largest over their pairs of the median way in pixels of what two share."""
+    pairs: int
+    """Pairs that share enough to tell."""
+    matches: int
+    """What such a pair shares, in the middle of them."""
+    features: int
+    """Features of a frame, in the middle of them."""
+
+
+def common(request: Request) -> Common:
+    """Measures the matches of the solved frames."""
+    told = [pair for pair in _shared(request) if len(pair.matches) >= LEAST_MATCHES]
+    with closing_database(request) as database:
+        found = [database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()]
+    matches = int(np.median([len(pair.matches) for pair in told])) if told else 0
+    return Common(max((pair.shift for pair in told), default=0.0), len(told), matches, int(np.median(found)))
+
+
+def turning(request: Request) -> bool:
+    """True if the camera only turns on the spot: homographies explain what the frames share, and are rotations."""
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    flat = {kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC}
+    pairs = [pair for pair in _shared(request) if len(pair.matches)]
+    explained = [pair for pair in pairs if pair.kind in flat]
+    if not pairs or len(explained) <= TURNING_SHARE * len(pairs):
+        return False
+    told = [(p.homography, p.shift) for p in explained if p.homography is not None and len(p.matches) >= LEAST_MATCHES]
+    homographies = np.array([homography for homography, _ in told], np.float64).reshape(-1, 3, 3)
+    shifts = np.array([shift for _, shift in told])
+    return only_turns(homographies, shifts, (request.size[0], request.size[1]), request.focal)
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """What two solved frames have in common."""
+
+    matches: NDArray[np.uint32]
+    kind: pycolmap.TwoViewGeometryConfiguration
+    homography: NDArray[np.float64] | None
+    shift: float
+    """Median way of the matches in pixels; 0 if there are none."""
+
+
+def _shared(request: Request) -> list[_Shared]:
+    solved = set(request.solved)
+    shared: list[_Shared] = []
+    with closing_database(request) as database:
+        images = {i.image_id for i in database.read_all_images() if i.name in solved}
+        keypoints = {image: database.read_keypoints(image)[:, :2] for image in images}
+        pairs, geometries = database.read_two_view_geometries()
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(pair)
+        matches = geometry.inlier_matches
+        if a in images and b in images:
+            way = np.linalg.norm(keypoints[a][matches[:, 0]] - keypoints[b][matches[:, 1]], axis=1)
+            shift = float(np.median(way)) if len(way) else 0.0
+            kind = pycolmap.TwoViewGeometryConfiguration(geometry.config)
+            shared.append(_Shared(matches, kind, geometry.H, shift))
+    return shared

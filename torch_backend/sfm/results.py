@@ -1,0 +1,281 @@
+"""What a solve writes: undistorted frames, cameras, points and the record, from what COLMAP's worker left."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..array_types import save_arrays
+from ..cameras.floor import floor_of
+from ..cameras.poses import camera_centre, fill_poses
+from ..contract import (
+    CAMERAS_FILE,
+    COLMAP_FOLDER,
+    PICTURE,
+    POINTS_FILE,
+    SOLVE_FILE,
+    CameraFrame,
+    CameraPath,
+    Reporter,
+    frame_file,
+)  # fmt: skip
+from ..footage import load_frames
+from ..footage.display import display_of
+from ..footage.images import read_frame, write_png
+from ..footage.masks import Mask
+from ..footage.sources import frame_words
+from ..lens.lens_verdict import lens_remarks
+from ..lens.undistort import Undistorter, of_frames
+from ..lens.zoom import zoom_words
+from ..replacing import Staged
+from ..shot import Shot, atomic_path, replace_file, write_json
+from .flat import flat_words
+from .given import doubts, refuse_misfit
+from .masks import write_undistorted
+from .points import filter_points
+from .verdict import FAIR_ERROR_PX, quality_words
+
+SOLVE_VERSION = 1
+_WRITERS = 2
+
+
+class SolveResult(TypedDict):
+    """What `solve_shot` returns, and summary.json repeats."""
+
+    frames: int
+    """Source frames of the range; each has a camera."""
+    solved_frames: int
+    """Frames given to the mapper."""
+    registered: int
+    """Of these, frames that the mapper placed."""
+    localised: int
+    """Further frames placed against the model."""
+    interpolated: int
+    """Frames whose pose is interpolated or held."""
+    reprojection_error_px: float
+    """Mean over the model's observations."""
+    points: int
+    """Points in points.npz."""
+    focal_px: float
+    """Focal length of the undistorted frames in pixels."""
+    quality: str
+    """The same in words."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be solved."""
+
+    shot: Shot
+    frames: dict[str, Any]
+    """frames.json."""
+    masks: dict[str, Mask]
+    facts: dict[str, Any]
+    """Of the record: what the solve was asked for."""
+
+
+def write_results(asked: Asked, answer: dict[str, Any], scratch: Path, staged: Staged, report: Reporter) -> SolveResult:
+    """Writes the solve's files, from what the worker left in `scratch`, to where they wait until they are whole.
+
+    Args:
+        answer: the worker's, `cameras.foreign`'s where cameras were given.
+    """
+    frames = asked.frames
+    solved = sum(f["solve"] for f in frames["frames"])
+    poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
+    maps = [scratch / f"undistort_{n}.npz" for n in range(1 + max(p.get("lens", 0) for p in poses.values()))]
+    path, lenses = _camera_path(frames, poses, [_pinhole(file) for file in maps])
+    with np.load(scratch / POINTS_FILE, allow_pickle=False) as data:
+        points = filter_points({name: data[name] for name in data.files}, _centres(path))
+    if "given" in answer:
+        refuse_misfit(answer, len(points["xyz"]))
+    _undistort_all(asked, lenses, maps, staged, report)
+    with atomic_path(staged.solve / POINTS_FILE) as beside:
+        save_arrays(beside, points)
+    replace_file(scratch / "model", staged.solve / COLMAP_FOLDER)
+    write_json(staged.solve / CAMERAS_FILE, path.to_json())
+    misled = flat_words(points["xyz"]) or zoom_words(
+        {int(Path(name).stem): change for name, change in answer.get("focal_changes", {}).items() if change is not None}
+    )
+    result = _result(answer, path, solved, len(points["xyz"]), path.frames[0].K[0], misled is not None)
+    warnings = _warnings(frames, path, result, "given" in answer)
+    warnings = ([misled] if misled is not None else []) + warnings
+    warnings += doubts(answer) if "given" in answer else lens_remarks(answer)
+    for message, hint in warnings:
+        report.warning(message, hint)
+    write_json(
+        staged.solve / SOLVE_FILE,
+        {
+            "version": SOLVE_VERSION,
+            **_record(answer, result),
+            **asked.facts,
+            "solved_frames": solved,
+            "lenses": [_lens(file) for file in maps],
+            "lens_of_frame": lenses,
+            "floor": floor_of(path, points["xyz"]),
+            "warnings": [" ".join(w).strip() for w in warnings],
+            "result": result,
+        },
+    )
+    return result
+
+
+def _record(answer: dict[str, Any], result: SolveResult) -> dict[str, Any]:
+    """What solve.json repeats of the worker's answer and of the result."""
+    return {
+        "registered": result["registered"],
+        "total_frames": result["frames"],
+        "reprojection_error_px": result["reprojection_error_px"],
+        "points": result["points"],
+        "camera_model": answer["camera_model"],
+        "distortion": answer["distortion"],
+        "focal_px": answer["focal_px"],
+        "focal_start_px": answer.get("lens", {}).get("start_px", 0.0),
+        "triangulation_angle_deg": answer["triangulation_angle_deg"],
+        "quality": result["quality"],
+        "cameras_from": answer.get("given", "solve"),
+        "world": answer.get("world", ""),
+        "rung": answer.get("rung"),
+        "tries": answer.get("tries", []),
+        "agreement": answer.get("agreement"),
+    }
+
+
+def _pinhole(file: Path) -> NDArray[np.float64]:
+    with np.load(file, allow_pickle=False) as data:
+        return data["pinhole"]
+
+
+def _lens(file: Path) -> dict[str, Any]:
+    """A lens of the working frames, as COLMAP names and orders it."""
+    with np.load(file, allow_pickle=False) as data:
+        return {"model": str(data["model"]), "params": data["params"].tolist()}
+
+
+def _camera_path(
+    frames: dict[str, Any], poses: dict[str, Any], pinholes: list[NDArray[np.float64]]
+) -> tuple[CameraPath, list[int]]:
+    """A camera for every frame: registered, localised, or interpolated in time between those; and its lens's index.
+
+    `pinholes` are fx, fy, cx, cy of each lens. A frame between two lenses has the nearer frame's.
+    """
+    listed = frames["frames"]
+    names = [Path(f["file"]).name for f in listed]
+    known = {i: np.array(poses[name]["pose"]) for i, name in enumerate(names) if name in poses}
+    filled = fill_poses(np.array([f["seconds"] for f in listed]), known)
+    nearest = _nearest(sorted(known), len(names))
+    lenses = [int(poses[names[k]].get("lens", 0)) for k in nearest]
+    cameras: list[CameraFrame] = []
+    for frame, name, pose, lens in zip(listed, names, filled, lenses, strict=True):
+        viewmat = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]]).ravel().tolist()
+        source = poses[name]["source"] if name in poses else "interpolated"
+        cameras.append(CameraFrame(frame["frame"], viewmat, pinholes[lens].tolist(), source))
+    return CameraPath(frames["width"], frames["height"], cameras), lenses
+
+
+def _nearest(known: list[int], count: int) -> list[int]:
+    """The nearest of some ascending indices to each of 0 to `count` - 1; of two as near the lower."""
+    spots = np.array(known)
+    every = np.arange(count)
+    above = np.searchsorted(spots, every).clip(0, len(spots) - 1)
+    below = (above - 1).clip(0)
+    return np.where(every - spots[below] <= spots[above] - every, spots[below], spots[above]).tolist()
+
+
+def _centres(path: CameraPath) -> NDArray[np.float64]:
+    return np.array([camera_centre(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
+
+
+def _undistort_all(asked: Asked, lenses: list[int], maps: list[Path], into: Staged, report: Reporter) -> None:
+    """Writes the undistorted frames and masks, lens by lens: a map takes 128 bytes per pixel."""
+    done = 0
+    for number, file in enumerate(maps):
+        rows = [frame for frame, lens in zip(asked.frames["frames"], lenses, strict=True) if lens == number]
+        if rows:
+            _undistort(asked, rows, file, into, (done, len(lenses)), report)
+        done += len(rows)
+
+
+def _undistort(
+    asked: Asked, listed: list[dict[str, Any]], file: Path, into: Staged, counts: tuple[int, int], report: Reporter
+) -> None:
+    """Frames of one lens; `counts` are the frames done before these, and all there are."""
+    before, total = counts
+    with np.load(file, allow_pickle=False) as data:
+        where = data["where"]
+    undistort = Undistorter(where)
+    of_frame = of_frames(undistort, where, display_of(load_frames(asked.shot)))
+
+    def one(frame: dict[str, Any]) -> int:
+        pixels = read_frame(asked.shot.frames / frame["file"])
+        write_png(into.frames / frame_file(frame["frame"], PICTURE), of_frame(pixels))
+        if asked.masks:
+            write_undistorted(asked.masks, frame["frame"], undistort, into.solve)
+        return frame["frame"]
+
+    with ThreadPoolExecutor(_WRITERS) as pool:
+        waiting = [pool.submit(one, frame) for frame in listed]
+        try:
+            for done, future in enumerate(waiting, start=1 + before):
+                report.check_cancelled()
+                report.progress("solve: undistort", done, total, f"frame {future.result()}")
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _result(
+    answer: dict[str, Any], path: CameraPath, solved: int, points: int, focal: float, misled: bool
+) -> SolveResult:
+    sources = [f.source for f in path.frames]
+    error = round(float(answer["reprojection_error_px"]), 4)
+    registered = int(answer["registered"])
+    return SolveResult(
+        frames=len(sources),
+        solved_frames=solved,
+        registered=registered,
+        localised=sources.count("localised"),
+        interpolated=sources.count("interpolated"),
+        reprojection_error_px=error,
+        points=points,
+        focal_px=round(focal, 3),
+        quality=quality_words(registered, solved, error, "given" in answer, misled),
+    )
+
+
+def _warnings(
+    frames: dict[str, Any], path: CameraPath, result: SolveResult, given: bool = False
+) -> list[tuple[str, str]]:
+    warnings: list[tuple[str, str]] = []
+    lost = [
+        camera.frame
+        for camera, frame in zip(path.frames, frames["frames"], strict=True)
+        if frame["solve"] and camera.source != "registered"
+    ]
+    if lost and not given:  # given cameras were told of when they were matched
+        warnings.append(
+            (
+                f"The mapper did not register {len(lost)} solved frames: {frame_words(lost)}.",
+                "Their cameras are placed from their neighbours.",
+            )
+        )
+    guessed = [i for i, camera in enumerate(path.frames) if camera.source == "interpolated"]
+    placed = [i for i, camera in enumerate(path.frames) if camera.source != "interpolated"]
+    held = [path.frames[i].frame for i in guessed if i < placed[0] or i > placed[-1]]
+    if held:
+        warnings.append(
+            (
+                f"The camera holds its pose in {frame_words(held)}, beyond the last frame that was placed.",
+                "Cut them off.",
+            )
+        )
+    if result["reprojection_error_px"] > FAIR_ERROR_PX:
+        hint = "Are they of this clip and its lens?" if given else "Try the OPENCV camera model."
+        warnings.append(("The reprojection error is high: the picture will be soft.", hint))
+    return warnings

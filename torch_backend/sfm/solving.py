@@ -1,0 +1,317 @@
+"""Cameras from the working frames: COLMAP in a child process, then undistorted frames and plain files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from ..cameras import foreign
+from ..cameras.stored import load_cameras, load_points, load_record
+from ..contract import (
+    CAMERA_MODELS,
+    CAMERAS_KNOWN,
+    MASK_FOUND,
+    MASK_KINDS,
+    MOTION_UNFINISHED_FILE,
+    ST_MAP_WAYS,
+    STMAP_FILES,
+    ExitCode,
+    JobError,
+    Reporter,
+    UserError,
+    open_regular,
+)
+from ..footage import load_frames
+from ..footage.images import is_whole_png
+from ..footage.lens_tags import focal_px
+from ..footage.masks import Mask, read_masks
+from ..footage.sources import frame_words
+from ..lens import map_reading
+from ..lens.map_lens import MapLens
+from ..lens.straight import Straight
+from ..lens.undistort import Undistorter
+from ..replacing import replacing_solve, settle_solve
+from ..shot import Shot, content_key, make_folder, need_disk, write_json
+from .given import prepare, take_over
+from .ladder import climb
+from .masks import facts_of, given_masks, more_features, wants_wide, write_matching
+from .results import SOLVE_VERSION, Asked, SolveResult, write_results
+
+_LOG_END_BYTES = 16_384
+
+
+@dataclass
+class SolveConfig:
+    """How cameras are found."""
+
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP camera model, one camera for all frames: SIMPLE_RADIAL, OPENCV for strong or tangential distortion, or
+    OPENCV_FISHEYE."""
+    overlap: int = 15
+    """Each solved frame is matched with those 1, 2, 4, ... 2^(overlap - 1) frames after it."""
+    features: int = 4096
+    """Most SIFT features per frame, from the upsampled octave on."""
+    localise: bool = True
+    """Place frames that the step left out against the model, each by itself; else they are interpolated."""
+    neighbours: int = 2
+    """A frame to be placed is matched with this many registered frames on either side of it."""
+    ignore_mask: str = ""
+    """Mask of what is no part of the scene, as `footage.masks.read_masks` takes it, or `MASK_FOUND`; empty: none."""
+    people_mask: str = ""
+    """Mask of what alone may move; empty: everything may."""
+    focal_mm: float = 0.0
+    """Focal length of the lens in mm, with which the solve begins; 0: it is not known."""
+    sensor_mm: float = 36.0
+    """Width in mm of the part of the sensor that the picture shows."""
+    refine_focal: bool = True
+    """Refine `focal_mm`; else it is held."""
+    st_map: str = ""
+    """File of an ST map that holds the lens; empty: the solve finds it."""
+    st_map_way: str = "undistort"
+    """One of `contract.ST_MAP_WAYS`."""
+    st_map_layer: str = ""
+    """Layer of the file; empty: red and green."""
+    retry: bool = True
+    """Try again in other ways where the solve is refused or poor, as `ladder.climb` does."""
+
+
+def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str = "") -> SolveResult:
+    """Finds the camera of every frame of `shot` and writes the undistorted frames.
+
+    Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
+    contract.CameraPath in COLMAP's world ("solve units"), OpenCV axes, world-to-camera, pinhole of the undistorted
+    frames. They take the place of a solve of before when all of them are written; until then, and if this one fails,
+    that one stays. A shot already solved from the same frames with the same configuration is left alone.
+
+    With an ST map in `config` the frames are undistorted through it first, and the solve finds the focal length alone.
+
+    With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
+    its world, frames without one interpolated.
+
+    `report` hears a metric `CAMERAS_KNOWN` at the end.
+
+    Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
+    """
+    _check(config, cameras)
+    for folder in (shot.frames, shot.colmap, *map(shot.masks, MASK_KINDS)):  # files of before are replaced
+        shot.own(folder)
+    settle_solve(shot)
+    frames = load_frames(shot)
+    source = [foreign.fingerprint(cameras)] if cameras else []
+    source += [map_reading.fingerprint(config.st_map)] if config.st_map else []
+    masks = read_masks(shot, _mask_sources(shot, config), report)
+    key = _key(config, frames, source, masks)
+    done = _finished(shot, frames, key)
+    if done is not None:
+        report.progress("solve", 1, 1, "already solved")
+        result = SolveResult(**done["result"])
+    else:
+        result = _solved_anew(Asked(shot, frames, masks, _facts(shot, config, masks, key)), config, cameras, report)
+    report.metric(CAMERAS_KNOWN, dict(result))
+    return result
+
+
+def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Reporter) -> SolveResult:
+    """Solves, and puts the files in the place of those before."""
+    shot, frames = asked.shot, asked.frames
+    taken = prepare(frames, cameras, report) if cameras else None
+    lens = _lens_of_map(config, frames, report)
+    _refuse_damaged(shot, frames)
+    # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
+    size = (1.2 if lens is None else 2.4) * sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
+    need_disk(shot.root, size + (len(frames["frames"]) << 20), "The camera solve")
+    scratch = shot.solve / "scratch"
+    shutil.rmtree(scratch, ignore_errors=True)
+    make_folder(scratch)
+    try:
+        if taken is None:
+            answer, left = _mapped(asked, config, lens, scratch, report)
+        else:
+            options = _matching(frames, config, asked.masks, scratch)
+            answer, left = take_over(shot, frames, taken, options, scratch, report), scratch
+        had_maps = any((shot.solve / name).is_file() for name in STMAP_FILES)
+        with replacing_solve(shot) as staged:
+            result = write_results(asked, answer, left, staged, report)
+            _mark_motion_unfinished(shot)
+    except JobError as error:
+        error.add_note(_log_end(shot.colmap_log))
+        raise
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    if had_maps:
+        report.warning("The ST maps of the solve before were of its lens: they are gone.", "Write them again.")
+    return result
+
+
+def _mapped(
+    asked: Asked, config: SolveConfig, lens: MapLens | None, scratch: Path, report: Reporter
+) -> tuple[dict[str, Any], Path]:
+    """COLMAP's answer, and the folder in which its files lie."""
+    shot, frames = asked.shot, asked.frames
+    straight = None if lens is None else Straight(shot, frames, lens, scratch / "straight", report)
+    request = _request(shot, frames, config, asked.masks, scratch, straight)
+    climbed = climb(request, frames, config.retry, scratch, shot.colmap_log, report)
+    answer = {**climbed.best.answer["result"], "rung": climbed.best.rung, "tries": climbed.tries}
+    if straight is not None:
+        answer |= straight.told(climbed.best.folder)
+    return answer, climbed.best.folder
+
+
+def _facts(shot: Shot, config: SolveConfig, masks: dict[str, Mask], key: str) -> dict[str, Any]:
+    """What the record keeps of what was asked for."""
+    return {
+        "key": key,
+        "masks": facts_of(masks, _mask_sources(shot, config)),
+        "st_map": [config.st_map, config.st_map_way, config.st_map_layer] if config.st_map else None,
+    }
+
+
+def _lens_of_map(config: SolveConfig, frames: dict[str, Any], report: Reporter) -> MapLens | None:
+    """The lens that the ST map holds; None without one."""
+    if not config.st_map:
+        return None
+    return map_reading.read_lens(config.st_map, config.st_map_way, config.st_map_layer, frames, report)
+
+
+def _mask_sources(shot: Shot, config: SolveConfig) -> dict[str, str]:
+    """Kind of mask -> where it comes from; empty: there is none."""
+    ignored = config.ignore_mask
+    if ignored == MASK_FOUND:
+        ignored = str(shot.burnt_in) if shot.burnt_in.is_file() else ""
+    return dict(zip(MASK_KINDS, (ignored, config.people_mask), strict=True))
+
+
+def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: dict[str, Mask]) -> str:
+    """Tells a solve from others. Masks count by what they cover, wherever they lie."""
+    settings = asdict(config)
+    new = ["ignore_mask", "people_mask"]  # solves of before had none of these
+    new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # the file counts by what is in it
+    new += [] if config.focal_mm else ["focal_mm", "sensor_mm", "refine_focal"]
+    new += ["retry"] if config.retry else []  # who switches it on again wants what it may find
+    for name in new:
+        settings.pop(name)
+    return content_key(SOLVE_VERSION, settings, frames.get("key"), *source, *(mask.key for mask in masks.values()))
+
+
+def _mark_motion_unfinished(shot: Shot) -> None:
+    """Has later steps find what moves if the job ends after the cameras are written and before the search begins.
+
+    Mattes that belong to the shot's cameras are not made void by it: should the new solve not come to hold, they stay.
+    """
+    mark = shot.own(shot.motion) / MOTION_UNFINISHED_FILE
+    if not mark.is_file():
+        make_folder(mark.parent)
+        write_json(mark, {"version": 0})
+
+
+def _log_end(log: Path) -> str:
+    """What COLMAP said last, for the job's own log."""
+    try:
+        with open_regular(log) as handle:
+            handle.seek(max(0, os.fstat(handle.fileno()).st_size - _LOG_END_BYTES))
+            end = handle.read().decode("utf-8", errors="replace")
+    except (OSError, ValueError):
+        return ""
+    return f"The end of {log}:\n{end}"
+
+
+def _check(config: SolveConfig, cameras: str) -> None:
+    if config.st_map and cameras:
+        raise JobError(
+            "Cameras from elsewhere bring their own lens: an ST map beside them would be a second one.",
+            "Give one of the two.",
+            ExitCode.USAGE,
+        )
+    if config.st_map_way not in ST_MAP_WAYS:
+        raise UserError(f"st_map_way should be one of {', '.join(ST_MAP_WAYS)}, got {config.st_map_way!r}")
+    if config.camera_model not in CAMERA_MODELS:
+        raise UserError(f"camera_model should be one of {', '.join(CAMERA_MODELS)}, got {config.camera_model!r}")
+    if config.focal_mm < 0 or config.sensor_mm <= 0:
+        raise UserError(f"focal_mm and sensor_mm should be lengths, got {config.focal_mm} and {config.sensor_mm}")
+    if not 1 <= config.overlap <= 31 or config.features < 128 or config.neighbours < 1:
+        raise UserError(
+            "overlap should be 1 to 31, features at least 128 and neighbours at least 1, got "
+            f"{config.overlap}, {config.features} and {config.neighbours}"
+        )
+
+
+def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | None:
+    """solve.json if it is of this key and the solve is whole: to solve again is how a damaged one is mended."""
+    try:
+        record = load_record(shot)
+        if record.get("key") != key or not isinstance(record.get("result"), dict):
+            return None
+        load_cameras(shot)
+        load_points(shot)
+    except (JobError, ValueError):
+        return None
+    numbers = [f["frame"] for f in frames["frames"]]
+    plates = [shot.plate(n) for n in numbers]
+    plates += [shot.mask(kind, n) for kind in given_masks(shot) for n in numbers]
+    return record if all(is_whole_png(p) for p in plates) else None
+
+
+def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
+    """JobError (FOOTAGE) if a frame cannot be read: COLMAP would leave it out, and say so in its log alone."""
+    bad = [f["frame"] for f in frames["frames"] if not is_whole_png(shot.frames / f["file"])]
+    if bad:
+        raise JobError(
+            f"Damaged or missing in {shot.raw}: {frame_words(bad)}.",
+            "Import the clip again.",
+            ExitCode.FOOTAGE,
+        )
+
+
+def _matching(
+    frames: dict[str, Any],
+    config: SolveConfig,
+    masks: dict[str, Mask],
+    scratch: Path,
+    undistort: Undistorter | None = None,
+) -> dict[str, Any]:
+    """What the worker is told of features and matches; writes its masks, of frames that went through `undistort`."""
+    options: dict[str, Any] = {"overlap": config.overlap, "features": config.features}
+    if not masks:
+        return options
+    folder = scratch / "not_matched"
+    write_matching(masks, {f["frame"]: Path(f["file"]).name for f in frames["frames"]}, folder, undistort)
+    options |= {"features": round(config.features * more_features(masks)), "masks": str(folder)}
+    return {**options, "wide": True} if wants_wide(masks) else options
+
+
+def _focal_of_file(frames: dict[str, Any]) -> float:
+    """Focal length in pixels of the working frames that the footage's file tells; 0 if it does not."""
+    told = frames.get("reading", {}).get("focal_35mm")
+    return focal_px(told, frames["width"], frames["height"]) if told else 0.0
+
+
+def _request(
+    shot: Shot,
+    frames: dict[str, Any],
+    config: SolveConfig,
+    masks: dict[str, Mask],
+    scratch: Path,
+    straight: Straight | None,
+) -> dict[str, Any]:
+    """What the worker is asked for at first: of frames whose lens was taken out before, no bend."""
+    scale = 1.0 if straight is None else straight.focal_scale
+    names: dict[bool, list[str]] = {True: [], False: []}
+    for frame in frames["frames"]:
+        names[bool(frame["solve"])].append(Path(frame["file"]).name)
+    return {
+        "images": str(shot.raw if straight is None else straight.folder),
+        "solved": names[True],
+        "others": names[False],
+        "camera_model": config.camera_model if straight is None else "SIMPLE_RADIAL",
+        "hold_bend": straight is not None,
+        "size": [frames["width"], frames["height"]],
+        "focal_px": config.focal_mm / config.sensor_mm * frames["width"] * scale,
+        "hold_focal": not config.refine_focal,
+        "start_focal_px": _focal_of_file(frames) * scale,
+        **_matching(frames, config, masks, scratch, None if straight is None else straight.undistort),
+        "neighbours": config.neighbours if config.localise else 0,
+        "threads": max(1, min(os.cpu_count() or 1, 16)),
+    }

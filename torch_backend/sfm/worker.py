@@ -1,0 +1,149 @@
+"""What runs in the child process of COLMAP, which `start_worker.py` starts.
+
+A process of its own because pycolmap and OpenImageIO cannot share one (see footage/images.py), because COLMAP ends its
+process on a failed check, and because a process can be stopped at any moment. Nothing else imports its parts, which
+load pycolmap: `request.py`, `matching.py`, `mapping.py`, `placing.py`, `answers.py` and `colmap_types.py`.
+
+Standard input is held open by the parent: when it closes, the parent is gone and so is the worker. Standard output
+carries JSON lines: {"stage"} when one begins, with {"done", "total"} where COLMAP calls back; {"result": {...}} or
+{"failure": "reason"} at the end.
+Beside the request it writes: model/ (binary COLMAP model), points.npz, poses.json (cameras from world, 3x4) and, for
+each lens, undistort_N.npz (the lens, camera of the undistorted frames, where its pixels lie in the distorted ones).
+
+A request with "known" cameras ({"lenses": [{"model", "width", "height", "params"}], "images": {name: {"lens",
+"pose"}}, "triangulate"}) is not solved: the lenses are undistorted and, if asked for, points are triangulated with the
+poses held.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from ..contract import own_input
+from ..lens.lens_verdict import angle_deg, bends_of, impossible
+from . import colmap_types as colmap
+from .answers import focal_changes, write_answers, write_points, write_undistortion
+from .mapping import (
+    agreement,
+    as_good,
+    build,
+    first_camera,
+    left_bend,
+    lens_doubt,
+    lens_of,
+    posed,
+    triangulate,
+    triangulation_angle,
+)
+from .matching import STILL_SHARE, common, extract, match, turning
+from .placing import localise
+from .request import SEED, Request, say
+
+
+def main(path: str) -> int:
+    """Runs the request; 0 unless something broke that no sentence covers."""
+    threading.Thread(target=_die_with_parent, args=(own_input(),), daemon=True).start()
+    request = Request(Path(path))
+    pycolmap.set_random_seed(SEED)
+    if request.known is not None:
+        return take_over(request, request.known)
+    if not request.reuse:
+        extract(request, request.solved, None)
+    match(request)
+    shared = common(request)
+    if not shared.pairs:
+        say(failure="bare", **vars(shared))
+        return 0
+    if shared.flow_px < STILL_SHARE * request.size[0]:
+        say(failure="still", **vars(shared))
+        return 0
+    models = build(request)
+    if not models:
+        say(failure="turning" if turning(request) else "no_pair", **vars(shared))
+        return 0
+    doubt = lens_doubt(request, models[0])
+    first, held = first_camera(models[0]), False
+    if doubt:
+        again = build(request, hold_lens=True)
+        held = bool(again) and as_good(again[0], models[0])
+        models = again if held else models
+    model = models[0]
+    poses = localise(request, model)
+    write_answers(request, model, poses)
+    camera = first_camera(model)
+    say(
+        result={
+            "registered": model.num_reg_images(),
+            "parts": [sorted(image.name for image in posed(m)) for m in models],
+            "reprojection_error_px": model.compute_mean_reprojection_error(),
+            "points": model.num_points3D(),
+            "triangulation_angle_deg": triangulation_angle(model),
+            "camera_model": camera.model_name,
+            "focal_px": camera.mean_focal_length(),
+            "distortion": [float(camera.params[i]) for i in camera.extra_params_idxs()],
+            "flow_px": shared.flow_px,
+            "turning": turning(request),
+            "focal_changes": focal_changes(model),
+            "localised": len(poses) - model.num_reg_images(),
+            "lens": {
+                "doubt": doubt,
+                "held": held,
+                "found_px": first.mean_focal_length(),
+                "found_deg": angle_deg(*lens_of(first)),
+                "found_bend": bends_of(first.model_name, [float(value) for value in first.params])[0],
+                "view_deg": angle_deg(*lens_of(camera)),
+                "impossible": impossible(*lens_of(camera)),
+                "given_px": request.focal,
+                "start_px": request.start_focal,
+                "width": camera.width,
+                "height": camera.height,
+                **({"left_bend": left_bend(model)} if request.hold_bend else {}),
+            },
+        }
+    )
+    return 0
+
+
+def take_over(request: Request, known: dict[str, Any]) -> int:
+    """Undistorts the lenses of known cameras and triangulates points between them, if asked; 0."""
+    lenses = [
+        pycolmap.Camera(model=n["model"], width=n["width"], height=n["height"], params=n["params"])
+        for n in known["lenses"]
+    ]
+    for number, lens in enumerate(lenses):
+        say(stage="lens", done=number, total=len(lenses))
+        write_undistortion(request, lens, number)
+    if not known["triangulate"]:
+        say(result={})
+        return 0
+    poses = {name: (image["lens"], np.array(image["pose"], np.float64)) for name, image in known["images"].items()}
+    model = triangulate(request, lenses, poses)
+    if not model.num_points3D():
+        say(result={"points": 0})
+        return 0
+    write_points(request, model)
+    folder = request.scratch / "model"
+    folder.mkdir()
+    colmap.write_binary(model, folder)
+    say(
+        result={
+            "points": model.num_points3D(),
+            "reprojection_error_px": model.compute_mean_reprojection_error(),
+            "triangulation_angle_deg": triangulation_angle(model),
+            "agreement": agreement(request, model),
+        }
+    )
+    return 0
+
+
+def _die_with_parent(told: int) -> None:
+    # Unbuffered: the interpreter could not close a buffer that a thread still reads.
+    while os.read(told, 64):
+        pass
+    os._exit(1)
