@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from torch_backend.contract import Cancelled
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import write_png
+from torch_backend.motion_search import motion_after_solve
 from torch_backend.sfm.solving import SolveConfig, solve_shot
 from torch_backend.shot import Shot
 
@@ -136,6 +137,12 @@ def write_clip(folder, poses, noise=1.0, blurred=(), contrast=1.0):
     return folder
 
 
+def solve_all(shot, config, report, cameras=""):
+    """As the job does, with optical flow alone: the result of the solve and of the search for what moves."""
+    solved = solve_shot(shot, config, report, cameras)
+    return {**solved, **(motion_after_solve(shot, report, static_model=None) or {})}
+
+
 @dataclass
 class Solved:
     shot: Shot
@@ -152,7 +159,7 @@ def solved(tmp_path_factory):
     clip = write_clip(folder, poses)
     shot, report = Shot.create(folder / "room.splannequin"), Recorder()
     import_footage(shot, str(clip), FootageConfig(step=STEP), report)
-    return Solved(shot, poses, solve_shot(shot, SolveConfig(features=1500), report), report)
+    return Solved(shot, poses, solve_all(shot, SolveConfig(features=1500), report), report)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from torch_backend.cameras.poses import (
     rotation_to_quat,
     slerp,
 )
-from torch_backend.sfm.solving import _nearest
+from torch_backend.sfm.results import _nearest
 
 vectors = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 shares = st.floats(0.0, 1.0)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.backend.solved_room import solve_all
 from torch_backend.contract import CameraPath, JobError, read_json
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import read_png, write_png
@@ -50,7 +51,7 @@ def masked(tmp_path_factory, tools):
         write_png(folder / "mask" / f"m.{101 + n}.png", np.where(on[..., None], np.uint8(255), np.uint8([0, 0, 0])))
     shot, report = Shot.create(folder / "room.splannequin"), tools.recorder()
     import_footage(shot, str(clip), FootageConfig(step=1), report)
-    solve_shot(shot, config(folder / "mask"), report)
+    solve_all(shot, config(folder / "mask"), report)
     return shot, poses, folder / "mask"
 
 

@@ -5,13 +5,14 @@ import shutil
 
 import pytest
 
+from tests.backend.solved_room import solve_all
 from torch_backend.cameras.stored import load_cameras
 from torch_backend.contract import CAMERAS_KNOWN, EVENTS_FILE, FORECAST, Cancelled, ExitCode, SolveParams
 from torch_backend.footage import load_frames
 from torch_backend.job import new_job, run_job
 from torch_backend.motion.mattes import is_outdated
 from torch_backend.sfm.progress import OneBar, weights_of
-from torch_backend.sfm.solving import SolveConfig, solve_shot
+from torch_backend.sfm.solving import SolveConfig
 
 FRAMES = {"width": 640, "height": 480, "frames": [{"solve": n % 2 == 0} for n in range(40)]}
 
@@ -99,14 +100,14 @@ def test_cameras_are_whole_when_they_are_known_and_a_search_that_ends_there_is_f
     heard = Heard(stop=True)
     bar = OneBar(heard, weights_of(load_frames(shot)))
     with pytest.raises(Cancelled):
-        solve_shot(shot, SolveConfig(features=1000), bar, model)
+        solve_all(shot, SolveConfig(features=1000), bar, model)
     known = [share for kind, share, _ in heard.metrics if kind == CAMERAS_KNOWN]
     assert len(known) == 1 and known[0] < 1.0
     before = shot.cameras.read_bytes()
     assert len(load_cameras(shot).frames) == 21 and shot.plate(101).is_file()
     assert is_outdated(shot), "whoever needs the mattes finds them first"
     heard = Heard()
-    result = solve_shot(shot, SolveConfig(features=1000), OneBar(heard, weights_of(load_frames(shot))), model)
+    result = solve_all(shot, SolveConfig(features=1000), OneBar(heard, weights_of(load_frames(shot))), model)
     assert "motion_pixels_share" in result and heard.bar[-1] == pytest.approx(1.0)
     assert shot.cameras.read_bytes() == before and not is_outdated(shot)
 

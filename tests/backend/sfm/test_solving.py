@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.backend.solved_room import solve_all
 from torch_backend.cameras.floor import floor_of
 from torch_backend.cameras.poses import camera_centre
 from torch_backend.cameras.stored import load_points
@@ -135,7 +136,7 @@ def test_progress_names_the_stages_in_order(solved):
 def test_a_solved_shot_is_left_alone(solved, tools):
     before = {p: p.stat().st_mtime_ns for p in solved.shot.root.rglob("*") if p.is_file()}
     report = tools.recorder()
-    assert solve_shot(solved.shot, SolveConfig(features=1500), report) == solved.result
+    assert solve_all(solved.shot, SolveConfig(features=1500), report) == solved.result
     assert {p: p.stat().st_mtime_ns for p in solved.shot.root.rglob("*") if p.is_file()} == before
 
 
@@ -153,12 +154,12 @@ def test_a_solve_holds_without_its_motion_matte_and_the_next_one_finds_it(solved
     shutil.rmtree(shot.solve / "motion")
     (shot.solve / "motion").write_bytes(b"in the way")
     report = tools.recorder()
-    result = solve_shot(shot, SolveConfig(features=1500), report)
+    result = solve_all(shot, SolveConfig(features=1500), report)
     assert "motion_pixels_share" not in result and result["registered"] == 11
     (said,) = report.warnings
     assert said.startswith("What moves by itself could not be told from the pictures: ") and "is not a folder" in said
     (shot.solve / "motion").unlink()
-    assert solve_shot(shot, SolveConfig(features=1500), tools.recorder()) == solved.result
+    assert solve_all(shot, SolveConfig(features=1500), tools.recorder()) == solved.result
 
 
 def test_the_same_frames_give_the_same_cameras(solved, tools, tmp_path):
