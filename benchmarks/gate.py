@@ -23,7 +23,7 @@ from torch_backend.raster.cpu import warm_up
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot
 from torch_backend.train import config_from_params
-from torch_backend.train.run import training_size
+from torch_backend.train.pictures import training_size
 from torch_backend.train.trainer import Trainer
 
 ROWS = {"static": ("static", "none"), "gate": ("auto", "support"), "open": ("hexplane", "support")}

@@ -50,8 +50,8 @@ from torch_backend.shot import Shot, write_json
 from torch_backend.train import PRESETS, config_from_params, train_shot
 from torch_backend.train.device import cuda_refusal
 from torch_backend.train.memory import plan_memory
+from torch_backend.train.pictures import training_size
 from torch_backend.train.recorder import Recorder
-from torch_backend.train.run import training_size
 from torch_backend.train.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[1]

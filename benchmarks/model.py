@@ -53,7 +53,7 @@ from torch_backend.train.checkpoint import CHECKPOINT_FILE, read_meta
 from torch_backend.train.config import TrainConfig, config_from_json, config_to_json
 from torch_backend.train.ignored import Masks, load_ignored
 from torch_backend.train.movers import load_movers
-from torch_backend.train.run import training_size
+from torch_backend.train.pictures import training_size
 from torch_backend.train.trainer import Trainer
 
 FIGURES = ("still", "moving", "whole", "frozen", "gradient")

@@ -33,7 +33,9 @@ from torch_backend.scene import Scene, load_images, load_scene, split_frames
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key, write_json
 from torch_backend.train import TrainConfig, config_from_params
 from torch_backend.train.config import config_to_json
-from torch_backend.train.run import moving_share, solve_key, training_size
+from torch_backend.train.identity import solve_key
+from torch_backend.train.metrics import moving_share
+from torch_backend.train.pictures import training_size
 from torch_backend.train.trainer import Trainer
 
 METHODS = ("hexplane", "mlp", "control_points", "auto")

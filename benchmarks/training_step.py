@@ -36,7 +36,7 @@ from torch_backend.train import config_from_params
 from torch_backend.train import trainer as trainer_module
 from torch_backend.train.ignored import load_ignored
 from torch_backend.train.movers import load_movers
-from torch_backend.train.run import training_size
+from torch_backend.train.pictures import training_size
 from torch_backend.train.trainer import Trainer
 
 

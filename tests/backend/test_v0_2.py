@@ -14,7 +14,7 @@ from torch_backend.footage.importing import load_frames
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.scene import load_scene
 from torch_backend.shot import Shot
-from torch_backend.train.run import load_run
+from torch_backend.train.loaded import load_run
 
 OLD = Path(__file__).parents[1] / "data" / "v0_2"
 LINES = json.loads((OLD / "command_lines.json").read_text(encoding="utf-8"))["backend"]

@@ -2,7 +2,8 @@
 
 from .config import PRESETS, TrainConfig, config_from_params
 from .device import choose_device
-from .run import LoadedRun, load_run, train_shot
+from .loaded import LoadedRun, load_run
+from .run import train_shot
 from .static_world import static_views
 
 __all__ = [

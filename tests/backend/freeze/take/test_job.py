@@ -34,7 +34,7 @@ from torch_backend.scene import load_scene
 from torch_backend.shot import Shot, write_json
 from torch_backend.train import device, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
-from torch_backend.train.run import solve_key
+from torch_backend.train.identity import solve_key
 from torch_backend.train.self_test import SelfTest
 
 

@@ -1,0 +1,101 @@
+"""A run read again, to be rendered or frozen."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..contract import ExitCode, JobError, file_digest
+from ..shot import Shot
+from .checkpoint import CHECKPOINT_FILE, MISFITS, load_checkpoint, misfit
+from .config import TrainConfig, config_from_json
+from .depth import FittedDepth, load_fitted
+from .identity import of_other_pictures, solve_key
+from .model import DynamicModel, restore_model
+
+_ATTEMPTS = 5
+"""A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
+
+
+@dataclass
+class LoadedRun:
+    """A finished (or interrupted) run, ready to be rendered."""
+
+    folder: Path
+    """runs/<name>."""
+    config: TrainConfig
+    """Its numbers."""
+    model: DynamicModel
+    """Its Gaussians and field."""
+    width: int
+    """Width in pixels of the images it was trained on."""
+    height: int
+    """Height of them."""
+    train_frames: list[int]
+    """Frame numbers it was trained on."""
+    stamp: str
+    """`contract.file_digest` of the checkpoint that the model is from: what is made of it is known by it."""
+    former_stamp: list[Any] = dataclasses.field(default_factory=list[Any])
+    """The checkpoint's name, size and modification time (ns), by which earlier versions knew it."""
+    depth_key: str = ""
+    """Identifies the artist's depth maps that it was trained with; empty without."""
+
+    def depth(self) -> FittedDepth | None:
+        """Those maps, read from the run's folder; None without. JobError (TRAIN) if they are not there any more."""
+        return load_fitted(self.folder, self.depth_key) if self.depth_key else None
+
+    @property
+    def stale(self) -> bool:
+        """True if the run has been trained since it was loaded."""
+        return _stamp(self.folder / CHECKPOINT_FILE) != self.stamp
+
+
+def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> LoadedRun:
+    """A run as it stands in its checkpoint, on `device`. JobError if there is none."""
+    folder = shot.run(name)
+    checkpoint = folder / CHECKPOINT_FILE
+    if not checkpoint.is_file():
+        message = f"{shot.root.name} has no trained run named {name!r}."
+        raise JobError(message, "Run the training step first.", ExitCode.FREEZE)
+    for _ in range(_ATTEMPTS):
+        stamp = _stamp(checkpoint)
+        tensors, meta = load_checkpoint(checkpoint)
+        if stamp == _stamp(checkpoint):  # else it was replaced meanwhile: which one was read cannot be told
+            break
+    else:
+        message = f"The run {name!r} is written again and again while it is read."
+        raise JobError(message, "Wait for its training to end.", ExitCode.FREEZE)
+    if meta.get("solve") != solve_key(shot):
+        message = f"The run {name!r} was trained on other cameras than the shot has now."
+        raise JobError(message, "Train it again.", ExitCode.FREEZE)
+    if of_other_pictures(shot, meta):
+        message = f"The run {name!r} was trained on other pictures than the shot has now: they were imported again."
+        raise JobError(message, "Train it again.", ExitCode.FREEZE)
+    try:
+        config = config_from_json(meta["config"])
+        model = restore_model(tensors, meta, config, device)
+        size = int(meta["width"]), int(meta["height"])
+        depth = str(meta["depth"]["key"]) if meta.get("depth") else ""
+        return LoadedRun(
+            folder, config, model, *size, list(meta["train_frames"]), stamp, _former_stamp(checkpoint), depth
+        )
+    except MISFITS as error:  # whole, but not as `save` wrote it
+        raise misfit(checkpoint, error, ExitCode.FREEZE) from None
+
+
+def _stamp(checkpoint: Path) -> str:
+    """Digest of a checkpoint, empty if it is gone."""
+    try:
+        return file_digest(checkpoint)
+    except FileNotFoundError:
+        return ""
+
+
+def _former_stamp(checkpoint: Path) -> list[Any]:
+    """See `LoadedRun.former_stamp`."""
+    status = checkpoint.stat()
+    return [checkpoint.name, status.st_size, status.st_mtime_ns]
