@@ -73,41 +73,46 @@ def main(path: str) -> int:
         again = build(request, hold_lens=True)
         held = bool(again) and as_good(again[0], models[0])
         models = again if held else models
-    model = models[0]
-    poses = localise(request, model)
-    write_answers(request, model, poses)
-    camera = first_camera(model)
-    say(
-        result={
-            "registered": model.num_reg_images(),
-            "parts": [sorted(image.name for image in posed(m)) for m in models],
-            "reprojection_error_px": model.compute_mean_reprojection_error(),
-            "points": model.num_points3D(),
-            "triangulation_angle_deg": triangulation_angle(model),
-            "camera_model": camera.model_name,
-            "focal_px": camera.mean_focal_length(),
-            "distortion": [float(camera.params[i]) for i in camera.extra_params_idxs()],
-            "flow_px": shared.flow_px,
-            "turning": turning(request),
-            "focal_changes": focal_changes(model),
-            "localised": len(poses) - model.num_reg_images(),
-            "lens": {
-                "doubt": doubt,
-                "held": held,
-                "found_px": first.mean_focal_length(),
-                "found_deg": angle_deg(*lens_of(first)),
-                "found_bend": bends_of(first.model_name, [float(value) for value in first.params])[0],
-                "view_deg": angle_deg(*lens_of(camera)),
-                "impossible": impossible(*lens_of(camera)),
-                "given_px": request.focal,
-                "start_px": request.start_focal,
-                "width": camera.width,
-                "height": camera.height,
-                **({"left_bend": left_bend(model)} if request.hold_bend else {}),
-            },
-        }
-    )
+    poses = localise(request, models[0])
+    write_answers(request, models[0], poses)
+    lens = {"doubt": doubt, "held": held, **_found(request, first, models[0])}
+    result = _result(models, len(poses))
+    say(result={**result, "flow_px": shared.flow_px, "turning": turning(request), "lens": lens})
     return 0
+
+
+def _result(models: list[pycolmap.Reconstruction], placed: int) -> dict[str, Any]:
+    """What is told of the models, the first of which is used; `placed` frames have a pose."""
+    model, camera = models[0], first_camera(models[0])
+    return {
+        "registered": model.num_reg_images(),
+        "parts": [sorted(image.name for image in posed(m)) for m in models],
+        "reprojection_error_px": model.compute_mean_reprojection_error(),
+        "points": model.num_points3D(),
+        "triangulation_angle_deg": triangulation_angle(model),
+        "camera_model": camera.model_name,
+        "focal_px": camera.mean_focal_length(),
+        "distortion": [float(camera.params[i]) for i in camera.extra_params_idxs()],
+        "focal_changes": focal_changes(model),
+        "localised": placed - model.num_reg_images(),
+    }
+
+
+def _found(request: Request, first: pycolmap.Camera, model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """The lens that was found at first, and the one that is used."""
+    camera = first_camera(model)
+    return {
+        "found_px": first.mean_focal_length(),
+        "found_deg": angle_deg(*lens_of(first)),
+        "found_bend": bends_of(first.model_name, [float(value) for value in first.params])[0],
+        "view_deg": angle_deg(*lens_of(camera)),
+        "impossible": impossible(*lens_of(camera)),
+        "given_px": request.focal,
+        "start_px": request.start_focal,
+        "width": camera.width,
+        "height": camera.height,
+        **({"left_bend": left_bend(model)} if request.hold_bend else {}),
+    }
 
 
 def take_over(request: Request, known: dict[str, Any]) -> int:

@@ -112,37 +112,11 @@ def _finish(
         write_stage(folder.usd, splats, camera_path_of(shot, params.camera_path), placement, info.fps, report)
     redistort = _redistort(shot, folder, size, spec.beyond, intrinsics(frames), report)
     facts = {
-        "version": 1,
-        "key": take.key,
-        "take": params.take,
-        "run": params.run,
-        "checkpoint": run.stamp,
-        "t_star_frame": t_star,
-        "t_star_per_frame": params.t_star_per_frame,
-        "camera_path": params.camera_path,
-        "query": params.query,
-        **({"developed": spec.instants.frames} if params.develop == "on" else {}),
-        "width": size[0],
-        "height": size[1],
-        "overscan": params.overscan,
-        "margin": list(spec.beyond),
-        "redistort": str(redistort or ""),
+        **_facts(shot, params, take),
         "first": numbers[0],
         "last": numbers[-1],
         "frames": len(numbers),
-        "frames_in_all": len(take.whole),
-        **({} if params.t_star is None else {"t_star_asked": params.t_star}),
-        "fps": shot.info().fps,
-        "scale": scene.scale,
-        "passes": spec.passes is not None,
-        "deep": spec.deep is not None,
-        "shutter": 0.0 if spec.blur is None else spec.blur.shutter,
-        "grain": None if spec.grain is None else spec.grain.to_json(),
-        "footage": footage_facts(shot, folder.root),
-        "exr_dir": str(folder.root),
-        "contact_sheet": str(folder.contact_sheet),
-        "video": str(folder.video),
-        "ply": str(folder.ply),
+        "redistort": str(redistort or ""),
         "usd": str(folder.usd) if folder.usd.is_file() else "",
         "placement": placement.to_json(),
         **made_of,
@@ -152,6 +126,40 @@ def _finish(
     report.image("contact sheet", folder.contact_sheet)
     report.progress("finishing the take", 3, 3, "done")
     return facts
+
+
+def _facts(shot: Shot, params: FreezeParams, take: PlannedTake) -> dict[str, Any]:
+    """What take.json keeps of what was asked for and planned, and where the files lie."""
+    folder, spec = take.folder, take.spec
+    return {
+        "version": 1,
+        "key": take.key,
+        "take": params.take,
+        "run": params.run,
+        "checkpoint": spec.run.stamp,
+        "t_star_frame": take.t_star,
+        "t_star_per_frame": params.t_star_per_frame,
+        "camera_path": params.camera_path,
+        "query": params.query,
+        **({"developed": spec.instants.frames} if params.develop == "on" else {}),
+        "width": spec.size[0],
+        "height": spec.size[1],
+        "overscan": params.overscan,
+        "margin": list(spec.beyond),
+        "frames_in_all": len(take.whole),
+        **({} if params.t_star is None else {"t_star_asked": params.t_star}),
+        "fps": shot.info().fps,
+        "scale": take.scene.scale,
+        "passes": spec.passes is not None,
+        "deep": spec.deep is not None,
+        "shutter": 0.0 if spec.blur is None else spec.blur.shutter,
+        "grain": None if spec.grain is None else spec.grain.to_json(),
+        "footage": footage_facts(shot, folder.root),
+        "exr_dir": str(folder.root),
+        "contact_sheet": str(folder.contact_sheet),
+        "video": str(folder.video),
+        "ply": str(folder.ply),
+    }
 
 
 @contextlib.contextmanager
