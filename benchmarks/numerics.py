@@ -86,9 +86,13 @@ def _cases(bodies: list[str], names: list[str]) -> list[str]:
         gradient = "finite" if case.gradient is None else _cell(case.gradient)
         plain = f" (reference32: {_cell(case.plain)})" if case.plain else ""
         bounds = f"{case.psnr:.0f}, {gradient}{plain}; flips {100 * case.flips:.0f} %"
-        lines.append(f"| {name} | {' | '.join(map(_errors, errors))} | {bounds} |")
+        told = f"{name}: {case.note}" if case.note else name
+        lines.append(f"| {told} | {' | '.join(map(_errors, errors))} | {bounds} |")
     close = len(names) - len(lines) + 2
-    return [*lines, "", f"In the other {close} cases all are within {_CLOSE[0]:.0f} dB and {_cell(_CLOSE[1])}."]
+    others = (
+        f"In the other {close} cases every body reaches {_CLOSE[0]:.0f} dB, with gradients within {_cell(_CLOSE[1])}."
+    )
+    return [*lines, "", others]
 
 
 def _generated(cases: int) -> str:
@@ -163,10 +167,6 @@ def report(bodies: list[str], names: list[str], cases: int) -> str:
         "## Notes on conditioning",
         "",
         _NOTES.rstrip(),
-    ]
-    notes = {name: CASES[name].note for name in names if CASES[name].note}
-    text += [f"- **{name}.** {note[0].upper()}{note[1:]}." for name, note in notes.items()]
-    text += [
         "",
         "## Generated cases",
         "",
