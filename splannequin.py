@@ -10,7 +10,8 @@
     python3 splannequin.py setup                    make the environments and stop
 
 The backend lives in `.venv`; Blender as a Python module lives in `.venv-bpy-X.Y` (their numpy versions exclude each
-other). Both stand beside this file, or in the folder that SPLANNEQUIN_HOME names. Exit codes: docs/troubleshooting.md.
+other). Both stand beside this file, or in the folder that SPLANNEQUIN_HOME names. Exit codes:
+docs/manual/troubleshooting.md.
 
 This file and what it imports at its top run under Python 3.8, so that an old Python can say which one is needed.
 """

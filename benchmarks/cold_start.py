@@ -1,5 +1,5 @@
 """Seconds until the first frame of a new process, with an empty and with a full kernel cache: `python
-benchmarks/cold_start.py [--rounds N]`. A frame is 100 Gaussians on 64 x 48 px, forward and backward, on the CPU.
+-m benchmarks.cold_start [--rounds N]`. A frame is 100 Gaussians on 64 x 48 px, forward and backward, on the CPU.
 
 Each round starts processes of its own. `import` is what importing the rasteriser takes once torch is imported; `first`
 the first call, `second` the one after it.

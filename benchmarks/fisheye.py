@@ -3,7 +3,7 @@
 # As in synthetic/render_bpy.py: nodes, lights and meshes are more to Blender than their types say.
 """A rendered fisheye, solved: a lens of another formula than the solve's, against the cameras it was rendered from.
 
-    BPY_PYTHON benchmarks/fisheye.py render OUT             # Cycles: OUT/clip/NNNN.png and OUT/truth.json
+    BPY_PYTHON -m benchmarks.fisheye render OUT             # Cycles: OUT/clip/NNNN.png and OUT/truth.json
     python -m benchmarks.fisheye solve OUT [--camera-model OPENCV_FISHEYE]
 
 The lens is equisolid, r = 2 f sin(angle / 2), as photographic fisheyes are; `OPENCV_FISHEYE` has r = f angle (1 + k1

@@ -1,4 +1,4 @@
-"""How near blending comes to the limit of its inner loops: `python benchmarks/hot_loop.py [W1 W2 W3] [--json FILE]`.
+"""How near blending comes to the limit of its inner loops: `python -m benchmarks.hot_loop [W1 W2 W3] [--json FILE]`.
 
 The limit: the very text of the forward and the backward row loop (`cpu_source.FORWARD_ROW`, `BACKWARD_ROW`), compiled
 the same way, over one tile of 16 full rows and 16 Gaussians, all of it in the first-level cache, every row lit and

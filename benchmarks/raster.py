@@ -1,4 +1,4 @@
-"""Times the rasteriser on four seeded workloads: `python benchmarks/raster.py [W0 W1 ...] [--json FILE]`.
+"""Times the rasteriser on four seeded workloads: `python -m benchmarks.raster [W0 W1 ...] [--json FILE]`.
 
 Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). `--limit`,
 `--scaling`, `--memory` and `--errors` add tables.

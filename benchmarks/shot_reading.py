@@ -1,6 +1,6 @@
 """Times what Blender's main thread spends on reading a long shot's folder, every second while a take grows.
 
-    python benchmarks/shot_reading.py [--frames 5000] [--runs 3]
+    python -m benchmarks.shot_reading [--frames 5000] [--runs 3]
 
 A Python with Blender's module (bpy). Makes a shot of files as the backend writes them, with a solve that is newer than
 its runs and a take that gains a frame between readings; prints the median and the longest reading in milliseconds.

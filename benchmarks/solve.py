@@ -1,6 +1,6 @@
 """Solves clips and says how long it took and how good it is; against motion capture where there is any.
 
-    python benchmarks/solve.py examples/sitting.mp4 --truth groundtruth.txt --times frames.txt --step 1 2 --out s.json
+    python -m benchmarks.solve examples/sitting.mp4 --truth groundtruth.txt --times frames.txt --step 1 2 --out s.json
 
 `--truth` is a TUM trajectory ("timestamp tx ty tz qx qy qz qw", camera to world), `--times` gives the timestamp of each
 frame ("frame timestamp"). With a step above 1 the frames that it leaves out tell localisation from interpolation: both

@@ -1,4 +1,4 @@
-"""Breakdown of one training step before and after the gate opens: `python benchmarks/training_step.py SHOT`.
+"""Breakdown of one training step before and after the gate opens: `python -m benchmarks.training_step SHOT`.
 
 SHOT is a solved shot folder; nothing is written into it. One run of the preset trains with the tuning split (every 8th
 frame held out, four frames off) and the shot's motion mattes; `--steps` steps are timed at each share of the run in

@@ -46,7 +46,7 @@ def main() -> int:
         frames = _prepare(args.shot.absolute(), args.take, args.frames, work)
         ask = {"shot": str(work / "shot.splannequin"), "take": args.take, "frames": frames, "work": name}
         for python in args.bpy:
-            subprocess.run([python, __file__, _INSIDE, json.dumps(ask)], check=True, cwd=ROOT)
+            subprocess.run([python, "-P", __file__, _INSIDE, json.dumps(ask)], check=True, cwd=ROOT)
             errors = _compare(frames, work)
             held = held and max(errors["delivered_relative"], errors["graded_relative"]) < 1e-3
             print(json.dumps({"bpy": (work / "version").read_text(), "frames": frames, **errors}), flush=True)

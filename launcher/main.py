@@ -27,6 +27,17 @@ from .places import DEMO_CLIP, HERE
 from .summary import failed_job, read_summary
 from .testing import run_sensitive_tests, run_tests
 
+COMMANDS = {
+    "demo": "freeze the bundled clip",
+    "freeze": "freeze your own clip, or a shot folder anew; other options go to the backend (--t-star N, ...)",
+    "test": "run all tests; other arguments go to pytest",
+    "bench": "the method against ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
+    "doctor": "say what this machine can do",
+    "setup": "make the environments and stop",
+    "farm": "shots as a job for a render farm, and what it will cost; its options are the backend's",
+}
+"""Command -> what it does."""
+
 
 def parser() -> argparse.ArgumentParser:
     """The grammar. What `freeze` and `demo` do not know goes to the backend, what `test` does not, to pytest, what
@@ -35,16 +46,7 @@ def parser() -> argparse.ArgumentParser:
         prog="splannequin.py", description="Freeze time in a handheld clip.", allow_abbrev=False
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    helps = {
-        "demo": "freeze the bundled clip",
-        "freeze": "freeze your own clip, or a shot folder anew; other options go to the backend (--t-star N, ...)",
-        "test": "run all tests; other arguments go to pytest",
-        "bench": "the method against ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
-        "doctor": "say what this machine can do",
-        "setup": "make the environments and stop",
-        "farm": "shots as a job for a render farm, and what it will cost; its options are the backend's",
-    }
-    for name, text in helps.items():
+    for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
         if name == "freeze":
             command.add_argument("clip", metavar="INPUT", help=INPUT[1])

@@ -83,7 +83,7 @@ def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = N
     elif wheels is not None and re.search(r"No matching distribution|from versions:", output):
         lacking = re.search(r"No matching distribution found for ([\w.=+-]+)", output)
         last = f"{wheels} has no wheel of {lacking.group(1) if lacking else 'a package'} for this Python and system"
-        advice = "put it there (docs/user-guide.md, Without a network, says how), then start the same command again"
+        advice = "put it there (docs/manual/setup.md, Without a network, says how), then start the same command again"
     elif BROKEN_CONNECTION.search(output) and not answered:
         last, advice = _unreachable(output)
     elif re.search(r"ensurepip|python3-venv", output):

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from torch_backend.contract import BACKEND, BLENDER, COMMANDS, FRAME_LAYERS, VERBS, default_of, options_for
+from tools import reference
+from torch_backend.contract import FRAME_LAYERS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -14,7 +15,6 @@ PAGES = [
 ]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 MANUAL = ROOT / "docs" / "manual"
-GUIDE = ROOT / "docs" / "user-guide.md"
 STEPS = ("import", "solve", "train", "freeze", "bake")
 ROOMS = ("footage", "solve", "train", "freeze", "bake")
 
@@ -98,36 +98,12 @@ def test_what_the_manual_sets_in_italics_is_on_the_screen_or_in_a_message():
     assert not lost
 
 
-def option_table(command: str) -> str:
-    """The options of a command as the user guide's table."""
-    rows = {}
-    for cls in COMMANDS[command].values():
-        for one, told in options_for(command, cls):
-            if told.flag.startswith("--"):
-                name = f"`{told.flag} {told.metavar}`" if told.metavar else f"`{told.flag}`"
-                default = default_of(one, told)
-                shown = f"`{default}`" if default and default == one.default else default
-                rows.setdefault(told.flag, f"| {name} | {told.help} | {shown} |".replace("t*", "t\\*"))
-    return "\n".join(["| option | what it does | default |", "|---|---|---|", *rows.values()])
+def test_the_reference_is_made_of_the_tables():
+    page = reference.PAGE.read_text(encoding="utf-8")
+    assert page == reference.text(), "run `python3 tools/reference.py`"
 
 
-def test_the_user_guides_options_are_those_of_the_command_line():
-    table = option_table("freeze")
-    assert table in text_of(ROOT / "docs" / "user-guide.md"), f"put this table into docs/user-guide.md:\n\n{table}\n"
-
-
-def test_the_user_guide_says_which_command_line_has_which_verbs():
-    row = re.search(r"^\| `\.venv/bin/python -m torch_backend VERB`[^|]*\|([^|]+)", text_of(GUIDE), re.MULTILINE)
-    named = {name for name, verb in VERBS.items() if BLENDER in verb.sides}
-    assert row and set(re.findall(r"`([a-z]+)`", row[1])) == named - {"bake"}
-    assert all(BACKEND in VERBS[name].sides for name in named - {"bake"}) and BACKEND not in VERBS["bake"].sides
-
-
-def test_the_layers_of_a_frame_in_the_manual_are_those_of_the_table():
-    rows = [f"| `{one.shown}` | {one.stored} | {one.content} |" for one in FRAME_LAYERS]
-    guide = text_of(ROOT / "docs" / "user-guide.md")
-    assert "\n".join(f"  {row}" for row in rows) in guide, "put these rows into docs/user-guide.md:\n" + "\n".join(rows)
-    assert f"Combined, Alpha, {', '.join(one.name for one in FRAME_LAYERS[1:])}." in guide
-    page = text_of(MANUAL / "layers.md").split("## The freeze")[0]
+def test_every_layer_of_a_frame_has_a_use_in_the_manual():
+    page = text_of(MANUAL / "layers.md").split("## In another compositor")[0]
     page = re.findall(r"^\| `([^`]+)` \| ([\w, ]+) \|", page, re.MULTILINE)
     assert dict(page) == {one.shown: "Combined, Alpha" if one.name == "Combined" else one.name for one in FRAME_LAYERS}

@@ -64,7 +64,7 @@ def torch_threads(values: int) -> Generator[None]:
     on no more than they had.
 
     Between two operators torch's threads sleep (OMP_WAIT_POLICY): where each works on little, waking them takes longer
-    than they save (docs/decisions.md, "Processor"). Compiled snippets have threads of their own.
+    than they save (docs/decisions.md, "Processor, cards, Blender"). Compiled snippets have threads of their own.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(max(1, min(before, round(values / _WORTH_A_THREAD))))

@@ -1,4 +1,4 @@
-"""What a rival must offer to be timed: `python benchmarks/raster.py --peer MODULE`, MODULE being a Python import path.
+"""What a rival must offer to be timed: `python -m benchmarks.raster --peer MODULE`, MODULE being a Python import path.
 
 Such a module has a `NAME`, and two functions with the signatures of `Peer`. `gsplat.py` beside this file is an example.
 """

@@ -147,7 +147,7 @@ def image_of(name: str, rgb: np.ndarray):
 
 
 def mapped(tree, picture, path: Path):
-    """Socket of a picture sent through an ST map, as the user guide says."""
+    """Socket of a picture sent through an ST map, as the manual says."""
     source = tree.nodes.new("CompositorNodeImage")
     source.image = bpy.data.images.load(str(path))
     source.image.colorspace_settings.name = "Non-Color"

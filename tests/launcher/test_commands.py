@@ -3,7 +3,6 @@
 import ast
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -66,14 +65,6 @@ def test_a_benchmark_of_ones_own_scenes_needs_no_blender():
     assert commands._own_scenes(["--truth", "folder"]) and commands._own_scenes(["--shot=x", "--seeds", "2"])
     assert not commands._own_scenes(["--shot", "x", "--hard"])
     assert not commands._own_scenes(["--quick"]) and not commands._own_scenes(["--shot", "x", "--size=tiny"])
-
-
-def test_help_names_every_command_and_the_guide_has_them_all():
-    told = launch("--help").stdout
-    guide = (ROOT / "docs" / "user-guide.md").read_text(encoding="utf-8")
-    named = re.search(r"^\| `python3 splannequin\.py VERB`[^|]*\|([^|]+)", guide, re.MULTILINE)
-    commands_told = set(re.findall(r"^ {4}([a-z]+) ", told, re.MULTILINE))
-    assert named and "farm" in commands_told and set(re.findall(r"`([a-z]+)`", named[1])) == commands_told
 
 
 def test_benchs_help_is_the_benchmarks_own():

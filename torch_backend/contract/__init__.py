@@ -1,7 +1,7 @@
 """What crosses the wall between Blender and the backend. Standard library only: both sides read this package.
 
     errors          exit codes, and the failure that an artist reads
-    options         what each step may be asked for: option_table makes panel and user guide of it
+    options         what each step may be asked for: option_table makes panel and reference of it
     verbs           the words of the command lines; command_line makes both of them of it
     jobs            a job's folder: request, status, events
     processes       children, and which process lives

@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 class ExitCode(enum.IntEnum):
-    """Exit codes of every command, documented in docs/troubleshooting.md."""
+    """Exit codes of every command, documented in docs/manual/troubleshooting.md."""
 
     OK = 0
     INTERNAL = 1

@@ -19,9 +19,9 @@ class FrameLayer:
     stored: str
     """half or float."""
     shown: str
-    """Its channels as the user guide writes them."""
+    """Its channels as the reference writes them."""
     content: str
-    """What it holds, for the user guide."""
+    """What it holds, for docs/reference.md."""
     part: str = ""
     """Empty: every frame has it; grain, detail: those frames that were made with it. A name of its own: those whose
     writer was handed it as `more`; it goes by this row alone."""

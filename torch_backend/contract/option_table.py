@@ -1,7 +1,7 @@
-"""One table of options: what a field of a step's parameters is on a command line, in the user guide and on the panel.
+"""One table of options: what a field of a step's parameters is on a command line, in the reference and on the panel.
 
 Each field that has a door carries an `Option` in its metadata. Both command lines (`command_line`), Blender's
-properties and the tables of the user guide are made from them, so an option is added in one place.
+properties and docs/reference.md are made from them, so an option is added in one place.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class Option:
     flag: str = ""
     """On a command line: --name, or a bare name for what stands without one. Empty: no command line has it."""
     help: str = ""
-    """What it does, for --help and the user guide; `default` below it is added there."""
+    """What it does, for --help and the reference; `default` below it is added there."""
     default: str = ""
     """The default in words, where its value says too little."""
     choices: tuple[str, ...] = ()
     """What it may be."""
     metavar: str | None = None
-    """What --help and the user guide write for the value, unit or kind."""
+    """What --help and the reference write for the value, unit or kind."""
     parse: Callable[[str], Any] | None = None
     """Text to value, ValueError on what cannot be; None: as the field's type."""
     switch: bool = False

@@ -2,7 +2,7 @@
 
 A step that is not finite changes nothing (`FusedAdam`), and the rasteriser culls what is not finite; so one bad number
 does no harm at once. But it stays: a NaN in an opacity leaves out every further step, and one in a position is never
-seen again in any loss (docs/numerics.md). So
+seen again in any loss (benchmarks/known_failures.py). So
 
 - a Gaussian with a parameter that is not finite is dropped: its neighbours and the next round of growth fill the hole;
 - a quaternion without length, whose Gaussian is culled and gets no gradient, becomes the identity;

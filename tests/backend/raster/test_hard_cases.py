@@ -1,6 +1,7 @@
 """Inputs that break rasterisers, on every body; the bounds against the oracle are stated in benchmarks/raster_cases.py.
 
-`docs/numerics.md` says which test stands for which known failure of other programs, `remedies.py` what makes it fail.
+`benchmarks/known_failures.py` says which test stands for which known failure of other programs, `remedies.py` what
+makes it fail.
 """
 
 import importlib.util
