@@ -43,15 +43,22 @@ def test_links_and_pictures_are_there(page: Path):
 
 
 def test_what_contributors_are_sent_to_is_there():
-    """Every file, folder and name of a test between backticks; `NAME` stands for the reader's own."""
+    """Every file and folder between backticks; `NAME` stands for the reader's own."""
     page = text_of(ROOT / "CONTRIBUTING.md")
-    tests = "".join(text_of(path) for path in (ROOT / "tests").rglob("test_*.py"))
     named = [word for word in re.findall(r"`([^`\n]+)`", page) if "NAME" not in word]
     paths = {word for word in named if re.fullmatch(r"[\w.-]+(/[\w.-]+)+/?|\w+\.(py|toml)", word)}
     run = re.findall(r"pytest -q (\S+)", page)
     assert len(paths) > 30 and len(run) == 4
     assert not sorted(path for path in {*paths, *run} if not (ROOT / path).exists())
-    assert not [word for word in named if word.startswith("test_") and f"def {word}(" not in tests]
+
+
+def test_every_test_that_a_page_names_is_there():
+    """`file.py::test`, `::test` of the file before it in the row, or `test` alone."""
+    tests = "".join(text_of(path) for path in (ROOT / "tests").rglob("test_*.py"))
+    for page in PAGES:
+        for file, name in re.findall(r"`(?:([\w/]*test_\w+\.py)(?:::)?|::)?(test_\w+)?`", text_of(page)):
+            assert not file or list((ROOT / "tests").rglob(Path(file).name)), f"{page.name}: {file}"
+            assert f"def {name}" in tests, f"{page.name}: {name}"
 
 
 def test_the_forge_runs_the_commands_of_the_readme():
