@@ -15,11 +15,9 @@ from ...torch_backend import contract
 from ..access import named, settings_of
 from ..properties import BoolProperty, CollectionProperty, FloatProperty, PointerProperty, StringProperty
 from ..scene import paths, session
-from ..scene.ownership import TAG
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""
-_KINDS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 
 
 class SPLANNEQUIN_PG_splats(bpy.types.PropertyGroup):
@@ -150,22 +148,6 @@ def _stands(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bp
     """True if a scene has an object, looked for by its name `among` some first: every turn of the timer asks, and
     `users_scene` copies the list of all objects of every scene, which may be tens of thousands."""
     return any(named(objects, item.name) == item for objects in among) or bool(item.users_scene)
-
-
-def adopt(scene: bpy.types.Scene, shot: Path) -> None:
-    """Takes over what 0.2.0 made, which marked objects instead: the one of each kind that kept its name."""
-    name = name_of(shot)
-    if settings_of(scene).made or not any(o.get(TAG) == name for o in scene.objects):
-        return
-    entry = new(scene, shot)
-    for item in [o for o in scene.objects if o.get(TAG) == name]:
-        kind = _KINDS.get(item.type, "")
-        if kind and item.name == f"{name} {kind}":
-            setattr(entry, kind, item)
-        del item[TAG]
-    for collection in [c for c in scene.collection.children_recursive if c.get(TAG) == name]:
-        entry.collection = collection
-        del collection[TAG]
 
 
 def placed_root(

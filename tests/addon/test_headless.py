@@ -235,8 +235,8 @@ def test_both_command_lines_print_the_same_options_for_the_same_verb(addon, pack
 
 
 def test_freeze_of_a_shot_is_the_step_alone(run, root, tmp_path):
-    shot = tmp_path / "old.splannequin"
-    shutil.copytree(root / "tests" / "data" / "v0_2" / "shot", shot)
+    shot = tmp_path / "stored.splannequin"
+    shutil.copytree(root / "tests" / "data" / "shot", shot)
     words = ("--run", "tiny", "--t-star", 8, "--take", "again", "--detail", "off", "--develop", "off",
              "--freeze-width", 32, "--device", "cpu")  # fmt: skip
     code, said, wrong = run("freeze", shot, *words)

@@ -254,12 +254,7 @@ def _config(record: dict[str, Any]) -> FootageConfig:
 
 def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
     """True if the footage is known to have the working frames' size and no values that they lack."""
-    size = record.get("source_size")
-    recorded: dict[str, Any] = record.get("config") or {}
-    if size is None:  # imported by an earlier version
-        same = not recorded.get("working_height") and working[1] < _NO_LARGER
-        return same and record.get("bits") == 8
-    return tuple(size) == working and not record.get("extended", True)
+    return tuple(record["source_size"]) == working and not record.get("extended", True)
 
 
 def _lenses(shot: Shot) -> dict[int, PlateLens | MapLens] | str:

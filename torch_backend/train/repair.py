@@ -104,10 +104,8 @@ class FieldMemory:
 
     @torch.no_grad()
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Takes over what `state` told; a checkpoint of before it has none: then the next look begins anew."""
+        """Takes over what `state` told."""
         own = {name.removeprefix(_STATE): t for name, t in tensors.items() if name.startswith(_STATE)}
-        if "reach" not in own:
-            return
         self._reach.copy_(own["reach"])
         self._worst.copy_(own["worst"])
         device, kept = self._reach.device, [f"kept.{n}." for n in range(2)]

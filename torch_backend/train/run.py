@@ -363,8 +363,8 @@ def pictures_key(shot: Shot) -> str:
 
 
 def _of_other_pictures(shot: Shot, facts: dict[str, Any]) -> bool:
-    """Was a checkpoint of these facts trained on other pictures than the shot has now? One of before does not say."""
-    return facts.get("pictures") not in (None, pictures_key(shot))
+    """Was a checkpoint of these facts trained on other pictures than the shot has now?"""
+    return facts.get("pictures") != pictures_key(shot)
 
 
 def motion_of(shot: Shot, config: TrainConfig) -> str | None:
