@@ -14,21 +14,20 @@ import json
 import resource
 import tempfile
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_backend.contract import CameraPath, read_json
+from torch_backend.contract import CameraPath, Reporter, read_json
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.shot import Shot
 from torch_backend.solve import SolveConfig, solve_shot
 from torch_backend.solve.poses import camera_centre, fill_poses
 
 
-class Stopwatch:
+class Stopwatch(Reporter):
     """Reporter that keeps when each stage began."""
 
     def __init__(self) -> None:
@@ -39,17 +38,8 @@ class Stopwatch:
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
         self.stages.setdefault(stage, time.perf_counter() - self.began)
 
-    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
-        pass
-
-    def image(self, label: str, path: str | Path) -> None:
-        pass
-
     def warning(self, message: str, hint: str = "") -> None:
         self.warnings.append(message)
-
-    def check_cancelled(self) -> None:
-        pass
 
     def seconds_by_stage(self) -> dict[str, float]:
         starts = [*self.stages.values(), time.perf_counter() - self.began]

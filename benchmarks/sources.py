@@ -24,7 +24,7 @@ from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, similarity_to_exact, solved_shot
 from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
-from torch_backend.contract import JobError, read_json
+from torch_backend.contract import JobError, Reporter, read_json
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key, locked
 from torch_backend.solve.motion import find_motion
@@ -178,7 +178,17 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
-class Log:
+class Warnings(Reporter):
+    """A reporter that keeps the warnings."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+
+    def warning(self, message: str, hint: str = "") -> None:
+        self.warnings.append(f"{message} {hint}".strip())
+
+
+class Log(Reporter):
     """A reporter that says one line per stage."""
 
     def __init__(self) -> None:
@@ -197,9 +207,6 @@ class Log:
 
     def warning(self, message: str, hint: str = "") -> None:
         print(f"note: {message} {hint}", flush=True)
-
-    def check_cancelled(self) -> None:
-        """Ctrl-C and SIGTERM end scoring by their own exceptions."""
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from torch_backend.contract import CAMERAS_KNOWN, EVENTS_FILE, FORECAST, Cancelled, ExitCode, SolveParams
+from torch_backend.contract import CAMERAS_KNOWN, EVENTS_FILE, FORECAST, Cancelled, ExitCode, Reporter, SolveParams
 from torch_backend.footage import load_frames
 from torch_backend.job import new_job, run_job
 from torch_backend.solve import SolveConfig, solve_shot
@@ -16,7 +16,7 @@ from torch_backend.solve.stored import load_cameras
 FRAMES = {"width": 640, "height": 480, "frames": [{"solve": n % 2 == 0} for n in range(40)]}
 
 
-class Heard:
+class Heard(Reporter):
     """Keeps the bar; ends all in the moment in which the cameras are known if asked to, as a kill would."""
 
     def __init__(self, stop=False):
@@ -30,15 +30,6 @@ class Heard:
         self.metrics.append((stage, self.bar[-1], dict(values)))
         if self.stop and stage == CAMERAS_KNOWN:
             raise Cancelled
-
-    def image(self, label, path):
-        pass
-
-    def warning(self, message, hint=""):
-        pass
-
-    def check_cancelled(self):
-        pass
 
 
 def stage(bar, name, *shares):
