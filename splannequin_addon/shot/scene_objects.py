@@ -13,7 +13,7 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import named, settings_of
-from ..properties import BoolProperty, CollectionProperty, FloatProperty, PointerProperty, StringProperty
+from ..properties import BoolProperty, CollectionProperty, FloatProperty, Items, PointerProperty, StringProperty
 from ..scene import paths, session
 
 PARTS = ("root", "camera", "points")
@@ -148,6 +148,27 @@ def _stands(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bp
     """True if a scene has an object, looked for by its name `among` some first: every turn of the timer asks, and
     `users_scene` copies the list of all objects of every scene, which may be tens of thousands."""
     return any(named(objects, item.name) == item for objects in among) or bool(item.users_scene)
+
+
+def remove_kept(
+    scene: bpy.types.Scene, kept: Items[SPLANNEQUIN_PG_splats | SPLANNEQUIN_PG_surface], take: str | None
+) -> bool:
+    """Takes the objects of a take, or of all takes, out of a list of them and out of the file. True if there were some.
+    What stands in other scenes alone stays in the file."""
+    is_found = False
+    for index in reversed(range(len(kept))):
+        if take is not None and kept[index].name != take:
+            continue
+        item = kept[index].object
+        kept.remove(index)
+        if item is None or (item.users_scene and scene not in item.users_scene):
+            continue
+        is_found = True
+        data = item.data
+        bpy.data.objects.remove(item)
+        if data is not None and data.users <= int(data.use_fake_user):
+            bpy.data.batch_remove([data])
+    return is_found
 
 
 def placed_root(
