@@ -15,19 +15,6 @@ import pytest
 from bpy.app.handlers import persistent
 
 
-@pytest.fixture
-def run(addon, capfd):
-    """run(*arguments) is (exit code, standard output, standard error)."""
-
-    def call(*arguments) -> tuple[int, str, str]:
-        capfd.readouterr()
-        code = addon("command_line.headless").main([str(a) for a in arguments])
-        out, err = capfd.readouterr()
-        return code, out, err
-
-    return call
-
-
 def test_bake_leaves_frames_a_file_and_a_summary(run, shot, tmp_path, pictures, layers, addon, scene):
     out = tmp_path / "out"
     out.mkdir()
