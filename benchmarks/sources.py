@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, similarity_to_exact, solved_shot
 from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import JobError, Reporter, read_json
+from torch_backend.native import default_threads
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key, locked
 from torch_backend.solve.motion import find_motion
@@ -121,6 +123,30 @@ class SyntheticTruth:
         moving = _nearest(regions.moving, width, height)
         things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
         return {"moving": moving, "static": ~moving, **things}
+
+
+def load_synthetic(folder: Path, results: Path, cameras: str = "exact") -> SyntheticTruth:
+    """The scene of benchmarks/synthetic in a folder; ValueError for any other."""
+    truth = load_source(f"{cameras}:{folder.absolute()}", results.absolute())
+    if not isinstance(truth, SyntheticTruth):
+        raise ValueError(f"{folder}: depth is only known of scenes of benchmarks/synthetic")
+    return truth
+
+
+def in_words(main: Callable[[Sequence[str] | None], None]) -> Callable[..., int]:
+    """A command line as a function that returns an exit code: what goes wrong is one sentence."""
+
+    @functools.wraps(main)
+    def run(argv: Sequence[str] | None = None) -> int:
+        torch.set_num_threads(default_threads())
+        try:
+            main(argv)
+        except (JobError, OSError, RuntimeError, ValueError, ModuleNotFoundError) as error:
+            print(f"Error: {error}", file=sys.stderr)
+            return 1
+        return 0
+
+    return run
 
 
 def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
