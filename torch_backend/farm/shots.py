@@ -197,7 +197,7 @@ def _of_shot(path: str, requests: dict[str, Any]) -> FarmShot:
         info, record = read_json(folder.info_path), read_json(folder.listing)
         numbers = [int(row["frame"]) for row in record["frames"]]
         working = int(record["width"]), int(record["height"])
-        width, height = record["source_size"]
+        width, height = record.get("source_size") or working
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise JobError(
             f"{folder.root} holds no imported clip ({error}).", "Import the clip first, or name the clip itself.",

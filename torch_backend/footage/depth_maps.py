@@ -99,7 +99,7 @@ def find_depth(shot: Shot, source: str, report: Reporter) -> DepthSequence:
     words = pairing_words(f"The depth sequence {sequence.pattern}", theirs, paired)
     if words is not None:
         report.warning(*words)
-    width, height = record["source_size"]
+    width, height = record.get("source_size") or (record["width"], record["height"])
     stretched = float(record.get("reading", {}).get("pixel_aspect", 1.0))
     files = {frame: sequence.files[number] for frame, number in paired.numbers.items()}
     return DepthSequence(path, files, width / height, stretched)
