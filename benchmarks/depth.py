@@ -36,9 +36,8 @@ from torch.nn import functional as F
 from benchmarks.detail_clip import DetailClip
 from benchmarks.detail_figures import dilate
 from benchmarks.detail_truth import scene_arguments, trained
-from benchmarks.sources import SyntheticTruth, load_source
-from torch_backend.contract import SWITCH, JobError
-from torch_backend.native import default_threads
+from benchmarks.sources import SyntheticTruth, in_words, load_synthetic
+from torch_backend.contract import SWITCH
 from torch_backend.report.truth import PANES
 from torch_backend.shot import write_json
 
@@ -200,33 +199,25 @@ def mean_of(found: Sequence[dict[str, dict[str, float | None]]]) -> dict[str, di
     return mean
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of the trainings")
     parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
     found: dict[str, dict[str, dict[str, float | None]]] = {}
     results = args.results.absolute()
-    try:
-        for folder in args.scenes:
-            source = f"{args.cameras}:{folder.absolute()}"
-            truth = load_source(source, results)
-            if not isinstance(truth, SyntheticTruth):
-                raise ValueError(f"{folder}: depth is only known of scenes of benchmarks/synthetic")
-            of: dict[str, Any] = {}
-            for seed in args.seeds:
-                run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
-                of[f"seed {seed}"] = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on")
-            found[truth.name] = mean_of(list(of.values()))
-            write_json(results / f"depth-{truth.name.replace(' ', '-')}.json", {"version": 1, **of})
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    for folder in args.scenes:
+        truth, source = load_synthetic(folder, results, args.cameras), f"{args.cameras}:{folder.absolute()}"
+        of: dict[str, Any] = {}
+        for seed in args.seeds:
+            run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
+            of[f"seed {seed}"] = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on")
+        found[truth.name] = mean_of(list(of.values()))
+        write_json(results / f"depth-{truth.name.replace(' ', '-')}.json", {"version": 1, **of})
     print("\n".join(["", *table(found)]))
-    return 0
 
 
 if __name__ == "__main__":

@@ -19,14 +19,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import cv2
 import numpy as np
-import torch
 
 from benchmarks import depth as depth_bench
 from benchmarks import detail_truth
-from benchmarks.sources import Log, SyntheticTruth, load_source
+from benchmarks.sources import Log, SyntheticTruth, in_words, load_synthetic
 from benchmarks.synthetic.folder import SyntheticScene
-from torch_backend.contract import JobError, TrainParams
-from torch_backend.native import default_threads
+from torch_backend.contract import TrainParams
 from torch_backend.report.records import DELIVERED, SPLATS
 from torch_backend.shot import make_folder, write_atomic, write_json
 from torch_backend.train import train_shot
@@ -80,8 +78,9 @@ def table(found: dict[str, dict[str, Any]]) -> list[str]:
     return lines
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
@@ -90,28 +89,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=3, metavar="N", help="judge every n-th pose")
     parser.add_argument("--iterations", type=int, default=0, metavar="N", help="training steps; 0: the preset's")
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
     results, found = args.results.absolute(), dict[str, dict[str, Any]]()
-    try:
-        for folder in args.scenes:
-            truth = load_source(f"exact:{folder.absolute()}", results)
-            if not isinstance(truth, SyntheticTruth):
-                raise ValueError(f"{folder}: depth is only known of scenes of benchmarks/synthetic")
-            maps = write_maps(SyntheticScene.load(folder), results / "maps" / truth.name.replace(" ", "-"))
-            for seed in args.seeds:
-                of: dict[str, Any] = {}
-                for way, source in (("without", ""), ("with", str(maps))):
-                    run = f"maps-{way}-{seed}"
-                    params = TrainParams(run=run, seed=seed, iterations=args.iterations, depth=source)
-                    train_shot(truth.shot, params, Log())
-                    of[way] = judged(truth, run, args.every, args.t_star or truth.t_stars)
-                found[f"{truth.name}, {seed}"] = of
-            write_json(results / f"depth-maps-{truth.name.replace(' ', '-')}.json", {"version": 1, "found": found})
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    for folder in args.scenes:
+        truth = load_synthetic(folder, results)
+        maps = write_maps(SyntheticScene.load(folder), results / "maps" / truth.name.replace(" ", "-"))
+        for seed in args.seeds:
+            of: dict[str, Any] = {}
+            for way, source in (("without", ""), ("with", str(maps))):
+                run = f"maps-{way}-{seed}"
+                params = TrainParams(run=run, seed=seed, iterations=args.iterations, depth=source)
+                train_shot(truth.shot, params, Log())
+                of[way] = judged(truth, run, args.every, args.t_star or truth.t_stars)
+            found[f"{truth.name}, {seed}"] = of
+        write_json(results / f"depth-maps-{truth.name.replace(' ', '-')}.json", {"version": 1, "found": found})
     print("\n".join(["", *table(found)]))
-    return 0
 
 
 if __name__ == "__main__":

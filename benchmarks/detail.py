@@ -26,9 +26,9 @@ from torch import Tensor
 
 from benchmarks.detail_clip import VARIANTS, DetailClip, open_clip, over
 from benchmarks.detail_figures import mean_difference, picture_figures
-from torch_backend.contract import SWITCH, JobError
+from benchmarks.sources import in_words
+from torch_backend.contract import SWITCH
 from torch_backend.footage.images import write_png
-from torch_backend.native import default_threads
 from torch_backend.shot import write_json
 
 FIGURES = {"whole_db": "whole, dB", "best_90_db": "best 90 %, dB", "still_db": "still, dB", "gradient": "gradient"}
@@ -178,27 +178,22 @@ def name_of(shot: Path) -> str:
     return shot.absolute().parent.name if shot.stem == "shot" else shot.stem
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     common_arguments(parser)
     parser.add_argument("--width", type=int, default=0, help="pixels (0: the plates' own)")
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
-    try:
-        clip = open_clip(args.shot, args.run, args.width, args.develop == "on")
-        frames = chosen_frames(clip, args)
-        name, since = name_of(args.shot), time.perf_counter()
-        strips = None if args.no_strips else args.results / f"strips-{name}"
-        result = judge(clip, args.t_star or clip.instants(), frames, strips, args.worst)
-    except (JobError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    clip = open_clip(args.shot, args.run, args.width, args.develop == "on")
+    frames = chosen_frames(clip, args)
+    name, since = name_of(args.shot), time.perf_counter()
+    strips = None if args.no_strips else args.results / f"strips-{name}"
+    result = judge(clip, args.t_star or clip.instants(), frames, strips, args.worst)
     result |= {"version": 1, "shot": str(args.shot), "run": args.run, "develop": args.develop}
     result["seconds"] = time.perf_counter() - since
     write_json(args.results / f"detail-{name}.json", result)
     print("\n".join(["", *table(name, result)]))
-    return 0
 
 
 if __name__ == "__main__":

@@ -43,8 +43,6 @@ THREADS = 2
 WIDTHS = (640, 1280, 3840)
 ALLOWED = {640: 0.4, 1280: 1.5, 3840: 14.0}
 """Width of 16:9 frames -> seconds that one may take."""
-ALLOWED_MB = 2500
-"""Peak memory that the largest may take."""
 PATHS = {640: (24, 150), 1280: (12, 48), 3840: (6, 18)}
 """Width -> frames along the path: memory must not grow with them."""
 _REAL = 3

@@ -47,8 +47,7 @@ from benchmarks.detail_figures import (
     unexplained_flow,
     unsteadiness,
 )
-from torch_backend.contract import JobError
-from torch_backend.native import default_threads
+from benchmarks.sources import in_words
 from torch_backend.shot import write_json
 
 WHAT = ("plate", "splats", "delivered")
@@ -258,27 +257,22 @@ def pairs_of(clip: DetailClip, args: argparse.Namespace) -> list[tuple[int, int]
     return pairs[:: args.every]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     common_arguments(parser)
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
-    try:
-        clip = open_clip(args.shot, args.run, FLOW_WIDTH, args.develop == "on")
-        pairs, since = pairs_of(clip, args), time.perf_counter()
-        freezes = [judge_flow(clip, t_star, pairs) for t_star in args.t_star or clip.instants()]
-        name = name_of(args.shot)
-        for freeze in freezes if not args.no_strips else ():
-            save_worst(clip, freeze, args.results / f"flow-{name}", args.worst)
-    except (JobError, ModuleNotFoundError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    clip = open_clip(args.shot, args.run, FLOW_WIDTH, args.develop == "on")
+    pairs, since = pairs_of(clip, args), time.perf_counter()
+    freezes = [judge_flow(clip, t_star, pairs) for t_star in args.t_star or clip.instants()]
+    name = name_of(args.shot)
+    for freeze in freezes if not args.no_strips else ():
+        save_worst(clip, freeze, args.results / f"flow-{name}", args.worst)
     result = {"version": 1, "shot": str(args.shot), "run": args.run, "develop": args.develop, "freezes": freezes}
     result["motion_from"] = clip.motion_from
     write_json(args.results / f"flow-{name}.json", result | {"seconds": time.perf_counter() - since})
     print("\n".join(["", *table(name, freezes), "", *verdicts(freezes), f"What moves: {clip.motion_from}."]))
-    return 0
 
 
 if __name__ == "__main__":

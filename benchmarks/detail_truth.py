@@ -27,9 +27,8 @@ from torch import Tensor
 
 from benchmarks.bench import RunSpec, hold_out_phase, train_spec
 from benchmarks.detail_clip import DetailClip, over
-from benchmarks.sources import load_source
-from torch_backend.contract import SWITCH, JobError
-from torch_backend.native import default_threads
+from benchmarks.sources import in_words, load_source
+from torch_backend.contract import SWITCH
 from torch_backend.report.metrics import WHOLE, score
 from torch_backend.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
 from torch_backend.report.things import overall, recall_of
@@ -189,8 +188,9 @@ def scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gaussians", type=int, default=10_000)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the training")
@@ -198,29 +198,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--delivered", action="store_true", help="judge at the size of the plates")
     parser.add_argument("--train-only", action="store_true")
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
     found, seen, there, results = {}, {}, {}, args.results.absolute()
-    try:
-        for folder in args.scenes:
-            source = f"{args.cameras}:{folder.absolute()}"
-            truth = load_source(source, results)
-            run = trained(truth, source, args)
-            print(f"{truth.name}: {truth.shot.run(run)}", flush=True)
-            if args.train_only:
-                continue
-            width = 0 if args.delivered else load_run(truth.shot, run, torch.device("cpu")).width
-            rows = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on", width)
-            found[truth.name], seen[truth.name], there[truth.name] = means(rows), perceived(rows), recalls(rows)
-            name = truth.name.replace(" ", "-")
-            facts = {"version": 1, "scene": truth.name, "run": str(truth.shot.run(run))}
-            write_json(results / f"truth-{name}.json", {**facts, "mean": found[truth.name], "frames": rows})
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    for folder in args.scenes:
+        source = f"{args.cameras}:{folder.absolute()}"
+        truth = load_source(source, results)
+        run = trained(truth, source, args)
+        print(f"{truth.name}: {truth.shot.run(run)}", flush=True)
+        if args.train_only:
+            continue
+        width = 0 if args.delivered else load_run(truth.shot, run, torch.device("cpu")).width
+        rows = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on", width)
+        found[truth.name], seen[truth.name], there[truth.name] = means(rows), perceived(rows), recalls(rows)
+        name = truth.name.replace(" ", "-")
+        facts = {"version": 1, "scene": truth.name, "run": str(truth.shot.run(run))}
+        write_json(results / f"truth-{name}.json", {**facts, "mean": found[truth.name], "frames": rows})
     if found:
         tables = [*table(found), *perceived_table(seen), *recall_table(there)]
         print("\n".join(["", *tables, "", *shortfalls(found)]))
-    return 0
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from benchmarks import raster as raster_bench
+from benchmarks.sources import Warnings
 from benchmarks.workload import WORKLOADS, room
 from torch_backend.cli import card_facts
 from torch_backend.contract import METRICS_FILE, CameraPath, FreezeParams, JobError, LiveView, TrainParams, program
@@ -66,24 +67,6 @@ TESTS = (
 """Files with tests that need a card."""
 TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
 PEER = "benchmarks.peers.gsplat"
-
-
-class Silent:
-    """A reporter that keeps the warnings."""
-
-    def __init__(self) -> None:
-        self.warnings: list[str] = []
-
-    def progress(self, stage: str, done: float, total: float, message: str = "") -> None: ...
-
-    def metric(self, stage: str, values: Any) -> None: ...
-
-    def image(self, label: str, path: Any) -> None: ...
-
-    def warning(self, message: str, hint: str = "") -> None:
-        self.warnings.append(f"{message} {hint}".strip())
-
-    def check_cancelled(self) -> None: ...
 
 
 class Stage:
@@ -285,7 +268,7 @@ def _late_step(stage: Stage) -> dict[str, Any]:
         TrainParams(preset="preview", iterations=100 if stage.dry else 0, max_gaussians=few, width=width)
     )
     images = load_images(scene, scene.solved, *training_size(scene, width)).to(stage.device)
-    trainer = Trainer(scene, images, scene.solved, config, Silent(), {}, stage.device)
+    trainer = Trainer(scene, images, scene.solved, config, Warnings(), {}, stage.device)
     while trainer.iteration < 0.6 * config.iterations:
         _step(trainer)
     told: dict[str, Any] = {"gaussians": len(trainer.model.gaussians), "open": len(trainer.model.open_rows())}
@@ -321,7 +304,7 @@ def _whole_runs(stage: Stage) -> dict[str, Any]:
                 preset="preview", iterations=steps, max_gaussians=few, width=width, seed=seed, holdout=8
             )
             config = config_from_params(asked)
-            trainer = Trainer(scene, images[: len(train)], train, config, Silent(), {}, stage.device)
+            trainer = Trainer(scene, images[: len(train)], train, config, Warnings(), {}, stage.device)
             trainer.recorder = trainer.recorder if records else None
             stage.wait()
             since = time.perf_counter()
@@ -404,7 +387,7 @@ def training(stage: Stage) -> None:
 def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any]:
     """A run: PSNR on frames held out, and ms a step between its measurements."""
     steps = 20 if stage.dry else {"preview": 0, "final": 3000}[preset]
-    report, name = Silent(), f"gpu-{preset}-{device}-{seed}"
+    report, name = Warnings(), f"gpu-{preset}-{device}-{seed}"
     shot, known = stage.scratch_shot(), PRESETS[preset]()
     # The processor's numbers on either device: a card's own are others.
     few = 400 if stage.dry else known.densify.budget
@@ -439,7 +422,7 @@ def _trainer(
         planes = [image.permute(2, 0, 1)[None].float() for image in images]
         images = torch.cat([interpolate(plane, stretched[::-1], mode="bilinear").half() for plane in planes])
         images = images.permute(0, 2, 3, 1).contiguous()
-    return Trainer(scene, images, scene.solved, config, Silent(), {}, stage.device)
+    return Trainer(scene, images, scene.solved, config, Warnings(), {}, stage.device)
 
 
 def _step(trainer: Trainer) -> None:
@@ -597,7 +580,7 @@ def _resumed(stage: Stage) -> dict[str, Any]:
     told: dict[str, Any] = {"at": trainer.iteration}
     for device in dict.fromkeys((stage.device.type, "cpu")):
         other = Trainer(
-            trainer.scene, trainer.images.to(device), trainer.train_ids, trainer.config, Silent(), {}, device
+            trainer.scene, trainer.images.to(device), trainer.train_ids, trainer.config, Warnings(), {}, device
         )
         other.restore(path)
         before = len(other.model.gaussians)
@@ -626,7 +609,7 @@ def _frozen(stage: Stage) -> dict[str, Any]:
     since = time.perf_counter()
     asked = FreezeParams(run=name, take="gpu", first=first, last=last, device=stage.device.type)
     asked.develop = "off" if stage.dry else asked.develop
-    facts = freeze_shot(shot, asked, Silent())
+    facts = freeze_shot(shot, asked, Warnings())
     return {"frames": facts["frames"], "seconds_per_frame": round((time.perf_counter() - since) / facts["frames"], 3)}
 
 

@@ -209,7 +209,7 @@ def trained(args: argparse.Namespace, shot: Shot, config: TrainConfig) -> tuple[
         module.warm_up()
     since, left = time.process_time(), args.results / f"{args.name}.safetensors"
     ignored = load_ignored(masks_of(shot), scene, train, width, height)
-    trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)  # type: ignore[arg-type]
+    trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)
     if args.run or args.again:
         trainer.restore(shot.run(args.run) / CHECKPOINT_FILE if args.run else left)
     else:

@@ -8,7 +8,6 @@ Errors are those of `raster_errors.py`, cases those of `raster_cases.py`.
 from __future__ import annotations
 
 import argparse
-import ast
 import datetime
 import math
 import os
@@ -23,20 +22,10 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 
 import torch
 
-from benchmarks.known_failures import ROWS, TRAINING
 from benchmarks.raster_cases import CASES, size
 from benchmarks.raster_errors import BODIES, INPUTS, Errors, compare, workload
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-
-
-def test_names() -> set[str]:
-    """`file::function` of all tests of the rasteriser."""
-    names = set()
-    for path in (ROOT / "tests" / "backend" / "raster").glob("test_*.py"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        names |= {f"{path.name}::{node.name}" for node in tree.body if isinstance(node, ast.FunctionDef)}
-    return names
 
 
 BARS = {"W0": (0.0, 1e-4), "W1": (100.0, 4e-4)}
@@ -172,12 +161,6 @@ def report(bodies: list[str], names: list[str], cases: int) -> str:
         "",
         "`tests/backend/raster/test_properties.py`: " + _generated(cases) + " `SPLANNEQUIN_CASES=20000` in the "
         "environment tries that many of each property.",
-        "",
-        "## Known failures of other programs",
-        "",
-        f"`benchmarks/known_failures.py` lists {len(ROWS)} of rasterisers and {len(TRAINING)} of training, with the "
-        "tests that stand for them.",
-        "`tests/backend/raster/remedies.py` takes the remedies out, one at a time, and checks that these tests fail.",
         "",
         "## Hard cases",
         "",

@@ -1,7 +1,7 @@
 """Times the rasteriser on four seeded workloads: `python -m benchmarks.raster [W0 W1 ...] [--json FILE]`.
 
-Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). `--limit`,
-`--scaling`, `--memory` and `--errors` add tables.
+Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). `--scaling`,
+`--memory` and `--errors` add tables.
 
 The workloads are those of `benchmarks/workload.py`. Bodies are run in turn, round by round, so that whatever else the
 machine does falls on all of them alike.
@@ -18,7 +18,7 @@ import platform
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
@@ -28,7 +28,6 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 import numpy as np
 import torch
 
-from benchmarks import hot_loop
 from benchmarks.peers import Peer, Prepared
 from benchmarks.workload import WORKLOADS, Workload, room
 from torch_backend.raster import RasterSettings, rasterize
@@ -199,26 +198,6 @@ def measure(size: tuple[int, int, int], bodies: dict[str, Body], rivals: list[st
     return result
 
 
-def limit(name: str, threads: list[int], rounds: int) -> list[dict[str, Any]]:
-    """Cycles per lane of blending on the CPU, and their share of the hot loop's limit, per number of threads."""
-    hot, work, rows = hot_loop.limits(), room(*WORKLOADS[name]), []
-    for count in threads:
-        blend = hot_loop.blend_times(work, count, rounds)
-        ahead, back = blend.shares(hot)
-        cycles = count * hot.clock_hz
-        rows.append(
-            {
-                "threads": count,
-                "limit": asdict(hot),
-                "forward_share": ahead,
-                "backward_share": back,
-                "forward_cycles_per_lane": blend.forward_s * cycles / blend.forward_lanes,
-                "backward_cycles_per_lane": blend.backward_s * cycles / blend.backward_lanes,
-            }
-        )
-    return rows
-
-
 def errors(name: str, bodies: dict[str, Body]) -> dict[str, Any]:
     """Against the float64 oracle: PSNR of the image (dB), relative L2 of the gradient of each input."""
     work = room(*WORKLOADS[name])
@@ -327,11 +306,6 @@ def _arguments() -> argparse.Namespace:
         metavar="MODULE",
         help="time this peer too, e.g. benchmarks.peers.gsplat; may be given again",
     )
-    parser.add_argument(
-        "--limit",
-        action="store_true",
-        help="also measure blending's cycles per lane against benchmarks/hot_loop.py (CPU only)",
-    )
     parser.add_argument("--scaling", action="store_true", help="also time along N, pixels and threads")
     parser.add_argument("--memory", action="store_true", help="also measure each body's peak memory (Linux, or CUDA)")
     parser.add_argument("--errors", action="store_true", help="also compare with the float64 oracle on W0 and W1")
@@ -344,8 +318,6 @@ def _arguments() -> argparse.Namespace:
         parser.error("--device cuda: torch finds no CUDA device on this machine")
     if arguments.memory and arguments.device == "cpu" and not pathlib.Path("/proc/self/clear_refs").exists():
         parser.error("--memory: on the CPU it needs Linux's /proc")
-    if arguments.limit and arguments.device != "cpu":
-        parser.error("--limit: the hot loop is the CPU body's")
     return arguments
 
 
@@ -371,14 +343,6 @@ def main() -> None:
         result = measure(WORKLOADS[name], ours | rivals, list(rivals), arguments.rounds)
         report["workloads"][name] = result
         _print_times(name, result)
-        if arguments.limit:
-            result["limit"] = limit(name, arguments.threads, arguments.rounds)
-            for row in result["limit"]:
-                print(
-                    f"{name}  blending, {row['threads']} threads, cycles per lane and share of the hot-loop limit: "
-                    f"forward {row['forward_cycles_per_lane']:.2f}, {row['forward_share']:.0%}; "
-                    f"backward {row['backward_cycles_per_lane']:.2f}, {row['backward_share']:.0%}"
-                )
         if arguments.memory:
             result["peak_mib"] = memory(WORKLOADS[name], ours | rivals)
             for label, peak in result["peak_mib"].items():

@@ -100,6 +100,19 @@ def relative(value: Tensor, truth: Tensor) -> float:
     return float((value - truth).norm() / truth.norm().clamp_min(1e-300))
 
 
+def assert_gradients(grads: dict[str, Tensor], truth: dict[str, Tensor], bound: float) -> None:
+    """AssertionError unless all are finite and within a relative error of `bound` of the truth."""
+    assert all(torch.isfinite(grad).all() for grad in grads.values())
+    errors = {name: relative(grads[name], value) for name, value in truth.items()}
+    assert max(errors.values()) <= bound, errors
+
+
+def on_host(out: RasterOutput) -> RasterOutput:
+    """The same images on the CPU."""
+    held = {one.name: getattr(out, one.name) for one in dataclasses.fields(out)}
+    return RasterOutput(**{name: None if value is None else value.cpu() for name, value in held.items()})
+
+
 def _decibels(error: Tensor) -> float:
     """PSNR of errors at a peak of 1; infinite where there are none."""
     return float(-10 * torch.log10(error.square().mean())) if error.numel() else math.inf

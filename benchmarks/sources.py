@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, similarity_to_exact, solved_shot
 from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
-from torch_backend.contract import JobError, read_json
+from torch_backend.contract import JobError, Reporter, read_json
 from torch_backend.motion_search import find_motion
+from torch_backend.native import default_threads
 from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key, locked
 
@@ -122,6 +124,30 @@ class SyntheticTruth:
         return {"moving": moving, "static": ~moving, **things}
 
 
+def load_synthetic(folder: Path, results: Path, cameras: str = "exact") -> SyntheticTruth:
+    """The scene of benchmarks/synthetic in a folder; ValueError for any other."""
+    truth = load_source(f"{cameras}:{folder.absolute()}", results.absolute())
+    if not isinstance(truth, SyntheticTruth):
+        raise ValueError(f"{folder}: depth is only known of scenes of benchmarks/synthetic")
+    return truth
+
+
+def in_words(main: Callable[[Sequence[str] | None], None]) -> Callable[..., int]:
+    """A command line as a function that returns an exit code: what goes wrong is one sentence."""
+
+    @functools.wraps(main)
+    def run(argv: Sequence[str] | None = None) -> int:
+        torch.set_num_threads(default_threads())
+        try:
+            main(argv)
+        except (JobError, OSError, RuntimeError, ValueError, ModuleNotFoundError) as error:
+            print(f"Error: {error}", file=sys.stderr)
+            return 1
+        return 0
+
+    return run
+
+
 def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
     """A mask at another size."""
     values = torch.from_numpy(mask.astype(np.float32))[None, None]
@@ -177,7 +203,17 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
-class Log:
+class Warnings(Reporter):
+    """A reporter that keeps the warnings."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+
+    def warning(self, message: str, hint: str = "") -> None:
+        self.warnings.append(f"{message} {hint}".strip())
+
+
+class Log(Reporter):
     """A reporter that says one line per stage."""
 
     def __init__(self) -> None:
@@ -196,9 +232,6 @@ class Log:
 
     def warning(self, message: str, hint: str = "") -> None:
         print(f"note: {message} {hint}", flush=True)
-
-    def check_cancelled(self) -> None:
-        """Ctrl-C and SIGTERM end scoring by their own exceptions."""
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -25,6 +25,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 
 import torch
 
+from benchmarks.sources import Warnings
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.shot import exact_shot
 from torch_backend.contract import JobError, TrainParams, read_json
@@ -71,24 +72,6 @@ class Outcome:
     """Of training."""
 
 
-class _Listener:
-    """A reporter that keeps warnings."""
-
-    def __init__(self) -> None:
-        self.warnings: list[str] = []
-
-    def progress(self, stage: str, done: float, total: float, message: str = "") -> None: ...
-
-    def metric(self, stage: str, values: Mapping[str, Any]) -> None: ...
-
-    def image(self, label: str, path: str | pathlib.Path) -> None: ...
-
-    def warning(self, message: str, hint: str = "") -> None:
-        self.warnings.append(f"{message} {hint}".strip())
-
-    def check_cancelled(self) -> None: ...
-
-
 class Watched(Trainer):
     """A trainer on the CPU that counts the steps left out."""
 
@@ -112,7 +95,7 @@ def train_once(scene: Scene, config: TrainConfig) -> Outcome:
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     images = load_images(scene, train + test, width, height)
-    listener, since = _Listener(), time.perf_counter()
+    listener, since = Warnings(), time.perf_counter()
     trainer = Watched(scene, images[: len(train)], train, config, listener)
     value = None
     with tempfile.TemporaryDirectory() as folder:
@@ -169,7 +152,7 @@ def main() -> None:
     if (args.shot / "scene.json").is_file():
         made = SyntheticScene.load(args.shot)
         place = args.results.absolute().parent / f"{made.size}-{made.name}-exact{SHOT_SUFFIX}"
-        shot = exact_shot(made, place, _Listener())
+        shot = exact_shot(made, place, Warnings())
     else:
         shot = Shot.open(args.shot)
     scene, kept = load_scene(shot), read_json(args.results)["runs"] if args.results.is_file() else {}

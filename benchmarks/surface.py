@@ -24,22 +24,20 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from benchmarks.detail_truth import scene_arguments, trained
 from benchmarks.shadow import Set, likeness, places_of
-from benchmarks.sources import Log, SyntheticTruth, load_source
+from benchmarks.sources import Log, SyntheticTruth, in_words, load_synthetic
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.regions import Geometry, View
 from torch_backend.cameras.placement import Similarity
-from torch_backend.contract import FreezeParams, JobError, SurfaceParams, TakeFolder, placement_of, read_json
+from torch_backend.contract import FreezeParams, SurfaceParams, TakeFolder, placement_of, read_json
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.surface.job import make_surface, read_surface, view_of
 from torch_backend.freeze.surface.volume import SurfaceConfig, unprojected
 from torch_backend.freeze.take.folder import frames_of
-from torch_backend.native import default_threads
 from torch_backend.shot import write_json
 
 BEYOND = 0.01
@@ -139,47 +137,39 @@ def shadows(surface: RayScene, truth: RayScene, views: Sequence[View]) -> dict[s
     return told | ({"mean": float(np.mean(known)), "worst": min(known)} if known else {})
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of the trainings")
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
     rows = ["| scene | seed | t* | part | points | seen by two plates | median, % | ninth tenth, % | beyond 1 %, % |"]
     rows.append("|---|---:|---:|---|---:|---:|---:|---:|---:|")
     ends = [""]
-    try:
-        if args.cameras != "exact":
-            raise ValueError("the surface is judged in metres: only exact cameras have them")
-        for folder in args.scenes:
-            source = f"exact:{folder.absolute()}"
-            truth = load_source(source, args.results.absolute())
-            if not isinstance(truth, SyntheticTruth):
-                raise ValueError(f"{folder}: depth is only known of scenes of benchmarks/synthetic")
-            told: dict[str, Any] = {}
-            scene = SyntheticScene.load(folder)
-            for seed in args.seeds:
-                run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
-                for t_star in args.t_star or truth.t_stars:
-                    found = told[f"seed {seed}, t* {t_star}"] = judge(truth, scene, run, t_star, args.every)
-                    shaded = found["shadow"]
-                    cells = [f"{shaded[k]:.3f}" if k in shaded else "–" for k in ("mean", "worst")]
-                    where = f"{truth.name}, seed {seed}, t* {t_star}"
-                    ends.append(f"{where}: shadows {cells[0]}, worst {cells[1]} of {shaded['pictures']:.0f}")
-                    for part, of in found.items():
-                        if part == "shadow":
-                            continue
-                        cells = [f"{100 * of[k]:.2f}" if k in of else "–" for k in ("median", "ninth tenth", "beyond")]
-                        where = f"{truth.name} | {seed} | {t_star} | {part} | {of['points']:.0f} | {of['seen']:.2f}"
-                        rows.append(f"| {where} | {' | '.join(cells)} |")
-                        print(rows[-1], flush=True)
-            write_json(args.results.absolute() / f"surface-{truth.name.replace(' ', '-')}.json", {"version": 1, **told})
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    if args.cameras != "exact":
+        raise ValueError("the surface is judged in metres: only exact cameras have them")
+    for folder in args.scenes:
+        truth, source = load_synthetic(folder, args.results), f"exact:{folder.absolute()}"
+        told: dict[str, Any] = {}
+        scene = SyntheticScene.load(folder)
+        for seed in args.seeds:
+            run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
+            for t_star in args.t_star or truth.t_stars:
+                found = told[f"seed {seed}, t* {t_star}"] = judge(truth, scene, run, t_star, args.every)
+                shaded = found["shadow"]
+                cells = [f"{shaded[k]:.3f}" if k in shaded else "–" for k in ("mean", "worst")]
+                where = f"{truth.name}, seed {seed}, t* {t_star}"
+                ends.append(f"{where}: shadows {cells[0]}, worst {cells[1]} of {shaded['pictures']:.0f}")
+                for part, of in found.items():
+                    if part == "shadow":
+                        continue
+                    cells = [f"{100 * of[k]:.2f}" if k in of else "–" for k in ("median", "ninth tenth", "beyond")]
+                    where = f"{truth.name} | {seed} | {t_star} | {part} | {of['points']:.0f} | {of['seen']:.2f}"
+                    rows.append(f"| {where} | {' | '.join(cells)} |")
+                    print(rows[-1], flush=True)
+        write_json(args.results.absolute() / f"surface-{truth.name.replace(' ', '-')}.json", {"version": 1, **told})
     print("\n".join(["", *rows, *ends]))
-    return 0
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 
 import torch
 
-from torch_backend.contract import TrainParams
+from torch_backend.contract import Reporter, TrainParams
 from torch_backend.motion.mattes import load_motion
 from torch_backend.native import default_threads, torch_threads
 from torch_backend.raster.cpu import warm_up
@@ -40,19 +40,11 @@ from torch_backend.train.pictures import training_size
 from torch_backend.train.trainer import Trainer
 
 
-class _Silent:
-    """A reporter that says nothing."""
-
-    def progress(self, stage: str, done: float, total: float, message: str = "") -> None: ...
-
-    def metric(self, stage: str, values: Any) -> None: ...
-
-    def image(self, label: str, path: Any) -> None: ...
+class _Silent(Reporter):
+    """A reporter of warnings alone."""
 
     def warning(self, message: str, hint: str = "") -> None:
         print(f"note: {message} {hint}")
-
-    def check_cancelled(self) -> None: ...
 
 
 class Parts:
@@ -185,7 +177,7 @@ def main() -> None:
     movers = load_movers(functools.partial(load_motion, shot), scene, train, width, height)
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train, width, height)
     images = load_images(scene, train, width, height)
-    trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)  # type: ignore[arg-type]
+    trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)
     parts, results = Parts(), {}
     with torch_threads(3 * width * height):  # as `Trainer.run`
         for share in args.at:

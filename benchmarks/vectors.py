@@ -16,18 +16,16 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from benchmarks.detail_truth import scene_arguments, trained
-from benchmarks.sources import Log, SyntheticTruth, load_source
+from benchmarks.sources import Log, SyntheticTruth, in_words, load_synthetic
 from torch_backend.cameras.placement import Similarity
-from torch_backend.contract import FreezeParams, JobError
+from torch_backend.contract import FreezeParams
 from torch_backend.freeze.exr import read_frozen_exr
 from torch_backend.freeze.take.frames import whole_camera
 from torch_backend.freeze.take.passes import Passes
 from torch_backend.freeze.take.plan import planned
-from torch_backend.native import default_threads
 from torch_backend.torch_types import from_numpy
 
 WANTED = 0.25
@@ -94,29 +92,21 @@ def judge(truth: SyntheticTruth, run: str, t_star: int) -> dict[str, dict[str, f
     return told
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     scene_arguments(parser)
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
     print("| scene | t* | part | pixels | median, px | ninth tenth, px | within 0.25 px, % |", flush=True)
     print("|---|---:|---|---:|---:|---:|---:|", flush=True)
-    try:
-        for folder in args.scenes:
-            source = f"exact:{folder.absolute()}"
-            truth = load_source(source, args.results.absolute())
-            if not isinstance(truth, SyntheticTruth):
-                raise ValueError(f"{folder}: depth is only known of scenes of benchmarks/synthetic")
-            run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": 0}))
-            for t_star in args.t_star or truth.t_stars:
-                for part, of in judge(truth, run, t_star).items():
-                    cells = f"{of['median']:.3f} | {of['ninth tenth']:.3f} | {100 * of['within']:.1f}"
-                    print(f"| {truth.name} | {t_star} | {part} | {of['pixels']:.0f} | {cells} |", flush=True)
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    for folder in args.scenes:
+        truth, source = load_synthetic(folder, args.results), f"exact:{folder.absolute()}"
+        run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": 0}))
+        for t_star in args.t_star or truth.t_stars:
+            for part, of in judge(truth, run, t_star).items():
+                cells = f"{of['median']:.3f} | {of['ninth tenth']:.3f} | {100 * of['within']:.1f}"
+                print(f"| {truth.name} | {t_star} | {part} | {of['pixels']:.0f} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":

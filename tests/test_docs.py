@@ -1,6 +1,5 @@
-"""What the documents refer to is there, and the manual says what the buttons say."""
+"""What the documents refer to is there, and their tables are those of the code."""
 
-import ast
 import re
 from pathlib import Path
 
@@ -43,59 +42,24 @@ def test_links_and_pictures_are_there(page: Path):
 
 
 def test_what_contributors_are_sent_to_is_there():
-    """Every file, folder and name of a test between backticks; `NAME` stands for the reader's own."""
+    """Every file and folder between backticks; `NAME` stands for the reader's own."""
     page = text_of(ROOT / "CONTRIBUTING.md")
-    tests = "".join(text_of(path) for path in (ROOT / "tests").rglob("test_*.py"))
     named = [word for word in re.findall(r"`([^`\n]+)`", page) if "NAME" not in word]
     paths = {word for word in named if re.fullmatch(r"[\w.-]+(/[\w.-]+)+/?|\w+\.(py|toml)", word)}
     run = re.findall(r"pytest -q (\S+)", page)
     assert len(paths) > 30 and len(run) == 4
     assert not sorted(path for path in {*paths, *run} if not (ROOT / path).exists())
-    assert not [word for word in named if word.startswith("test_") and f"def {word}(" not in tests]
 
 
-def test_the_forge_runs_the_commands_of_the_readme():
-    workflow = text_of(ROOT / ".github" / "workflows" / "two-commands.yml")
-    commands = re.findall(r"^python3 (splannequin\.py .+)$", text_of(ROOT / "README.md"), re.MULTILINE)
-    assert len(commands) == 2
-    for command in commands:
-        assert f"run: python {command.replace('CLIP.mp4', 'examples/sitting.mp4')}\n" in workflow
-    for system in ("ubuntu", "windows", "macos"):
-        assert f"{system}-latest" in workflow
-
-
-def test_the_manual_has_a_page_per_step_with_its_picture_and_its_button():
-    buttons = {}
-    for room in ROOMS:
-        tree = ast.parse(text_of(ROOT / "splannequin_addon" / room / "step.py"))
-        step = next(n for n in tree.body if isinstance(n, ast.ClassDef) and ast.unparse(n.bases[0]) == "Step")
-        told = {ast.unparse(n.targets[0]): n.value for n in step.body if isinstance(n, ast.Assign)}
-        buttons[ast.literal_eval(told["name"])] = ast.literal_eval(told["button"])
-    assert tuple(buttons) == STEPS
-    index = text_of(MANUAL / "README.md")
-    for number, step in enumerate(STEPS, 1):
-        page = text_of(MANUAL / f"{step}.md")
-        assert f"*{buttons[step]}*" in page and f"*{buttons[step]}*" in index
-        assert f"window-{number}-{step}-done.jpg" in page
-        assert f"({step}.md)" in index
-
-
-def test_all_pages_of_the_manual_are_in_its_index():
-    index = text_of(MANUAL / "README.md")
-    assert all(f"({page.name})" in index for page in MANUAL.glob("*.md") if page.name != "README.md")
-
-
-def test_what_the_manual_sets_in_italics_is_on_the_screen_or_in_a_message():
-    """Labels are written *so*: a button that is renamed does not stay in the manual under its old name."""
-    sources = "".join(text_of(p) for p in (ROOT / "splannequin_addon").rglob("*.py"))
-    sources += "".join(text_of(p) for p in (ROOT / "torch_backend").rglob("*.py"))
-    lost = []
-    for page in MANUAL.glob("*.md"):
-        for label in re.findall(r"(?<!\*)\*([^*\n]+)\*(?!\*)", text_of(page).replace("t\\*", "t\N{ASTERISK OPERATOR}")):
-            plain = label.replace("\N{ASTERISK OPERATOR}", "*")
-            if not plain.startswith(("Render >", "Splannequin")) and plain not in sources:
-                lost.append(f"{page.name}: {plain}")
-    assert not lost
+def test_every_test_that_a_page_names_is_there():
+    """`file.py::test`, `::test` of the file before it in the row, or `test` alone."""
+    tests = "".join(text_of(path) for path in (ROOT / "tests").rglob("test_*.py"))
+    for page in PAGES:
+        for file, name in re.findall(
+            r"`(?:([\w/]*test_\w+\.py)(?:::)?|::)?(test_\w+)?`", text_of(page).replace("test_NAME", "")
+        ):
+            assert not file or list((ROOT / "tests").rglob(Path(file).name)), f"{page.name}: {file}"
+            assert f"def {name}" in tests, f"{page.name}: {name}"
 
 
 def test_the_reference_is_made_of_the_tables():

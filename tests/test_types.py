@@ -5,8 +5,6 @@ import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parent.parent
 MOST = 0.05
 """Share of the add-on's parameters whose type may be open."""
@@ -62,25 +60,6 @@ def test_hardly_a_parameter_of_the_addon_has_an_open_type():
 def test_every_open_parameter_of_the_addon_has_a_reason():
     told = addon_parameters()
     assert {name for name, kind in told if is_open(kind) and kind not in RECORDS} == set(OPEN)
-
-
-@pytest.mark.parametrize(
-    ("kind", "nothing"),
-    [("", True), ("Any", True), ("list[Any] | None", True), ("bpy.types.AnyType", False), ("dict[str, int]", False)],
-)
-def test_the_count_knows_an_open_type(kind: str, nothing: bool):
-    assert is_open(kind) == nothing
-
-
-def test_the_count_sees_every_kind_of_parameter():
-    source = "class A:\n    def f(self, a, /, b: Any, *c: int, d: str = '', **e): ..."
-    assert list(parameters(ast.parse(source))) == [
-        ("f", "a", ""),
-        ("f", "b", "Any"),
-        ("f", "d", "str"),
-        ("f", "c", "int"),
-        ("f", "e", ""),
-    ]
 
 
 def annotated_calls(tree: ast.AST) -> list[int]:

@@ -35,17 +35,6 @@ def sparse_entries(
     return library.csr_array(library.coo_array((weights, (rows, columns)), shape=shape))
 
 
-def connected(values: NDArray[np.floating[Any]], step: float) -> NDArray[np.int32]:
-    """Labels [H, W] from 0 of the parts of a picture [H, W] whose pixels are joined by neighbours, across or down, that
-    differ by less than `step`."""
-    height, width = values.shape
-    places = np.arange(height * width, dtype=np.int64).reshape(height, width)
-    across, down = (np.asarray(np.abs(np.diff(values, axis=axis)) < step, np.bool_) for axis in (1, 0))
-    ends = np.concatenate([places[:, 1:][across], places[1:][down]])
-    others = np.concatenate([places[:, :-1][across], places[:-1][down]])
-    return pieces(ends, others, height * width).reshape(height, width)
-
-
 def pieces(ends: NDArray[np.integer[Any]], others: NDArray[np.integer[Any]], count: int) -> NDArray[np.int32]:
     """Labels [count] from 0 of the pieces of a graph of `count` nodes. Its edges join `ends` [E] with `others` [E]."""
     from scipy.sparse import csgraph

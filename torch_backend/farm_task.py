@@ -19,13 +19,13 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from . import contract
-from .contract import Cancelled, Event, ExitCode, FreezeParams, JobError, ShotFolder
+from .contract import Cancelled, Event, ExitCode, FreezeParams, JobError, Reporter, ShotFolder
 from .contract.files import is_json_object
 from .farm import records
 from .farm.request import read_request, shot_name
@@ -37,7 +37,7 @@ BLENDER_VARIABLE = "SPLANNEQUIN_BLENDER_COMMAND"
 _STATUS_SECONDS = 5.0
 
 
-class EngineReporter:
+class EngineReporter(Reporter):
     """A reporter that speaks to the engine that runs the farm; also the listener of a job."""
 
     def __init__(self, what: str) -> None:
@@ -57,9 +57,6 @@ class EngineReporter:
         self._last = (stage, now, share)
         self._say("openjd_progress", f"{100 * share:.1f}")
         self._say("openjd_status", f"{self.what}: {stage} {100 * share:.0f}% {message}")
-
-    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
-        """Figures are in the shot's own files."""
 
     def image(self, label: str, path: str | Path) -> None:
         """A line of the log."""

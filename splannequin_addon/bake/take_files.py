@@ -55,11 +55,6 @@ def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:
     return (found[0][0], found[1][0]) if found[0] and found[1] else (0, 0)
 
 
-def exr_size(path: Path) -> tuple[int, int]:
-    """Width and height of an EXR's frame, as `exr_windows`."""
-    return exr_windows(path)[0]
-
-
 def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
     """An EXR's width and height, and the pixels it has beyond them left and right, and above and below.
 

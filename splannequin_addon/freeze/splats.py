@@ -225,21 +225,8 @@ def find(scene: bpy.types.Scene, shot: Path, take: str) -> bpy.types.Object | No
 
 def remove(scene: bpy.types.Scene, shot: Path, take: str | None = None) -> bool:
     """Takes the splats of a take, or of all takes of a shot, out of the file. True if there were some."""
-    entry, found = scene_objects.of(scene, shot), False
-    for index in reversed(range(len(entry.splats) if entry is not None else 0)):
-        kept = present(entry).splats[index]
-        if take is not None and kept.name != take:
-            continue
-        item = kept.object
-        present(entry).splats.remove(index)
-        if item is None or (item.users_scene and scene not in item.users_scene):
-            continue
-        found = True
-        data = item.data
-        bpy.data.objects.remove(item)
-        if data is not None and data.users <= int(data.use_fake_user):
-            bpy.data.batch_remove([data])
-    return found
+    entry = scene_objects.of(scene, shot)
+    return entry is not None and scene_objects.remove_kept(scene, entry.splats, take)
 
 
 def _material() -> bpy.types.Material:

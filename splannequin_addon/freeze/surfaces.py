@@ -15,7 +15,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...torch_backend import contract
-from ..access import mesh_of, named, present
+from ..access import named, present
 from ..process import job_timer
 from ..scene.ownership import TAG
 from ..shot import inventory, placement, scene_objects
@@ -167,21 +167,8 @@ def find(scene: bpy.types.Scene, shot: Path, take: str) -> list[bpy.types.Object
 
 def remove(scene: bpy.types.Scene, shot: Path, take: str | None = None) -> bool:
     """Takes the surface of a take, or of all takes of a shot, out of the file. True if there was one."""
-    entry, is_found = scene_objects.of(scene, shot), False
-    for index in reversed(range(len(entry.surfaces) if entry is not None else 0)):
-        kept = present(entry).surfaces[index]
-        if take is not None and kept.name != take:
-            continue
-        item = kept.object
-        present(entry).surfaces.remove(index)
-        if item is None or (item.users_scene and scene not in item.users_scene):
-            continue
-        is_found = True
-        data = mesh_of(item)
-        bpy.data.objects.remove(item)
-        if data.users <= int(data.use_fake_user):
-            bpy.data.meshes.remove(data)
-    return is_found
+    entry = scene_objects.of(scene, shot)
+    return entry is not None and scene_objects.remove_kept(scene, entry.surfaces, take)
 
 
 def _material() -> bpy.types.Material:

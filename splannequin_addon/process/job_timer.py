@@ -18,7 +18,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
-from ..access import library_of, settings_of
+from ..access import settings_of
 from ..scene import sequences
 from ..shot import inventory, markers, scene_objects, selection
 from ..shot.shot_state import ShotState
@@ -448,10 +448,6 @@ def _on_load(*_: object) -> None:
     """Another file: its shots are looked at afresh; running jobs go on and are found again."""
     markers.forget()
     sequences.forget_ahead()
-    for scene in bpy.data.scenes:
-        folder = selection.shot_folder(scene)
-        if folder is not None and not library_of(scene):
-            scene_objects.adopt(scene, folder)
     for shot in [s for s, w in _watches.items() if w.running() is None]:
         del _watches[shot]
     redraw()

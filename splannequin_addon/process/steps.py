@@ -141,10 +141,6 @@ STEPS: dict[str, Step] = {}
 """The steps in order, by name. `registration.py` fills it."""
 
 
-OLD_NAMES = {"footage": "import", "camera": "solve"}
-"""What version 0.2.0 called steps, in job folders and in scripts that call our operators -> as they are called."""
-
-
 def add(step: Step) -> None:
     """Makes a step known, after those that are."""
     STEPS[step.name] = step
@@ -152,7 +148,7 @@ def add(step: Step) -> None:
 
 def step_of(job: jobs.Job) -> str:
     """Name of the step that a job found in a shot folder belongs to: Freeze and Bake ask for the same kind."""
-    told = current(_noted(job, contract.STEP_FILE))
+    told = _noted(job, contract.STEP_FILE)
     names = [s.name for s in STEPS.values() if job.kind in (s.kind, *s.also)]
     return told if told in names else names[0]
 
@@ -174,8 +170,3 @@ def _noted(job: jobs.Job, name: str) -> str:
             return file.read(1024).decode("utf-8", "replace")
     except (OSError, ValueError):
         return ""
-
-
-def current(name: str) -> str:
-    """The name of a step, of which `name` may be one that it had before."""
-    return OLD_NAMES.get(name, name)

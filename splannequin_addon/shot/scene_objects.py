@@ -13,13 +13,11 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import named, settings_of
-from ..properties import BoolProperty, CollectionProperty, FloatProperty, PointerProperty, StringProperty
+from ..properties import BoolProperty, CollectionProperty, FloatProperty, Items, PointerProperty, StringProperty
 from ..scene import paths, session
-from ..scene.ownership import TAG
 
 PARTS = ("root", "camera", "points")
 """Our objects of a shot."""
-_KINDS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
 
 
 class SPLANNEQUIN_PG_splats(bpy.types.PropertyGroup):
@@ -152,20 +150,25 @@ def _stands(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bp
     return any(named(objects, item.name) == item for objects in among) or bool(item.users_scene)
 
 
-def adopt(scene: bpy.types.Scene, shot: Path) -> None:
-    """Takes over what 0.2.0 made, which marked objects instead: the one of each kind that kept its name."""
-    name = name_of(shot)
-    if settings_of(scene).made or not any(o.get(TAG) == name for o in scene.objects):
-        return
-    entry = new(scene, shot)
-    for item in [o for o in scene.objects if o.get(TAG) == name]:
-        kind = _KINDS.get(item.type, "")
-        if kind and item.name == f"{name} {kind}":
-            setattr(entry, kind, item)
-        del item[TAG]
-    for collection in [c for c in scene.collection.children_recursive if c.get(TAG) == name]:
-        entry.collection = collection
-        del collection[TAG]
+def remove_kept(
+    scene: bpy.types.Scene, kept: Items[SPLANNEQUIN_PG_splats | SPLANNEQUIN_PG_surface], take: str | None
+) -> bool:
+    """Takes the objects of a take, or of all takes, out of a list of them and out of the file. True if there were some.
+    What stands in other scenes alone stays in the file."""
+    is_found = False
+    for index in reversed(range(len(kept))):
+        if take is not None and kept[index].name != take:
+            continue
+        item = kept[index].object
+        kept.remove(index)
+        if item is None or (item.users_scene and scene not in item.users_scene):
+            continue
+        is_found = True
+        data = item.data
+        bpy.data.objects.remove(item)
+        if data is not None and data.users <= int(data.use_fake_user):
+            bpy.data.batch_remove([data])
+    return is_found
 
 
 def placed_root(

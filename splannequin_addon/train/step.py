@@ -49,8 +49,6 @@ class Train(Step):
         quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
         size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % may move"
         verdict = contract.verdict_lines(run)
-        if run.get("quality") == "Poor" and not verdict:  # trained by an older version
-            verdict = ["It is poor: take a range in which nobody walks, or solve the camera again."]
         depth = [line] if (line := contract.depth_line(run)) else []
         lines = [f"Run {settings_of(scene).run_name}: {quality}", size, *depth, *verdict]
         return View(True, True, lines, "Next: freeze an instant.")

@@ -163,7 +163,6 @@ MESSAGES: dict[str, str] = {
     "The solve is not in this scene: load it.": "Die Kameralösung ist nicht in dieser Szene: laden.",
     "Look through the camera, then train.": "Durch die Kamera schauen, dann trainieren.",
     "Learn the scene and what moves in it.": "Die Szene lernen und was sich darin bewegt.",
-    "It is poor: take a range in which nobody walks, or solve the camera again.": "Er ist schwach: einen Bereich nehmen, in dem niemand geht, oder die Kamera neu lösen.",
     "{} dB on frames kept out": "{} dB auf zurückgehaltenen Bildern",
     "no frames kept out": "keine Bilder zurückgehalten",
     "{} Gaussians, {} % may move": "{} Gaussians, {} % beweglich",

@@ -38,7 +38,7 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         if watch is not None and render is not None and render.turns is None and not bpy.app.is_job_running("RENDER"):
             watch.work = None  # it ended, and nothing said so
             return {"FINISHED"}
-        job = watch.jobs.get(steps.current(self.step) or watch.running() or "") if watch else None
+        job = watch.jobs.get(self.step or watch.running() or "") if watch else None
         if job is None or job.ended:
             self.report({"WARNING"}, "Nothing is running")
             return {"CANCELLED"}
@@ -62,8 +62,8 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> Outcome:
         """Opens it."""
         folder = selection.shot_folder(scene_in(context))
-        job = job_timer.watch_of(folder).jobs.get(steps.current(self.step)) if folder else None
-        log = steps.STEPS[steps.current(self.step)].log(job) if job is not None else None
+        job = job_timer.watch_of(folder).jobs.get(self.step) if folder else None
+        log = steps.STEPS[self.step].log(job) if job is not None else None
         if log is None:
             self.report({"WARNING"}, "There is no log")
             return {"CANCELLED"}

@@ -33,6 +33,7 @@ def _load(path: Path) -> types.ModuleType:
 make_frames = _load(DATA / "make_frames.py")
 make_shot = _load(DATA / "make_shot.py")
 write_png, add_take = make_shot.write_png, make_shot.add_take
+pixels = _load(DATA / "pixels.py")
 PACKAGE = _load(ROOT / "splannequin_addon" / "run_in_bpy.py")
 
 
@@ -71,16 +72,6 @@ def layers() -> Callable[[int], dict[str, np.ndarray]]:
     return make_frames.layers
 
 
-def read_png(path: Path) -> np.ndarray:
-    """Values in 0..1 as they stand in the file, [H, W, 3], top row first."""
-    image = bpy.data.images.load(str(path))
-    image.colorspace_settings.name = "Non-Color"
-    width, height = image.size
-    pixels = np.array(image.pixels[:]).reshape(height, width, -1)[::-1, :, :3]
-    bpy.data.images.remove(image)
-    return pixels
-
-
 def srgb(linear: np.ndarray) -> np.ndarray:
     """IEC 61966-2-1 in float64."""
     linear = np.clip(linear.astype(np.float64), 0.0, 1.0)
@@ -89,7 +80,20 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def pictures() -> types.SimpleNamespace:
-    return types.SimpleNamespace(write=write_png, read=read_png, srgb=srgb)
+    return types.SimpleNamespace(write=write_png, read=lambda path: pixels.read(path)[..., :3], srgb=srgb)
+
+
+@pytest.fixture
+def run(addon, capfd):
+    """run(*arguments) is (exit code, standard output, standard error)."""
+
+    def call(*arguments) -> tuple[int, str, str]:
+        capfd.readouterr()
+        code = addon("command_line.headless").main([str(a) for a in arguments])
+        out, err = capfd.readouterr()
+        return code, out, err
+
+    return call
 
 
 @pytest.fixture

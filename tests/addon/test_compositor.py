@@ -207,11 +207,11 @@ def test_a_compositor_of_another_file_is_refused_in_words_and_stays(addon, contr
 
 def test_size_comes_from_the_exr_header(addon, shot, tmp_path):
     addon("bake.compositor")
-    assert addon("bake.take_files").exr_size(shot / "takes" / "freeze" / "000006.exr") == (16, 12)
+    assert addon("bake.take_files").exr_windows(shot / "takes" / "freeze" / "000006.exr")[0] == (16, 12)
     wrong = tmp_path / "wrong.exr"
     wrong.write_bytes(b"no picture")
     with pytest.raises(ValueError, match="no OpenEXR file"):
-        addon("bake.take_files").exr_size(wrong)
+        addon("bake.take_files").exr_windows(wrong)
 
 
 def render(addon, scene, folder: Path) -> None:

@@ -9,19 +9,6 @@ import pytest
 
 
 @pytest.fixture
-def run(addon, capfd):
-    """run(*arguments) is (exit code, standard output, standard error)."""
-
-    def call(*arguments) -> tuple[int, str, str]:
-        capfd.readouterr()
-        code = addon("command_line.headless").main([str(a) for a in arguments])
-        out, err = capfd.readouterr()
-        return code, out, err
-
-    return call
-
-
-@pytest.fixture
 def imported(shot, contract):
     """The shot, as an import leaves its record."""
     there = contract.ShotFolder(shot)

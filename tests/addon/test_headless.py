@@ -15,19 +15,6 @@ import pytest
 from bpy.app.handlers import persistent
 
 
-@pytest.fixture
-def run(addon, capfd):
-    """run(*arguments) is (exit code, standard output, standard error)."""
-
-    def call(*arguments) -> tuple[int, str, str]:
-        capfd.readouterr()
-        code = addon("command_line.headless").main([str(a) for a in arguments])
-        out, err = capfd.readouterr()
-        return code, out, err
-
-    return call
-
-
 def test_bake_leaves_frames_a_file_and_a_summary(run, shot, tmp_path, pictures, layers, addon, scene):
     out = tmp_path / "out"
     out.mkdir()
@@ -235,8 +222,8 @@ def test_both_command_lines_print_the_same_options_for_the_same_verb(addon, pack
 
 
 def test_freeze_of_a_shot_is_the_step_alone(run, root, tmp_path):
-    shot = tmp_path / "old.splannequin"
-    shutil.copytree(root / "tests" / "data" / "v0_2" / "shot", shot)
+    shot = tmp_path / "stored.splannequin"
+    shutil.copytree(root / "tests" / "data" / "shot", shot)
     words = ("--run", "tiny", "--t-star", 8, "--take", "again", "--detail", "off", "--develop", "off",
              "--freeze-width", 32, "--device", "cpu")  # fmt: skip
     code, said, wrong = run("freeze", shot, *words)

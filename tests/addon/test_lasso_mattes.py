@@ -2,11 +2,12 @@
 
 import json
 import sys
-from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
+
+from tests.addon.data.pixels import read
 
 WIDTH, HEIGHT = 64, 48
 
@@ -44,9 +45,7 @@ def test_polygons_are_what_blender_renders_of_a_mask(addon, shot, handle, size):
     told = json.loads(listing.read_text())
     listing.write_text(json.dumps({**told, "width": width, "height": height}))
     file = addon("solve.drawn_masks").render(mask, shot, "people") / "000006.png"
-    image = bpy.data.images.load(str(file))
-    image.colorspace_settings.name = "Non-Color"
-    rendered = np.array(image.pixels[:]).reshape(height, width, 4)[::-1, :, 0] > 0.5
+    rendered = read(file)[..., 0] > 0.5
     (polygon,) = addon("freeze.mattes").polygons(mask, width, height)
     drawn = filled(polygon, width, height)
     # Blender blurs a mask's edge outwards by a pixel.
@@ -75,14 +74,6 @@ def chosen(scene, world):
     return props
 
 
-def read(path: Path) -> np.ndarray:
-    image = bpy.data.images.load(str(path))
-    width, height = image.size
-    pixels = np.array(image.pixels[:]).reshape(height, width, 4)[::-1, :, 0]
-    bpy.data.images.remove(image)
-    return pixels
-
-
 def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, chosen, world, tmp_path):
     shot, masks, outline = world
     chosen.matte_mask = mask_of("red patch", outline)
@@ -90,7 +81,7 @@ def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, 
     single = shot / "takes" / "freeze" / "mattes" / "single" / "red patch"
     found = []
     for frame, mask in masks.items():
-        matte = read(single / f"{frame:06d}.exr") > 0.5
+        matte = read(single / f"{frame:06d}.exr")[..., 0] > 0.5
         found.append((matte & mask).sum() / (matte | mask).sum())
     assert np.mean(found) > 0.8
     state = addon("process.job_timer").watch_of(shot)
@@ -117,10 +108,8 @@ def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, 
     scene.frame_set(106)
     render.filepath = str(tmp_path / "picked.png")
     bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(render.filepath)
-    image.colorspace_settings.name = "Non-Color"
-    picked = np.array(image.pixels[:]).reshape(HEIGHT, WIDTH, 4)[::-1, :, 0]
-    assert np.abs(picked - read(single / "000106.exr")).max() < 0.01
+    picked = read(render.filepath)[..., 0]
+    assert np.abs(picked - read(single / "000106.exr")[..., 0]).max() < 0.01
     assert (picked > 0.5).any()
 
     assert bpy.ops.splannequin.remove_matte(name="red patch") == {"FINISHED"}

@@ -11,6 +11,7 @@ import pytest
 
 from tests.addon.data import make_detail as made
 from tests.addon.data import make_frames as frames
+from tests.addon.data.pixels import read, render
 
 DATA = Path(__file__).resolve().parent / "data"
 SIZE = made.WIDTH, made.HEIGHT
@@ -50,24 +51,6 @@ def graded(addon, scene, detailed):
 
 
 GRADE = np.array([2.0, 2.0, 0.5])
-
-
-def render(scene, folder: Path, frame: int = 6, size=SIZE) -> np.ndarray:
-    """A frame of the scene as it leaves the compositor, [H, W, 4] float32, top row first."""
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *size, 100
-    settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):
-        settings.media_type = "IMAGE"
-    settings.file_format, settings.color_depth, settings.color_mode = "OPEN_EXR", "32", "RGBA"
-    scene.render.filepath = str(folder / f"{frame}.exr")
-    scene.frame_set(frame)
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    image.colorspace_settings.is_data = True
-    image.alpha_mode = "CHANNEL_PACKED"
-    pixels = np.array(image.pixels[:], np.float32).reshape(size[1], size[0], 4)[::-1]
-    bpy.data.images.remove(image)
-    return pixels
 
 
 def node_of(addon, scene):
@@ -352,7 +335,5 @@ def test_the_command_line_bakes_a_warp_into_the_artists_file(addon, scene, detai
     assert addon("command_line.headless").main([*words, "--take", "freeze", "--first", "6", "--last", "6"]) == 7
     assert "has no warp" in capsys.readouterr().err
     assert addon("command_line.headless").main([*words, "--take", "detail", "--first", "6", "--last", "6"]) == 0
-    image = bpy.data.images.load(str(tmp_path / "out" / "composited" / "000006.exr"))
-    image.colorspace_settings.is_data = True
-    found = np.array(image.pixels[:], np.float32).reshape(made.HEIGHT, made.WIDTH, 4)[::-1, :, :3]
+    found = read(tmp_path / "out" / "composited" / "000006.exr")[..., :3]
     assert relative(found, made.frozen(6) * GRADE) < 1e-3

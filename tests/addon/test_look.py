@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.addon.data import make_grain as grains
+from tests.addon.data.pixels import read
 
 
 def exr_output(scene, kind: str = "OPEN_EXR") -> None:
@@ -17,17 +18,6 @@ def exr_output(scene, kind: str = "OPEN_EXR") -> None:
     settings.file_format, settings.color_depth = kind, "32"
     if kind == "OPEN_EXR":
         settings.color_mode = "RGBA"
-
-
-def read_exr(path: Path) -> np.ndarray:
-    """[H, W, 4] as stored, top row first."""
-    image = bpy.data.images.load(str(path))
-    image.colorspace_settings.name = "Non-Color"
-    width, height = image.size
-    pixels = np.empty(width * height * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    bpy.data.images.remove(image)
-    return pixels.reshape(height, width, 4)[::-1]
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
@@ -56,7 +46,7 @@ def grainy(addon, scene, shot):
         node.inputs["Grain"].default_value = factor
         out = shot / f"out{factor}"
         addon("bake.rendering").render(scene, out, png=False)
-        return np.stack([read_exr(out / f"{n:06d}.exr") for n in grains.FRAMES])
+        return np.stack([read(out / f"{n:06d}.exr") for n in grains.FRAMES])
 
     return render
 
@@ -154,7 +144,7 @@ def test_the_plate_passes_through_untouched(addon, scene, shot, pictures, settin
     if kind == "PNG":
         assert np.abs(pictures.read(out / "000006.png") - expected).max() * 255 < 0.5, "the very levels"
         return
-    found = read_exr(out / "000006.exr") if kind == "OPEN_EXR" else read_layers(addon, out / "000006.exr", shot)
+    found = read(out / "000006.exr") if kind == "OPEN_EXR" else read_layers(addon, out / "000006.exr", shot)
     assert np.abs(found[..., :3] - linear_of(expected)).max() < 1e-3
 
 
@@ -173,7 +163,7 @@ def read_layers(addon, path: Path, folder: Path) -> np.ndarray:
     exr_output(scene)
     scene.frame_start = scene.frame_end = 1
     addon("bake.rendering").render(scene, folder / "read", png=False)
-    return read_exr(folder / "read" / "000001.exr")
+    return read(folder / "read" / "000001.exr")
 
 
 @pytest.mark.parametrize("stop_at", [2, 3])

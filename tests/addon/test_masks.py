@@ -10,17 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
-
-def read(path) -> np.ndarray:
-    """[H, W] float32 of a picture's red, top row first."""
-    image = bpy.data.images.load(str(path))
-    try:
-        width, height = image.size
-        pixels = np.empty(width * height * 4, np.float32)
-        image.pixels.foreach_get(pixels)
-        return pixels.reshape(height, width, 4)[::-1, :, 0]
-    finally:
-        bpy.data.images.remove(image)
+from tests.addon.data.pixels import read
 
 
 @pytest.fixture
@@ -71,7 +61,7 @@ def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file
     asked = addon("process.steps").STEPS["solve"].params(scene)
     assert Path(asked.people_mask) == shot / "masks" / "people"
     assert sorted(p.name for p in Path(asked.people_mask).iterdir()) == ["000005.png", "000006.png", "000007.png"]
-    found = read(shot / "masks" / "people" / "000006.png")
+    found = read(shot / "masks" / "people" / "000006.png")[..., 0]
     listing = json.loads((shot / "frames" / "frames.json").read_text())
     assert found.shape == (listing["height"], listing["width"])
     height, width = found.shape
@@ -86,7 +76,7 @@ def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file
 def test_a_drawn_masks_values_are_those_of_its_picture(addon, shot, drawn, share):
     """The solve cuts at half: a view transform would make half of what is drawn at 0.4 (AgX) or darker."""
     drawn.layers[0].alpha = share
-    found = read(addon("solve.drawn_masks").render(drawn, shot, "people") / "000006.png")
+    found = read(addon("solve.drawn_masks").render(drawn, shot, "people") / "000006.png")[..., 0]
     height, width = found.shape
     inside = found[round(0.45 * height) : round(0.55 * height), round(0.15 * width) : round(0.25 * width)]
     assert np.allclose(inside, share, atol=0.01) and (found[:, width // 2 :] == 0.0).all()

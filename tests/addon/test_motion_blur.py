@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
+from tests.addon.data.pixels import read
+
 DATA = Path(__file__).resolve().parent / "data"
 SIZE, LENS, DEPTH, MIDDLE = (64, 48), 30.0, 5.0, 4
 FLIP = Matrix.Diagonal((1.0, -1.0, -1.0, 1.0))
@@ -20,11 +22,7 @@ def picture(scene, folder: Path) -> np.ndarray:
     """[H, W, 3] scene-linear: the scene as it renders."""
     scene.render.filepath = str(folder / "one.exr")
     bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    image.colorspace_settings.is_data = True
-    pixels = np.array(image.pixels[:], np.float64).reshape(SIZE[1], SIZE[0], 4)[..., :3]
-    bpy.data.images.remove(image)
-    return pixels
+    return read(scene.render.filepath)[::-1, :, :3].astype(np.float64)
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:

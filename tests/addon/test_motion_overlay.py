@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.addon.data.pixels import read
 from tests.addon.test_mattes import HEIGHT, labels, matted, png  # noqa: F401 - a fixture
 
 
@@ -24,11 +25,7 @@ def frames(addon, shot):
     """Frame -> [H, W, 4] of the tinted frames on the disk, as Blender reads them, top row first."""
     found = {}
     for path in sorted(addon("solve.mattes").overlay_folder(shot).iterdir()):
-        image = bpy.data.images.load(str(path))
-        image.alpha_mode = "CHANNEL_PACKED"
-        pixels = np.array(image.pixels[:]).reshape(HEIGHT, -1, 4)[::-1]
-        found[int(path.stem)] = np.rint(pixels * 255).astype(int)
-        bpy.data.images.remove(image)
+        found[int(path.stem)] = np.rint(read(path) * 255).astype(int)
     return found
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from tests.addon.data import make_detail as made
 from tests.addon.data import make_shoulder as shoulder
+from tests.addon.data.pixels import read
 
 DATA = Path(__file__).resolve().parent / "data"
 
@@ -156,9 +157,7 @@ def with_detail(shot, probe):
 
 def light(path):
     """[H, W, 3] as it stands in a file of the scene's light."""
-    image = bpy.data.images.load(str(path))
-    image.colorspace_settings.is_data = True
-    return np.array(image.pixels[:], np.float32).reshape(image.size[1], image.size[0], -1)[::-1, :, :3]
+    return read(path)[..., :3]
 
 
 def off(found, expected):

@@ -11,6 +11,7 @@ import pytest
 from tests.addon.data import make_detail as made
 from tests.addon.data import make_levels as levels
 from tests.addon.data import make_shoulder as shoulder
+from tests.addon.data import pixels
 
 DATA = Path(__file__).resolve().parent / "data"
 SIZE = made.WIDTH, made.HEIGHT
@@ -44,22 +45,8 @@ def node_of(addon, scene):
     return addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
 
 
-def render(scene, folder, frame, size=SIZE):
-    """[H, W, 3] float32, what leaves the compositor."""
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *size, 100
-    settings = scene.render.image_settings
-    if hasattr(settings, "media_type"):
-        settings.media_type = "IMAGE"
-    settings.file_format, settings.color_depth, settings.color_mode = "OPEN_EXR", "32", "RGBA"
-    scene.render.filepath = str(folder / f"{frame}.exr")
-    scene.frame_set(frame)
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
-    image.colorspace_settings.is_data = True
-    image.alpha_mode = "CHANNEL_PACKED"
-    pixels = np.array(image.pixels[:], np.float32).reshape(size[1], size[0], 4)[::-1, :, :3]
-    bpy.data.images.remove(image)
-    return pixels
+def render(*asked):
+    return pixels.render(*asked)[..., :3]
 
 
 def st_map(path: Path, places: np.ndarray) -> None:

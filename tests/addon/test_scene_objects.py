@@ -175,20 +175,3 @@ def test_another_shots_camera_takes_the_place_of_a_removed_one(addon, built, sho
     assert built.camera == cameras.find(built, other, "CAMERA")
     cameras.remove(built, other)
     assert built.camera == own
-
-
-def test_a_file_of_0_2_0_is_taken_over(addon, built, shot, tmp_path):
-    cameras = addon("solve.cameras")
-    name = addon("shot.scene_objects").name_of(shot)
-    for kind in ("EMPTY", "CAMERA", "MESH"):  # as 0.2.0 left it: marks, no pointers
-        cameras.find(built, shot, kind)["splannequin"] = name
-    built.splannequin.made[0].collection["splannequin"] = name
-    built.splannequin.made.clear()
-    duplicate(built.objects[f"{name} camera"])
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "old.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "old.blend"))
-    scene = bpy.context.scene
-    assert cameras.find(scene, shot, "CAMERA").name == f"{name} camera"
-    assert cameras.remove(scene, shot)
-    assert [o.name for o in scene.objects if o.name.startswith(name)] == [f"{name} camera.001"]
-    assert not any("splannequin" in o for o in scene.objects)

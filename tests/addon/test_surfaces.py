@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from mathutils import Matrix, Vector
 
+from tests.addon.data.pixels import read
+
 FLOOR = np.array([(-5, -5, 0), (5, -5, 0), (5, 5, 0), (-5, 5, 0)], float)
 PERSON = np.array([(-2, -1.5, 0), (-0.2, -1.5, 0), (-0.2, -1.5, 3), (-2, -1.5, 3)], float)
 
@@ -135,8 +137,7 @@ def test_a_render_has_the_shadow_and_what_is_behind_people_is_hidden(scene, shot
     render.use_compositing = False
     render.image_settings.file_format, render.filepath = "OPEN_EXR", str(tmp_path / "cg.exr")
     bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(render.filepath)
-    alpha = np.array(image.pixels[:]).reshape(120, 160, 4)[::-1, :, 3]
+    alpha = read(render.filepath)[..., 3]
     assert alpha[50:76, 76:96].mean() > 0.95, "the cube beside the person"
     assert alpha[50:76, 66:71].max() < 0.05, "the cube behind the person"
     assert 0.3 < alpha[66:71, 98:108].mean() <= 1.0, "its shadow on the floor"

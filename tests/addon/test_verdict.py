@@ -41,12 +41,6 @@ def test_a_verdict_stands_once_a_runs_under_train_and_a_takes_under_freeze(addon
         assert lines.count(sentence) == 1, sentence
 
 
-def test_a_run_of_before_is_still_told_to_be_poor(addon, with_shot, shot):
-    add(shot / "runs" / "main" / "summary.json", quality="Poor")
-    lines = addon("process.steps").STEPS["train"].view(with_shot, addon("shot.inventory").read(shot)).state
-    assert lines[2:] == ["It is poor: take a range in which nobody walks, or solve the camera again."]
-
-
 @pytest.mark.parametrize("damaged", [7, {"word": "good", "sentences": [1]}, {"word": "x", "sentences": ["a"]}])
 def test_a_damaged_verdict_is_left_out(addon, with_shot, shot, damaged):
     for path in (shot / "runs" / "main" / "summary.json", shot / "takes" / "freeze" / "take.json"):

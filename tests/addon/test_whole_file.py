@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from mathutils import Vector
 
+from tests.addon.data.pixels import read
+
 
 def beside(name: str) -> types.ModuleType:
     """A test file of this folder, for what it writes into a take; no import finds it in Blender."""
@@ -53,10 +55,7 @@ def rendered(path):
     scene.frame_set(6)
     scene.render.filepath = str(path)
     bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(str(path))
-    pixels = np.array(image.pixels[:]).reshape(image.size[1], image.size[0], -1)[..., :3]
-    bpy.data.images.remove(image)
-    return pixels
+    return read(path)[..., :3]
 
 
 def test_moved_and_without_the_addon_it_renders_as_before(full, scene, addon, package, tmp_path):

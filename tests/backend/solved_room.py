@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from torch_backend.contract import Cancelled
+from torch_backend.contract import Cancelled, Reporter
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.images import write_png
 from torch_backend.motion_search import motion_after_solve
@@ -21,7 +21,7 @@ COUNT = 21
 STEP = 2
 
 
-class Recorder:
+class Recorder(Reporter):
     """Keeps events; cancels at the first progress of `cancel_at`."""
 
     def __init__(self, cancel_at=None):
@@ -30,12 +30,6 @@ class Recorder:
     def progress(self, stage, done, total, message=""):
         self.steps.append((stage, done, total))
         self.cancelled = self.cancelled or stage == self.cancel_at
-
-    def metric(self, stage, values):
-        pass
-
-    def image(self, label, path):
-        pass
 
     def warning(self, message, hint=""):
         self.warnings.append(message)

@@ -36,7 +36,7 @@ from benchmarks.synthetic.shot import (
     surface_points,
 )
 from benchmarks.synthetic.sizes import HARD, HELD, KINDS, REPORT_SEEDS, SIZES, THING, TUNING_SEEDS
-from torch_backend.contract import CameraFrame, CameraPath, read_json
+from torch_backend.contract import CameraFrame, CameraPath, Reporter, read_json
 from torch_backend.footage.images import read_png
 from torch_backend.scene import load_scene
 from torch_backend.shot import write_json
@@ -46,21 +46,8 @@ TINY = SIZES["tiny"]
 SEED = 0
 
 
-class Silent:
-    def progress(self, stage, done, total, message=""):
-        pass
-
-    def metric(self, stage, values):
-        pass
-
-    def image(self, label, path):
-        pass
-
-    def warning(self, message, hint=""):
-        pass
-
-    def check_cancelled(self):
-        pass
+class Silent(Reporter):
+    pass
 
 
 @pytest.fixture(scope="session")

@@ -140,7 +140,7 @@ def test_a_folder_that_is_gone_is_one_sentence(tmp_path: Path):
 
 
 def test_a_shot_that_is_frozen_anew_tells_of_the_take_that_was_named():
-    shot = ROOT / "tests" / "data" / "v0_2" / "shot"
+    shot = ROOT / "tests" / "data" / "shot"
     for words in ([], ["--t-star", "8", "--take=freeze"]):
         found = commands._of_a_shot(str(shot), words, 2.0)
         assert (found["shot"], found["take"], found["t_star_frame"]) == (str(shot), "freeze", 8)

@@ -37,29 +37,13 @@ Frames of reference, here as everywhere: camera axes OpenCV (x right, y down, z 
 row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame numbers are those of the clip.
 """
 
-from .camera_path import (
-    OWN_FACTS,
-    SCENE_WORLD,
-    CameraFrame,
-    CameraPath,
-)
-from .checkpoint_header import (
-    checkpoint_facts,
-)
-from .clip_shot import (
-    is_imported_from,
-    path_digest,
-    readable_stem,
-    refuse_anothers,
-    same_name,
-    shot_beside,
-)
-from .colour import (
-    PROBE,
-    SHOULDER,
-    SHOULDER_FROM,
-    SHOULDER_ROLL,
-)
+# pyright: reportUnusedImport=false
+# Every name here is imported from here.
+
+from .camera_path import OWN_FACTS, SCENE_WORLD, CameraFrame, CameraPath
+from .checkpoint_header import checkpoint_facts
+from .clip_shot import is_imported_from, path_digest, readable_stem, refuse_anothers, same_name, shot_beside
+from .colour import PROBE, SHOULDER, SHOULDER_FROM, SHOULDER_ROLL
 from .command_line import (
     as_json,
     command_line,
@@ -107,30 +91,10 @@ from .files import (
     regular_file,
     remove_link,
 )
-from .frame_layers import (
-    CRYPTOMATTE,
-    FRAME_LAYERS,
-    MATTE_LAYERS,
-    NO_DEPTH,
-    FrameLayer,
-    channels_of,
-    layers_of,
-)
-from .frame_names import (
-    NumberedFiles,
-    ending,
-    file_as_blender_counts,
-    is_pattern,
-    matching_files,
-    numbered_files,
-)
-from .hosts import (
-    host_names,
-)
-from .identity import (
-    file_digest,
-    files_digest,
-)
+from .frame_layers import CRYPTOMATTE, FRAME_LAYERS, MATTE_LAYERS, NO_DEPTH, FrameLayer, channels_of, layers_of
+from .frame_names import NumberedFiles, ending, file_as_blender_counts, is_pattern, matching_files, numbered_files
+from .hosts import host_names
+from .identity import file_digest, files_digest
 from .installed import (
     SETUP_BEGUN,
     SETUP_NOTES,
@@ -164,24 +128,9 @@ from .jobs import (
     new_job,
     runs_job,
 )
-from .light_facts import (
-    LightFacts,
-    light_of_take,
-    point_of,
-)
-from .live_messages import (
-    LIVE_LIMIT,
-    LIVE_SHOWS,
-    LiveView,
-    read_message,
-    write_message,
-)
-from .lock import (
-    Writer,
-    busy,
-    gives_back,
-    read_writer,
-)
+from .light_facts import LightFacts, light_of_take, point_of
+from .live_messages import LIVE_LIMIT, LIVE_SHOWS, LiveView, read_message, write_message
+from .lock import Writer, busy, gives_back, read_writer
 from .option_table import (
     MASK_ALPHA,
     MASK_FOUND,
@@ -225,21 +174,10 @@ from .options import (
     TrainParams,
     check_params,
 )
-from .path_rules import (
-    RULES_VARIABLE,
-    mapped,
-)
-from .picture_files import (
-    is_whole_picture,
-    read_exr_header,
-)
-from .placement import (
-    Placement,
-    placement_of,
-)
-from .ply_header import (
-    read_ply_header,
-)
+from .path_rules import RULES_VARIABLE, mapped
+from .picture_files import is_whole_picture, read_exr_header
+from .placement import Placement, placement_of
+from .ply_header import read_ply_header
 from .processes import (
     GRACE_SECONDS,
     Process,
@@ -313,47 +251,13 @@ from .shot_folder import (
     ShotFolder,
     TakeFolder,
 )
-from .shot_work import (
-    FOLDERS_OF_FRAMES,
-    work_words,
-)
-from .surface_header import (
-    TRIANGLE_FIELDS,
-    VERTEX_FIELDS,
-    SurfaceHeader,
-    read_surface_header,
-    surface_of_take,
-)
-from .timecode import (
-    later,
-    parse_timecode,
-)
-from .torch_source import (
-    CPU_INDEX,
-    CUDA_INDEX,
-    TORCH_INDEX,
-    brings_cuda,
-    torch_index,
-)
-from .typed import (
-    CONTRACT_VERSION,
-    check_version,
-    from_dict,
-)
-from .unborn import (
-    discard_unborn,
-    refuse_foreign,
-)
-from .verbs import (
-    BACKEND,
-    BLENDER,
-    COMMANDS,
-    INPUT,
-    VERBS,
-    ExportWords,
-    FarmWords,
-    Verb,
-)
+from .shot_work import FOLDERS_OF_FRAMES, work_words
+from .surface_header import TRIANGLE_FIELDS, VERTEX_FIELDS, SurfaceHeader, read_surface_header, surface_of_take
+from .timecode import later, parse_timecode
+from .torch_source import CPU_INDEX, CUDA_INDEX, TORCH_INDEX, brings_cuda, torch_index
+from .typed import CONTRACT_VERSION, check_version, from_dict
+from .unborn import discard_unborn, refuse_foreign
+from .verbs import BACKEND, BLENDER, COMMANDS, INPUT, VERBS, ExportWords, FarmWords, Verb
 from .writing import (
     atomic_path,
     content_key,
@@ -373,276 +277,3 @@ from .writing import (
     write_atomic,
     write_json,
 )
-
-__all__ = [
-    "BACKEND",
-    "BLENDER",
-    "BLEND_FILE",
-    "BURNT_IN_FILE",
-    "CAMERAS_FILE",
-    "CAMERAS_KNOWN",
-    "CAMERA_MODELS",
-    "CANCEL_FILE",
-    "CARD_GAUSSIANS",
-    "CARD_WIDTH",
-    "CHECKPOINT_FILE",
-    "COLMAP_FOLDER",
-    "COLMAP_LOG",
-    "COMMANDS",
-    "CONFIG_FILE",
-    "CONTRACT_VERSION",
-    "CPU_INDEX",
-    "CRYPTOMATTE",
-    "CUDA_INDEX",
-    "DEPTH_FILE",
-    "DEPTH_KINDS",
-    "DETECTORS",
-    "DEVELOPED_FOLDER",
-    "DEVICES",
-    "DRAWN_FOLDER",
-    "EVENTS_FILE",
-    "EXTENSION_FILE",
-    "FOLDERS_OF_FRAMES",
-    "FORECAST",
-    "FRAMES_FILE",
-    "FRAMES_FOLDER",
-    "FRAME_LAYERS",
-    "GRACE_SECONDS",
-    "HEARTBEAT_SECONDS",
-    "HOSTS",
-    "HOST_CONFIGS",
-    "INFO_FILE",
-    "INPUT",
-    "JOBS_FOLDER",
-    "JOB_COMMAND",
-    "LAST_FRAME",
-    "LAYERS",
-    "LIMITS",
-    "LIVE_LIMIT",
-    "LIVE_LOG",
-    "LIVE_SHOWS",
-    "LIVE_SOURCE",
-    "LOG_FILE",
-    "LONGEST_ARRAYS",
-    "LONGEST_CHECKPOINT",
-    "LONGEST_JSON",
-    "LONGEST_LINE",
-    "LONGEST_PICTURE",
-    "MASK_ALPHA",
-    "MASK_FOUND",
-    "MASK_KINDS",
-    "MATTE_FORMATS",
-    "MATTE_LAYERS",
-    "METHODS",
-    "METRICS_FILE",
-    "MOST_PIXELS",
-    "MOTION_FILE",
-    "MOTION_FOLDER",
-    "MOTION_UNFINISHED_FILE",
-    "NEXT_FOLDER",
-    "NO_DEPTH",
-    "OWN_FACTS",
-    "PAINTED_FOLDER",
-    "PARAMS",
-    "PICTURE",
-    "PLY_FILE",
-    "POINTS_FILE",
-    "PRESET_STEPS",
-    "PRESET_WIDTHS",
-    "PREVIEWS_FOLDER",
-    "PROBE",
-    "QUERIES",
-    "RAW_FOLDER",
-    "REQUEST_FILE",
-    "RULES_VARIABLE",
-    "RUNS_FOLDER",
-    "SCENE_FILE",
-    "SCENE_WORLD",
-    "SETUP_BEGUN",
-    "SETUP_NOTES",
-    "SETUP_STAMP",
-    "SHORT_JSON",
-    "SHOT_SUFFIX",
-    "SHOULDER",
-    "SHOULDER_FROM",
-    "SHOULDER_ROLL",
-    "SOLVE_FILE",
-    "SOLVE_FOLDER",
-    "STATUS_FILE",
-    "STATUS_VERSION",
-    "STEP_FILE",
-    "STEP_PARAMS",
-    "STMAP_FILES",
-    "ST_MAP_WAYS",
-    "SUMMARY_FILE",
-    "SUPERVISIONS",
-    "SURFACE",
-    "SURFACE_FILE",
-    "SWITCH",
-    "TAKES_FOLDER",
-    "TAKE_FILE",
-    "TAKE_UNDISTORT",
-    "TORCH_INDEX",
-    "TRIANGLE_FIELDS",
-    "UNPUBLISHED_FILE",
-    "USD_FILE",
-    "VERBS",
-    "VERDICT_WORDS",
-    "VERTEX_FIELDS",
-    "WORK",
-    "WRITER_FILE",
-    "CameraFrame",
-    "CameraPath",
-    "Cancelled",
-    "CombineParams",
-    "Event",
-    "ExitCode",
-    "ExportWords",
-    "FarmWords",
-    "FrameLayer",
-    "FreezeParams",
-    "ImportParams",
-    "JobError",
-    "JobRequest",
-    "LightFacts",
-    "LightParams",
-    "Limit",
-    "LiveView",
-    "MatteParams",
-    "MissingError",
-    "NumberedFiles",
-    "Option",
-    "Placement",
-    "Process",
-    "Reporter",
-    "RunFolder",
-    "ShotFolder",
-    "SolveParams",
-    "Status",
-    "SurfaceHeader",
-    "SurfaceParams",
-    "TakeFolder",
-    "TrainParams",
-    "UnreadableFile",
-    "UserError",
-    "Verb",
-    "Verdict",
-    "Writer",
-    "as_json",
-    "atomic_path",
-    "brings_cuda",
-    "broke",
-    "busy",
-    "changed_packages",
-    "changed_since_set_up",
-    "channels_of",
-    "check_params",
-    "check_version",
-    "checked_name",
-    "checkpoint_facts",
-    "command_line",
-    "commands_of_ps",
-    "computer_name",
-    "content_key",
-    "default_of",
-    "depth_line",
-    "discard_unborn",
-    "disk_error",
-    "disk_time",
-    "end_with_starter",
-    "ending",
-    "file_as_blender_counts",
-    "file_digest",
-    "files_digest",
-    "frame_file",
-    "frame_number",
-    "freezes_a_shot",
-    "from_dict",
-    "gives_back",
-    "gone",
-    "host_names",
-    "incomplete",
-    "is_disk_full",
-    "is_half_written",
-    "is_imported_from",
-    "is_link",
-    "is_pattern",
-    "is_shot",
-    "is_whole_picture",
-    "later",
-    "layers_of",
-    "light_of_take",
-    "limits_of",
-    "locked",
-    "make_folder",
-    "mapped",
-    "matching_files",
-    "measured",
-    "need_disk",
-    "new_job",
-    "notes",
-    "numbered_files",
-    "open_arrays",
-    "open_regular",
-    "option",
-    "options_for",
-    "options_of",
-    "overscan",
-    "own_input",
-    "package_name",
-    "panel",
-    "parse_timecode",
-    "path_digest",
-    "path_error",
-    "placement_of",
-    "png_size",
-    "point_of",
-    "printable",
-    "process",
-    "process_of_ps",
-    "process_start",
-    "program",
-    "python_child",
-    "read_exr_header",
-    "read_json",
-    "read_lines",
-    "read_message",
-    "read_ply_header",
-    "read_surface_header",
-    "read_writer",
-    "readable_stem",
-    "record_packages",
-    "refuse_anothers",
-    "refuse_foreign",
-    "regular_file",
-    "remove_file",
-    "remove_link",
-    "replace_file",
-    "replaced_folder",
-    "replacing_folder",
-    "requested_params",
-    "restore_folder",
-    "run_from",
-    "runs_job",
-    "runs_still",
-    "said_of",
-    "same_name",
-    "shot_beside",
-    "site_packages",
-    "summarise",
-    "surface_of_take",
-    "sweep_half_written",
-    "take_figures",
-    "torch_index",
-    "trains_anew",
-    "try_lock",
-    "unexpected",
-    "verdict_lines",
-    "verdict_of",
-    "words_of",
-    "work_words",
-    "working_on",
-    "write_atomic",
-    "write_json",
-    "write_message",
-]

@@ -47,7 +47,7 @@ HEARTBEAT_SECONDS = 2.0
 
 
 class Reporter(Protocol):
-    """How a station speaks while it works. Implemented by `job.JobReporter`."""
+    """How a station speaks while it works. Implemented by `job.JobReporter`; a class of it says nothing by itself."""
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
         """`done` of `total` units of `stage` are finished."""

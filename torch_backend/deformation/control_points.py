@@ -25,8 +25,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ..gaussians.model import SH_C0
+from ..gaussians.rotations import rotation_matrices
 from ..torch_types import backward, norm, split, unflatten, unique_with_inverse
-from .geometry import farthest_points, near_identity, nearest, rigid_rotations, rotation_matrices
+from .geometry import farthest_points, near_identity, nearest, rigid_rotations
 from .geometry import warm_up as warm_up_nearest
 from .mlp import Trunk, blurred, linear
 from .protocol import (

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from ..kernel_text import kernel_text
 from ..native import INTEGER, POINTER, Snippet
-from ..torch_types import cross, determinant, norm, singular_values, split, unflatten
+from ..torch_types import cross, determinant, norm, singular_values, split
 
 _SERIES = 0.25
 """Below this squared angle sin and cos quotients are series: their closed forms cancel in float32."""
@@ -38,17 +38,6 @@ def near_identity(change: Tensor) -> Tensor:
     one[..., 0] = 1.0
     quats = one + change
     return F.normalize(torch.where(quats.square().sum(-1, keepdim=True) < 1e-12, one, quats), dim=-1)
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """[..., 3, 3] of unit quaternions [..., 4] wxyz."""
-    w, x, y, z = quats.unbind(-1)
-    entries = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return unflatten(torch.stack(entries, dim=-1), -1, (3, 3))
 
 
 def screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:

@@ -63,9 +63,6 @@ FRAMES_VERSION = 1
 MANY_FRAMES = 1500
 EXPOSURE_DRIFT_STOPS = 1.0
 CLIPPED_SHARE = 0.01
-_PARTIAL = "raw.partial"
-"""What a killed import of an earlier version left."""
-"""What a killed process leaves of a file that it was writing, see `shot.atomic_path`."""
 _WRITERS = 2
 _DISK_CHECK_FRAMES = 16
 
@@ -573,7 +570,7 @@ def _keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:
     ours, needed = _listed(old / FRAMES_FILE), _names(record)
     for found in sorted(p for p in old.rglob("*") if p.is_symlink() or not p.is_dir()):
         name = found.relative_to(old)
-        if name in ours or name.parts[0] == _PARTIAL or is_half_written(name.name):
+        if name in ours or is_half_written(name.name):
             continue
         while name in needed or os.path.lexists(fresh / name):
             name = name.with_name(f"{name.stem}.kept{name.suffix}")

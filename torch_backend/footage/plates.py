@@ -35,8 +35,6 @@ PLATES_VERSION = 1
 STAYS = "Frozen frames stay at the size and depth of the working frames."
 """End of every note."""
 _KEPT, _KEPT_BYTES = 11, 150e6
-_NO_LARGER = 720
-"""Import leaves clips of fewer lines than this at their size unless it is told otherwise."""
 _AGREE = 4.0 / 255.0
 _DISAGREE_SHARE = 1e-3
 """A plate is of another picture than its working frame if more than this share of pixels is farther off than that, or
@@ -254,12 +252,7 @@ def _config(record: dict[str, Any]) -> FootageConfig:
 
 def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
     """True if the footage is known to have the working frames' size and no values that they lack."""
-    size = record.get("source_size")
-    recorded: dict[str, Any] = record.get("config") or {}
-    if size is None:  # imported by an earlier version
-        same = not recorded.get("working_height") and working[1] < _NO_LARGER
-        return same and record.get("bits") == 8
-    return tuple(size) == working and not record.get("extended", True)
+    return tuple(record.get("source_size", ())) == working and not record.get("extended", True)
 
 
 def _lenses(shot: Shot) -> dict[int, PlateLens | MapLens] | str:

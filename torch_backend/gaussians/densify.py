@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..torch_types import norm
 from .model import Gaussians
+from .rotations import rotation_matrices
 
 _SHRINK = 1.6
 """Standard deviation of a child along the split axis is the parent's over this (3DGS densify_and_split)."""
@@ -117,7 +118,8 @@ def _separate(model: Gaussians, first: int, count: int) -> None:
     one, two = slice(first, first + count), slice(first + count, first + 2 * count)
     log_scales = p["log_scales"][one]
     longest = log_scales.argmax(1)
-    axis = torch.gather(_rotation(p["quats"][one]), 2, longest[:, None, None].expand(-1, 3, 1))[..., 0]
+    turned = rotation_matrices(torch.nn.functional.normalize(p["quats"][one], dim=1))
+    axis = torch.gather(turned, 2, longest[:, None, None].expand(-1, 3, 1))[..., 0]
     # The mixture of the two keeps the parent's second moment: s^2 = d^2 + (s / 1.6)^2.
     distance = log_scales.gather(1, longest[:, None]).exp() * math.sqrt(1.0 - _SHRINK**-2)
     shrunk = log_scales.scatter_add(1, longest[:, None], log_scales.new_full((count, 1), -math.log(_SHRINK)))
@@ -127,14 +129,3 @@ def _separate(model: Gaussians, first: int, count: int) -> None:
         p["means"].data[rows] += sign * distance * axis
         p["log_scales"].data[rows] = shrunk
         p["opacity_logits"].data[rows] = logit
-
-
-def _rotation(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz, normalised here."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=1).view(-1, 3, 3)

@@ -144,11 +144,7 @@ def _block_text() -> str:
 
 
 _KERNELS = Path(__file__).with_name("kernels") / "cpu"
-"""Every stage is one of these files. The small ones below stand in `blend.cpp` and `blend_backward.cpp`, and alone in
-`benchmarks/hot_loop.py`."""
-HIT, ROWS = kernel_text(_KERNELS / "hit.cpp"), kernel_text(_KERNELS / "rows.cpp")
-FORWARD_ROW, BACKWARD_ROW = kernel_text(_KERNELS / "forward_row.cpp"), kernel_text(_KERNELS / "backward_row.cpp")
-BACKWARD_SUMS = kernel_text(_KERNELS / "backward_sums.cpp")
+"""Every stage is one of these files, or several: `blend.cpp` and `blend_backward.cpp` include the small ones."""
 
 PROJECT, SORT, COUNT, PREFIX, EMIT, WEIGHTS, PROJECT_BACKWARD = range(7)
 BLEND, BLEND_BACKWARD = range(2)

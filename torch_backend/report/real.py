@@ -4,14 +4,14 @@ whatever t* is. Where nothing moves, the motion matte of the solve says (`motion
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from ..contract import Reporter
 from ..motion.mattes import MOVING, STILL, load_motion
 from ..motion_search import find_motion
 from ..shot import Shot
@@ -59,20 +59,5 @@ def far_from(poses: Sequence[int], t_star: int, frames: int) -> list[int]:
     return [pose for pose in poses if abs(pose - t_star) > frames / 4]
 
 
-class _Mute:
+class _Mute(Reporter):
     """A reporter to whom nobody listens."""
-
-    def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        """Nothing."""
-
-    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
-        """Nothing."""
-
-    def image(self, label: str, path: object) -> None:
-        """Nothing."""
-
-    def warning(self, message: str, hint: str = "") -> None:
-        """Nothing."""
-
-    def check_cancelled(self) -> None:
-        """Goes on."""

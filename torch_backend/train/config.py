@@ -236,25 +236,7 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
         "supervision": SupervisionConfig, "exposure": ExposureConfig, "needs": StoppingConfig,
         "poses": PosesConfig,
     }  # fmt: skip
-    values: dict[str, Any] = {
-        "needs": {},
-        "poses": {},
-        "lr_end": 0.1,
-        "average": 0.0,
-        "soft_movers": 0.0,
-        "lr_means_reach": 0.0,
-        **data,
-    }  # earlier runs decided nothing, kept their last step, softened nothing, moved near and far means alike; a
-    # finished one is only read
-    values.pop("coarse", None)  # builds of a day began on coarse pictures
-    if "hexplane" in values:  # written before there were other hosts
-        values.update(host="hexplane", host_config="default", field=values.pop("hexplane"))
-    if "rounds" in values.get("gate", {}):  # written before the gate opened on trial, and HexPlane bent by SiLU
-        values["gate"] = {k: v for k, v in values["gate"].items() if k not in ("rounds", "threshold", "floor")}
-        if values.get("host") == "hexplane":
-            values["field"] = {**values["field"], "silu": False}
-    if values.get("host") == "hexplane":  # the axes of earlier runs are even
-        values["field"] = {"stretch": 0.0, **values["field"]}
+    values: dict[str, Any] = dict(data)
     try:
         nested["field"] = host(values["host"]).settings
         for name, cls in nested.items():

@@ -2,7 +2,7 @@
 
 A step that is not finite changes nothing (`FusedAdam`), and the rasteriser culls what is not finite; so one bad number
 does no harm at once. But it stays: a NaN in an opacity leaves out every further step, and one in a position is never
-seen again in any loss (benchmarks/known_failures.py). So
+seen again in any loss. So
 
 - a Gaussian with a parameter that is not finite is dropped: its neighbours and the next round of growth fill the hole;
 - a quaternion without length, whose Gaussian is culled and gets no gradient, becomes the identity;
@@ -104,10 +104,8 @@ class FieldMemory:
 
     @torch.no_grad()
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Takes over what `state` told; a checkpoint of before it has none: then the next look begins anew."""
+        """Takes over what `state` told."""
         own = {name.removeprefix(_STATE): t for name, t in tensors.items() if name.startswith(_STATE)}
-        if "reach" not in own:
-            return
         self._reach.copy_(own["reach"])
         self._worst.copy_(own["worst"])
         device, kept = self._reach.device, [f"kept.{n}." for n in range(2)]

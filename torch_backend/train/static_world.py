@@ -7,9 +7,6 @@ frames.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -68,7 +65,7 @@ def steps_for(frames: int) -> int:
     return min(max(STEPS, least), most)
 
 
-class _Heard:
+class _Heard(Reporter):
     """Hands on how far a training is, and that it is to stop; its figures and advice are of no run."""
 
     def __init__(self, report: Reporter) -> None:
@@ -77,15 +74,6 @@ class _Heard:
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
         """As a stage of the solve."""
         self._report.progress(STAGE, done, total, message)
-
-    def metric(self, stage: str, values: Mapping[str, Any]) -> None:
-        """Nothing."""
-
-    def image(self, label: str, path: str | Path) -> None:
-        """Nothing."""
-
-    def warning(self, message: str, hint: str = "") -> None:
-        """Nothing."""
 
     def check_cancelled(self) -> None:
         """As the one that is told."""

@@ -12,8 +12,9 @@ from torch_backend.deformation.control_points import (
     arap_energy,
     elastic_energy,
 )
-from torch_backend.deformation.geometry import near_identity, rotation_matrices
+from torch_backend.deformation.geometry import near_identity
 from torch_backend.deformation.registry import host_config
+from torch_backend.gaussians.rotations import rotation_matrices
 
 BOX = torch.tensor([[-2.0] * 3, [2.0] * 3])
 

@@ -11,9 +11,9 @@ from torch_backend.deformation.geometry import (
     nearest,
     quat_product,
     rigid_rotations,
-    rotation_matrices,
     screw,
 )
+from torch_backend.gaussians.rotations import rotation_matrices
 
 
 def unit_quats(count, seed=0):

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from torch_backend.deformation import HexPlane, HexPlaneConfig, Start, field_box, host, host_config
-from torch_backend.train.config import TrainConfig, config_from_json, config_to_json
 
 BOX = torch.tensor([[-1.0, -2.0, 0.5], [1.0, 2.0, 3.0]])
 
@@ -68,17 +67,6 @@ def test_stretched_axes_are_fine_where_the_gaussians_are():
         again = host("hexplane").restore(made.config, made.state())
         assert torch.equal(again.features_at(means, torch.tensor([0.2])), made.features_at(means, torch.tensor([0.2])))
     assert nodes[2.0] > 10.0 * nodes[0.0]
-
-
-def test_a_run_of_before_keeps_even_axes():
-    made, before = stir(field()), config_to_json(TrainConfig())
-    del before["field"]["stretch"]
-    known = config_from_json({**before, "field": {**before["field"], "features": 4, "resolution": 8, "width": 16}})
-    again = host("hexplane").restore(known.field, made.state())
-    assert again.around is None
-    assert torch.equal(
-        again.features_at(points(), torch.tensor([0.4])), made.features_at(points(), torch.tensor([0.4]))
-    )
 
 
 def test_gradients_match_finite_differences_at_float64():

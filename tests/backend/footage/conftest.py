@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from torch_backend.contract import Cancelled
+from torch_backend.contract import Cancelled, Reporter
 
 
-class Recorder:
+class Recorder(Reporter):
     """Keeps events; cancels once `cancel_after` checks have passed."""
 
     def __init__(self, cancel_after=None):
@@ -18,12 +18,6 @@ class Recorder:
 
     def progress(self, stage, done, total, message=""):
         self.steps.append((stage, done, total))
-
-    def metric(self, stage, values):
-        pass
-
-    def image(self, label, path):
-        pass
 
     def warning(self, message, hint=""):
         self.warnings.append(message)

@@ -83,17 +83,6 @@ def test_a_clip_of_the_working_size_is_the_undistorted_frames(tmp_path, shot_of,
     assert half.display(3).shape == (24, 32, 3) and half.key != plates.key
 
 
-def test_frames_of_an_earlier_version_need_no_footage_either(tmp_path, shot_of, pan, write_video):
-    write_video(tmp_path / "a.mp4", pan(10))
-    shot = shot_of(tmp_path / "a.mp4")
-    record = load_frames(shot)
-    for new in ("source_size", "extended", "start"):
-        del record[new]
-    write_json(shot.frames / "frames.json", record)
-    os.remove(tmp_path / "a.mp4")
-    assert Plates(shot).note == ""
-
-
 def test_a_larger_clip_is_read_at_its_own_size(tmp_path, shot_of, pan, write_video):
     frames = pan(12, height=96, width=128)
     write_video(tmp_path / "a.mp4", frames)

@@ -1,10 +1,7 @@
 """Inputs that break rasterisers, on every body; the bounds against the oracle are stated in benchmarks/raster_cases.py.
 
-`benchmarks/known_failures.py` says which test stands for which known failure of other programs, `remedies.py` what
-makes it fail.
 """
 
-import importlib.util
 import math
 import os
 import subprocess
@@ -14,8 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import numerics
-from benchmarks.known_failures import ROWS
 from benchmarks.raster_cases import CASES, scaled_world, size
 from benchmarks.raster_errors import BODIES, PER_GAUSSIAN, compare
 from torch_backend.raster import RasterSettings, rasterize
@@ -672,21 +667,3 @@ def test_a_device_without_a_body_says_so(tools):
     leaves = {name: value.to("meta") for name, value in scene.tensors.items() if name != "viewmats"}
     with pytest.raises(NotImplementedError, match="meta"):
         scene.run("auto", leaves | {"viewmats": torch.eye(4)[None]})
-
-
-def test_what_remedies_take_out_is_still_there_and_every_row_has_some():
-    # `python tests/backend/raster/remedies.py` takes it out and asks whether the tests notice.
-    spec = importlib.util.spec_from_file_location("remedies", Path(__file__).with_name("remedies.py"))
-    remedies = importlib.util.module_from_spec(spec)
-    sys.modules["remedies"] = remedies
-    spec.loader.exec_module(remedies)
-    names = numerics.test_names()
-    for remedy in remedies.REMEDIES:
-        remedy.made(ROOT)  # says, if it cannot be, what is not there any more and what to do
-        assert remedy.full_test in names, remedy.name
-    assert remedies.without_remedy() == []
-
-
-def test_the_table_of_rows_names_tests_that_exist():
-    names = numerics.test_names()
-    assert not [name for _, tests, _ in ROWS for name in tests if name not in names]

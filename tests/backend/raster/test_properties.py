@@ -10,7 +10,7 @@ import os
 
 import pytest
 import torch
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.raster_errors import BODIES, PER_GAUSSIAN, SAME_SIDE, Scene, camera, compare, scalar
@@ -20,8 +20,6 @@ from torch_backend.raster.constants import ALPHA_MIN
 ASKED = int(os.environ.get("SPLANNEQUIN_CASES", "0"))
 SHARE = {"cpu": 1.0, "reference": 0.25, "reference32": 0.25, "cuda": 0.05, "gpu": 0.5}
 """Cases per body relative to the CPU's, by how fast it is."""
-PHASES = [phase for phase in Phase if "SPLANNEQUIN_NO_SHRINK" not in os.environ or phase is Phase.generate]
-"""remedies.py asks only whether a test fails, not for the smallest example."""
 on_every_body = pytest.mark.parametrize("body", BODIES)
 
 
@@ -31,7 +29,6 @@ def for_all(strategy, body, usual, generated, holds):
     @settings(
         max_examples=max(5, round(SHARE[body] * (ASKED or usual))),
         suppress_health_check=list(HealthCheck),
-        phases=PHASES,
     )
     @given(strategy)
     def each(example):

@@ -1,11 +1,13 @@
-"""The compiled SSIM against the same formulas in float64 torch, differentiated by autograd."""
+"""The compiled SSIMs against the same formulas in float64 torch, differentiated by autograd."""
 
 import threading
 
 import pytest
 import torch
 
-from torch_backend.raster.ssim import photometric, ssim
+from torch_backend.raster import ssim as cpu
+from torch_backend.raster import ssim_cuda
+from torch_backend.raster.ssim import ssim
 from torch_backend.train import losses
 
 
@@ -33,47 +35,64 @@ def pair(height, width, channels, noise=0.1):
     return target + noise * torch.randn(target.shape, generator=g), target
 
 
-SIZES = [(11, 11), (17, 23), (13, 640), (640, 13), (48, 64)]
+BODIES = {
+    "cpu": (cpu.ssim, cpu.photometric, "cpu"),
+    "torch": (losses.ssim, losses.photometric, "cpu"),
+    "fibers": (ssim_cuda.ssim, ssim_cuda.photometric, "cpu"),
+    "gpu": (ssim_cuda.ssim, ssim_cuda.photometric, "cuda"),
+}
+"""Body: SSIM, the loss, device. `fibers` runs the CUDA kernel on Warp's cpu device."""
+on_every_body = pytest.mark.parametrize(
+    "body",
+    [
+        "cpu",
+        "torch",
+        "fibers",
+        pytest.param("gpu", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")),
+    ],
+)
 
 
+@on_every_body
 @pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_value_and_gradient_match_float64(height, width, channels):
+@pytest.mark.parametrize(("height", "width"), [(11, 11), (17, 23), (13, 200), (90, 12), (13, 640), (640, 13), (48, 64)])
+def test_value_and_gradient_match_float64(body, height, width, channels):
     image, target = pair(height, width, channels)
-    x, x64 = image.clone().requires_grad_(), image.double().requires_grad_()
-    value, expected = ssim(x, target), reference(x64, target.double())
+    score, _, device = BODIES[body]
+    x, x64 = image.to(device, copy=True).requires_grad_(), image.double().requires_grad_()
+    value, expected = score(x, target.to(device)), reference(x64, target.double())
     assert float(value.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
     (got,) = torch.autograd.grad(3.0 * value, x)
     (want,) = torch.autograd.grad(3.0 * expected, x64)
-    assert float((got - want).norm() / want.norm()) <= 1e-5
+    assert float((got.cpu() - want).norm() / want.norm()) <= 1e-5
 
 
+@on_every_body
 @pytest.mark.parametrize("hides", [False, True])
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_the_loss_and_its_gradient_match_float64(height, width, hides):
+@pytest.mark.parametrize(("height", "width"), [(11, 11), (37, 23), (13, 640), (640, 13)])
+def test_the_loss_and_its_gradient_match_float64(body, height, width, hides):
     image, target = pair(height, width, 3)
     image[3, 4] = target[3, 4]  # the slope of |x - y| is 0 there
     generator = torch.Generator().manual_seed(6)
     ignored = torch.rand(height, width, generator=generator) > 0.8 if hides else None
-    x, x64 = image.clone().requires_grad_(), image.double().requires_grad_()
-    value, expected = photometric(x, target, 0.2, ignored), losses.photometric(x64, target.double(), 0.2, ignored)
-    assert float(losses.photometric(image, target, 0.2, ignored)) == float(value.detach())
+    _, loss, device = BODIES[body]
+    x, x64 = image.to(device, copy=True).requires_grad_(), image.double().requires_grad_()
+    value = loss(x, target.to(device), 0.2, None if ignored is None else ignored.to(device))
+    expected = losses.photometric(x64, target.double(), 0.2, ignored)
     assert float(value.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
     (got,) = torch.autograd.grad(3.0 * value, x)
     (want,) = torch.autograd.grad(3.0 * expected, x64)
-    assert float((got - want).norm() / want.norm()) <= 1e-5
-    assert ignored is None or not got[ignored].any()
+    assert float((got.cpu() - want).norm() / want.norm()) <= 1e-5
+    assert ignored is None or not got.cpu()[ignored].any()
 
 
-def test_torch_path_agrees():
-    """`losses.ssim` runs float32 compiled and float64 in torch: one function."""
-    image, target = pair(37, 53, 3)
-    x, x64 = image.clone().requires_grad_(), image.double().requires_grad_()
-    value, value64 = losses.ssim(x, target), losses.ssim(x64, target.double())
-    assert float(value.detach()) == pytest.approx(float(value64.detach()), rel=1e-6)
-    value.backward()
-    value64.backward()
-    assert float((x.grad - x64.grad).norm() / x64.grad.norm()) <= 1e-5
+def test_torch_in_float64_is_the_reference():
+    image, target = (one.double() for one in pair(17, 23, 3))
+    image.requires_grad_()
+    value, expected = losses.ssim(image, target), reference(image, target)
+    assert abs(float((value - expected).detach())) < 1e-12
+    (got,), (want,) = torch.autograd.grad(value, image), torch.autograd.grad(expected, image)
+    assert float((got - want).norm() / want.norm()) < 1e-10
 
 
 def test_torch_path_stays_on_the_images_device():

@@ -16,7 +16,6 @@ from benchmarks.ablate.instants import Instants, digest
 from benchmarks.ablate.measures import FrameMaker, summary
 from benchmarks.ablate.switches import COMBINATIONS, FRAME, RULES, detail_config, replaced, switched_off, variants
 from benchmarks.ablate.table import TRUTH, Store, sweep_table, table
-from benchmarks.detail_ceiling import chosen
 from benchmarks.detail_clip import open_clip
 from benchmarks.other_state import OTHER, Painted, Pair, Polygon
 
@@ -145,15 +144,6 @@ def test_digests_tell_content_and_not_objects():
     a, b = torch.zeros(3), torch.zeros(3)
     assert digest([a, {"x": 1}, object()]) == digest([b, {"x": 1}, object()])
     assert len({digest([a]), digest([a.double()]), digest([a[:2]]), digest([a + 1]), digest([])}) == 5
-
-
-def test_the_best_label_of_each_block():
-    truth = torch.zeros(5, 6, 3)
-    sources = torch.stack([truth + 0.1, truth + 0.2])
-    sources[1, 0, 0] = 0.0  # better in one pixel, worse in its block
-    assert torch.equal(chosen(sources, truth, 4), sources[0])
-    best = chosen(sources, truth, 1)
-    assert bool((best[0, 0] == 0.0).all()) and torch.equal(best[1:], sources[0, 1:])
 
 
 def test_what_is_let_go_is_held_against_what_was_painted(clip, tmp_path, monkeypatch):

@@ -6,9 +6,8 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 
-from benchmarks import detail, detail_cost, detail_flow, detail_truth, still_truth
+from benchmarks import detail, detail_cost, detail_flow, detail_truth
 from benchmarks.detail_clip import VARIANTS, open_clip
 from benchmarks.other_state import OTHER, Painted, Pair, Polygon, score
 from benchmarks.other_state import __main__ as other_state
@@ -172,23 +171,3 @@ def test_how_much_of_a_small_mover_is_there_is_told_of_all_poses_and_of_the_wors
     few = detail_truth.recalls([pose(0, 0)])
     assert detail_truth.recall_table({"room": few})[-1] == f"| room | arm | {' -> '.join(['– / –'] * 4)} |"
     assert detail_truth.recall_table({"room": detail_truth.recalls([nowhere])}) == []
-
-
-def test_a_sway_that_mattes_miss_makes_plates_prefer_the_mean_and_truth_the_instant():
-    def picture(*places: int) -> torch.Tensor:
-        shown = torch.full((40, 60, 3), 0.2)
-        for at in places:
-            shown[10:30, at : at + 8] += 0.6 / len(places)
-        return shown
-
-    plate, target = picture(26), picture(20)  # of its own time, and as it stood at t*
-    moves = (plate - target).abs().amax(-1) > 0.0
-    everything = torch.ones_like(moves)
-    row = still_truth.compared({"auto": target + 0.01, "static": picture(20, 26)}, plate, target, everything, moves)
-    rows = [{"kind": "developed", **row}, {"kind": "field", **row}]
-    assert still_truth.gains(rows, "developed", "plate")[0] < -4.0, "the mean of two places is nearer to either"
-    assert still_truth.gains(rows, "developed", "truth")[0] > 10.0
-    assert still_truth.gains(rows, "developed", "sway")[0] > 10.0 and row["sways"] == moves.float().mean()
-    assert row["static"]["held"] > 100.0 > row["auto"]["held"] > 39.0, "the mean errs nowhere else, 0.01 is 40 dB"
-    none = still_truth.compared({"auto": target, "static": target}, plate, target, ~everything, moves)
-    assert still_truth.gains([{"kind": "field", **none}], "field", "truth") == []

@@ -7,7 +7,7 @@ import pytest
 
 from tests.backend.solved_room import solve_all
 from torch_backend.cameras.stored import load_cameras
-from torch_backend.contract import CAMERAS_KNOWN, EVENTS_FILE, FORECAST, Cancelled, ExitCode, SolveParams
+from torch_backend.contract import CAMERAS_KNOWN, EVENTS_FILE, FORECAST, Cancelled, ExitCode, Reporter, SolveParams
 from torch_backend.footage import load_frames
 from torch_backend.job import new_job, run_job
 from torch_backend.motion.mattes import is_outdated
@@ -17,7 +17,7 @@ from torch_backend.sfm.solving import SolveConfig
 FRAMES = {"width": 640, "height": 480, "frames": [{"solve": n % 2 == 0} for n in range(40)]}
 
 
-class Heard:
+class Heard(Reporter):
     """Keeps the bar; ends all in the moment in which the cameras are known if asked to, as a kill would."""
 
     def __init__(self, stop=False):
@@ -31,15 +31,6 @@ class Heard:
         self.metrics.append((stage, self.bar[-1], dict(values)))
         if self.stop and stage == CAMERAS_KNOWN:
             raise Cancelled
-
-    def image(self, label, path):
-        pass
-
-    def warning(self, message, hint=""):
-        pass
-
-    def check_cancelled(self):
-        pass
 
 
 def stage(bar, name, *shares):

@@ -18,19 +18,17 @@ from torch_backend.shot import Shot
 ROOT = Path(__file__).resolve().parents[3]
 AGAIN = """
 import os, signal, sys
+from torch_backend.contract import Reporter
 from torch_backend.shot import Shot
 from torch_backend.sfm.solving import SolveConfig, solve_shot
 
 shot, at_stage, at_rename = Shot(sys.argv[1]), sys.argv[2], int(sys.argv[3])
 renames = 0
 
-class Report:
+class Report(Reporter):
     def progress(self, stage, done, total, message=""):
         if stage == at_stage and done >= 3:
             os.kill(os.getpid(), signal.SIGKILL)
-    def warning(self, message, hint=""): pass
-    def metric(self, stage, values): pass
-    def check_cancelled(self): pass
 
 def hook(event, args):
     global renames

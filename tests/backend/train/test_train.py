@@ -247,12 +247,6 @@ def test_near_and_far_means_move_by_as_many_pixels(world, quiet):
         assert torch.allclose((means.detach() - before).abs()[pulled], expected[pulled], rtol=0.02, atol=1e-6)
 
 
-def test_runs_of_before_move_near_and_far_means_alike():
-    stored = config_to_json(config_from_params(TrainParams()))
-    assert stored.pop("lr_means_reach") > 0.0
-    assert config_from_json(stored).lr_means_reach == 0.0
-
-
 def iteration_of(folder):
     return read_meta(folder / "checkpoint.safetensors")["iteration"]
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.backend.footage.test_plates import solved
-from torch_backend.contract import PROBE
+from torch_backend.contract import PROBE, Reporter
 from torch_backend.footage import FootageConfig, import_footage
 from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png, write_png
@@ -20,11 +20,8 @@ from torch_backend.lens.plate_lens import load_plate_lenses
 from torch_backend.shot import Shot
 
 
-class Quiet:
+class Quiet(Reporter):
     """A reporter that says nothing."""
-
-    def __getattr__(self, name):
-        return lambda *words, **more: None
 
 
 def pictures(folder, count=9, size=(96, 128), suffix="png", **attributes):

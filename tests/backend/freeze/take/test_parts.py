@@ -114,13 +114,11 @@ def test_frames_of_before_stay_until_the_take_is_finished(own, quiet):
 
 KILLED = """
 import os, signal, sys
-from torch_backend.contract import FreezeParams
+from torch_backend.contract import FreezeParams, Reporter
 from torch_backend.freeze import freeze_part, open_take
 from torch_backend.shot import Shot
 
-class Quiet:
-    def progress(self, *words): ...
-    metric = image = warning = check_cancelled = progress
+class Quiet(Reporter): pass
 
 root, take, writes = sys.argv[1], sys.argv[2], int(sys.argv[3])
 shot, replace, seen = Shot.open(root), os.replace, []
