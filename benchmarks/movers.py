@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,61 +23,52 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.sources import load_source
+from benchmarks.sources import in_words, load_source
 from torch_backend.cameras.stored import load_cameras
-from torch_backend.contract import JobError
 from torch_backend.motion.mattes import MOVING, load_motion
 from torch_backend.report.truth import THINGS, TruthScene
 from torch_backend.shot import write_json
 
 MOVERS = ("moving", *(name for name in THINGS if name not in ("glass", "mirror", "wall")))
 """Regions of truth that mattes should mark."""
-LABELS = ("moving", "likely")
-"""What mattes call moving, and that with what is likely to move."""
 LEAST = 50
 """Pixels of a thing below which a frame says nothing about its recall."""
 
 
-def frame_row(
-    mattes: Mapping[str, NDArray[np.uint8]], regions: Mapping[str, NDArray[np.bool_]], margin: int
-) -> dict[str, Any]:
-    """Pixel counts of one frame by label: `marked`, `right` of them, and `found`: [marked, all] of each mover.
+def frame_row(matte: NDArray[np.uint8], regions: Mapping[str, NDArray[np.bool_]], margin: int) -> dict[str, Any]:
+    """Pixel counts of one frame: `marked`, `right` of them, and `found`: [marked, all] of each mover.
 
     Args:
-        mattes: of each of `LABELS`, [H, W] as `load_motion` returns it.
+        matte: [H, W] as `load_motion` returns it.
         regions: name -> [H, W]; `moving` has to be there.
         margin: pixels around what moves that may be marked, too.
     """
     block = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
     near = cv2.dilate(regions["moving"].astype(np.uint8), block) > 0
-    row: dict[str, Any] = {}
-    for label, matte in mattes.items():
-        marked = matte == MOVING
-        found = {name: [int((marked & of).sum()), int(of.sum())] for name, of in regions.items() if name in MOVERS}
-        row[label] = {"marked": int(marked.sum()), "right": int((marked & near).sum()), "found": found}
-    return row
+    marked = matte == MOVING
+    found = {name: [int((marked & of).sum()), int(of.sum())] for name, of in regions.items() if name in MOVERS}
+    return {"marked": int(marked.sum()), "right": int((marked & near).sum()), "found": found}
 
 
 def judge(truth: TruthScene, margin: int) -> list[dict[str, Any]]:
     """One row per frame that has a matte, see `frame_row`."""
     rows: list[dict[str, Any]] = []
     for frame in (camera.frame for camera in load_cameras(truth.shot).frames):
-        matte, likely = load_motion(truth.shot, frame), load_motion(truth.shot, frame, likely=True)
-        if matte is None or likely is None:
+        matte = load_motion(truth.shot, frame)
+        if matte is None:
             continue
         height, width = matte.shape
         regions = {name: mask.numpy() for name, mask in truth.frame_regions(frame, width, height).items()}
-        rows.append({"frame": frame, **frame_row({"moving": matte, "likely": likely}, regions, margin)})
+        rows.append({"frame": frame, **frame_row(matte, regions, margin)})
     return rows
 
 
-def summary(rows: Sequence[Mapping[str, Any]], label: str) -> dict[str, float | None]:
+def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     """Precision, recall of each mover, and that of the thing in its worst frames; None where nothing is marked."""
-    of = [row[label] for row in rows]
-    marked, right = (sum(each[name] for each in of) for name in ("marked", "right"))
+    marked, right = (sum(each[name] for each in rows) for name in ("marked", "right"))
     found: dict[str, float | None] = {"precision": right / marked if marked else None}
     for name in MOVERS:
-        pairs = [each["found"][name] for each in of if name in each["found"]]
+        pairs = [each["found"][name] for each in rows if name in each["found"]]
         whole = sum(pair[1] for pair in pairs)
         if not whole:
             continue
@@ -93,40 +84,21 @@ def text(found: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {'–' if value is None else f'{value:.3f}'}" for name, value in found.items())
 
 
-def run(
-    argv: Sequence[str] | None, about: str | None, name: str, labels: Sequence[str],
-    judge: Callable[[TruthScene, int], list[dict[str, Any]]],
-) -> int:  # fmt: skip
-    """A command line that judges scenes and prints the summary of each of `labels`; returns an exit code.
-
-    Args:
-        about: its help.
-        name: what its files in DIR begin with.
-        judge: rows of a scene, by its truth and `--margin`.
-    """
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
     parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")
     parser.add_argument("--margin", type=int, default=1, help="pixels around what moves that may be marked, too")
     args = parser.parse_args(argv)
-    try:
-        for folder in args.scenes:
-            truth = load_source(f"{args.cameras}:{folder.absolute()}", args.results.absolute())
-            rows = judge(truth, args.margin)
-            path = args.results / f"{name}-{truth.name.replace(' ', '-')}.json"
-            write_json(path, {"version": 1, "margin": args.margin, "frames": rows})
-            for label in labels:
-                print(f"{truth.name}, {label}: {text(summary(rows, label))}", flush=True)
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
-    return run(argv, __doc__, "movers", LABELS, judge)
+    for folder in args.scenes:
+        truth = load_source(f"{args.cameras}:{folder.absolute()}", args.results.absolute())
+        rows = judge(truth, args.margin)
+        path = args.results / f"movers-{truth.name.replace(' ', '-')}.json"
+        write_json(path, {"version": 1, "margin": args.margin, "frames": rows})
+        print(f"{truth.name}: {text(summary(rows))}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,4 @@
-"""Inputs that break rasterisers, on every body; the bounds against the oracle are stated in benchmarks/raster_cases.py.
-
-"""
+"""Inputs that break rasterisers, on every body; `benchmarks/raster_cases.py` states the bounds against the oracle."""
 
 import math
 import os
