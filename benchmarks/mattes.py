@@ -6,9 +6,10 @@ centre shows a person, by rays through the scene's triangles.
 
 Each person is lassoed once per instant, at the frame of the instant itself. The lasso is the outline of the truth
 there, a corner every `--corner` pixels, each moved by up to `--sloppy` pixels in any direction; a person whom something
-parts has a polygon for each part of a twentieth or more. Judged are all other poses that show at least `LEAST` pixels
-of the person: intersection over union of the matte, cut at half, and the truth. Seconds are those of the job up to its
-first matte, loading of the run included, and of each further frame with all its mattes.
+parts has a polygon for each part of a twentieth or more. Judged are all other frames of the take (every `--every`-th
+of the clip, t* among them) that show at least `LEAST` pixels of the person: intersection over union of truth and the
+matte, cut at half. Seconds are those of the job up to its first matte, loading of the run included, and of each further
+frame with all its mattes.
 
 DIR gets mattes-NAME.json.
 """
@@ -41,6 +42,7 @@ from torch_backend.contract import FreezeParams, JobError, MatteParams, TakeFold
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.mattes.files import matte_file, read_matte
 from torch_backend.freeze.mattes.job import make_mattes
+from torch_backend.freeze.take.folder import frames_of
 from torch_backend.native import default_threads
 from torch_backend.shot import Shot, write_json
 
@@ -123,11 +125,10 @@ class Watch(Log):
 
 def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     """One row per person and pose that is judged: {t_star, person, pose, pixels, iou, first, others}."""
-    poses = scene.poses
     take = f"mattes{t_star}"
-    freeze_shot(shot, FreezeParams(run=run, take=take, t_star=t_star, only_missing=True), Log())
+    freeze_shot(shot, FreezeParams(run=run, take=take, t_star=t_star, step=args.every, only_missing=True), Log())
     folder = TakeFolder(shot.take(take))
-    masks = person_masks(scene, t_star, sorted({*poses, t_star}))
+    masks = person_masks(scene, t_star, frames_of(folder))
     masks = {name: of for name, of in masks.items() if of[t_star].sum() >= LEAST}
     rows = [
         {"name": name, "frame": t_star, "polygon": polygon}

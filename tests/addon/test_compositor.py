@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from mathutils import Vector
 
+from tests.addon.test_layers import render as float_picture
+
 
 @pytest.fixture
 def take(addon, shot):
@@ -504,6 +506,31 @@ def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, la
         expected = nearer * over(cg, data["rgba"]) + (1.0 - nearer) * over(data["rgba"], cg)
         found = pictures.read(tmp_path / "out" / f"{frame:06d}.png")
         assert np.abs(found - pictures.srgb(expected[..., :3])).max() * 255 < 1.1
+
+
+def test_cg_softness_0_changes_no_bit(addon, scene, take, tmp_path):
+    """Float pictures by the group's steps of CG Softness at 0, and by the same group without these steps."""
+    addon("bake.compositor").insert(scene, take)
+    node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
+    node.inputs["CG"].default_value = (0.25, 0.125, 0.0, 0.5)
+
+    def shown(softness):
+        node.inputs["CG Softness"].default_value = softness
+        for depth in (12.25, 12.5, 12.53, 12.56):
+            node.inputs["CG Depth"].default_value = depth
+            yield float_picture(scene, tmp_path, size=(16, 12))
+
+    off, soft = np.stack([*shown(0.0)]), np.stack([*shown(0.25)])
+    (smooth,) = (n for n in node.node_tree.nodes if n.label == "CG is nearer")
+    slope = smooth.inputs[1].links[0].from_node
+    eased = slope.inputs[0].links[0].from_node
+    raised = eased.inputs[0].links[0].from_node
+    node.node_tree.links.new(raised.inputs[2].links[0].from_socket, eased.inputs[0])
+    node.node_tree.links.remove(eased.inputs[1].links[0])
+    eased.inputs[1].default_value = 1.0
+    hard = np.stack([*shown(0.25)])
+    assert np.array_equal(off, hard) and not np.array_equal(soft, hard)
+    assert len(np.unique((off - off[0])[1:, :, 1:, 0])) > 5, "pixels that CG is half behind are among them"
 
 
 def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_path, layers, pictures):

@@ -29,7 +29,7 @@ class TakeFrame:
     picture: Picture
     """[H, W, 3] as displayed."""
     depth: NDArray[np.float32]
-    """[H, W] along the camera's axis, any unit."""
+    """[H, W] along the camera's axis, scene units."""
     viewmat: Tensor
     """[4, 4] world-to-camera, scene units."""
     K: Tensor
@@ -88,8 +88,8 @@ def carry(
 
 def _refined(votes: Tensor, frozen: FrozenGaussians, frame: TakeFrame, config: SegmentConfig | None) -> Matte:
     """The matte [H, W] of what votes [N, 2] are about, at a frame."""
-    height, width = frame.depth.shape
-    shown = render_members(frozen, membership(votes), frame.viewmat, frame.K, width, height, frame.beyond)
+    depth = from_numpy(frame.depth)
+    shown = render_members(frozen, membership(votes), frame.viewmat, frame.K, depth, frame.beyond)
     return refine(frame.picture, frame.depth, shown[..., 0].numpy(), shown[..., 1].numpy(), config)
 
 
@@ -108,5 +108,6 @@ def _votes_of(mattes: Mapping[str, Matte], frame: TakeFrame, frozen: FrozenGauss
     K = resize_intrinsics(frame.K[None], width, height, *small)[0]
     layers = [cv2.resize(matte, small, interpolation=cv2.INTER_AREA) for matte in mattes.values()]
     pictures = np.stack([*layers, np.ones(small[::-1], np.float32)], axis=-1)
-    pixels = vote(frozen, frame.viewmat, K, from_numpy(pictures)) * (width / small[0]) ** 2
+    depth = from_numpy(cv2.resize(frame.depth, small, interpolation=cv2.INTER_NEAREST_EXACT))
+    pixels = vote(frozen, frame.viewmat, K, from_numpy(pictures), depth) * (width / small[0]) ** 2
     return {name: pixels[:, [n, -1]] for n, name in enumerate(mattes)}

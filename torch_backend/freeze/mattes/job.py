@@ -37,7 +37,7 @@ from .files import is_current, matte_file, read_matte, suffixes_beside, write_ma
 from .lassos import Lasso, json_list, lasso_of, read_lassos
 from .segment import Matte, SegmentConfig
 
-MATTES_VERSION = 1
+MATTES_VERSION = 2
 """Of mattes.json; and rises when mattes made before are not to be used any more."""
 
 
@@ -244,7 +244,8 @@ def read_take_frame(folder: TakeFolder, number: int, scene: Scene) -> TakeFrame:
     K[0, 2] += frame.margin[0]
     K[1, 2] += frame.margin[1]
     picture = linear_to_srgb8(np.clip(frame.rgba[..., :3], 0.0, 1.0))
-    return TakeFrame(number, picture, frame.depth, viewmat, K, frame.margin, frame.metadata.t_star_frame)
+    depth = frame.depth * np.float32(scene.scale)
+    return TakeFrame(number, picture, depth, viewmat, K, frame.margin, frame.metadata.t_star_frame)
 
 
 def _sweep(take: _Take, params: MatteParams, wanted: Mapping[str, list[Lasso]]) -> None:

@@ -11,28 +11,42 @@ from ...raster import RasterSettings
 from ...torch_types import from_numpy
 from ...train.model import gathered, render
 from ..frozen import FrozenGaussians
-from ..views.reproject import inside, project
+from ..views.reproject import inside, look_up, project
+from ..views.source_views import VisibilityConfig
 
 SEEN = 0.05
 """Pixels of a Gaussian that cameras have to see before mattes can say whether it is a member."""
 
-RIM = 0.05
+RIM = 0.25
 """Gaussians that no lassoed frame shows can belong to the thing within this share of its diagonal from its members: a
-back that the camera comes to see, but not the floor behind it. Things that a frame cuts off need a second lasso."""
+back that the camera comes to see, an arm that the frame cuts off, but not the wall behind. At 0.05 and 0.1 such arms
+were lost (docs/benchmarks.md, "Mattes by pointing"). Things that are cut off farther need a second lasso."""
 
 
-def vote(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, weights: Tensor) -> Tensor:
+def vote(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, weights: Tensor, depth: Tensor) -> Tensor:
     """[N, C]: of what a camera sees of each Gaussian, the pixels in each of pictures [H, W, C].
 
-    viewmat [4, 4] in scene units, K [3, 3] in pixels of the pictures. A Gaussian whose centre is outside of the picture
-    is not seen: what reaches into it may be a hundredth of a large one.
+    viewmat [4, 4] in scene units, K [3, 3] in pixels of the pictures. `depth` [H, W] is that of what they show, along
+    the camera's axis, scene units. A Gaussian whose centre is outside of the picture is not seen: what reaches into it
+    may be a hundredth of a large one. One that is not `in_front` is not seen either.
     """
     device = frozen.support.device
     height, width, _ = weights.shape
     camera = viewmat.to(device), K.to(device)
     pixels, _ = project(frozen.state["means"], *camera)
-    within = inside(pixels, width, height, soft=1e-3) > 0.0
-    return gathered(frozen.state, *camera, width, height, weights.to(device)) * within[:, None]
+    seen = (inside(pixels, width, height, soft=1e-3) > 0.0) & in_front(frozen, *camera, depth)
+    return gathered(frozen.state, *camera, width, height, weights.to(device)) * seen[:, None]
+
+
+def in_front(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, depth: Tensor) -> Tensor:
+    """[N] bool: False for Gaussians behind the surface that a picture shows there; `depth` [H, W] as in `vote`.
+
+    Splats of a person are not opaque. A wall that shines through them would become a part of them; once it is known as
+    wall, it would lower their share at thin parts and outlines.
+    """
+    pixels, away = project(frozen.state["means"], viewmat, K)
+    surface = look_up(depth.to(pixels.device), pixels, "nearest")
+    return away < surface * (1.0 + VisibilityConfig().depth_tolerance)
 
 
 def membership(votes: Tensor) -> Tensor:
@@ -69,18 +83,21 @@ def rule_out(votes: Tensor, means: Tensor) -> Tensor:
 
 @torch.no_grad()
 def render_members(
-    frozen: FrozenGaussians, members: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int,
+    frozen: FrozenGaussians, members: Tensor, viewmat: Tensor, K: Tensor, depth: Tensor,
     overscan: tuple[float, float] = (0.0, 0.0),
 ) -> Tensor:  # fmt: skip
-    """[H, W, 2] in 0..1, on the CPU: `members` [N, 2] as one camera sees them, as shares of what is modelled.
+    """[H, W, 2] in 0..1, on the CPU: `members` [N, 2] as one camera sees them, as shares of what is `in_front`.
 
-    The first is a share of what is known: a pixel that is half unknown and half the thing is the thing.
+    The first is a share of what is known: a pixel that is half unknown and half the thing is the thing. `depth` [H, W]
+    is that of the frame, as in `vote`.
     """
-    device = frozen.support.device
+    device, (height, width) = frozen.support.device, depth.shape
+    camera = viewmat.to(device), K.to(device)
+    colors = torch.nn.functional.pad(members.to(device), (0, 1), value=1.0) * in_front(frozen, *camera, depth)[:, None]
     out = render(
-        frozen.state, 0, viewmat.to(device), K.to(device), width, height, colors=members.to(device),
-        with_contributions=False, settings=RasterSettings(overscan=overscan),
+        frozen.state, 0, *camera, width, height, colors=colors, with_contributions=False,
+        settings=RasterSettings(overscan=overscan),
     )  # fmt: skip
-    alpha, (members_of, known) = out.alphas[0], out.colors[0, ..., 3:].unbind(-1)
-    shares = torch.stack([members_of / known.clamp_min(1e-4), known / alpha.clamp_min(1e-4)], dim=-1)
-    return torch.where(alpha[..., None] > 1e-3, shares, 0.0).clamp(0.0, 1.0).cpu()
+    members_of, known, shown = out.colors[0, ..., 3:].unbind(-1)
+    shares = torch.stack([members_of / known.clamp_min(1e-4), known / shown.clamp_min(1e-4)], dim=-1)
+    return torch.where(shown[..., None] > 1e-3, shares, 0.0).clamp(0.0, 1.0).cpu()
