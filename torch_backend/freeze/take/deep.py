@@ -34,10 +34,10 @@ class DeepConfig:
     """Slabs of depth between the nearest and the farthest hundredth of a frame; two more hold what is beyond."""
     step: float = 0.05
     """Share by which depth rises from one pixel to the next where two surfaces meet; within it, one is sloped."""
-    least: float = 1.0 / 64.0
-    """Share of a pixel below which a surface has no sample: the other gives it."""
-    gain: float = 4.0
-    """Times by which the splats' colour is multiplied at most to be the frame's; the rest is added to both samples."""
+
+
+_LEAST = float(np.finfo(np.float16).eps)
+"""Share of a pixel below which a surface has no sample: less is none beside 1 in a half float."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,6 @@ class DeepSamples:
     """[2, H, W, 3] scene-linear, their colour times that share."""
     depth: Tensor
     """[2, H, W] along the camera's axis, scene units of the model."""
-    config: DeepConfig
 
     def rows(self, rows: slice, rgba: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Some rows of the samples as a deep file has them.
@@ -66,16 +65,16 @@ class DeepSamples:
         weight = self.weight[:, rows].numpy()
         share = weight[0] / np.maximum(weight.sum(0), 1e-8)
         share[weight.sum(0) <= 0.0] = 1.0  # plate where no splat is
-        share[share < self.config.least] = 0.0
-        share[share > 1.0 - self.config.least] = 1.0
+        share[share < _LEAST] = 0.0
+        share[share > 1.0 - _LEAST] = 1.0
         alpha = rgba[..., 3]
         own = np.stack([share * alpha, (1.0 - share) * alpha / np.maximum(1.0 - share * alpha, 1e-8)])
         own[1, share < 1.0] = np.where(alpha == 1.0, 1.0, own[1])[share < 1.0]  # to the last bit
         colour = self.light[:, rows].numpy() / np.maximum(weight, 1e-8)[..., None]
         target = rgba[..., :3] / np.maximum(alpha, 1e-8)[..., None]
         shown = share[..., None] * colour[0] + (1.0 - share[..., None]) * colour[1]
-        gain = np.clip(target / np.maximum(shown, 1e-8), 0.0, self.config.gain)
-        colour = gain * colour + (target - gain * shown)
+        gain = np.maximum(target, 0.0) / np.maximum(shown, 1e-8)
+        colour = gain * colour + (target - gain * shown)  # the remainder: splats are black, or the frame is negative
         samples = np.concatenate([colour * own[..., None], own[..., None]], axis=-1)
         return samples.astype(np.float32), self.depth[:, rows].numpy()
 
@@ -114,7 +113,7 @@ def deep_samples(
         weight.scatter_add_(0, at, (left * image.alpha)[None])
         light.scatter_add_(0, at[..., None].expand(1, height, width, 3), (left[..., None] * shown[..., :3])[None])
         left *= 1.0 - image.alpha
-    return DeepSamples(weight, light, depth, config)
+    return DeepSamples(weight, light, depth)
 
 
 def _surfaces(surface: Tensor, step: float) -> tuple[Tensor, Tensor]:

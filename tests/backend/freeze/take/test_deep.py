@@ -13,7 +13,7 @@ from torch_backend.contract import NO_DEPTH, CameraPath, FreezeParams, JobError,
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.deep_exr import DEEP_CHANNELS
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.freeze.take.deep import DeepConfig, DeepSamples
+from torch_backend.freeze.take.deep import DeepSamples
 from torch_backend.shot import write_json
 
 PLACED = Placement([0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0])
@@ -102,7 +102,7 @@ def test_two_surfaces_become_two_samples_of_the_frames_colour():
     weight = torch.tensor([[[0.3, 0.0, 0.995, 0.0]], [[0.5, 0.9, 0.0, 0.0]]])
     red, blue = torch.tensor([0.8, 0.1, 0.0]), torch.tensor([0.0, 0.1, 0.6])
     light = weight[..., None] * torch.stack([red, blue])[:, None, None]
-    deep = DeepSamples(weight, light, torch.tensor([[[1.0] * 4], [[2.0] * 4]]), DeepConfig())
+    deep = DeepSamples(weight, light, torch.tensor([[[1.0] * 4], [[2.0] * 4]]))
     rgba = np.float32([[[0.4, 0.2, 0.3, 1.0], [0.1, 0.1, 0.1, 0.5], [5.0, 0.0, -0.01, 1.0], [0.2, 0.2, 0.2, 1.0]]])
     samples, depth = deep.rows(slice(0, 1), rgba)
     np.testing.assert_allclose(over(samples[0], samples[1]), rgba, atol=1e-6)
