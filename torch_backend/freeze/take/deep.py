@@ -74,7 +74,7 @@ class DeepSamples:
         target = rgba[..., :3] / np.maximum(alpha, 1e-8)[..., None]
         shown = share[..., None] * colour[0] + (1.0 - share[..., None]) * colour[1]
         gain = np.maximum(target, 0.0) / np.maximum(shown, 1e-8)
-        colour = gain * colour + (target - gain * shown)  # the rest where splats are black, or the frame below it
+        colour = gain * colour + (target - gain * shown)  # the remainder: splats are black, or the frame is negative
         samples = np.concatenate([colour * own[..., None], own[..., None]], axis=-1)
         return samples.astype(np.float32), self.depth[:, rows].numpy()
 
