@@ -109,8 +109,9 @@ def assert_gradients(grads: dict[str, Tensor], truth: dict[str, Tensor], bound: 
 
 def on_host(out: RasterOutput) -> RasterOutput:
     """The same images on the CPU."""
-    held = {one.name: getattr(out, one.name) for one in dataclasses.fields(out)}
-    return RasterOutput(**{name: None if value is None else value.cpu() for name, value in held.items()})
+    held: dict[str, Any] = {one.name: getattr(out, one.name) for one in dataclasses.fields(out)}
+    moved: dict[str, Any] = {name: None if value is None else value.cpu() for name, value in held.items()}
+    return RasterOutput(**moved)
 
 
 def _decibels(error: Tensor) -> float:
