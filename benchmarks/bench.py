@@ -25,14 +25,14 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
 
+from benchmarks.report.records import RECORD_VERSION, RunRecord, finished, machine_facts, save_record
+from benchmarks.report.truth import TruthScene
 from benchmarks.sources import Log, child_environ, end_with_parent, load_source, make_scenes
 from benchmarks.synthetic.make import default_folder
 from benchmarks.synthetic.sizes import HARD, KINDS, LIMITS, SIZES
 from torch_backend.contract import METHODS, SUPERVISIONS, ExitCode, JobError, TrainParams, from_dict, read_json
 from torch_backend.job import new_job, run_job
 from torch_backend.native import default_threads
-from torch_backend.report.records import RECORD_VERSION, RunRecord, finished, machine_facts, save_record
-from torch_backend.report.truth import TruthScene
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.shot import content_key, locked, write_json
 from torch_backend.train import PRESETS, TrainConfig, config_from_params
@@ -400,7 +400,7 @@ def _judge(
     spec: RunSpec, truth: TruthScene, run_name: str, results: Path, trained: dict[str, Any], trained_on: str
 ) -> int:
     """Scores the trained run, on the device that trained it, and writes its record."""
-    from torch_backend.report.evaluate import evaluate_run
+    from benchmarks.report.evaluate import evaluate_run
 
     measured = evaluate_run(truth, run_name, spec.query, results, spec.run_id, Log(), trained_on)
     record = RunRecord(
@@ -440,7 +440,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return work(Path(args.work), results, args.jobs)
     if args.tied:
         end_with_parent()
-    from torch_backend.report.write import write_report
+    from benchmarks.report.write import write_report
 
     results.mkdir(parents=True, exist_ok=True)
     quick = {"max_gaussians": args.max_gaussians or QUICK_GAUSSIANS} if args.quick else {}

@@ -36,9 +36,9 @@ from torch.nn import functional as F
 from benchmarks.detail_clip import DetailClip
 from benchmarks.detail_figures import dilate
 from benchmarks.detail_truth import scene_arguments, trained
+from benchmarks.report.truth import PANES
 from benchmarks.sources import SyntheticTruth, in_words, load_synthetic
 from torch_backend.contract import SWITCH
-from torch_backend.report.truth import PANES
 from torch_backend.shot import write_json
 
 INSIDE = 2

@@ -22,10 +22,10 @@ import numpy as np
 
 from benchmarks import depth as depth_bench
 from benchmarks import detail_truth
+from benchmarks.report.records import DELIVERED, SPLATS
 from benchmarks.sources import Log, SyntheticTruth, in_words, load_synthetic
 from benchmarks.synthetic.folder import SyntheticScene
 from torch_backend.contract import TrainParams
-from torch_backend.report.records import DELIVERED, SPLATS
 from torch_backend.shot import make_folder, write_atomic, write_json
 from torch_backend.train import train_shot
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
+from benchmarks.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 
 STILL_MATTE = 0.05
 """A pixel is still if its motion matte is below this,"""

@@ -4,7 +4,7 @@ SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 t
 cameras, and an `auto` run are made in DIR if they are not there. Printed is the mean PSNR of all poses and instants
 that have a truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and what got worse; and
 their ST-LPIPS, if its weights are there: a metric of pictures that forgives a shift by two pixels. Of scenes with a
-small mover it also tells how much of that is there (`torch_backend/report/things.py`). The pose of t* itself does not
+small mover it also tells how much of that is there (`benchmarks/report/things.py`). The pose of t* itself does not
 count: plate t* is its truth. DIR gets truth-NAME.json.
 
 Pictures are judged at the size of the run, or with `--delivered` as an artist gets them: at that of the plates.
@@ -27,12 +27,12 @@ from torch import Tensor
 
 from benchmarks.bench import RunSpec, hold_out_phase, train_spec
 from benchmarks.detail_clip import DetailClip, over
+from benchmarks.report.metrics import WHOLE, score
+from benchmarks.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
+from benchmarks.report.things import overall, recall_of
+from benchmarks.report.truth import HELD, REGIONS, TruthScene
 from benchmarks.sources import in_words, load_source
 from torch_backend.contract import SWITCH
-from torch_backend.report.metrics import WHOLE, score
-from torch_backend.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
-from torch_backend.report.things import overall, recall_of
-from torch_backend.report.truth import HELD, REGIONS, TruthScene
 from torch_backend.shot import write_json
 from torch_backend.train import load_run
 

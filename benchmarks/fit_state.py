@@ -29,13 +29,13 @@ from torch.nn import functional as F
 
 from benchmarks.detail_clip import DetailClip
 from benchmarks.detail_truth import trained
+from benchmarks.report.truth import TruthScene
 from benchmarks.sources import load_source
 from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go
 from torch_backend.freeze.frozen import OutputFrame
 from torch_backend.freeze.views.reproject import blurred, resized
 from torch_backend.freeze.views.target_view import target_view
 from torch_backend.native import default_threads
-from torch_backend.report.truth import TruthScene
 from torch_backend.train import load_run
 
 NAMES = [f.name for f in fields(StateWeights) if f.name != "bias"]

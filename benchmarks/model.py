@@ -33,6 +33,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from benchmarks.detail_figures import induced_places, inside, sampled, still_pixels
+from benchmarks.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 from benchmarks.training_step import _Silent
 from torch_backend.contract import JobError, TrainParams
 from torch_backend.deformation import planes
@@ -44,7 +45,6 @@ from torch_backend.freeze.views.source_views import motion_mattes
 from torch_backend.motion.mattes import load_motion
 from torch_backend.raster import cpu as raster_cpu
 from torch_backend.raster import ssim
-from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.sfm.masks import IGNORE, load_mask
 from torch_backend.shot import Shot, write_json

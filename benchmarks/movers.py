@@ -23,10 +23,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.report.truth import THINGS, TruthScene
 from benchmarks.sources import in_words, load_source
 from torch_backend.cameras.stored import load_cameras
 from torch_backend.motion.mattes import MOVING, load_motion
-from torch_backend.report.truth import THINGS, TruthScene
 from torch_backend.shot import write_json
 
 MOVERS = ("moving", *(name for name in THINGS if name not in ("glass", "mirror", "wall")))

@@ -33,13 +33,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 from torch_backend.cameras.stored import load_cameras
 from torch_backend.contract import JobError
 from torch_backend.footage import load_frames
 from torch_backend.footage.display import display_of
 from torch_backend.footage.images import read_png
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 from torch_backend.shot import Shot, write_json
 from torch_backend.torch_types import from_numpy
 

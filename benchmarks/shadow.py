@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.report.metrics import ssim_map
 from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.regions import View
-from torch_backend.report.metrics import ssim_map
 
 RADIUS = 0.15
 """Metres: that of the ball."""

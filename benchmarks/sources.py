@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from benchmarks.report.truth import RealScene, TruthFolder, TruthScene
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.make import scene_name
 from benchmarks.synthetic.shot import SolvedPixels, exact_shot, similarity_to_exact, solved_shot
@@ -28,7 +29,6 @@ from benchmarks.synthetic.sizes import LIMITS, REPORT_SEEDS, SIZES, TUNING_SEEDS
 from torch_backend.contract import JobError, Reporter, read_json
 from torch_backend.motion_search import find_motion
 from torch_backend.native import default_threads
-from torch_backend.report.truth import RealScene, TruthFolder, TruthScene
 from torch_backend.shot import SHOT_SUFFIX, Shot, content_key, locked
 
 ROOT = Path(__file__).resolve().parents[1]

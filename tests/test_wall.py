@@ -33,7 +33,6 @@ STATIONS = (
     "motion_search",
     "freeze",
     "live",
-    "report",
 )
 """In the order of docs/architecture.md: a station imports only stations before it. `footage/plates.py` and
 `motion_search.py` are late."""
@@ -119,7 +118,6 @@ LAYOUT = {
 OTHER_FOLDERS = {
     ("splannequin_addon/process/environment.py", "summary.json"),  # of the launcher, in an environment
     ("splannequin_addon/process/environment.py", ".splannequin"),
-    ("torch_backend/report/records.py", "summary.json"),  # of a benchmark
     ("torch_backend/cameras/foreign.py", "colmap/sparse/0"),  # of another program
 }
 """(file, name) of what is called like something of the shot, and is not."""

@@ -15,8 +15,8 @@ import torch
 from benchmarks.detail_clip import DetailClip
 from benchmarks.detail_figures import FLOW_WIDTH
 from benchmarks.detail_truth import trained
+from benchmarks.report.truth import TruthScene
 from benchmarks.sources import load_source
-from torch_backend.report.truth import TruthScene
 from torch_backend.shot import Shot
 from torch_backend.train import load_run
 

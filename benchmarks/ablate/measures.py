@@ -16,11 +16,11 @@ from benchmarks.ablate.switches import RULES, detail_config, replaced, switched_
 from benchmarks.detail_clip import DetailClip, View, over
 from benchmarks.detail_figures import Flow, textured, unexplained_flow, unsteadiness
 from benchmarks.detail_flow import LEAST, Pair, Shown, lay_over
+from benchmarks.report.metrics import psnr_by_region, psnr_of
+from benchmarks.report.things import recall_of
+from benchmarks.report.truth import TruthScene
 from torch_backend.freeze.composite.compositor import CompositeFrame, Compositor
 from torch_backend.freeze.frozen import FrozenImage, OutputFrame
-from torch_backend.report.metrics import psnr_by_region, psnr_of
-from torch_backend.report.things import recall_of
-from torch_backend.report.truth import TruthScene
 
 DECISIONS = (("composite.compositor", "primary_matte"),)
 """Functions that decide from which plate a pixel comes: their CPU seconds are those of the decision."""

@@ -39,7 +39,7 @@ def test_source_and_zip_are_valid_and_hold_what_is_needed(packager, root, tmp_pa
     }  # fmt: skip
     needed = {"backend.txt", "backend.lock", "torch.lock", "torch-cpu.lock", "torch-cu130.lock", "cuda.lock"}
     assert {"splannequin_addon/registration.py", *(f"requirements/{name}" for name in needed)} <= set(names)
-    for_developers = ("torch_backend/report/", "requirements/test", "requirements/bench")
+    for_developers = ("requirements/test", "requirements/bench")
     assert not [n for n in names if n.startswith(for_developers)]
     assert {"torch_backend/contract/__init__.py", "torch_backend/contract/options.py"} <= set(names)
     assert {"splannequin_addon/translations/__init__.py", "splannequin_addon/translations/de_DE.py"} <= set(names)

@@ -21,7 +21,7 @@ from benchmarks.detail_figures import (
     unexplained_flow,
     unsteadiness,
 )
-from torch_backend.report.metrics import gradient_magnitude
+from benchmarks.report.metrics import gradient_magnitude
 
 HEIGHT, WIDTH = 120, 160
 

@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from benchmarks.bench import ABLATIONS, HOLDOUT, RunSpec, cores, override, plan, run_plan
+from benchmarks.report.evaluate import last_third_step_ms
+from benchmarks.report.records import DELIVERED, DEVELOPED, WITHHELD, finished, load_record
+from benchmarks.report.truth import RealScene, TruthFolder
+from benchmarks.report.write import write_report
 from benchmarks.sources import ROOT, last_words
 from torch_backend.contract import METHODS, read_json
 from torch_backend.deformation import host_config, hosts
-from torch_backend.report.evaluate import last_third_step_ms
-from torch_backend.report.records import DELIVERED, DEVELOPED, WITHHELD, finished, load_record
-from torch_backend.report.truth import RealScene, TruthFolder
-from torch_backend.report.write import write_report
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.train.config import config_from_json
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.report import colorvideovdp, stlpips
-from torch_backend.report.metrics import (
+from benchmarks.report import colorvideovdp, stlpips
+from benchmarks.report.metrics import (
     best_share_psnr,
     error_maps,
     gradient_energy,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.report.real import far_from, motion_shares, near
+from benchmarks.report.truth import RealScene
 from torch_backend.motion.mattes import MOVING, PAINTED, STILL, UNKNOWN, write_matte
-from torch_backend.report.real import far_from, motion_shares, near
-from torch_backend.report.truth import RealScene
 from torch_backend.shot import Shot
 
 

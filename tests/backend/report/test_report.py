@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from torch_backend.footage.images import write_png
-from torch_backend.report.metrics import score
-from torch_backend.report.records import (
+from benchmarks.report.metrics import score
+from benchmarks.report.records import (
     DELIVERED,
     DEVELOPED,
     WITHHELD,
@@ -28,8 +27,9 @@ from torch_backend.report.records import (
     machine_facts,
     save_record,
 )
-from torch_backend.report.tables import all_tables, comparisons, settings_of
-from torch_backend.report.write import write_report
+from benchmarks.report.tables import all_tables, comparisons, settings_of
+from benchmarks.report.write import write_report
+from torch_backend.footage.images import write_png
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 

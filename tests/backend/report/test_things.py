@@ -7,11 +7,11 @@ import json
 import pytest
 import torch
 
+from benchmarks.report.metrics import score
+from benchmarks.report.records import DELIVERED, Detailed, FrameScore, RunRecord, load_record, save_record
+from benchmarks.report.tables import all_tables
+from benchmarks.report.things import matte_on_panes, opened_on, recall_of, recalled
 from torch_backend.motion.mattes import MOVING, PAINTED, STILL, UNKNOWN, write_matte
-from torch_backend.report.metrics import score
-from torch_backend.report.records import DELIVERED, Detailed, FrameScore, RunRecord, load_record, save_record
-from torch_backend.report.tables import all_tables
-from torch_backend.report.things import matte_on_panes, opened_on, recall_of, recalled
 from torch_backend.shot import Shot
 
 WALL, APPLE = torch.tensor([0.5, 0.5, 0.6]), torch.tensor([0.8, 0.1, 0.1])

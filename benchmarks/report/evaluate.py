@@ -13,18 +13,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import CHECKPOINT_FILE, METRICS_FILE, SUMMARY_FILE, JobError, Reporter, read_json
-from ..footage.images import write_png
-from ..footage.plates import Plates
-from ..freeze.composite.compositor import Compositor
-from ..freeze.frozen import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
-from ..freeze.instant.instants import Instants
-from ..motion_search import find_motion
-from ..scene import Scene, evenly_spaced, load_scene, read_image, split_frames
-from ..shot import Shot
-from ..train import LoadedRun, load_run
-from ..train.checkpoint import load_checkpoint
-from ..train.model import render
+from torch_backend.contract import CHECKPOINT_FILE, METRICS_FILE, SUMMARY_FILE, JobError, Reporter, read_json
+from torch_backend.footage.images import write_png
+from torch_backend.footage.plates import Plates
+from torch_backend.freeze.composite.compositor import Compositor
+from torch_backend.freeze.frozen import FrozenGaussians, FrozenImage, OutputFrame, freeze_at, render_frozen, span_of
+from torch_backend.freeze.instant.instants import Instants
+from torch_backend.motion_search import find_motion
+from torch_backend.scene import Scene, evenly_spaced, load_scene, read_image, split_frames
+from torch_backend.shot import Shot
+from torch_backend.train import LoadedRun, load_run
+from torch_backend.train.checkpoint import load_checkpoint
+from torch_backend.train.model import render
+
 from .colorvideovdp import sequence_jod
 from .metrics import best_share_psnr, gradient_energy, missing_metrics, psnr_by_region, score
 from .records import DELIVERED, DEVELOPED, PICTURES, SPLATS, WITHHELD, Detailed, FrameScore, HeldOut, Picture

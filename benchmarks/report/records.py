@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..contract import check_version, from_dict, read_json
-from ..shot import write_json
+from torch_backend.contract import check_version, from_dict, read_json
+from torch_backend.shot import write_json
+
 from .metrics import WHOLE, Key
 
 RECORD_VERSION = 4

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..shot import write_atomic, write_json
+from torch_backend.shot import write_atomic, write_json
+
 from . import plots
 from .metrics import WHOLE
 from .page import page

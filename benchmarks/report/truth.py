@@ -17,10 +17,11 @@ from typing import Protocol
 
 from torch import Tensor
 
-from ..contract import check_version, read_json
-from ..motion.mattes import motion_key
-from ..scene import evenly_spaced, load_scene, read_image
-from ..shot import Shot, content_key
+from torch_backend.contract import check_version, read_json
+from torch_backend.motion.mattes import motion_key
+from torch_backend.scene import evenly_spaced, load_scene, read_image
+from torch_backend.shot import Shot, content_key
+
 from .real import ensure_motion, far_from, motion_shares
 
 TRUTH_VERSION = 1

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from ..contract import Reporter
-from ..motion.mattes import MOVING, STILL, load_motion
-from ..motion_search import find_motion
-from ..shot import Shot
-from ..torch_types import from_numpy
+from torch_backend.contract import Reporter
+from torch_backend.motion.mattes import MOVING, STILL, load_motion
+from torch_backend.motion_search import find_motion
+from torch_backend.shot import Shot
+from torch_backend.torch_types import from_numpy
 
 MARGIN = 8.0
 """A still pixel this near to a mover, in pixels of a picture 640 wide, is no truth: outlines of movers are soft, and so

@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from ..torch_types import from_numpy
+from torch_backend.torch_types import from_numpy
+
 from . import colorvideovdp, stlpips
 
 METRICS = {"psnr_db": True, "ssim": True, "st_lpips": False, "flip": False}

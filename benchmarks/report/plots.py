@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ..footage.images import read_png
-from ..shot import atomic_path
+from torch_backend.footage.images import read_png
+from torch_backend.shot import atomic_path
+
 from .metrics import pareto_front
 from .records import Picture, RunRecord
 from .setting import Setting
