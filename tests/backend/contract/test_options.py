@@ -94,7 +94,7 @@ def read_of(files, names: tuple[str, ...]) -> set[str]:
     ("kind", "station"),
     [
         ("import", "footage"),
-        ("solve", "solve"),
+        ("solve", "sfm"),
         ("train", "train"),
         ("freeze", "freeze"),
         ("mattes", "freeze"),
