@@ -92,8 +92,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     has to consent, and the old frames and that work are kept in SHOT/replaced. An import that gives the same pictures
     replaces nothing.
 
-    Returns {frames, solved_frames, first, last, step, width, height, fps, colour, reading,
-    read_as, source}.
+    Returns {frames, solved_frames, first, last, step, width, height, fps, colour, reading, read_as, source}.
     Raises JobError (FOOTAGE, DISK) in one sentence, and Cancelled; either leaves no half import behind.
     """
     _check(config)

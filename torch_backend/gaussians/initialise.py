@@ -48,16 +48,9 @@ class InitConfig:
 
 
 def initialise(
-    scene: Scene,
-    images: Tensor,
-    indices: list[int],
-    bins: int,
-    config: InitConfig,
-    generator: torch.Generator,
-    budget: int,
-    ignored: Mapping[int, Tensor] | None = None,
-    depth: Callable[[int], Tensor | None] | None = None,
-) -> Gaussians:
+    scene: Scene, images: Tensor, indices: list[int], bins: int, config: InitConfig, generator: torch.Generator,
+    budget: int, ignored: Mapping[int, Tensor] | None = None, depth: Callable[[int], Tensor | None] | None = None,
+) -> Gaussians:  # fmt: skip
     """Gaussians from points and seeds, on the CPU, where the scene is.
 
     Args:

@@ -53,12 +53,7 @@ def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> Taken:
 
 
 def take_over(
-    shot: Shot,
-    frames: dict[str, Any],
-    taken: Taken,
-    options: dict[str, Any],
-    scratch: Path,
-    report: Reporter,
+    shot: Shot, frames: dict[str, Any], taken: Taken, options: dict[str, Any], scratch: Path, report: Reporter
 ) -> dict[str, Any]:
     """Has the worker do what given cameras leave to do: undistort their lenses, and triangulate points if need be.
 

@@ -78,20 +78,11 @@ class Trainer:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        images: Tensor,
-        train: list[int],
-        config: TrainConfig,
-        report: Reporter,
-        identity: dict[str, Any] | None = None,
-        device: torch.device | str = "cpu",
-        movers: Tensor | None = None,
-        ignored: dict[int, Tensor] | None = None,
-        most: int | None = None,
-        pieces: int | None = None,
+        self, scene: Scene, images: Tensor, train: list[int], config: TrainConfig, report: Reporter,
+        identity: dict[str, Any] | None = None, device: torch.device | str = "cpu", movers: Tensor | None = None,
+        ignored: dict[int, Tensor] | None = None, most: int | None = None, pieces: int | None = None,
         depth: FittedDepth | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.identity, self.device = identity or {}, torch.device(device)
         self.scene, self.images, self.train_ids, self.config, self.report = scene, images, train, config, report
         self.movers = movers if config.decides else None
