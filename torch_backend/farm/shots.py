@@ -39,7 +39,7 @@ from ..contract.option_table import options_of
 from ..footage.images import working_size
 from ..footage.numbering import renumbered, shift_of
 from ..footage.opening import open_source
-from ..footage.sequence import PICTURES
+from ..footage.sequence_files import PICTURES
 from .request import shot_name
 
 _LONGEST = 40

@@ -19,7 +19,7 @@ from .images import check_size, error_of
 from .importing import load_frames
 from .oiio_types import channel_names
 from .pairing import counted_of, pair, pairing_words
-from .sequence import find_sequence
+from .sequence_files import find_sequence
 from .sources import footage_error, frame_words
 
 _FARTHEST = 1e9

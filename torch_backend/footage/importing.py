@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,6 @@ from ..contract import (
     ShotFolder,
     UserError,
     frame_file,
-    is_half_written,
     later,
     mapped,
     read_json,
@@ -38,11 +36,10 @@ from ..shot import Shot, content_key, make_folder, need_disk, replacing_folder, 
 from .analysis import FrameMeasures, automatic_step, choose_solved, flag_duplicate, looks_like_log, measure
 from .bars import Bars, find_bars
 from .burnt_in import WIDTH, find_mark, looked_at
-from .continuity import small_grey
-from .cuts import Frames, Transition, find_transitions
-from .display import MOST_LIGHT, PLAIN, ROLLED, Display, clipped_share
+from .display import PLAIN, ROLLED, Display, clipped_share
 from .earlier_work import EarlierWork, SamePictures, digest_of, footage_key
 from .images import is_whole_png, read_frame, resize, working_size, write_png
+from .import_findings import Extracted, refuse_cuts, refuse_unusable, remarks
 from .numbering import recorded_shift, renumbered, shift_of
 from .ocio import Colours
 from .opening import open_source
@@ -55,31 +52,17 @@ from .sources import (
     SourceFrame,
     SourceInfo,
     footage_error,
-    frame_words,
     told_in,
 )
+from .strangers import keep_strangers
 
 FRAMES_VERSION = 1
-MANY_FRAMES = 1500
-EXPOSURE_DRIFT_STOPS = 1.0
-CLIPPED_SHARE = 0.01
 _WRITERS = 2
 _DISK_CHECK_FRAMES = 16
 
 
 FootageConfig = ImportParams
 """What is taken of the footage, and how large. Which footage that is, is asked for apart: `source` is not looked at."""
-
-
-@dataclass
-class _Extracted:
-    """Frames on disk and what was measured of them, in order."""
-
-    measures: list[FrameMeasures]
-    seconds: list[float]
-    clipped: float
-    width: int
-    height: int
 
 
 def import_footage(shot: Shot, source: str, config: FootageConfig, report: Reporter) -> dict[str, Any]:
@@ -119,8 +102,8 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     try:
         with replacing_folder(shot.frames, keep=earlier is not None) as fresh:
             extracted = _extract(shot, opened, numbered, fresh / RAW_FOLDER, report)
-            _refuse_unusable(extracted.measures)
-            _refuse_cuts(extracted.measures, fresh / RAW_FOLDER, shift)
+            refuse_unusable(extracted.measures)
+            refuse_cuts(extracted.measures, fresh / RAW_FOLDER, shift)
             record = _record(opened, config, extracted, key, shift)
             record["beside"] = _beside(shot, source)
             if earlier is not None:
@@ -128,12 +111,12 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
                 if not config.replace:
                     raise earlier.refusal()
                 order = earlier.order(record)
-            for message, hint in opened.warnings + _remarks(extracted) + _log_remark(opened.info, config, extracted):
+            for message, hint in opened.warnings + remarks(extracted) + _log_remark(opened.info, config, extracted):
                 report.warning(message, hint)
             record |= _marked(shot, record, fresh, report)
             write_json(fresh / FRAMES_FILE, record)
             write_json(fresh / UNPUBLISHED_FILE, _news(record, source) | order)
-            _keep_strangers(shot.frames, fresh, record)
+            keep_strangers(shot.frames, fresh, record)
     except SamePictures:
         report.progress("import", 1, 1, "already imported")
         shot.update(source=str(source))
@@ -280,7 +263,7 @@ def _finished(shot: Shot, keys: set[str]) -> dict[str, Any] | None:
     return record if whole else None
 
 
-def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, report: Reporter) -> _Extracted:
+def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, report: Reporter) -> Extracted:
     """Decodes, resizes, measures and writes every frame of the range."""
     info = opened.info
     width, height = working_size(info.width, info.height, config.working_height)
@@ -321,7 +304,7 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
                 collect()
         while pending:
             collect()
-    return _Extracted(measures, seconds, clipped, width, height)
+    return Extracted(measures, seconds, clipped, width, height)
 
 
 def _work(frame: SourceFrame, width: int, height: int, display: Display, into: Path) -> FrameMeasures:
@@ -343,64 +326,7 @@ def _expected(opened: Source, config: FootageConfig) -> int:
     return min(info.last, info.last if config.last is None else config.last) - first + 1
 
 
-def _refuse_unusable(measures: list[FrameMeasures]) -> None:
-    """JobError for a clip that no solve could use: too short, or a still."""
-    if len(measures) < LEAST_FRAMES:
-        raise footage_error(
-            f"The clip has only {len(measures)} frames: a freeze needs at least {LEAST_FRAMES}.",
-            "Choose a longer clip or range.",
-        )
-    usable = sum(not m.flags for m in measures)
-    repeated = sum("duplicate" in m.flags for m in measures)
-    if usable < LEAST_FRAMES:
-        if repeated > len(measures) // 2:
-            raise footage_error(
-                f"The picture does not change in {repeated} of {len(measures)} frames: the camera stands still.",
-                "A freeze needs a clip in which the camera moves sideways by a step or more.",
-            )
-        raise footage_error(
-            f"Only {usable} of {len(measures)} frames are usable, the others are blank, damaged or repeated.",
-            f"A freeze needs at least {LEAST_FRAMES}: choose another range.",
-        )
-
-
-def _refuse_cuts(measures: list[FrameMeasures], folder: Path, shift: int) -> None:
-    """JobError for a clip of several takes; `folder` holds its working frames. `shift`: see `numbering`."""
-
-    def picture(index: int) -> NDArray[np.uint8]:
-        return small_grey(read_frame(folder / frame_file(measures[index].frame, PICTURE)))
-
-    features = [m.features for m in measures]
-    frames = Frames([f for f in features if f is not None], [m.exposure for m in measures], picture)
-    found = find_transitions(frames, [n for n, m in enumerate(measures) if not m.flags])
-    if found:
-        raise _cut_error([m.frame - shift for m in measures], found)
-
-
-def _cut_error(numbers: list[int], found: list[Transition]) -> Exception:
-    """The error, in the footage's own `numbers`, which the range that it proposes has to be in."""
-    starts = [numbers[0], *(numbers[one.after] for one in found)]
-    ends = [*(numbers[one.before] for one in found), numbers[-1]]
-    longest = max(zip(starts, ends, strict=True), key=lambda take: take[1] - take[0])
-    takes = [f"{a} to {b}" for a, b in zip(starts, ends, strict=True) if b - a + 1 >= LEAST_FRAMES]
-    where = [_transition_words(one.kind, numbers[one.before], numbers[one.after]) for one in found[:3]]
-    where += ["more"] if len(found) > 3 else []
-    return footage_error(
-        f"The clip has {', '.join(where)}: a freeze needs one continuous take.",
-        f"Pass the range of one take: {', '.join(takes[:6])} (for example --first {longest[0]} --last {longest[1]})."
-        if takes
-        else f"No take of it has {LEAST_FRAMES} frames: choose another clip.",
-    )
-
-
-def _transition_words(kind: str, before: int, after: int) -> str:
-    """A transition as part of a sentence, by the last frame before it and the first one after it."""
-    if kind == "hard cut":
-        return f"a hard cut at frame {after}"
-    return f"a {kind} between frames {before} and {after}"
-
-
-def _log_remark(info: SourceInfo, config: FootageConfig, extracted: _Extracted) -> list[tuple[str, str]]:
+def _log_remark(info: SourceInfo, config: FootageConfig, extracted: Extracted) -> list[tuple[str, str]]:
     """A warning about a clip that looks like a camera's log and was taken for a display."""
     tones = looks_like_log(extracted.measures)
     if tones is None or info.colour == "linear" or config.colour_space or config.lut:
@@ -415,37 +341,7 @@ def _log_remark(info: SourceInfo, config: FootageConfig, extracted: _Extracted) 
     ]
 
 
-def _remarks(extracted: _Extracted) -> list[tuple[str, str]]:
-    """Warnings (message, hint) about a clip that is usable."""
-    remarks: list[tuple[str, str]] = []
-    measures = extracted.measures
-    stops = [m.exposure for m in measures if not m.flags]
-    drift = max(stops) - min(stops)
-    if drift > EXPOSURE_DRIFT_STOPS:
-        remarks.append(
-            (
-                f"The exposure changes by {drift:.1f} stops over the clip.",
-                "Lock exposure and white balance when filming.",
-            )
-        )
-    if extracted.clipped > CLIPPED_SHARE:
-        remarks.append(
-            (
-                f"Up to {100 * extracted.clipped:.0f} % of a frame is brighter than {MOST_LIGHT:.0f} times white: what "
-                "splats show of it is cut there.",
-                "Lower the exposure.",
-            )
-        )
-    if len(measures) > MANY_FRAMES:
-        remarks.append((f"The clip has {len(measures)} frames, which will take long.", "Take a shorter range."))
-    for flag, words in (("duplicate", "repeats"), ("blank", "blank"), ("corrupt", "damaged")):
-        numbers = [m.frame for m in measures if flag in m.flags]
-        if numbers:
-            remarks.append((f"Neither solved nor trained on, for being {words}: {frame_words(numbers)}.", ""))
-    return remarks
-
-
-def _record(opened: Source, config: FootageConfig, extracted: _Extracted, key: str, shift: int) -> dict[str, Any]:
+def _record(opened: Source, config: FootageConfig, extracted: Extracted, key: str, shift: int) -> dict[str, Any]:
     """frames.json; `shift`: see `numbering`."""
     measures, info = extracted.measures, opened.info
     step = config.step or automatic_step(len(measures), info.fps)
@@ -559,46 +455,6 @@ def _displayed(info: SourceInfo, measures: list[FrameMeasures]) -> dict[str, Any
     """What frames.json says of the working frames' display, as `display_of` reads it."""
     display = display_for(info)
     return {"display": display.name, "brightest": max(m.brightest for m in measures)} if display.bends else {}
-
-
-def _keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:
-    """Takes over what lies in the frames folder and is not ours, under its own name or, where we need that, another.
-
-    Ours are the listing, the frames that it names, and their undistorted copies beside raw/.
-    """
-    ours, needed = _listed(old / FRAMES_FILE), _names(record)
-    for found in sorted(p for p in old.rglob("*") if p.is_symlink() or not p.is_dir()):
-        name = found.relative_to(old)
-        if name in ours or is_half_written(name.name):
-            continue
-        while name in needed or os.path.lexists(fresh / name):
-            name = name.with_name(f"{name.stem}.kept{name.suffix}")
-        target = fresh / name
-        make_folder(target.parent)
-        try:
-            os.link(found, target, follow_symlinks=False)
-        except (OSError, NotImplementedError):  # no hard links there: a network share, a memory card
-            shutil.copy2(found, target, follow_symlinks=False)
-
-
-def _listed(listing: Path) -> set[Path]:
-    """Our files in a folder with this frames.json; the listing alone if it cannot be read: no other is known to be."""
-    try:
-        return _names(read_json(listing))
-    except (OSError, ValueError, KeyError, TypeError):
-        return {Path(FRAMES_FILE)}
-
-
-def _names(record: dict[str, Any]) -> set[Path]:
-    """Files of an import, relative to the frames folder, and the undistorted ones that a solve writes beside raw/."""
-    files = [Path(str(row["file"])) for row in record["frames"]]
-    return {
-        Path(FRAMES_FILE),
-        Path(BURNT_IN_FILE),
-        Path(UNPUBLISHED_FILE),
-        *files,
-        *(Path(file.name) for file in files),
-    }
 
 
 def _news(record: dict[str, Any], source: str) -> dict[str, Any]:

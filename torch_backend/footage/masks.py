@@ -28,7 +28,8 @@ from .layers import find_layer
 from .opening import open_video, opens_as_video
 from .orientation import UPRIGHT, Orientation, orientation_of_picture
 from .pairing import counted_of, pair, pairing_words
-from .sequence import AS_STORED, SequenceSource, find_sequence, sequence_of_file, straight_colour
+from .sequence import AS_STORED, SequenceSource, straight_colour
+from .sequence_files import find_sequence, sequence_of_file
 from .sources import footage_error, frame_words
 from .video import VideoSource
 

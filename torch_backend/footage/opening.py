@@ -13,7 +13,8 @@ from av.error import FFmpegError
 from ..contract import JobError, is_pattern, regular_file
 from .images import error_of
 from .ocio import Colours
-from .sequence import PICTURES, SequenceSource, find_sequence, numbered_neighbours, unreadable_pictures
+from .sequence import SequenceSource
+from .sequence_files import PICTURES, find_sequence, numbered_neighbours, unreadable_pictures
 from .sources import Source, Told, footage_error
 from .video import VideoSource
 

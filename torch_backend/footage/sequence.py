@@ -5,7 +5,6 @@ What was made for a display and is not 8-bit sRGB already becomes 16-bit sRGB.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,12 +17,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ..contract import (
-    JobError,
-    NumberedFiles,
-    ending,
     file_as_blender_counts,
-    matching_files,
-    numbered_files,
     parse_timecode,
     regular_file,
 )
@@ -36,9 +30,9 @@ from .look import look_space
 from .ocio import Colours
 from .oiio_types import attribute, bits_of, channel_names
 from .orientation import UPRIGHT, Orientation, orientation_of_picture
+from .sequence_files import FEW, PictureSequence
 from .sources import (
     FASTEST_FPS,
-    LEAST_FRAMES,
     SLOWEST_FPS,
     Known,
     PlateReader,
@@ -52,131 +46,12 @@ from .sources import (
 )
 
 DEFAULT_FPS = 24.0
-FEW = 2
-_NO_PICTURES = {"null", "term"}
-"""Formats of OpenImageIO that hold none: one makes pictures up, one writes text."""
-
-
-def _picture_endings() -> frozenset[str]:
-    formats = (one.partition(":") for one in oiio.get_string_attribute("extension_list").split(";"))
-    readable = set(oiio.get_string_attribute("input_format_list").split(",")) - _NO_PICTURES
-    return frozenset(f".{end}" for name, _, ends in formats if name in readable for end in ends.split(","))
-
-
-PICTURES = _picture_endings()
-"""Endings of files that OpenImageIO reads, lower case."""
 
 
 _IN_BLENDER = {
     ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
 }  # fmt: skip
 """Endings of files that Blender shows alike. It knows no JPEG XL, and loses a line of a colour of SGI files."""
-
-
-@dataclass(frozen=True)
-class PictureSequence:
-    """The files of a numbered image sequence."""
-
-    folder: Path
-    numbered: NumberedFiles
-
-    @property
-    def pattern(self) -> str:
-        """Name of its files with # for the frame number."""
-        return self.numbered.pattern
-
-    @property
-    def files(self) -> dict[int, Path]:
-        """Frame number -> file, ascending."""
-        return {number: self.folder / name for number, name in self.numbered.files.items()}
-
-
-def find_sequence(path: Path) -> PictureSequence:
-    """The sequence that a folder, one file of it, or a pattern (shot.####.exr, *_left.%04d.png) stands for.
-
-    JobError if there is none, if a file has no number, or if several are meant.
-    """
-    if path.is_dir():
-        return _only(path, _sequences_in(path, _names_in(path)), f"The folder {path} holds", _no_sequence_in(path))
-    if not path.exists():
-        found = matching_files(_names_in(path.parent), path.name)
-        missing = footage_error(
-            f"No pictures match {path}.", "Check the folder and the pattern: # or %04d stands for the frame number."
-        )
-        return _only(path.parent, [s for s in found if _is_readable(s)], f"{path} means", missing)
-    found = sequence_of_file(path)
-    if found is None:
-        raise footage_error(
-            f"{path.name} is a single picture, not part of a numbered sequence.",
-            "A freeze needs a clip: choose a video or a sequence.",
-        )
-    return found
-
-
-def sequence_of_file(path: Path) -> PictureSequence | None:
-    """The sequence that a picture belongs to; None if it is a single one. JobError if it belongs to several."""
-    found = [s for s in _sequences_in(path.parent, _names_in(path.parent)) if path.name in s.files.values()]
-    return _only(path.parent, found, f"{path.name} belongs to", None) if found else None
-
-
-def numbered_neighbours(path: Path) -> NumberedFiles | None:
-    """The numbered files, of whatever ending, that a file belongs to; None if it stands alone."""
-    found = numbered_files(_names_in(path.parent))
-    return next((s for s in found if len(s.files) >= FEW and path.name in s.files.values()), None)
-
-
-def unreadable_pictures(pattern: str) -> JobError:
-    """The refusal of numbered files that OpenImageIO does not read."""
-    return footage_error(
-        f"{pattern} cannot be read: OpenImageIO does not know the ending {ending(pattern) or 'of these pictures'}.",
-        "Convert them to PNG, TIFF or EXR.",
-    )
-
-
-def _names_in(folder: Path) -> list[str]:
-    try:
-        with os.scandir(folder) as entries:
-            # A dot: what macOS and programs keep beside a file under its name.
-            return [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
-    except OSError:
-        return []
-
-
-def _sequences_in(folder: Path, names: list[str]) -> list[NumberedFiles]:
-    readable = [name for name in names if Path(name).suffix.lower() in PICTURES]
-    return [s for s in numbered_files(readable) if len(s.files) >= FEW or s.twice]
-
-
-def _is_readable(numbered: NumberedFiles) -> bool:
-    """True if OpenImageIO reads such files."""
-    return Path(next(iter(numbered.files.values()))).suffix.lower() in PICTURES
-
-
-def _only(folder: Path, found: list[NumberedFiles], who: str, missing: JobError | None) -> PictureSequence:
-    """The one of the sequences found. JobError if there are several, or files with the same number."""
-    if not found and missing is not None:
-        raise missing
-    if len(found) > 1:
-        names = ", ".join(s.pattern for s in found[:4]) + (", ..." if len(found) > 4 else "")
-        raise footage_error(
-            f"{who} {len(found)} image sequences ({names}).",
-            f"Choose one by its pattern, such as {found[0].pattern}, or by one of its pictures.",
-        )
-    if found[0].twice:
-        raise footage_error(
-            f"{found[0].twice[0]} and {found[0].twice[1]} have the same frame number.",
-            "Move one of the two sequences to another folder.",
-        )
-    return PictureSequence(folder, found[0])
-
-
-def _no_sequence_in(folder: Path) -> JobError:
-    others = sorted(numbered_files(_names_in(folder)), key=lambda s: -len(s.files))
-    if others and len(others[0].files) >= LEAST_FRAMES and not _is_readable(others[0]):
-        return unreadable_pictures(others[0].pattern)
-    return footage_error(
-        f"The folder {folder} holds no numbered image sequence.", "Choose a folder with frames, or a video."
-    )
 
 
 _NO_ORIENTATION = (
@@ -221,10 +96,7 @@ class SequenceSource:
         self._stored = spec.full_width, spec.full_height
         width, height = self._orientation.size(*square_size(*self._stored, self._aspect))
         self._describe(names, layer, (width, height))
-        rate = attribute(spec, "framesPerSecond") or attribute(spec, "FramesPerSecond")
-        if isinstance(rate, tuple):  # a rational, as OpenEXR stores it
-            rate = rate[0] / rate[1] if rate[1] else 0.0
-        rate = rate if isinstance(rate, (int, float)) and SLOWEST_FPS <= rate <= FASTEST_FPS else 0.0
+        rate = fps or _rate(spec)
         space, light = self._space, self._space.is_light
         reading_key = [space.name, self._layer.name, float(self._aspect), "straight", *space.origin.values()]
         ordinary = space.as_it_stands or space == InputSpace("lin", declared=space.declared)
@@ -236,7 +108,7 @@ class SequenceSource:
         self.info = SourceInfo(
             width=width,
             height=height,
-            fps=float(fps or rate or DEFAULT_FPS),
+            fps=float(rate or DEFAULT_FPS),
             first=min(self._files),
             last=max(self._files),
             deep=light or not space.as_it_stands or str(spec.format) not in ("uint8", "int8"),
@@ -254,25 +126,32 @@ class SequenceSource:
             reading={
                 "files": sequence.pattern,
                 "numbers": [min(self._files), max(self._files)],
-                "colour": space.name,
-                "colour_told": space.declared,
-                **space.origin,
-                **({"light": space.light} if space.light != LIGHTS[0] else {}),
-                "layer": self._layer.name,
                 "layers": names,
-                "alpha": self._layer.alpha is not None,
-                "pixel_aspect": float(self._aspect),
                 "pixel_aspect_told": aspect is not None,
-                "fps_told": bool(fps or rate),
-                "timecode": parse_timecode(str(spec.get_string_attribute("smpte:TimeCode"))),
-                "bits": bits_of(spec),
-                "orientation": self._orientation.code,
-                **({"focal_35mm": lens} if (lens := focal_of_picture(spec)) else {}),
+                "fps_told": bool(rate),
+                **self._reading(spec),
             },
             file=str(first),
             probe=space.probe,
             unlike=_unlike(spec, len(names), self._aspect, self._orientation) or _named_unlike(first.name, self._files),
         )
+
+    def _reading(self, spec: oiio.ImageSpec) -> dict[str, Any]:
+        """How the pictures are read, for frames.json."""
+        space = self._space
+        return {
+            "colour": space.name,
+            "colour_told": space.declared,
+            **space.origin,
+            **({"light": space.light} if space.light != LIGHTS[0] else {}),
+            "layer": self._layer.name,
+            "alpha": self._layer.alpha is not None,
+            "pixel_aspect": float(self._aspect),
+            "timecode": parse_timecode(str(spec.get_string_attribute("smpte:TimeCode"))),
+            "bits": bits_of(spec),
+            "orientation": self._orientation.code,
+            **({"focal_35mm": lens} if (lens := focal_of_picture(spec)) else {}),
+        }
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
         """See `Source.frames`."""
@@ -479,6 +358,14 @@ def _former_name(sequence: PictureSequence) -> str:
     width = len(hashes[0])
     pad = "#" * (width // 4) if width % 4 == 0 else "@" * width
     return f"{sequence.pattern[: hashes.start()]}{numbers[0]}-{numbers[-1]}{pad}{sequence.pattern[hashes.end() :]}"
+
+
+def _rate(spec: oiio.ImageSpec) -> float:
+    """Frames per second that a picture tells; 0 if it tells none, or none that can be."""
+    rate = attribute(spec, "framesPerSecond") or attribute(spec, "FramesPerSecond")
+    if isinstance(rate, tuple):  # a rational, as OpenEXR stores it
+        rate = rate[0] / rate[1] if rate[1] else 0.0
+    return float(rate) if isinstance(rate, (int, float)) and SLOWEST_FPS <= rate <= FASTEST_FPS else 0.0
 
 
 def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:

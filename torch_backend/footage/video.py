@@ -13,7 +13,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
-from ..contract import MOST_PIXELS, open_regular, parse_timecode, regular_file
+from ..contract import MOST_PIXELS, regular_file
 from . import plate_encoding
 from .av_types import seconds_of
 from .color import DIFFUSE_WHITE_NITS, InputSpace
@@ -38,9 +38,19 @@ from .sources import (
     frame_words,
     square_size,
 )
-
-NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
-"""FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
+from .video_stream import (
+    alpha_decoder_of,
+    count_from_duration,
+    first_frame,
+    listed,
+    no_video,
+    pixel_aspect,
+    promise,
+    size_words,
+    stream_of,
+    streams_of,
+    timecode,
+)
 
 _ANIMATED_PICTURES = {"apng", "gif"}
 """Formats of FFmpeg that other programs take for pictures."""
@@ -81,17 +91,17 @@ class VideoSource:
         self.warnings: list[tuple[str, str]] = []
         told = told or Told()
         with self._open() as container:
-            stream = _stream_of(container, path, layer)
+            stream = stream_of(container, path, layer)
             self._tell_streams(container, stream)
             if stream.codec_context.width * stream.codec_context.height > MOST_PIXELS:
                 raise too_large(path.name, stream.codec_context.width, stream.codec_context.height)
-            frame = _first_frame(container, stream, path)
+            frame = first_frame(container, stream, path)
             self._is_picture = container.format.name in _ANIMATED_PICTURES
             matrix = display_matrix(frame)
             orientation = UPRIGHT if matrix is None else orientation_of_matrix(matrix)
             self._orientation, self._rotation = orientation or UPRIGHT, frame.rotation
             # FFmpeg makes the stream's pixel aspect of the matrix: of one that is not applied it means nothing.
-            aspect = told.pixel_aspect or _pixel_aspect(stream if orientation else stream.codec_context)
+            aspect = told.pixel_aspect or pixel_aspect(stream if orientation else stream.codec_context)
             self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
             look = look_space(told.look) if told.look else None
             self._space = look or _chosen_space(path, colours or Colours()) or _input_space(frame, self.warnings)
@@ -100,11 +110,11 @@ class VideoSource:
             self._size = width, height = self._shown_size(frame)
             rate = stream.average_rate or stream.guessed_rate
             rate_told, rate = bool(rate), rate or Fraction(24)
-            count = stream.frames or _count_from_duration(container, stream, rate)
+            count = stream.frames or count_from_duration(container, stream, rate)
             self._fields = "" if frame.interlaced_frame else self._unmarked_fields(frame.height)
             self._interlaced = bool(frame.interlaced_frame or self._fields)
-            self._promise = _promise(container, stream, rate)
-            self._alpha_decoder = _alpha_decoder_of(stream)
+            self._promise = promise(container, stream, rate)
+            self._alpha_decoder = alpha_decoder_of(stream)
             held = any(component.is_alpha for component in frame.format.components)
             self.has_alpha = held or bool(self._alpha_decoder)
             """True if the clip has an alpha that `alphas` can read."""
@@ -114,13 +124,8 @@ class VideoSource:
             reading = {
                 **_reading(frame, self._space, self._coding),
                 "fps_told": rate_told,
-                "pixel_aspect": float(self._aspect),
                 "pixel_aspect_told": aspect is not None,
-                "alpha": self.has_alpha,
-                "interlaced": self._interlaced,
-                "timecode": _timecode(container, stream),
-                "orientation": self._orientation.code,
-                **({"focal_35mm": lens} if (lens := focal_of_video(container, stream)) else {}),
+                **self._reading_of(container, stream),
             }
         stat = path.stat()
         reading_key = _reading_key(self._space) + (["deinterlaced"] if self._interlaced else [])
@@ -143,6 +148,17 @@ class VideoSource:
             probe=self._space.probe,
             unlike=self._unlike(frame, orientation),
         )
+
+    def _reading_of(self, container: Any, stream: Any) -> dict[str, Any]:
+        """How the stream is read, for frames.json."""
+        return {
+            "pixel_aspect": float(self._aspect),
+            "alpha": self.has_alpha,
+            "interlaced": self._interlaced,
+            "timecode": timecode(container, stream),
+            "orientation": self._orientation.code,
+            **({"focal_35mm": lens} if (lens := focal_of_video(container, stream)) else {}),
+        }
 
     def _unlike(self, frame: av.VideoFrame, orientation: Orientation | None) -> str:
         """Why other programs show the clip otherwise, see `SourceInfo.unlike`."""
@@ -169,7 +185,7 @@ class VideoSource:
         number, got, seen, noticed = 0, 0, _Seen(), Noticed()
         lost: list[int] = []
         with self._open() as container:
-            stream = _stream_of(container, self.path, self.layer)
+            stream = stream_of(container, self.path, self.layer)
             stream.thread_type = "AUTO"
             for frame in decoded(container, stream, noticed, self._fields):
                 number += 1
@@ -210,7 +226,7 @@ class VideoSource:
         if not self.has_alpha:
             raise footage_error(f"{self.path.name} has no alpha.", "Give the mask as pictures of their own.")
         with self._open() as container:
-            stream = _stream_of(container, self.path, self.layer)
+            stream = stream_of(container, self.path, self.layer)
             stream.thread_type = "AUTO"
             decoder = None
             if self._alpha_decoder:
@@ -257,7 +273,7 @@ class VideoSource:
     def open(self, threads: int) -> tuple[Any, Any]:
         """The container and its stream, to be decoded by at most so many threads. JobError if it cannot be opened."""
         container = self._open()
-        stream = _stream_of(container, self.path, self.layer)
+        stream = stream_of(container, self.path, self.layer)
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
         return container, stream
@@ -295,7 +311,7 @@ class VideoSource:
 
     def _tell_streams(self, container: Any, stream: Any) -> None:
         """Says which of several video streams is read."""
-        streams = _streams_of(container, self.path)
+        streams = streams_of(container, self.path)
         self.has_streams = len(streams) > 1
         """True if there is another that `layer` could name."""
         # Blender shows the first.
@@ -304,8 +320,8 @@ class VideoSource:
             number = 1 + [one.index for one in streams].index(stream.index)
             self.warnings.append(
                 (
-                    f"The clip has {len(streams)} video streams: number {number} is taken, {_size_words(stream)}.",
-                    f"Name another by its number (--layer): {_listed(streams)}.",
+                    f"The clip has {len(streams)} video streams: number {number} is taken, {size_words(stream)}.",
+                    f"Name another by its number (--layer): {listed(streams)}.",
                 )
             )
 
@@ -317,7 +333,7 @@ class VideoSource:
         key = str(self.path), stat.st_size, stat.st_mtime_ns
         if key not in _fields_of:
             with self._open() as container:
-                stream = _stream_of(container, self.path, self.layer)
+                stream = stream_of(container, self.path, self.layer)
                 stream.thread_type = "AUTO"
                 _fields_of[key] = unmarked_fields(container, stream)
         return _fields_of[key]
@@ -329,7 +345,7 @@ class VideoSource:
                 regular_file(self.path, None), options={"protocol_whitelist": "file"}, metadata_errors="ignore"
             )
         except FFmpegError as error:
-            raise _no_video(self.path) from error
+            raise no_video(self.path) from error
 
     def _upright(self, frame: av.VideoFrame) -> NDArray[Any]:
         """[H, W, 3] uint8 or uint16 sRGB, or float16 light."""
@@ -397,101 +413,6 @@ def _deinterlaced_words(which: str) -> tuple[str, str]:
     return message, "Film progressive where you can: half of its lines are interpolated."
 
 
-_ATOMS = {b"ftyp", b"mdat", b"free", b"skip", b"wide", b"uuid", b"pnot", b"moof", b"sidx", b"styp", b"meta"}
-"""What MP4 and QuickTime files consist of at their top, beside the index."""
-
-
-def _lacks_index(path: Path) -> bool:
-    """True if a file is an MP4 or QuickTime file without its index (the moov atom), which recorders write last."""
-    try:
-        size = path.stat().st_size
-        with open_regular(path) as file:
-            at, count, head = 0, 0, b""
-            while at + 8 <= size:
-                file.seek(at)
-                head = bytes(file.read(16))
-                length, kind = int.from_bytes(head[:4], "big"), head[4:8]
-                if length == 1:  # the size follows, in 64 bits
-                    length = int.from_bytes(head[8:16], "big")
-                if kind not in _ATOMS:
-                    break
-                count += 1
-                at = at + length if length >= 8 else size  # 0: until the file ends
-            is_blank = head[:8] == bytes(8)  # room that was reserved and never filled
-            return count > 0 and (at >= size - 8 or is_blank)
-    except OSError:
-        return False
-
-
-def _no_video(path: Path) -> Exception:
-    if _lacks_index(path):
-        return footage_error(
-            f"{path.name} was not finished: its index (the moov atom) is missing, so that no player can read it.",
-            "Copy it again. If the recording itself broke off, the camera or a repair program can rebuild the index.",
-        )
-    return footage_error(
-        f"{path.name} is not a video that can be read.",
-        "Choose a video file (MP4, MOV, MKV) or a numbered image sequence.",
-    )
-
-
-def _stream_of(container: Any, path: Path, layer: str) -> Any:
-    """The video stream to read: of the number `layer`, else the largest. JobError if there is none."""
-    streams = _streams_of(container, path)
-    if not layer or len(streams) == 1:
-        return max(streams, key=lambda s: (s.codec_context.width or 0) * (s.codec_context.height or 0))
-    numbered = {str(number): stream for number, stream in enumerate(streams, start=1)}
-    if layer not in numbered:
-        raise footage_error(f"{path.name} has no video stream {layer!r}.", f"It has: {_listed(streams)}.")
-    return numbered[layer]
-
-
-def _size_words(stream: Any) -> str:
-    return f"{stream.codec_context.width}x{stream.codec_context.height}"
-
-
-def _listed(streams: list[Any]) -> str:
-    return ", ".join(f"{number} ({_size_words(one)})" for number, one in enumerate(streams, start=1))
-
-
-def _streams_of(container: Any, path: Path) -> list[Any]:
-    """Video streams that can be decoded, in the file's order. JobError if there is none."""
-    names = set(container.format.name.split(","))
-    streams = [s for s in container.streams.video if not (s.disposition & s.disposition.attached_pic)]
-    if names & NOT_VIDEO or not streams:
-        raise _no_video(path)
-    streams = [s for s in streams if s.codec_context is not None]
-    if not streams:
-        raise footage_error(
-            f"{path.name} is encoded in a way that cannot be decoded here, or its header is damaged.",
-            "Export it as H.264 or ProRes, or as an image sequence.",
-        )
-    return streams
-
-
-def _alpha_decoder_of(stream: Any) -> str:
-    """The decoder that gives the alpha of a clip whose own leaves it out; empty if its own does, or there is none.
-
-    VP8 and VP9 keep alpha as a second picture beside the first, which only Google's own decoder puts to it.
-    """
-    marked = {key.lower(): str(value) for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
-    decoder = {"vp8": "libvpx", "vp9": "libvpx-vp9"}.get(stream.codec_context.name, "")
-    return decoder if marked and decoder in av.codecs_available else ""
-
-
-def _first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:
-    for frame in stored_frames(container, stream):
-        if not isinstance(frame, FFmpegError):
-            return frame
-    raise _no_video(path)
-
-
-def _pixel_aspect(stream: Any) -> Fraction | None:
-    """Width of a pixel over its height; None if the file does not say."""
-    aspect = stream.sample_aspect_ratio
-    return Fraction(aspect) if aspect and aspect > 0 else None
-
-
 def _reading(frame: av.VideoFrame, space: InputSpace, coding: Coding) -> dict[str, Any]:
     """How the colours of a clip are read, for the record of the import."""
     return {
@@ -546,42 +467,3 @@ def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> Input
     assumed = "rec2020" if transfer in (16, 18) else "rec709"
     gamut = PRIMARIES.get(primaries, assumed if primaries in UNSAID else "rec709")
     return InputSpace(TRANSFERS.get(transfer, "g24"), gamut, declared=declared)
-
-
-def _timecode(container: Any, stream: Any) -> str:
-    """Of the first frame; empty if the file carries none."""
-    tables = [stream.metadata, container.metadata, *(one.metadata for one in container.streams)]
-    said = (parse_timecode(str(value)) for table in tables for key, value in table.items() if key.lower() == "timecode")
-    return next((code for code in said if code), "")
-
-
-def _promise(container: Any, stream: Any, rate: Fraction) -> tuple[int, float]:
-    """Frames that the file announces, and when the last of them ends, in seconds on the stream's clock.
-
-    (0, 0) where it announces nothing for this stream: with sound, the container's length may be the sound's.
-    """
-    start = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
-    if stream.duration and stream.time_base:
-        end = start + float(stream.duration * stream.time_base)
-    elif stream.metadata.get("DURATION"):  # Matroska: the end, not the length
-        end = _clock(stream.metadata["DURATION"])
-    elif container.duration and len(container.streams) == 1:
-        end = start + container.duration / av.time_base
-    else:
-        return 0, 0.0
-    return stream.frames or round((end - start) * rate), end
-
-
-def _clock(text: str) -> float:
-    """Seconds of "00:00:01.958000000"; 0 if it is something else."""
-    try:
-        hours, minutes, seconds = (float(part) for part in text.split(":"))
-    except ValueError:
-        return 0.0
-    return 3600.0 * hours + 60.0 * minutes + seconds
-
-
-def _count_from_duration(container: Any, stream: Any, rate: Fraction) -> int:
-    if stream.duration and stream.time_base:
-        return round(float(stream.duration * stream.time_base * rate))
-    return round(container.duration / av.time_base * float(rate)) if container.duration else 0

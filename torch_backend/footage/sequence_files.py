@@ -1,0 +1,143 @@
+"""Which files of a folder are the pictures of a sequence."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import OpenImageIO as oiio
+
+from ..contract import (
+    JobError,
+    NumberedFiles,
+    ending,
+    matching_files,
+    numbered_files,
+)
+from .sources import (
+    LEAST_FRAMES,
+    footage_error,
+)
+
+FEW = 2
+
+
+_NO_PICTURES = {"null", "term"}
+"""Formats of OpenImageIO that hold none: one makes pictures up, one writes text."""
+
+
+def _picture_endings() -> frozenset[str]:
+    formats = (one.partition(":") for one in oiio.get_string_attribute("extension_list").split(";"))
+    readable = set(oiio.get_string_attribute("input_format_list").split(",")) - _NO_PICTURES
+    return frozenset(f".{end}" for name, _, ends in formats if name in readable for end in ends.split(","))
+
+
+PICTURES = _picture_endings()
+"""Endings of files that OpenImageIO reads, lower case."""
+
+
+@dataclass(frozen=True)
+class PictureSequence:
+    """The files of a numbered image sequence."""
+
+    folder: Path
+    numbered: NumberedFiles
+
+    @property
+    def pattern(self) -> str:
+        """Name of its files with # for the frame number."""
+        return self.numbered.pattern
+
+    @property
+    def files(self) -> dict[int, Path]:
+        """Frame number -> file, ascending."""
+        return {number: self.folder / name for number, name in self.numbered.files.items()}
+
+
+def find_sequence(path: Path) -> PictureSequence:
+    """The sequence that a folder, one file of it, or a pattern (shot.####.exr, *_left.%04d.png) stands for.
+
+    JobError if there is none, if a file has no number, or if several are meant.
+    """
+    if path.is_dir():
+        return _only(path, _sequences_in(path, _names_in(path)), f"The folder {path} holds", _no_sequence_in(path))
+    if not path.exists():
+        found = matching_files(_names_in(path.parent), path.name)
+        missing = footage_error(
+            f"No pictures match {path}.", "Check the folder and the pattern: # or %04d stands for the frame number."
+        )
+        return _only(path.parent, [s for s in found if _is_readable(s)], f"{path} means", missing)
+    found = sequence_of_file(path)
+    if found is None:
+        raise footage_error(
+            f"{path.name} is a single picture, not part of a numbered sequence.",
+            "A freeze needs a clip: choose a video or a sequence.",
+        )
+    return found
+
+
+def sequence_of_file(path: Path) -> PictureSequence | None:
+    """The sequence that a picture belongs to; None if it is a single one. JobError if it belongs to several."""
+    found = [s for s in _sequences_in(path.parent, _names_in(path.parent)) if path.name in s.files.values()]
+    return _only(path.parent, found, f"{path.name} belongs to", None) if found else None
+
+
+def numbered_neighbours(path: Path) -> NumberedFiles | None:
+    """The numbered files, of whatever ending, that a file belongs to; None if it stands alone."""
+    found = numbered_files(_names_in(path.parent))
+    return next((s for s in found if len(s.files) >= FEW and path.name in s.files.values()), None)
+
+
+def unreadable_pictures(pattern: str) -> JobError:
+    """The refusal of numbered files that OpenImageIO does not read."""
+    return footage_error(
+        f"{pattern} cannot be read: OpenImageIO does not know the ending {ending(pattern) or 'of these pictures'}.",
+        "Convert them to PNG, TIFF or EXR.",
+    )
+
+
+def _names_in(folder: Path) -> list[str]:
+    try:
+        with os.scandir(folder) as entries:
+            # A dot: what macOS and programs keep beside a file under its name.
+            return [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
+    except OSError:
+        return []
+
+
+def _sequences_in(folder: Path, names: list[str]) -> list[NumberedFiles]:
+    readable = [name for name in names if Path(name).suffix.lower() in PICTURES]
+    return [s for s in numbered_files(readable) if len(s.files) >= FEW or s.twice]
+
+
+def _is_readable(numbered: NumberedFiles) -> bool:
+    """True if OpenImageIO reads such files."""
+    return Path(next(iter(numbered.files.values()))).suffix.lower() in PICTURES
+
+
+def _only(folder: Path, found: list[NumberedFiles], who: str, missing: JobError | None) -> PictureSequence:
+    """The one of the sequences found. JobError if there are several, or files with the same number."""
+    if not found and missing is not None:
+        raise missing
+    if len(found) > 1:
+        names = ", ".join(s.pattern for s in found[:4]) + (", ..." if len(found) > 4 else "")
+        raise footage_error(
+            f"{who} {len(found)} image sequences ({names}).",
+            f"Choose one by its pattern, such as {found[0].pattern}, or by one of its pictures.",
+        )
+    if found[0].twice:
+        raise footage_error(
+            f"{found[0].twice[0]} and {found[0].twice[1]} have the same frame number.",
+            "Move one of the two sequences to another folder.",
+        )
+    return PictureSequence(folder, found[0])
+
+
+def _no_sequence_in(folder: Path) -> JobError:
+    others = sorted(numbered_files(_names_in(folder)), key=lambda s: -len(s.files))
+    if others and len(others[0].files) >= LEAST_FRAMES and not _is_readable(others[0]):
+        return unreadable_pictures(others[0].pattern)
+    return footage_error(
+        f"The folder {folder} holds no numbered image sequence.", "Choose a folder with frames, or a video."
+    )

@@ -1,0 +1,158 @@
+"""The video stream of a container: which one, its first frame, length and timecode."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+from av.error import FFmpegError
+
+from ..contract import open_regular, parse_timecode
+from .decoding import stored_frames
+from .sources import (
+    footage_error,
+)
+
+NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
+"""FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
+
+
+_ATOMS = {b"ftyp", b"mdat", b"free", b"skip", b"wide", b"uuid", b"pnot", b"moof", b"sidx", b"styp", b"meta"}
+"""What MP4 and QuickTime files consist of at their top, beside the index."""
+
+
+def _lacks_index(path: Path) -> bool:
+    """True if a file is an MP4 or QuickTime file without its index (the moov atom), which recorders write last."""
+    try:
+        size = path.stat().st_size
+        with open_regular(path) as file:
+            at, count, head = 0, 0, b""
+            while at + 8 <= size:
+                file.seek(at)
+                head = bytes(file.read(16))
+                length, kind = int.from_bytes(head[:4], "big"), head[4:8]
+                if length == 1:  # the size follows, in 64 bits
+                    length = int.from_bytes(head[8:16], "big")
+                if kind not in _ATOMS:
+                    break
+                count += 1
+                at = at + length if length >= 8 else size  # 0: until the file ends
+            is_blank = head[:8] == bytes(8)  # room that was reserved and never filled
+            return count > 0 and (at >= size - 8 or is_blank)
+    except OSError:
+        return False
+
+
+def no_video(path: Path) -> Exception:
+    """What is raised for a file in which no video is found."""
+    if _lacks_index(path):
+        return footage_error(
+            f"{path.name} was not finished: its index (the moov atom) is missing, so that no player can read it.",
+            "Copy it again. If the recording itself broke off, the camera or a repair program can rebuild the index.",
+        )
+    return footage_error(
+        f"{path.name} is not a video that can be read.",
+        "Choose a video file (MP4, MOV, MKV) or a numbered image sequence.",
+    )
+
+
+def stream_of(container: Any, path: Path, layer: str) -> Any:
+    """The video stream to read: of the number `layer`, else the largest. JobError if there is none."""
+    streams = streams_of(container, path)
+    if not layer or len(streams) == 1:
+        return max(streams, key=lambda s: (s.codec_context.width or 0) * (s.codec_context.height or 0))
+    numbered = {str(number): stream for number, stream in enumerate(streams, start=1)}
+    if layer not in numbered:
+        raise footage_error(f"{path.name} has no video stream {layer!r}.", f"It has: {listed(streams)}.")
+    return numbered[layer]
+
+
+def size_words(stream: Any) -> str:
+    """Width and height of a stream in pixels, as a sentence has them."""
+    return f"{stream.codec_context.width}x{stream.codec_context.height}"
+
+
+def listed(streams: list[Any]) -> str:
+    """Streams by number and size."""
+    return ", ".join(f"{number} ({size_words(one)})" for number, one in enumerate(streams, start=1))
+
+
+def streams_of(container: Any, path: Path) -> list[Any]:
+    """Video streams that can be decoded, in the file's order. JobError if there is none."""
+    names = set(container.format.name.split(","))
+    streams = [s for s in container.streams.video if not (s.disposition & s.disposition.attached_pic)]
+    if names & NOT_VIDEO or not streams:
+        raise no_video(path)
+    streams = [s for s in streams if s.codec_context is not None]
+    if not streams:
+        raise footage_error(
+            f"{path.name} is encoded in a way that cannot be decoded here, or its header is damaged.",
+            "Export it as H.264 or ProRes, or as an image sequence.",
+        )
+    return streams
+
+
+def alpha_decoder_of(stream: Any) -> str:
+    """The decoder that gives the alpha of a clip whose own leaves it out; empty if its own does, or there is none.
+
+    VP8 and VP9 keep alpha as a second picture beside the first, which only Google's own decoder puts to it.
+    """
+    marked = {key.lower(): str(value) for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
+    decoder = {"vp8": "libvpx", "vp9": "libvpx-vp9"}.get(stream.codec_context.name, "")
+    return decoder if marked and decoder in av.codecs_available else ""
+
+
+def first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:
+    """The first frame that can be decoded. JobError (FOOTAGE) if none can."""
+    for frame in stored_frames(container, stream):
+        if not isinstance(frame, FFmpegError):
+            return frame
+    raise no_video(path)
+
+
+def pixel_aspect(stream: Any) -> Fraction | None:
+    """Width of a pixel over its height; None if the file does not say."""
+    aspect = stream.sample_aspect_ratio
+    return Fraction(aspect) if aspect and aspect > 0 else None
+
+
+def timecode(container: Any, stream: Any) -> str:
+    """Of the first frame; empty if the file carries none."""
+    tables = [stream.metadata, container.metadata, *(one.metadata for one in container.streams)]
+    said = (parse_timecode(str(value)) for table in tables for key, value in table.items() if key.lower() == "timecode")
+    return next((code for code in said if code), "")
+
+
+def promise(container: Any, stream: Any, rate: Fraction) -> tuple[int, float]:
+    """Frames that the file announces, and when the last of them ends, in seconds on the stream's clock.
+
+    (0, 0) where it announces nothing for this stream: with sound, the container's length may be the sound's.
+    """
+    start = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
+    if stream.duration and stream.time_base:
+        end = start + float(stream.duration * stream.time_base)
+    elif stream.metadata.get("DURATION"):  # Matroska: the end, not the length
+        end = _clock(stream.metadata["DURATION"])
+    elif container.duration and len(container.streams) == 1:
+        end = start + container.duration / av.time_base
+    else:
+        return 0, 0.0
+    return stream.frames or round((end - start) * rate), end
+
+
+def _clock(text: str) -> float:
+    """Seconds of "00:00:01.958000000"; 0 if it is something else."""
+    try:
+        hours, minutes, seconds = (float(part) for part in text.split(":"))
+    except ValueError:
+        return 0.0
+    return 3600.0 * hours + 60.0 * minutes + seconds
+
+
+def count_from_duration(container: Any, stream: Any, rate: Fraction) -> int:
+    """Frames by the duration that the stream, or else the container, tells; 0 if neither does."""
+    if stream.duration and stream.time_base:
+        return round(float(stream.duration * stream.time_base * rate))
+    return round(container.duration / av.time_base * float(rate)) if container.duration else 0
