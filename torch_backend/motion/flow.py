@@ -5,7 +5,7 @@ explains all of the matches, the surface stands still; its depth is found on the
 is seen as well wherever three views or more tell of it. Where nothing is matched, the pictures are compared where the
 point would be seen if it stood still. All is computed on a grid of half the pictures' pixels.
 
-Pure functions on numpy arrays, and a store of matches; `motion.py` reads and writes the files. Positions are in pixels
+Pure functions on numpy arrays, and a store of matches; `mattes.py` reads and writes the files. Positions are in pixels
 of the pictures that are matched ("flow pixels"), centres at +0.5, as a pair of planes x and y.
 """
 
