@@ -1,6 +1,7 @@
 """The ablation on the tiny world, and its switches, records and table."""
 
 import argparse
+import dataclasses
 import functools
 import importlib
 from collections import Counter
@@ -60,18 +61,22 @@ def test_groups_of_variants():
         variants(("bent",))
 
 
+def brightened(step, made=None):
+    """Developing that changes the scene, whatever it may keep of the tiny run on this processor; `made` counts."""
+
+    def brighten(*args, **more):
+        if made is not None:
+            made["develop"] += 1
+        frozen = step(*args, **more)
+        return dataclasses.replace(frozen, state={**frozen.state, "sh0": frozen.state["sh0"] + 0.05})
+
+    return brighten
+
+
 def test_steps_that_variants_share_are_made_once(instants, clip):
     """With `develop` off the steps before it are those of today; with frame rules off all of them are."""
     made = Counter[str]()
-
-    def counted(step):
-        def count(*args, **more):
-            made["develop"] += 1
-            return step(*args, **more)
-
-        return count
-
-    with replaced("instant.repairs", "develop", counted):
+    with replaced("instant.repairs", "develop", functools.partial(brightened, made=made)):
         today = instants.make(frozenset())
         assert instants.make(frozenset({next(n for n, r in RULES.items() if r.stage == FRAME)})).key == today.key
     assert made == {"develop": 1}
@@ -104,7 +109,8 @@ def test_what_was_measured_is_not_measured_again(clip, tmp_path):
         variants=["no residuals", "no develop"], clip_variants=None, every=1, pairs=2, draw=0, instants=0, seconds=0.0
     )
     store = Store(tmp_path / "code")
-    Ablation(store, tmp_path / "kept", args).run([case])
+    with replaced("instant.repairs", "develop", brightened):
+        Ablation(store, tmp_path / "kept", args).run([case])
     first = {path: path.stat().st_mtime_ns for path in store.folder.rglob("*.json")}
     assert {path.stem for path in first} == {"today", "no-residuals", "no-develop"}
     assert list((tmp_path / "kept").glob("develop-*.safetensors"))
