@@ -12,8 +12,7 @@ from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.plates import Plates
 from torch_backend.scene import load_images, load_scene
 from torch_backend.shot import Shot
-from torch_backend.train import config_from_params, train_shot
-from torch_backend.train import run as station
+from torch_backend.train import config_from_params, identity, train_shot
 from torch_backend.train.config import config_from_json, config_to_json
 from torch_backend.train.pictures import pictures_of, training_size
 
@@ -114,18 +113,18 @@ def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(sh
     with pytest.raises(Cancelled):
         train_shot(shot, asked, quiet(cancel_at=("training", 0.1)))
     report = quiet()
-    config, key, _ = station._asked(shot, scene, shot.run("f"), asked, card, report, [])
+    config, key, _ = identity.asked_for(shot, scene, shot.run("f"), asked, card, report, [])
     assert not config.plates and key == json.loads((shot.run("f") / "config.json").read_text())["key"]
     assert [event[1] for event in report.events] == [
         "The run was begun with the preset's numbers for the processor: it goes on with them."
     ]
     again = TrainParams(**{**vars(asked), "resume": False})
-    assert station._asked(shot, scene, shot.run("f"), again, card, quiet(), [])[0].plates
-    assert station._asked(shot, scene, shot.run("another"), asked, card, quiet(), [])[0].plates
+    assert identity.asked_for(shot, scene, shot.run("f"), again, card, quiet(), [])[0].plates
+    assert identity.asked_for(shot, scene, shot.run("another"), asked, card, quiet(), [])[0].plates
 
     on_card = TrainParams(**{**vars(asked), "run": "c"})
     with monkeypatch.context() as patched, pytest.raises(Cancelled):
-        patched.setattr(station, "config_from_params", lambda params, on_card=False: config_from_params(params, True))
+        patched.setattr(identity, "config_from_params", lambda params, on_card=False: config_from_params(params, True))
         train_shot(shot, on_card, quiet(cancel_at=("training", 0.1)))
     report = quiet()
     resumed = TrainParams(**{**vars(on_card), "width": 1920, "device": "cpu"})  # as Blender asks for a paused run
