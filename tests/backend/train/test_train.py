@@ -169,29 +169,6 @@ def test_any_host_works_behind_the_gate_and_resumes(world, quiet, host, monkeypa
         torch.testing.assert_close(value, broken[name], rtol=1e-3, atol=1e-4, msg=name)
 
 
-def test_runs_of_before_there_were_hosts_are_read(world, quiet):
-    train_shot(world.shot, short(world, "old", method="hexplane"), quiet())
-    path = world.shot.run("old") / "checkpoint.safetensors"
-    tensors, meta = load_checkpoint(path)
-    config = meta["config"]
-    config["hexplane"] = {
-        k: v for k, v in config.pop("field").items() if k not in ("start", "detached", "until", "published")
-    }
-    config["hexplane"]["time_nodes"] = tensors["field.temporal.0"].shape[2]
-    for name in ("host", "host_config"):
-        config.pop(name)
-    for name in ("detector", "look_every"):
-        config["supervision"].pop(name)
-    tensors.pop("gaussians.hidden")
-    before = load_run(world.shot, "old").model.state_at(0.3)
-    save_checkpoint(path, tensors, meta)
-    run = load_run(world.shot, "old")
-    assert run.config.host == "hexplane"
-    assert not bool(run.model.gaussians.hidden.any())
-    for name, value in run.model.state_at(0.3).items():
-        assert torch.equal(value, before[name])
-
-
 def test_wrong_choices_are_named():
     with pytest.raises(ValueError, match="preset"):
         config_from_params(TrainParams(preset="fast"))
@@ -447,15 +424,6 @@ def test_a_run_of_other_pictures_is_refused_and_trained_anew(tmp_path, quiet):
     with pytest.raises(JobError, match="other pictures"):
         train_shot(world.shot, short(world, "main", extend=5), quiet())
     assert trained() and not trained() and load_run(world.shot, "main").stamp != before.stamp
-    imported("as filmed")
-    assert trained()
-    _, meta = load_checkpoint(world.shot.run("main") / CHECKPOINT_FILE)
-    tensors, _ = load_checkpoint(world.shot.run("main") / CHECKPOINT_FILE)
-    save_checkpoint(
-        world.shot.run("main") / CHECKPOINT_FILE, tensors, {n: v for n, v in meta.items() if n != "pictures"}
-    )
-    imported("graded")
-    assert not trained(), "a run of before does not say what it was trained on, and stays"
 
 
 def test_a_run_is_known_by_its_content_whatever_the_time_of_its_file(world, quiet, tmp_path):

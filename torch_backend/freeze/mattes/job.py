@@ -37,8 +37,10 @@ from .files import is_current, matte_file, read_matte, suffixes_beside, write_ma
 from .lassos import Lasso, json_list, lasso_of, read_lassos
 from .segment import Matte, SegmentConfig
 
-MATTES_VERSION = 2
-"""Of mattes.json; and rises when mattes made before are not to be used any more."""
+MATTES_VERSION = 1
+"""Of mattes.json."""
+_METHOD = 2
+"""Rises when mattes made before are not to be used any more; their lassos stay."""
 
 
 @dataclass(frozen=True)
@@ -173,8 +175,7 @@ def _keys(take: _Take, wanted: Mapping[str, list[Lasso]]) -> dict[str, str]:
     shown = [[n, read_key(take.folder.frame(n))] for n in take.frames]
     how = dataclasses.asdict(SegmentConfig())
     return {
-        name: content_key(MATTES_VERSION, shown, [[one.frame, one.polygon] for one in of], how)
-        for name, of in wanted.items()
+        name: content_key(_METHOD, shown, [[one.frame, one.polygon] for one in of], how) for name, of in wanted.items()
     }
 
 
@@ -185,7 +186,7 @@ def _write(
     """Writes the mattes that are stale, and the Cryptomattes that hold one of them or a removed one."""
     if not wanted:
         return
-    whole = content_key(MATTES_VERSION, {name: keys[name] for name in wanted})
+    whole = content_key(_METHOD, {name: keys[name] for name in wanted})
     none: Iterator[tuple[int, dict[str, Matte]]] = ((number, {}) for number in take.frames)
     made = _carried(shot, take, params, stale, report) if stale else none
     for done, (number, mattes) in enumerate(made):
