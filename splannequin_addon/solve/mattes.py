@@ -291,7 +291,7 @@ def show_over_plate(scene: bpy.types.Scene, shot: Path) -> list[str]:
     sequences.show_sequence(background.image_user, image, numbers[0], numbers[-1])
     background.frame_method, background.display_depth, background.alpha = "FIT", "FRONT", 1.0
     data.show_background_images = True
-    return ["What moves is tinted over the plate: orange moves, faint orange may, blue is not known."]
+    return ["What moves is tinted over the plate: orange moves, blue is not known."]
 
 
 def _is_newer(file: Path, shot: Path, number: int) -> bool:

@@ -27,7 +27,7 @@ MESSAGES: dict[str, str] = {
     "The plate is shown as it is.": "Die Plate wird gezeigt, wie sie ist.",
     "The mattes are tinted.": "Die Masken werden eingefärbt.",
     "Tinting the motion, frame {} of {}": "Bewegung einfärben, Bild {} von {}",
-    "What moves is tinted over the plate: orange moves, faint orange may, blue is not known.": "Was sich bewegt, ist über der Plate eingefärbt: Orange bewegt sich, blasses Orange vielleicht, Blau ist nicht bekannt.",
+    "What moves is tinted over the plate: orange moves, blue is not known.": "Was sich bewegt, ist über der Plate eingefärbt: Orange bewegt sich, Blau ist nicht bekannt.",
     "Paint Motion": "Bewegung malen",
     "Save Motion Paint": "Gemalte Bewegung speichern",
     "Clear Motion Paint": "Gemalte Bewegung löschen",
