@@ -22,7 +22,7 @@ from .still import Ray, fitted_brightness
 _BEHIND = 19.0
 """`Ray.project` returns 20 times the inverse depth for points at or behind a camera."""
 _SPARSE = 4
-"""Brightness is fitted to every so manieth point."""
+"""Points from one that brightness is fitted to, to the next, in rows and columns."""
 
 
 @dataclass(frozen=True)
