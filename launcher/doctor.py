@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from torch_backend.cards import Card, nvidia_cards, why_unfit, why_unused
-from torch_backend.contract import ExitCode, python_child
+from torch_backend.contract import ExitCode, memory, python_child
 from torch_backend.shot import write_json
 
 from .blender import BPY_WHEELS, DEMO_WHEELS, choose_wheels, find_blender
@@ -29,7 +29,7 @@ from .environments import (
     home,
     this_machines_index,
 )
-from .places import LINUX, WINDOWS
+from .places import LINUX
 
 BLENDER_LIBRARIES = {
     "libX11.so.6": "libx11-6",
@@ -87,11 +87,11 @@ def machine_findings() -> Iterator[Finding]:
         yield Finding("64 bit", "missing", "this Python is 32-bit: install a 64-bit one")
     cores = os.cpu_count() or 1
     yield Finding("cores", "ok" if cores > 1 else "note", f"{cores} on {platform.platform(terse=True)}")
-    memory = memory_gb()
-    if memory is not None:
-        enough = memory >= 6
+    if (told := memory()) is not None:
+        total = told[0] / 1e9
+        enough = total >= 6
         yield Finding(
-            "memory", "ok" if enough else "note", f"{memory:.1f} GB{'' if enough else ': close other programs'}"
+            "memory", "ok" if enough else "note", f"{total:.1f} GB{'' if enough else ': close other programs'}"
         )
     folder = next(p for p in (home(), *home().parents) if os.path.exists(p))
     if not backend_environment().ready() and not (folder.is_dir() and os.access(folder, os.W_OK)):
@@ -101,27 +101,6 @@ def machine_findings() -> Iterator[Finding]:
     need = 1.0 if backend.ready() else disk_gb(backend, this_machines_index()) + BPY_DISK_GB
     advice = "" if free >= need else f": {need:.0f} GB are needed, free some or set SPLANNEQUIN_HOME to another disk"
     yield Finding("disk", "ok" if free >= need else "missing", f"{free:.0f} GB free in {folder}{advice}")
-
-
-def memory_gb() -> float | None:
-    """Physical memory in GB; None where the system does not say."""
-    if WINDOWS:
-
-        class Status(ctypes.Structure):
-            _fields_ = [
-                ("length", ctypes.c_ulong),
-                ("load", ctypes.c_ulong),
-                ("total", ctypes.c_ulonglong),
-                ("unread", ctypes.c_ulonglong * 6),
-            ]
-
-        status = Status(length=ctypes.sizeof(Status))
-        windll = getattr(ctypes, "windll")  # noqa: B009  (exists on Windows alone)
-        return status.total / 1e9 if windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status)) else None
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    except (ValueError, OSError):
-        return None
 
 
 def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:

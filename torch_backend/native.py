@@ -47,10 +47,16 @@ PROCESSOR_VARIABLE = "SPLANNEQUIN_MARCH"
 """Environment variable: compile kernels for this processor (as Clang names it: x86-64-v3) instead of this one."""
 
 
+def cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def default_threads() -> int:
-    """Number of worker threads used unless told otherwise: all cores that this process may use, at most 16."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, 16))
+    """Number of worker threads used unless told otherwise: all cores that this process may use, at most 16, or as many
+    as OMP_NUM_THREADS names, which torch obeys as well."""
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, min(cores(), 16, int(told) if told.isdecimal() else 16))
 
 
 _WORTH_A_THREAD = 460_000

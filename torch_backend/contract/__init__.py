@@ -181,9 +181,11 @@ from .ply_header import read_ply_header
 from .processes import (
     GRACE_SECONDS,
     Process,
+    child_environment,
     commands_of_ps,
     computer_name,
     end_with_starter,
+    memory,
     own_input,
     process,
     process_of_ps,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import calendar
 import contextlib
+import ctypes
 import functools
 import hashlib
 import os
@@ -35,6 +36,15 @@ def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]
     """
     python = os.path.abspath(python)
     return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
+
+
+def child_environment(root: Path) -> dict[str, str]:
+    """Of a child of `python_child` that finds our package in `root`, whatever this process was started from."""
+    # An empty or relative entry would be the folder that the child stands in.
+    inherited = [p for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if os.path.isabs(p)]
+    # Threads that spin while they wait take the core from whoever shares it.
+    environment = {"OMP_WAIT_POLICY": "passive"} | os.environ
+    return environment | {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join([str(root), *inherited])}
 
 
 def own_input() -> int:
@@ -262,3 +272,33 @@ def _process_of_windows(pid: int) -> Process | None:
         return Process(float(started), text.replace('"', ""))
     finally:
         kernel.CloseHandle(handle)
+
+
+def memory() -> tuple[float, float] | None:
+    """(bytes of physical memory, bytes of it that are free); None where the system does not say.
+
+    Free is what programs may take without others being moved out; on a Mac, which does not say it, half of all.
+    """
+    if sys.platform == "win32":
+
+        class Status(ctypes.Structure):
+            _fields_ = (
+                ("length", ctypes.c_ulong),
+                ("load", ctypes.c_ulong),
+                ("total", ctypes.c_ulonglong),
+                ("free", ctypes.c_ulonglong),
+                ("unread", ctypes.c_ulonglong * 5),
+            )
+
+        status = Status(length=ctypes.sizeof(Status))
+        told = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))
+        return (float(status.total), float(status.free)) if told else None
+    try:
+        total = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (ValueError, OSError):
+        return None
+    free = 0.5 * total
+    with contextlib.suppress(OSError, StopIteration, ValueError, IndexError):
+        rows = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        free = 1024.0 * int(next(row for row in rows if row.startswith("MemAvailable:")).split()[1])
+    return total, free

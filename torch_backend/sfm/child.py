@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import queue
 import re
 import subprocess
@@ -12,7 +11,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from ..contract import ExitCode, JobError, Reporter, incomplete, python_child
+from ..contract import ExitCode, JobError, Reporter, child_environment, incomplete, python_child
 from ..shot import need_disk
 
 _POLL_SECONDS = 0.2
@@ -30,14 +29,7 @@ def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = Fals
     loaded, DISK if that is full, else SOLVE) if it dies by itself, with the end of COLMAP's log, which is kept in
     `log`: with `keep_log` after what stands there.
     """
-    package_root = Path(__file__).resolve().parents[2]
-    environment = {**os.environ, "PYTHONSAFEPATH": "1"}
-    # This package must be found by the child as well, whatever this process was started from. An empty or relative
-    # entry would be the folder that the child stands in.
-    inherited = [p for p in environment.get("PYTHONPATH", "").split(os.pathsep) if os.path.isabs(p)]
-    environment["PYTHONPATH"] = os.pathsep.join([str(package_root), *inherited])
-    # Threads that spin while they wait take the core from whoever shares it.
-    environment.setdefault("OMP_WAIT_POLICY", "passive")
+    environment = child_environment(Path(__file__).resolve().parents[2])
     command = python_child(sys.executable, "torch_backend.sfm.start_worker", str(request.absolute()))
     with open(log, "ab" if keep_log else "wb") as errors:
         start = errors.tell()

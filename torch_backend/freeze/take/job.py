@@ -33,8 +33,9 @@ from .cameras import in_range, intrinsics
 from .contact_sheet import write_contact_sheet
 from .folder import clear, made_before, place_of, take_over
 from .footage_facts import footage_facts
-from .frames import make_ready, render_frames, small_share
+from .frames import make_ready, small_share
 from .plan import FrameSpec, PlannedTake, planned, run_verdict
+from .side_by_side import render_side_by_side
 from .splats import camera_path_of, placed_splats, write_stage
 from .verdict import judge_take, unsure
 from .video import write_video
@@ -54,7 +55,7 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     make_ready(take, frames, done, report)  # what can fail, or be cancelled, before anything of before goes
     if place.beside is None:
         clear(take, done)
-    shares = render_frames(dataclasses.replace(take, folder=place.folder), frames, done, report)
+    shares = render_side_by_side(shot, params, dataclasses.replace(take, folder=place.folder), frames, done, report)
     if place.beside is not None:
         take_over(take, place)
     frames_on_disk = done | {f.frame for f in frames}

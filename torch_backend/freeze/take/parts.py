@@ -22,7 +22,7 @@ from ...contract import (
     read_json,
     remove_file,
 )
-from ...shot import Shot, content_key, write_json
+from ...shot import Shot, write_json
 from ..frozen import OutputFrame
 from .cameras import in_range
 from .folder import files_of, frames_of, made_before, make_folders, right_frames, stored_key, stored_keys
@@ -46,7 +46,7 @@ def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, A
         report.warning(*made_before(params.take))
     if set(keys) - right_frames(take, keys):
         remove_file(take.folder.facts)  # what it tells of goes, frame by frame
-    state = {"version": 1, "key": take.key, "t_star": take.t_star, "frames": _all_keys(take)}
+    state = {"version": 1, "key": take.key, "t_star": take.t_star, "frames": take.all_keys}
     write_json(take.folder.state, state)
     return {"t_star": take.t_star, "first": chosen[0].frame, "last": chosen[-1].frame, "frames": len(chosen)}
 
@@ -101,11 +101,6 @@ def _right_of(take: PlannedTake, frames: list[OutputFrame]) -> set[int]:
     return right_frames(take, {f.frame: stored_key(take.folder, f.frame, take.spec) for f in frames})
 
 
-def _all_keys(take: PlannedTake) -> str:
-    """Changes with anything that any frame of the take shows."""
-    return content_key(sorted(take.keys.items()))
-
-
 def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
     """The take as `open_take` settled it. JobError if it did not, or if this computer would render something else."""
     try:
@@ -116,7 +111,7 @@ def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
             f"Take {params.take} of {shot.root.name} was not opened.", "Run its step `open` first.", ExitCode.FREEZE
         ) from None
     take = planned(shot, params, report, t_star)
-    if state.get("key") != take.key or state.get("frames") != _all_keys(take):
+    if state.get("key") != take.key or state.get("frames") != take.all_keys:
         raise JobError(
             f"Take {params.take} of {shot.root.name} was opened with another run, other footage or other settings than "
             "this computer sees.",
@@ -132,7 +127,7 @@ def _refuse_opened_anew(take: PlannedTake) -> None:
         state = read_json(take.folder.state)
     except (OSError, ValueError):
         state = {}
-    if state.get("frames") != _all_keys(take):
+    if state.get("frames") != take.all_keys:
         raise JobError(
             f"The take {take.folder.root.name} was opened with something else while a part of it was frozen.",
             "Freeze the parts of the job that opened it last.",

@@ -153,6 +153,11 @@ class PlannedTake:
     key: str
     """`take_key`."""
 
+    @property
+    def all_keys(self) -> str:
+        """Changes with anything that any frame of the take shows."""
+        return content_key(sorted(self.keys.items()))
+
 
 def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | None = None) -> PlannedTake:
     """What `params` ask for. Nothing of the take is written; motion mattes are, if the shot has none.

@@ -1,0 +1,136 @@
+"""Frames by several processes: the same bytes as by one, whoever is killed meanwhile; and nobody is left behind."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from torch_backend.contract import Cancelled, FreezeParams, JobError, TakeFolder
+from torch_backend.freeze.take.cameras import in_range
+from torch_backend.freeze.take.folder import make_folders
+from torch_backend.freeze.take.frames import render_frames
+from torch_backend.freeze.take.plan import planned
+from torch_backend.freeze.take.side_by_side import processes_for, render_side_by_side
+from torch_backend.native import default_threads
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="only Linux lists processes there")
+
+
+def opened(shot, take, report):
+    """A take ready to be rendered: (params, take, frames)."""
+    params = FreezeParams(take=take, t_star=104, first=103, last=106)
+    made = planned(shot, params, report)
+    make_folders(made.folder, made.spec)
+    return params, made, in_range(made.whole, params)
+
+
+def files(folder: TakeFolder):
+    found = [p for p in folder.root.rglob("*") if p.suffix in (".exr", ".png") and p.stem.isdecimal()]
+    return {p.relative_to(folder.root).as_posix(): p.read_bytes() for p in found}
+
+
+def helpers():
+    """Process ids of our children that render frames."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            words = (entry / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if parent == os.getpid() and b"frame_process" in words:
+            found.append(int(entry.name))
+    return found
+
+
+@pytest.fixture(scope="module")
+def own(trained_copy):
+    return trained_copy.shot
+
+
+@pytest.fixture(scope="module")
+def alone(own, quiet):
+    """(files, shares) of a take that one process rendered."""
+    _, take, frames = opened(own, "alone", quiet())
+    shares = render_frames(take, frames, set(), quiet())
+    return files(take.folder), shares
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+def test_any_number_of_processes_writes_the_same_bytes(own, quiet, alone, processes):
+    params, take, frames = opened(own, f"by{processes}", quiet())
+    shares = render_side_by_side(own, params, take, frames, {103}, quiet(), processes)
+    expected = {name: data for name, data in alone[0].items() if "000103" not in name}
+    assert files(take.folder) == expected
+    assert sorted(shares) == [104, 105, 106] and all(shares[n].equal(alone[1][n]) for n in shares)
+
+
+@needs_proc
+def test_what_a_killed_process_leaves_is_rendered_by_its_starter(own, quiet, alone):
+    params, take, frames = opened(own, "killed", quiet())
+
+    class Killer(type(quiet())):
+        killed = 0
+
+        def progress(self, stage, done, total, message=""):
+            if not self.killed and (found := helpers()):
+                os.kill(found[0], signal.SIGKILL)
+                self.killed = found[0]
+
+    report = Killer()
+    render_side_by_side(own, params, take, frames, set(), report, 2)
+    assert report.killed and files(take.folder) == alone[0] and not helpers()
+
+
+@needs_proc
+def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(own, quiet, alone):
+    params, take, frames = opened(own, "cancelled", quiet())
+
+    class Stop(type(quiet())):
+        heard = 0
+
+        def progress(self, stage, done, total, message=""):
+            self.heard += done > 0
+
+        def check_cancelled(self):
+            if self.heard:
+                raise Cancelled
+
+    with pytest.raises(Cancelled):
+        render_side_by_side(own, params, take, frames, set(), Stop(), 2)
+    assert not helpers()
+    left = files(take.folder)
+    assert len(left) < len(alone[0]) and all(alone[0][name] == data for name, data in left.items())
+    render_side_by_side(own, params, take, frames, set(), quiet(), 2)
+    assert files(take.folder) == alone[0]
+
+
+def test_what_stops_one_of_them_is_told_as_if_there_were_one(own, quiet):
+    """A plate that cannot be read ends the take with the same sentence."""
+    params, take, frames = opened(own, "unreadable", quiet())
+    plate = own.plate(104)
+    data = plate.read_bytes()
+    plate.write_bytes(data[:100])
+    try:
+        with pytest.raises(JobError) as by_one:
+            render_frames(take, frames, set(), quiet())
+        with pytest.raises(JobError) as by_two:
+            render_side_by_side(own, params, take, frames, set(), quiet(), 2)
+    finally:
+        plate.write_bytes(data)
+    told = [(error.value.message, error.value.hint, error.value.exit_code) for error in (by_one, by_two)]
+    assert told[0] == told[1]
+
+
+def test_as_many_as_cores_frames_and_memory_allow():
+    assert processes_for(300, 640 * 480, 16, 64e9) == 8
+    assert processes_for(300, 640 * 480, 1, 64e9) == 1
+    assert processes_for(30, 640 * 480, 16, 64e9) == 2
+    assert processes_for(300, 3840 * 2160, 16, 8e9) == 2
+    assert processes_for(300, 640 * 480, 16, 0.0) == 1
+
+
+def test_threads_are_as_many_as_torch_is_told(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert default_threads() == 1
