@@ -25,7 +25,7 @@ from torch_backend.freeze.instant.static_baseline import StaticBaselineConfig
 
 FRAME = "frame"
 """Stage of the rules that decide each frame; all other stages make the instant."""
-STAGES = ("apply_static_baseline", "develop")
+STAGES = ("apply_static_baseline", "with_missing", "develop")
 """Names in `torch_backend.freeze.instant.repairs` of the steps that make an instant, in their order."""
 MAKER = "instant.repairs"
 
@@ -116,6 +116,7 @@ _SCENE = (
         "baseline from near", "nothing counts as seen from near by the baseline", STAGES[0],
         (Switch("instant.static_baseline", "StaticBaselineConfig", _never_near, of_original=True),),
     ),
+    Rule("missing movers", "nothing is added", STAGES[1], (Switch(MAKER, STAGES[1], _third),)),
     Rule("develop", "no training step", "develop", (Switch(MAKER, "develop", _developed_as_is),)),
     Rule(
         "undersampled", "plate t* teaches what it sees from afar", "develop",
@@ -184,7 +185,7 @@ def _swept() -> Iterator[Rule]:
         for path, value in _numbers(DevelopConfig()):
             change = partial(_changed, path, _scaled(value, factor))
             switch = Switch("instant.instants", "config_for", change, of_original=True)
-            yield Rule(f"{word} develop.{path}", f"times {factor}", STAGES[1], (switch,))
+            yield Rule(f"{word} develop.{path}", f"times {factor}", STAGES[2], (switch,))
         for path, value in _numbers(StaticBaselineConfig()):
             change = partial(_preset, path, _scaled(value, factor))
             switch = Switch("instant.static_baseline", "StaticBaselineConfig", change, of_original=True)
@@ -209,7 +210,7 @@ NOT_SWEPT = ("seed",)
 CONSTANTS = (
     ("views.source_views", "DOUBT", FRAME),
     ("views.decisions", "MARGIN", FRAME),
-    ("views.working_plates", "SEEN", STAGES[1]),
+    ("views.working_plates", "SEEN", STAGES[2]),
 )
 """(module, name, stage) of constants that are swept, too."""
 

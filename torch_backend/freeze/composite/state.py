@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ...torch_types import norm
-from ..views.reproject import blurred, dilate, erode, look_up, project, resized
+from ..views.reproject import beyond, blurred, look_up, project, resized
 from ..views.source_views import MARGIN, SourceViews
 from ..views.target_view import TargetView, displacements
 from ..views.visibility import Visibility
@@ -89,7 +89,7 @@ def evidence(
         carried = look_up(source_views.view(target.t).picture.float(), instant.pixels)
         ours, theirs = (blurred(each * instant.visible[..., None], unit) for each in (plate, carried))
         reach = max(1, round(MARGIN * unit))  # by which depth may misplace plate t*
-        contradiction = torch.maximum(_beyond(ours, theirs, reach), _beyond(theirs, ours, reach))
+        contradiction = torch.maximum(beyond(ours, theirs, reach), beyond(theirs, ours, reach))
     gain = change - misfit
     return {
         "plate_matte": seen.moving,
@@ -110,12 +110,6 @@ def log_odds(of: Evidence, config: StateConfig, unit: float) -> Tensor:
 def let_go(odds: Tensor, config: StateConfig) -> Tensor:
     """[h, w] in 0..1: the share of each pixel that the plate does not give, of log-odds [h, w]."""
     return (0.5 + 0.5 * odds / config.softness).clamp(0.0, 1.0)
-
-
-def _beyond(picture: Tensor, other: Tensor, reach: int) -> Tensor:
-    """[h, w] by how much a picture [h, w, 3] leaves the range of what another shows within `reach` pixels."""
-    least, most = (torch.stack([of(each, reach) for each in other.unbind(-1)], -1) for of in (erode, dilate))
-    return torch.maximum(least - picture, picture - most).clamp_min(0.0).amax(-1)
 
 
 def _travel(source_views: SourceViews, target: TargetView, frame: int) -> Tensor:

@@ -87,7 +87,7 @@ def develop(
     stays as it was; and what moves does, or goes as far as t*'s neighbours bear.
 
     Args:
-        frozen: the run's scene at t*.
+        frozen: the run's scene at t*, and behind its Gaussians those of what it lacks (`missing.py`).
         t_star: frame number. If it is none of the run's trained frames its plate is not looked at: what moves is learnt
             from the nearest trained frame on either side, in which it stands where the field has it.
         moving: what moves in the clip's frames.
@@ -115,10 +115,13 @@ class _FineTuning:
         self.params = {name: torch.nn.Parameter(value.detach().clone()) for name, value in frozen.state.items()}
         self.optimizer = self._optimizer()
         self.mover = (self.plates.moving_share(frozen, t_star) > 0.5).float()
-        self.afar = undersampled(run, scene, frozen.state["means"], t_star, config.afar).float()
+        known = len(run.model.gaussians)
+        self.afar = torch.zeros_like(self.mover)
+        self.afar[:known] = undersampled(run, scene, frozen.state["means"][:known], t_star, config.afar).float()
         # Frames that show such a thing where it moves show it at other times: then nothing of it is learnt.
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in self.probes or self.instants])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
+        opened[known:] = 1.0
         self.held = ((self.afar > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
         self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
         """Rows of what moves and stands, at t*, in what the plate says moves."""

@@ -25,7 +25,7 @@ from .repairs import Moment, repaired, repairs
 
 FOLDER = DEVELOPED_FOLDER
 """Of developed instants, in a run's folder."""
-VERSION = 26
+VERSION = 27
 """Rises when instants developed before are not to be used any more."""
 MOST = 6
 """Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
@@ -167,6 +167,8 @@ def load_developed(
     closed = tensors["closed"].to(device)
     base = {name: tensors[f"base.{name}"].to(device) for name in PARAM_NAMES}
     support, motion = frozen.support.index_fill(0, closed, 1.0), frozen.motion.index_fill(0, closed, 0.0)
+    added = torch.ones(len(base["means"]) - len(support), device=device)
+    support, motion = torch.cat([support, added]), torch.cat([motion, added])
     before = FrozenGaussians(base, frozen.sh_degree, support, motion)
     state = {name: tensors[f"state.{name}"].to(device) for name in PARAM_NAMES}
     return FrozenGaussians(state, frozen.sh_degree, support, motion, before, tensors["origin"].to(device))
@@ -178,11 +180,12 @@ def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
     closed, origin, known = tensors.get("closed"), tensors.get("origin"), len(frozen.support)
     if closed is None or closed.dtype != torch.long or closed.dim() != 1 or not all(n in tensors for n in names):
         return False
-    if origin is None or origin.dtype != torch.uint8 or origin.shape != (known,):
+    if origin is None or origin.dtype != torch.uint8 or origin.dim() != 1 or len(origin) < known:
         return False
     for name in names:
         like, value = frozen.state[name.partition(".")[2]], tensors[name]
-        if value.dtype != like.dtype or value.shape != like.shape or not bool(value.isfinite().all()):
+        shape = len(origin), *like.shape[1:]
+        if value.dtype != like.dtype or value.shape != shape or not bool(value.isfinite().all()):
             return False
     return not len(closed) or (int(closed.min()) >= 0 and int(closed.max()) < known)
 
@@ -224,7 +227,7 @@ def _save(
     assert made.descent is not None and made.origin is not None
     path = developed_path(run, t_star)
     folder = shot.own(path.parent)
-    closed = torch.nonzero(made.descent.motion < field.motion).flatten()
+    closed = torch.nonzero(made.descent.motion[: len(field.motion)] < field.motion).flatten()
     tensors = {"closed": closed, "origin": made.origin}
     # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}

@@ -1,10 +1,12 @@
 """The scene at t*: the run's field at that instant, and what is repaired of it, in this order.
 
 1. Static baseline: what the field harms stands as it is on average.
-2. Develop: the scene is fine-tuned as the static scene that it is.
+2. Missing movers: what plate t* shows and the scene lacks is set where it stood.
+3. Develop: the scene is fine-tuned as the static scene that it is.
 
-A repair takes a scene and returns a scene of the same rows; it writes into neither. Each decides by the same question:
-does plate t* gain, and do the other plates not lose? What it does not answer with yes is left as it was.
+A repair takes a scene and returns a scene of the same rows, with new ones behind them if it adds any; it writes into
+neither. The first and the last ask: does plate t* gain, and do the other plates not lose? What that does not answer
+with yes is left as it was.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from ...train import LoadedRun
 from ..frozen import FrozenGaussians
 from ..views.source_views import MovingOf
 from .develop import Check, DevelopConfig, develop
+from .missing import MissingConfig, with_missing
 from .static_baseline import StaticBaselineConfig, apply_static_baseline
 
 
@@ -48,7 +51,7 @@ class Repair(Protocol):
         ...
 
     def apply(self, frozen: FrozenGaussians, moment: Moment) -> FrozenGaussians:
-        """The repaired scene, of the same rows; `frozen` is not changed."""
+        """The repaired scene, of the same rows and those that it adds; `frozen` is not changed."""
         ...
 
 
@@ -67,6 +70,20 @@ class StaticBaseline:
 
 
 @dataclass(frozen=True)
+class Missing:
+    """Adds what plate t* shows moving and the scene lacks: see `missing.py`."""
+
+    config: MissingConfig = field(default_factory=MissingConfig)
+    """How it is found and made."""
+    name: str = "missing movers"
+    """As in `Repair`."""
+
+    def apply(self, frozen: FrozenGaussians, moment: Moment) -> FrozenGaussians:
+        """The scene with what it lacks behind its rows."""
+        return with_missing(moment.run, moment.scene, frozen, moment.t_star, moment.moving, self.config)
+
+
+@dataclass(frozen=True)
 class Develop:
     """Fine-tunes the scene on the plates: see `develop.py`."""
 
@@ -82,7 +99,7 @@ class Develop:
 
 def repairs(config: DevelopConfig) -> tuple[Repair, ...]:
     """All repairs, in their order."""
-    return StaticBaseline(), Develop(config)
+    return StaticBaseline(), Missing(), Develop(config)
 
 
 def repaired(frozen: FrozenGaussians, moment: Moment, steps: Sequence[Repair]) -> FrozenGaussians:
@@ -90,8 +107,10 @@ def repaired(frozen: FrozenGaussians, moment: Moment, steps: Sequence[Repair]) -
     origin = torch.zeros(len(frozen.support), dtype=torch.uint8, device=frozen.support.device)
     for n, step in enumerate(steps):
         after = step.apply(frozen, moment)
+        known = len(origin)
+        origin = torch.cat([origin, origin.new_full((len(after.support) - known,), n + 1)])
         for name, value in after.state.items():
             if value is not frozen.state[name]:
-                origin[(value != frozen.state[name]).reshape(len(origin), -1).any(1)] = n + 1
+                origin[:known][(value[:known] != frozen.state[name]).reshape(known, -1).any(1)] = n + 1
         frozen = after
     return replace(frozen, origin=origin)

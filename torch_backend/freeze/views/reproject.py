@@ -135,3 +135,9 @@ def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:
     bottom = max(min(height, math.ceil(most) + _REACH), top + 1)
     down = torch.tensor([0.0, float(top)], dtype=pixels.dtype, device=pixels.device)
     return look_up(picture[top:bottom], pixels - down, "bicubic")
+
+
+def beyond(picture: Tensor, other: Tensor, reach: int) -> Tensor:
+    """[h, w] by how much a picture [h, w, 3] leaves the range of what another shows within `reach` pixels."""
+    least, most = (torch.stack([of(each, reach) for each in other.unbind(-1)], -1) for of in (erode, dilate))
+    return torch.maximum(least - picture, picture - most).clamp_min(0.0).amax(-1)

@@ -12,6 +12,8 @@ from ...scene import Scene
 from ...train import LoadedRun
 from ..frozen import FrozenGaussians, freeze_at
 
+HIDDEN = -20.0
+"""Opacity logit of a Gaussian that is not to be seen."""
 _KEPT = 90
 """Frames whose changes are kept: of 25,000 open Gaussians about 3 MB each."""
 
@@ -19,7 +21,8 @@ _KEPT = 90
 class SceneFlow:
     """From a scene frozen at t* to the clip's frames.
 
-    What was closed at t* (`static_twin.py`) is not moved.
+    What was closed at t* (`static_baseline.py`) is not moved. The run's own Gaussians come first in the scene; what
+    stands behind them (`missing.py`) is there at t* alone.
     """
 
     def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int) -> None:
@@ -29,15 +32,23 @@ class SceneFlow:
         """[M] int64, rows of the run's Gaussians that move."""
         self.t_star = t_star
         """Frame number."""
+        self._known = len(run.model.gaussians)
         self._changes: dict[int, dict[str, Tensor]] = {}
         self._at_t_star = self._field(t_star)
 
     def moved(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
         """The scene, or what it was developed to, as it is in a frame; with gradients."""
-        if frame == self.t_star or not len(self.rows):
-            return dict(state)
-        change = self._change(frame)
-        return {name: value.index_add(0, self.rows, change[name]) for name, value in state.items()}
+        made = dict(state)
+        if frame == self.t_star:
+            return made
+        if len(self.rows):
+            change = self._change(frame)
+            made = {name: value.index_add(0, self.rows, change[name]) for name, value in made.items()}
+        if len(made["means"]) > self._known:
+            opacity = made["opacity_logits"]
+            own = torch.arange(len(opacity), device=opacity.device) < self._known
+            made["opacity_logits"] = torch.where(own, opacity, HIDDEN)
+        return made
 
     @torch.no_grad()
     def _change(self, frame: int) -> dict[str, Tensor]:

@@ -14,6 +14,7 @@ from torch_backend.freeze import freeze_at, freeze_shot
 from torch_backend.freeze.exr import read_key
 from torch_backend.freeze.frozen import render_frozen, span_of
 from torch_backend.freeze.instant import develop as develop_module
+from torch_backend.freeze.instant import repairs as repairs_module
 from torch_backend.freeze.instant.develop import DevelopConfig, develop
 from torch_backend.freeze.instant.instants import (
     MOST,
@@ -24,6 +25,7 @@ from torch_backend.freeze.instant.instants import (
     developed_path,
     load_developed,
 )
+from torch_backend.freeze.instant.missing import with_missing
 from torch_backend.freeze.instant.repairs import Moment, repaired, repairs
 from torch_backend.freeze.instant.static_baseline import StaticBaselineConfig, apply_static_baseline, with_still_means
 from torch_backend.freeze.instant.undersampled import undersampled
@@ -112,8 +114,9 @@ def test_each_row_knows_what_repaired_it(made):
     steps = repairs(config_for(run))
     changed = torch.zeros(len(frozen.support), dtype=torch.bool)
     for name, value in frozen.state.items():
-        changed |= (now.state[name] != value).reshape(len(value), -1).any(1)
-    assert torch.equal(now.origin > 0, changed) and bool(changed.any())
+        changed |= (now.state[name][: len(value)] != value).reshape(len(value), -1).any(1)
+    assert torch.equal(now.origin[: len(changed)] > 0, changed) and bool((now.origin[len(changed) :] > 0).all())
+    assert bool(changed.any())
     moment = Moment(run, scene, T_STAR, motion_mattes(Shot(scene.folder.parent)))
     assert same(repaired(frozen, moment, steps), now)
     untouched = repaired(frozen, moment, [])
@@ -136,11 +139,67 @@ def test_developed_gaussians_travel_with_those_they_descend_from(made):
     stage = MovingScene(run, scene, now, T_STAR)
     assert all(torch.equal(value, now.state[name]) for name, value in stage.at(T_STAR).state.items())
     then = freeze_at(run.model, scene.time_of_frame(112), 1.0).state["means"] - frozen.state["means"]
-    moved = stage.at(112).state["means"] - now.state["means"]
-    moves = now.descent.motion > 0.5
+    known = len(then)
+    moved = (stage.at(112).state["means"] - now.state["means"])[:known]
+    moves = now.descent.motion[:known] > 0.5
     assert int(moves.sum()) > 10, "or the test says nothing"
     torch.testing.assert_close(moved[moves], then[moves], atol=1e-5, rtol=1e-4)
     assert not bool(moved[~moves].any())
+
+
+def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
+    """The field without half of what moves, as if it had never learnt that."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen = field(run, scene)
+    rows = run.model.open_rows()
+    x = frozen.state["means"][rows, 0]
+    lost, rest = rows[x < x.median()], rows[x >= x.median()]
+    opacity = frozen.state["opacity_logits"].index_fill(0, lost, -20.0)
+    halved = dataclasses.replace(frozen, state={**frozen.state, "opacity_logits": opacity})
+    mended = with_missing(run, scene, halved, T_STAR, motion_mattes(world.shot))
+    added = slice(len(frozen.support), None)
+    assert len(mended.support[added]) > 20 and bool((mended.motion[added] == 1.0).all())
+    i = scene.frames.index(T_STAR)
+    deep = [
+        float((means @ scene.viewmats[i, 2, :3] + scene.viewmats[i, 2, 3]).median())
+        for means in (mended.state["means"][added], frozen.state["means"][rest])
+    ]
+    assert abs(deep[0] / deep[1] - 1.0) < 0.1
+    before, after = (scores(world, run, scene, each) for each in (halved, mended))
+    assert after[0] > before[0] + 1.0 and after[1] > before[1] - 0.3
+    for frame in (101, 112):  # at other times nobody knows where it was
+        moved = SceneFlow(run, scene, mended, T_STAR).moved(mended.state, frame)
+        assert bool((torch.sigmoid(moved["opacity_logits"][added]) < 1e-6).all())
+
+
+def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
+    """Written, read again, and refused where a row is gone."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen, t_star = field(run, scene, 109), 109
+    extra = {name: value[:5] for name, value in frozen.state.items()}
+
+    def grown(run, scene, scene_at, *_):
+        state = {name: torch.cat([value, extra[name]]) for name, value in scene_at.state.items()}
+        ones = torch.ones(5)
+        return dataclasses.replace(
+            scene_at,
+            state=state,
+            support=torch.cat([scene_at.support, ones]),
+            motion=torch.cat([scene_at.motion, ones]),
+        )
+
+    monkeypatch.setattr(repairs_module, "with_missing", grown)
+    made = developed(world.shot, run, scene, t_star, frozen)
+    assert len(made.support) == len(frozen.support) + 5 and len(made.origin) == len(made.support)
+    assert same(load_developed(world.shot, run, t_star, frozen), made)
+    path = developed_path(run, t_star)
+    tensors, meta = load_checkpoint(path)
+    tensors["state.means"] = tensors["state.means"][:-1].clone()
+    save_checkpoint(path, tensors, meta)
+    assert load_developed(world.shot, run, t_star, frozen) is None
+    path.unlink()
 
 
 def in_tatters(run, frozen):
