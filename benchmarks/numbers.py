@@ -29,6 +29,7 @@ GUARDS = 1e-3, 1e4
 UNTUNED = {
     "views/reproject.py:_REACH": "mathematics",
     "views/scene_flow.py:_KEPT": "resource",
+    "views/scene_flow.py:HIDDEN": "guard",
     "views/source_views.py:LENGTHS_OF": "unit",
     "views/source_views.py:_VIEWS _VIEWS_BYTES": "resource",
     "views/source_views.py:_RESIDUALS_BYTES": "resource",
@@ -46,6 +47,7 @@ UNTUNED = {
     "instant/develop.py:_FineTuning._judged": "unit",
     "instant/instants.py:VERSION": "format",
     "instant/instants.py:MOST": "resource",
+    "instant/missing.py:with_missing": "guard",
     "instant/static_baseline.py:_Pair.__init__": "unit",
     "composite/compositor.py:_NOTHING": "format",
     "composite/compositor.py:Compositor._mix_frame": "format",

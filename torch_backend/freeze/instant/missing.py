@@ -26,9 +26,6 @@ from ..views.scene_flow import HIDDEN
 from ..views.source_views import LENGTHS_OF, MovingOf, VisibilityConfig
 from ..views.working_plates import WorkingPlates
 
-_SOME = 0.05
-"""Shares below this are nothing."""
-
 
 @dataclass(frozen=True)
 class MissingConfig:
@@ -115,21 +112,21 @@ def found(
     inverse, near = 1.0 / image.depth.clamp_min(1e-6), blurred(gone, sigma)
     hidden = blurred(gone * inverse, sigma) / near.clamp_min(1e-6)
     nearer = (inverse / hidden.clamp_min(1e-12) - 1.0).clamp_min(0.0) / config.depth_tolerance
-    holds = (1.0 - absent) * (1.0 - torch.exp(-nearer.square()))
-    depths = _depths(near, gone, holds, inverse, 2.0 * np.pi * sigma**2)
-    around = torch.minimum(matte, dilate(gone, reach))  # beside the arm the hand is within its reach
-    return torch.minimum(around, outline) * (depths > 0.0).float(), depths
+    holds = (1.0 - absent) * (1.0 - torch.exp(-nearer.square())) * (near > 1e-6)
+    depths = _depths(dilate(gone > 0.5, 2 * reach), gone, holds, inverse, 2.0 * np.pi * sigma**2)
+    whole = torch.minimum(matte, dilate(gone, reach))  # beside the arm the hand is within its reach
+    return torch.minimum(whole, outline) * (depths > 0.0).float(), depths
 
 
-def _depths(near: Tensor, gone: Tensor, holds: Tensor, inverse: Tensor, least: float) -> Tensor:
-    """[h, w] inverse depth of the regions of `near`: the median of what holds them; 0 where nothing does, and where
-    less than `least` pixels are `gone`, which is less than the low-pass that found them."""
-    count, regions = cv2.connectedComponents((near > _SOME).byte().numpy())
+def _depths(around: Tensor, gone: Tensor, holds: Tensor, inverse: Tensor, least: float) -> Tensor:
+    """[h, w] inverse depth of the regions of `around`, bool: the median of what holds them; 0 where nothing does, and
+    where less than `least` pixels are `gone`, which is less than the low-pass that found them."""
+    count, regions = cv2.connectedComponents(around.byte().numpy())
     weights, values, amounts = (each.numpy() for each in (holds, inverse, gone))
     deep = np.zeros(count, np.float32)
     for n in range(1, count):
         of = regions == n
-        holding = of & (weights > _SOME)
+        holding = of & (weights > 0.0)
         if holding.any() and amounts[of].sum() >= least:
             deep[n] = weighted_median(values[holding], weights[holding])
     return from_numpy(deep[regions])
