@@ -114,8 +114,7 @@ def found(
     nearer = (inverse / hidden.clamp_min(1e-12) - 1.0).clamp_min(0.0) / config.depth_tolerance
     holds = (1.0 - absent) * (1.0 - torch.exp(-nearer.square())) * (near > 1e-6)
     depths = _depths(dilate(gone > 0.5, 2 * reach), gone, holds, inverse, 2.0 * np.pi * sigma**2)
-    whole = torch.minimum(matte, dilate(gone, reach))  # beside the arm the hand is within its reach
-    return torch.minimum(whole, outline) * (depths > 0.0).float(), depths
+    return torch.minimum(gone, outline) * (depths > 0.0).float(), depths
 
 
 def _depths(around: Tensor, gone: Tensor, holds: Tensor, inverse: Tensor, least: float) -> Tensor:

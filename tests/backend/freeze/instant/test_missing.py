@@ -31,7 +31,7 @@ def test_a_hand_that_the_scene_lacks_is_as_deep_as_its_arm():
     missing, inverse = asked([(ARM_AT, ARM), (HAND_AT, ARM)], [(ARM_AT, ARM)])
     hand = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hand[HAND_AT] = True
-    assert float((missing[hand] > 0.5).float().mean()) > 0.95
+    assert float((missing[hand] > 0.5).float().mean()) > 0.9
     assert not bool((missing[~hand] > 0.5).any())
     torch.testing.assert_close(inverse[missing > 0.5], torch.full_like(inverse[missing > 0.5], 1.0 / ARM))
 
