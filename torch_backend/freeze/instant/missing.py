@@ -3,7 +3,8 @@
 The field learns from all frames, and what only a few of them show is in none of its states. Developing would paint it
 onto whatever lies behind. Plate t* shows it, but not how far away it is: it is as deep as what it hangs on, the parts
 of the scene beside it that are nearer than what the scene shows in its place. Its pixels become Gaussians of the
-plate's colours at that depth. What hangs on nothing is left to developing.
+plate's colours at that depth, and what the field has astray there is hidden. What hangs on nothing is left to
+developing.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from ...gaussians.model import SH_C0
 from ...scene import Scene
 from ...torch_types import from_numpy
 from ...train import LoadedRun
+from ...train.model import gathered
 from ..frozen import FrozenGaussians, FrozenImage, render_frozen
 from ..views.reproject import beyond, blurred, dilate, pixel_centres, unproject
 from ..views.scene_flow import HIDDEN
 from ..views.source_views import LENGTHS_OF, MovingOf, VisibilityConfig
-from ..views.working_plates import WorkingPlates
+from ..views.working_plates import SEEN, WorkingPlates
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ def with_missing(
     run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int, moving: MovingOf,
     config: MissingConfig | None = None,
 ) -> FrozenGaussians:  # fmt: skip
-    """The scene and, behind its rows, Gaussians of what plate t* shows moving and the scene lacks.
+    """The scene without what the field has astray and, behind its rows, Gaussians of what plate t* shows moving and it
+    lacks.
 
     Args:
         frozen: the run's scene at t*.
@@ -54,14 +57,19 @@ def with_missing(
         return frozen
     plates, time = WorkingPlates(scene, LENGTHS_OF, moving), scene.time_of_frame(t_star)
     viewmat, K, width, height = plates.camera(t_star)
-    opacity = torch.where(frozen.motion < 0.5, frozen.state["opacity_logits"], HIDDEN)
-    still = replace(frozen, state={**frozen.state, "opacity_logits": opacity})
-    image, behind = (
-        render_frozen(each, viewmat, K, width, height, run.model.exposure, time) for each in (frozen, still)
-    )
     picture, matte, ignored = plates.picture(t_star), plates.matte(t_star), plates.ignored(t_star)
     matte = matte if ignored is None else matte * (~ignored).float()
-    missing, inverse = found(picture, image, behind, matte, width / LENGTHS_OF, config.plates)
+    unit, moves = width / LENGTHS_OF, frozen.motion > 0.5
+
+    def shown(scene: FrozenGaussians) -> FrozenImage:
+        return render_frozen(scene, viewmat, K, width, height, run.model.exposure, time)
+
+    # What the field has where the plate shows something else is astray, and tells no depth.
+    wrong = matte * nowhere(picture, shown(frozen).color, unit, config.plates)
+    weights = torch.stack([wrong, torch.ones_like(wrong)], dim=-1).to(moves.device)
+    inside, whole = gathered(frozen.state, viewmat.to(moves.device), K.to(moves.device), width, height, weights).T
+    frozen = _without(frozen, moves & (whole > SEEN) & (inside > 0.5 * whole))
+    missing, inverse = found(picture, shown(frozen), shown(_without(frozen, moves)), matte, unit, config.plates)
     at = missing > 0.5
     depth, colour = 1.0 / inverse[at], picture[at]
     if run.model.exposure.config.on:
@@ -93,21 +101,14 @@ def found(
         matte: [h, w] in 0..1, what moves.
         unit: pixels to one of 640.
     """
-    margin = config.margin * unit
-    sigma, reach = 2.0 * margin, max(1, round(2.0 * margin))
-
-    def sure(off: Tensor) -> Tensor:
-        return 1.0 - torch.exp(-(off / config.unexplained).square())
-
-    def nowhere(shown: FrozenImage) -> Tensor:  # splats are soft, and a little off
-        return sure(beyond(blurred(picture, margin), blurred(shown.color, margin), reach))
+    sigma, reach = 2.0 * config.margin * unit, max(1, round(2.0 * config.margin * unit))
 
     def unlike(shown: FrozenImage) -> Tensor:
-        return sure((picture - shown.color).abs().amax(-1))
+        return _sure((picture - shown.color).abs().amax(-1), config)
 
     # Where the plate shows what is behind, the scene shows something too much, and lacks nothing.
-    absent = nowhere(image)
-    gone = matte * torch.minimum(absent, nowhere(behind))
+    absent, other = (nowhere(picture, each.color, unit, config) for each in (image, behind))
+    gone = matte * torch.minimum(absent, other)
     outline = torch.minimum(unlike(image), unlike(behind))
     inverse, near = 1.0 / image.depth.clamp_min(1e-6), blurred(gone, sigma)
     hidden = blurred(gone * inverse, sigma) / near.clamp_min(1e-6)
@@ -117,10 +118,28 @@ def found(
     return torch.minimum(gone, outline) * (depths > 0.0).float(), depths
 
 
+def nowhere(picture: Tensor, shown: Tensor, unit: float, config: VisibilityConfig) -> Tensor:
+    """[h, w] in 0..1: how sure a plate shows something that a render has nowhere near. Splats are soft, and a little
+    off. Both [h, w, 3], display-referred."""
+    margin = config.margin * unit
+    return _sure(beyond(blurred(picture, margin), blurred(shown, margin), max(1, round(2.0 * margin))), config)
+
+
+def _sure(difference: Tensor, config: VisibilityConfig) -> Tensor:
+    return 1.0 - torch.exp(-(difference / config.unexplained).square())
+
+
+def _without(frozen: FrozenGaussians, hidden: Tensor) -> FrozenGaussians:
+    """A scene in which the rows `hidden`, bool [N], are not to be seen."""
+    opacity = torch.where(hidden, HIDDEN, frozen.state["opacity_logits"])
+    return replace(frozen, state={**frozen.state, "opacity_logits": opacity})
+
+
 def _depths(around: Tensor, gone: Tensor, holds: Tensor, inverse: Tensor, least: float) -> Tensor:
     """[h, w] inverse depth of the regions of `around`, bool: the median of what holds them; 0 where nothing does, and
     where less than `least` pixels are `gone`, which is less than the low-pass that found them."""
-    count, regions = cv2.connectedComponents(around.byte().numpy())
+    count, labels = cv2.connectedComponents(around.byte().numpy())
+    regions = np.asarray(labels, np.int32)
     weights, values, amounts = (each.numpy() for each in (holds, inverse, gone))
     deep = np.zeros(count, np.float32)
     for n in range(1, count):

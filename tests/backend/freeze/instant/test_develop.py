@@ -173,6 +173,23 @@ def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
         assert bool((torch.sigmoid(moved["opacity_logits"][added]) < 1e-6).all())
 
 
+def test_what_the_field_has_astray_is_hidden_and_nothing_that_stands_still(trained):
+    """Part of what moves in a colour that plate t* does not have there."""
+    world, _ = trained
+    run, scene = load_run(world.shot, "main"), load_scene(world.shot)
+    frozen = field(run, scene)
+    rows = run.model.open_rows()
+    x = frozen.state["means"][rows, 0]
+    wrong = rows[x < x.median()]
+    sh0 = frozen.state["sh0"].index_copy(0, wrong, -frozen.state["sh0"][wrong] + 1.0)
+    astray = dataclasses.replace(frozen, state={**frozen.state, "sh0": sh0})
+    mended = with_missing(run, scene, astray, T_STAR, motion_mattes(world.shot))
+    changed = mended.state["opacity_logits"][: len(frozen.support)] != frozen.state["opacity_logits"]
+    assert bool(changed.any()) and not bool(changed[frozen.motion < 0.5].any())
+    others = torch.ones(len(changed), dtype=torch.bool).index_fill(0, wrong, False)
+    assert int(changed[wrong].sum()) > 4 * int(changed[others].sum())
+
+
 def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
     """Written, read again, and refused where a row is gone."""
     world, _ = trained
