@@ -52,14 +52,14 @@ def own(trained_copy):
 @pytest.fixture(scope="module")
 def alone(own, quiet):
     """(files, shares) of a take that one process rendered."""
-    _, take, frames = opened(own, "alone", quiet())
+    _, take, frames = opened(own, "one-process", quiet())
     shares = render_frames(take, frames, set(), quiet())
     return files(take.folder), shares
 
 
 @pytest.mark.parametrize("processes", [2, 3])
 def test_any_number_of_processes_writes_the_same_bytes(own, quiet, alone, processes):
-    params, take, frames = opened(own, f"by{processes}", quiet())
+    params, take, frames = opened(own, f"{processes}-processes", quiet())
     shares = render_side_by_side(own, params, take, frames, {103}, quiet(), processes)
     expected = {name: data for name, data in alone[0].items() if "000103" not in name}
     assert files(take.folder) == expected
@@ -68,12 +68,12 @@ def test_any_number_of_processes_writes_the_same_bytes(own, quiet, alone, proces
 
 @needs_proc
 def test_what_a_killed_process_leaves_is_rendered_by_its_starter(own, quiet, alone):
-    params, take, frames = opened(own, "killed", quiet())
+    params, take, frames = opened(own, "one-killed", quiet())
 
     class Killer(type(quiet())):
         killed = 0
 
-        def progress(self, stage, done, total, message=""):
+        def check_cancelled(self):
             if not self.killed and (found := helpers()):
                 os.kill(found[0], signal.SIGKILL)
                 self.killed = found[0]
@@ -85,7 +85,7 @@ def test_what_a_killed_process_leaves_is_rendered_by_its_starter(own, quiet, alo
 
 @needs_proc
 def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(own, quiet, alone):
-    params, take, frames = opened(own, "cancelled", quiet())
+    params, take, frames = opened(own, "all-cancelled", quiet())
 
     class Stop(type(quiet())):
         heard = 0
@@ -108,7 +108,7 @@ def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(own, quiet, alone):
 
 def test_what_stops_one_of_them_is_told_as_if_there_were_one(own, quiet):
     """A plate that cannot be read ends the take with the same sentence."""
-    params, take, frames = opened(own, "unreadable", quiet())
+    params, take, frames = opened(own, "one-unreadable", quiet())
     plate = own.plate(104)
     data = plate.read_bytes()
     plate.write_bytes(data[:100])
