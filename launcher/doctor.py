@@ -87,8 +87,8 @@ def machine_findings() -> Iterator[Finding]:
         yield Finding("64 bit", "missing", "this Python is 32-bit: install a 64-bit one")
     cores = os.cpu_count() or 1
     yield Finding("cores", "ok" if cores > 1 else "note", f"{cores} on {platform.platform(terse=True)}")
-    if (told := memory()) is not None:
-        total = told[0] / 1e9
+    if (known := memory()) is not None:
+        total = known[0] / 1e9
         enough = total >= 6
         yield Finding(
             "memory", "ok" if enough else "note", f"{total:.1f} GB{'' if enough else ': close other programs'}"

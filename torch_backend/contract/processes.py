@@ -39,7 +39,7 @@ def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]
 
 
 def child_environment(root: Path) -> dict[str, str]:
-    """Of a child of `python_child` that finds our package in `root`, whatever this process was started from."""
+    """Environment for a child of `python_child` that has to import our package from the folder `root`."""
     # An empty or relative entry would be the folder that the child stands in.
     inherited = [p for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if os.path.isabs(p)]
     # Threads that spin while they wait take the core from whoever shares it.
@@ -275,9 +275,9 @@ def _process_of_windows(pid: int) -> Process | None:
 
 
 def memory() -> tuple[float, float] | None:
-    """(bytes of physical memory, bytes of it that are free); None where the system does not say.
+    """(bytes of physical memory, bytes available without swapping); None where the system does not say.
 
-    Free is what programs may take without others being moved out; on a Mac, which does not say it, half of all.
+    macOS does not say how much is available: half of all is returned. Limits of a container are not considered.
     """
     if sys.platform == "win32":
 
@@ -291,8 +291,8 @@ def memory() -> tuple[float, float] | None:
             )
 
         status = Status(length=ctypes.sizeof(Status))
-        told = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))
-        return (float(status.total), float(status.free)) if told else None
+        is_known = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))
+        return (float(status.total), float(status.free)) if is_known else None
     try:
         total = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (ValueError, OSError):

@@ -1,10 +1,9 @@
-"""What plate t* shows moving and the scene lacks, set where it stood: a waving hand, an arm raised for a moment.
+"""Adds Gaussians for what plate t* shows moving and the frozen scene lacks: a waving hand, an arm raised for a moment.
 
-The field learns from all frames, and what only a few of them show is in none of its states. Developing would paint it
-onto whatever lies behind. Plate t* shows it, but not how far away it is: it is as deep as what it hangs on, the parts
-of the scene beside it that are nearer than what the scene shows in its place. Its pixels become Gaussians of the
-plate's colours at that depth, and what the field has astray there is hidden. What hangs on nothing is left to
-developing.
+The field learns from all frames. What only a few of them show is in none of its states, and developing would paint it
+onto the surfaces behind. Plate t* shows it, but not its depth. So it gets the depth of what it is attached to: the
+median over the pixels beside it at which the scene is nearer than where the thing is missing. Floaters of the field,
+which the plate contradicts, are hidden first. A thing that is attached to nothing is left to developing.
 """
 
 from __future__ import annotations
@@ -31,12 +30,13 @@ from ..views.working_plates import SEEN, WorkingPlates
 
 @dataclass(frozen=True)
 class MissingConfig:
-    """What is missing, and of what Gaussians it is made."""
+    """How missing movers are found, and how large their Gaussians are."""
 
     plates: VisibilityConfig = field(default_factory=VisibilityConfig)
-    """How pictures and depths are compared."""
+    """Tolerances for comparing pictures and depths."""
     sigma: float = 0.6
-    """Standard deviation of the Gaussian of one pixel, in pixels: neighbours blend, and outlines stay."""
+    """Standard deviation of a Gaussian in pixels of plate t*, which gets one per pixel: small enough to keep outlines,
+    large enough that neighbours blend."""
 
 
 @torch.no_grad()
@@ -44,12 +44,11 @@ def with_missing(
     run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int, moving: MovingOf,
     config: MissingConfig | None = None,
 ) -> FrozenGaussians:  # fmt: skip
-    """The scene without what the field has astray and, behind its rows, Gaussians of what plate t* shows moving and it
-    lacks.
+    """The frozen scene with floaters hidden, and with Gaussians of missing movers appended after its rows.
 
     Args:
         frozen: the run's scene at t*.
-        t_star: frame number. The plate of one that was not trained on is not looked at.
+        t_star: frame number. If it was not trained on, the scene is returned unchanged.
         moving: what moves in the clip's frames.
     """
     config = config or MissingConfig()
@@ -64,12 +63,13 @@ def with_missing(
     def shown(scene: FrozenGaussians) -> FrozenImage:
         return render_frozen(scene, viewmat, K, width, height, run.model.exposure, time)
 
-    # What the field has where the plate shows something else is astray, and tells no depth.
-    wrong = matte * nowhere(picture, shown(frozen).color, unit, config.plates)
+    # A moving Gaussian is a floater if plate t* contradicts most of what is seen of it. Left in, it would be taken for
+    # what a hand is attached to, and hold the hand too near.
+    wrong = matte * mismatch(picture, shown(frozen).color, unit, config.plates)
     weights = torch.stack([wrong, torch.ones_like(wrong)], dim=-1).to(moves.device)
     inside, whole = gathered(frozen.state, viewmat.to(moves.device), K.to(moves.device), width, height, weights).T
-    frozen = _without(frozen, moves & (whole > SEEN) & (inside > 0.5 * whole))
-    missing, inverse = found(picture, shown(frozen), shown(_without(frozen, moves)), matte, unit, config.plates)
+    frozen = _hiding(frozen, moves & (whole > SEEN) & (inside > 0.5 * whole))
+    missing, inverse = missing_pixels(picture, shown(frozen), shown(_hiding(frozen, moves)), matte, unit, config.plates)
     at = missing > 0.5
     depth, colour = 1.0 / inverse[at], picture[at]
     if run.model.exposure.config.on:
@@ -90,10 +90,10 @@ def with_missing(
     )  # fmt: skip
 
 
-def found(
+def missing_pixels(
     picture: Tensor, image: FrozenImage, behind: FrozenImage, matte: Tensor, unit: float, config: VisibilityConfig
 ) -> tuple[Tensor, Tensor]:
-    """([h, w] in 0..1 how much of each pixel is missing and hangs on something, [h, w] its inverse depth).
+    """([h, w] in 0..1 share of each pixel that is missing and attached to something, [h, w] its inverse depth).
 
     Args:
         picture: [h, w, 3] plate t*, display-referred.
@@ -106,8 +106,8 @@ def found(
     def unlike(shown: FrozenImage) -> Tensor:
         return _sure((picture - shown.color).abs().amax(-1), config)
 
-    # Where the plate shows what is behind, the scene shows something too much, and lacks nothing.
-    absent, other = (nowhere(picture, each.color, unit, config) for each in (image, behind))
+    # Where the plate matches the background, the scene shows something in excess there, and lacks nothing.
+    absent, other = (mismatch(picture, each.color, unit, config) for each in (image, behind))
     gone = matte * torch.minimum(absent, other)
     outline = torch.minimum(unlike(image), unlike(behind))
     inverse, near = 1.0 / image.depth.clamp_min(1e-6), blurred(gone, sigma)
@@ -118,9 +118,9 @@ def found(
     return torch.minimum(gone, outline) * (depths > 0.0).float(), depths
 
 
-def nowhere(picture: Tensor, shown: Tensor, unit: float, config: VisibilityConfig) -> Tensor:
-    """[h, w] in 0..1: how sure a plate shows something that a render has nowhere near. Splats are soft, and a little
-    off. Both [h, w, 3], display-referred."""
+def mismatch(picture: Tensor, shown: Tensor, unit: float, config: VisibilityConfig) -> Tensor:
+    """[h, w] in 0..1: confidence that a plate shows colours that a render has nowhere nearby, [h, w, 3] each,
+    display-referred. Blur and misplacement within the margin do not count, because splats have both."""
     margin = config.margin * unit
     return _sure(beyond(blurred(picture, margin), blurred(shown, margin), max(1, round(2.0 * margin))), config)
 
@@ -129,15 +129,15 @@ def _sure(difference: Tensor, config: VisibilityConfig) -> Tensor:
     return 1.0 - torch.exp(-(difference / config.unexplained).square())
 
 
-def _without(frozen: FrozenGaussians, hidden: Tensor) -> FrozenGaussians:
-    """A scene in which the rows `hidden`, bool [N], are not to be seen."""
+def _hiding(frozen: FrozenGaussians, hidden: Tensor) -> FrozenGaussians:
+    """The scene with the rows `hidden`, bool [N], made invisible."""
     opacity = torch.where(hidden, HIDDEN, frozen.state["opacity_logits"])
     return replace(frozen, state={**frozen.state, "opacity_logits": opacity})
 
 
 def _depths(around: Tensor, gone: Tensor, holds: Tensor, inverse: Tensor, least: float) -> Tensor:
-    """[h, w] inverse depth of the regions of `around`, bool: the median of what holds them; 0 where nothing does, and
-    where less than `least` pixels are `gone`, which is less than the low-pass that found them."""
+    """[h, w] inverse depth of each connected region of `around`, bool: the median weighted by `holds`. 0 where a region
+    is attached to nothing, or has less than `least` missing pixels: the area of the low-pass that found it."""
     count, labels = cv2.connectedComponents(around.byte().numpy())
     regions = np.asarray(labels, np.int32)
     weights, values, amounts = (each.numpy() for each in (holds, inverse, gone))

@@ -1,8 +1,8 @@
 """One of the processes of `side_by_side.py`: `python -m torch_backend.freeze.take.frame_process`.
 
-On its standard input comes one message of `contract.read_message`, whose header is the request: `shot`, `params` (of
-the freeze), `t_star`, `keys` of the whole take, `folder` for the frames, and `frames`, the numbers of those to render.
-The input stays open as long as the starter lives. On the standard output go messages:
+Reads one message (`contract.read_message`) from standard input. Its header is the request: `shot`, `params` of the
+freeze, `t_star`, `keys` of the whole take, `folder` for the frames, and `frames`, the numbers to render. The input
+stays open as long as the starter lives. Writes these messages to standard output:
 
 | kind | with |
 |---|---|
@@ -10,7 +10,7 @@ The input stays open as long as the starter lives. On the standard output go mes
 | `share` | `frame`, `size` [h, w]; the body: float32, the frame's share of plate, as `render_frames` returns it |
 | `error` | `message`, `hint`, `exit_code` of a `JobError` |
 
-Where it would render something else than its starter, because the run has been trained meanwhile, it ends in silence.
+If the take differs from the starter's, because the run was trained meanwhile, it exits without a message.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from ...contract import (
 )
 
 
-class _Told(Reporter):
-    """Says how far the frames are; the starter has said all else."""
+class _FrameReporter(Reporter):
+    """Sends the progress of the frames; warnings were given by the starter."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        """Frames alone."""
+        """Sends the progress of the stage `freezing`, and of no other."""
         if stage == "freezing" and done < total:
             write_message(self._stream, {"kind": "progress", "done": int(done), "message": message})
 
@@ -50,23 +50,23 @@ class _Told(Reporter):
 def main() -> int:
     """Runs the request; an `ExitCode`."""
     with os.fdopen(0, "rb", buffering=0, closefd=False) as stdin:
-        asked = read_message(stdin)
+        message = read_message(stdin)
     end_with_starter()
     stream = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever a library prints is no message
-    if asked is None:
+    os.dup2(2, 1)  # keep what libraries print out of the messages
+    if message is None:
         return ExitCode.CANCELLED
     try:
-        _render(asked[0], stream)
+        _render(message[0], stream)
     except KeyboardInterrupt:
         return ExitCode.CANCELLED
     except (JobError, OSError) as error:
-        told = error if isinstance(error, JobError) else path_error(error)
-        if told is None:
+        known = error if isinstance(error, JobError) else path_error(error)
+        if known is None:
             raise
-        header = {"kind": "error", "message": told.message, "hint": told.hint, "exit_code": int(told.exit_code)}
+        header = {"kind": "error", "message": known.message, "hint": known.hint, "exit_code": int(known.exit_code)}
         write_message(stream, header)
-        return told.exit_code
+        return known.exit_code
     return ExitCode.OK
 
 
@@ -75,15 +75,15 @@ def _render(request: dict[str, Any], stream: BinaryIO) -> None:
     from .frames import render_frames
     from .plan import planned
 
-    told, shot = _Told(stream), Shot.open(request["shot"])
+    report, shot = _FrameReporter(stream), Shot.open(request["shot"])
     params = from_dict(FreezeParams, request["params"])
-    take = planned(shot, params, told, request["t_star"])
+    take = planned(shot, params, report, request["t_star"])
     if take.all_keys != request["keys"]:
         return
     wanted = set(request["frames"])
     take = dataclasses.replace(take, folder=TakeFolder(shot.own(Path(request["folder"]))))
     frames = [output for output in take.whole if output.frame in wanted]
-    for frame, share in render_frames(take, frames, set(), told).items():
+    for frame, share in render_frames(take, frames, set(), report).items():
         header = {"kind": "share", "frame": frame, "size": list(share.shape)}
         write_message(stream, header, share.contiguous().numpy().tobytes())
 

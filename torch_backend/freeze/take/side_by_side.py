@@ -1,8 +1,8 @@
-"""The frames of a take, rendered by several processes at once where cores and memory allow it.
+"""Renders the frames of a take in several processes where cores and memory allow it.
 
-One process keeps about two cores busy, however many there are: what is decided of a frame runs in one thread beside
-the rasteriser's and the writer's. Each process renders a run of neighbouring frames, which look at the same plates.
-What a process does not finish, because it was killed or could not begin, its starter renders itself.
+One process uses about two cores, however many there are, because each frame is decided in one thread. Each process
+renders consecutive frames, which share source plates. Frames that a process does not finish, because it was killed or
+could not start, are rendered by the process that started it.
 """
 
 from __future__ import annotations
@@ -39,41 +39,42 @@ from .frames import make_ready, render_frames
 from .plan import PlannedTake
 
 THREADS = 2
-"""Of one process."""
+"""Threads of one process."""
 _FEWEST = 12
-"""Frames that a process is worth: it needs as long as for eight to load the run and to look at its first plates."""
+"""Least frames per process: it starts and loads the run in about 5 s, the time of 12 frames of 640 x 480."""
 _BYTES, _BYTES_A_PIXEL = 1.7e9, 130
-"""Memory of a process: `python -m benchmarks.detail_cost` peaks at 1.6 GB at 640 x 360 and at 2.5 GB at 3840 x 2160."""
+"""Memory of one process: `python -m benchmarks.detail_cost` peaks at 1.6 GB at 640 x 360, 2.5 GB at 3840 x 2160."""
 _POLL_SECONDS = 0.2
 
-Said = tuple[dict[str, Any], bytes] | None
-"""A message of a process, or None at its end."""
+Message = tuple[dict[str, Any], bytes] | None
+"""Header and body of a process's message; None when its output ends."""
 
 
-def processes_for(frames: int, pixels: int, cores: int, free: float) -> int:
-    """How many processes render so many frames of so many pixels, with so many cores and bytes that are free."""
-    return max(1, min(cores // THREADS, frames // _FEWEST, int(free / (_BYTES + _BYTES_A_PIXEL * pixels))))
+def processes_for(frames: int, pixels: int, core_count: int, free_bytes: float) -> int:
+    """Number of processes for so many frames of so many pixels each, at least 1."""
+    return max(1, min(core_count // THREADS, frames // _FEWEST, int(free_bytes / (_BYTES + _BYTES_A_PIXEL * pixels))))
 
 
 def render_side_by_side(
     shot: Shot, params: FreezeParams, take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter,
     processes: int | None = None,
 ) -> dict[int, Tensor]:  # fmt: skip
-    """As `render_frames`, by so many processes; None: as many as are worth it and fit the machine.
+    """As `render_frames`, in several processes.
 
-    A run on a card, or one whose instants are not kept where processes find them, is rendered by this process alone.
+    `processes` None: as many as `processes_for` allows. A run on a card is rendered by this process alone, and so is
+    one whose developed instants are not stored where other processes can read them.
     """
     make_ready(take, frames, done, report)
     missing = [output.frame for output in frames if output.frame not in done]
     spec = take.spec
     if processes is None:
-        free = (memory() or (0.0, 0.0))[1]
-        processes = processes_for(len(missing), spec.whole[0] * spec.whole[1], cores(), free)
+        free_bytes = (memory() or (0.0, 0.0))[1]
+        processes = processes_for(len(missing), spec.whole[0] * spec.whole[1], cores(), free_bytes)
     kept = all(spec.instants.is_kept(t) for t in spec.instants.keys)
     if processes < 2 or not kept or spec.run.stale or spec.run.model.gaussians.open.is_cuda:
         return render_frames(take, frames, done, report)
     parts = [missing[len(missing) * n // processes : len(missing) * (n + 1) // processes] for n in range(processes)]
-    asked = {
+    request = {
         "shot": str(shot.root.absolute()), "folder": str(take.folder.root.absolute()), "t_star": take.t_star,
         "keys": take.all_keys,
         "params": dataclasses.asdict(params) | {
@@ -82,8 +83,8 @@ def render_side_by_side(
         },
     }  # fmt: skip
     shares: dict[int, Tensor] = {}
-    with _started([{**asked, "frames": part} for part in parts]) as heard:
-        _listen(heard, len(parts), len(missing), shares, report)
+    with _started([{**request, "frames": part} for part in parts]) as messages:
+        _listen(messages, len(parts), len(missing), shares, report)
     lost = [n for n in missing if n not in shares]
     right = right_frames(take, {n: stored_key(take.folder, n, spec) for n in lost})
     rest = [output for output in frames if output.frame in lost and output.frame not in right]
@@ -91,20 +92,21 @@ def render_side_by_side(
 
 
 def _listen(
-    heard: queue.SimpleQueue[tuple[int, Said]], running: int, total: int, shares: dict[int, Tensor], report: Reporter
+    messages: queue.SimpleQueue[tuple[int, Message]], running: int, total: int, shares: dict[int, Tensor],
+    report: Reporter,
 ) -> None:  # fmt: skip
-    """Until so many processes have ended: fills `shares`, tells how far they are. JobError as one of them has it."""
+    """Waits until `running` processes have ended; fills `shares`, reports progress, raises the JobError of any."""
     done = dict.fromkeys(range(running), 0)
     while running:
         report.check_cancelled()
         try:
-            n, said = heard.get(timeout=_POLL_SECONDS)
+            n, message = messages.get(timeout=_POLL_SECONDS)
         except queue.Empty:
             continue
-        if said is None:
+        if message is None:
             running -= 1
             continue
-        header, body = said
+        header, body = message
         if header["kind"] == "error":
             raise JobError(header["message"], header["hint"], header["exit_code"])
         if header["kind"] == "share":
@@ -116,19 +118,20 @@ def _listen(
 
 
 @contextlib.contextmanager
-def _started(requests: list[dict[str, Any]]) -> Generator[queue.SimpleQueue[tuple[int, Said]]]:
-    """Processes at work on requests of `frame_process.py`, and what they say; at the end of the block none is left."""
+def _started(requests: list[dict[str, Any]]) -> Generator[queue.SimpleQueue[tuple[int, Message]]]:
+    """Starts a process of `frame_process.py` for each request; yields the queue of their messages. Ends all of them at
+    the end of the block."""
     root = Path(__file__).resolve().parents[3]
     environment = child_environment(root) | {"OMP_NUM_THREADS": str(THREADS), "OPENCV_FOR_THREADS_NUM": str(THREADS)}
-    heard: queue.SimpleQueue[tuple[int, Said]] = queue.SimpleQueue()
+    messages: queue.SimpleQueue[tuple[int, Message]] = queue.SimpleQueue()
     running: list[subprocess.Popen[bytes]] = []
 
     def read(n: int, process: subprocess.Popen[bytes]) -> None:
         answers = cast("BinaryIO", process.stdout)
         with contextlib.suppress(ValueError, OSError):  # cut off in the middle of a word: it was killed
-            while (said := read_message(answers)) is not None:
-                heard.put((n, said))
-        heard.put((n, None))
+            while (message := read_message(answers)) is not None:
+                messages.put((n, message))
+        messages.put((n, None))
 
     try:
         for n, request in enumerate(requests):
@@ -140,7 +143,7 @@ def _started(requests: list[dict[str, Any]]) -> Generator[queue.SimpleQueue[tupl
             with contextlib.suppress(OSError):  # it has ended already
                 write_message(cast("BinaryIO", process.stdin), request)
             threading.Thread(target=read, args=(n, process), name="frames out", daemon=True).start()
-        yield heard
+        yield messages
     finally:
         for process in running:
             if process.poll() is None:

@@ -147,14 +147,19 @@ def test_developed_gaussians_travel_with_those_they_descend_from(made):
     assert not bool(moved[~moves].any())
 
 
+def halves(run, frozen):
+    """Rows of what moves: (those on the left, those on the right)."""
+    rows = run.model.open_rows()
+    x = frozen.state["means"][rows, 0]
+    return rows[x < x.median()], rows[x >= x.median()]
+
+
 def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
     """The field without half of what moves, as if it had never learnt that."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen = field(run, scene)
-    rows = run.model.open_rows()
-    x = frozen.state["means"][rows, 0]
-    lost, rest = rows[x < x.median()], rows[x >= x.median()]
+    lost, rest = halves(run, frozen)
     opacity = frozen.state["opacity_logits"].index_fill(0, lost, -20.0)
     halved = dataclasses.replace(frozen, state={**frozen.state, "opacity_logits": opacity})
     mended = with_missing(run, scene, halved, T_STAR, motion_mattes(world.shot))
@@ -173,17 +178,15 @@ def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
         assert bool((torch.sigmoid(moved["opacity_logits"][added]) < 1e-6).all())
 
 
-def test_what_the_field_has_astray_is_hidden_and_nothing_that_stands_still(trained):
+def test_floaters_are_hidden_and_nothing_that_stands_still(trained):
     """Part of what moves in a colour that plate t* does not have there."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen = field(run, scene)
-    rows = run.model.open_rows()
-    x = frozen.state["means"][rows, 0]
-    wrong = rows[x < x.median()]
+    wrong, _ = halves(run, frozen)
     sh0 = frozen.state["sh0"].index_copy(0, wrong, -frozen.state["sh0"][wrong] + 1.0)
-    astray = dataclasses.replace(frozen, state={**frozen.state, "sh0": sh0})
-    mended = with_missing(run, scene, astray, T_STAR, motion_mattes(world.shot))
+    recoloured = dataclasses.replace(frozen, state={**frozen.state, "sh0": sh0})
+    mended = with_missing(run, scene, recoloured, T_STAR, motion_mattes(world.shot))
     changed = mended.state["opacity_logits"][: len(frozen.support)] != frozen.state["opacity_logits"]
     assert bool(changed.any()) and not bool(changed[frozen.motion < 0.5].any())
     others = torch.ones(len(changed), dtype=torch.bool).index_fill(0, wrong, False)

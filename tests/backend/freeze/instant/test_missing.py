@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torch_backend.freeze.frozen import FrozenImage
-from torch_backend.freeze.instant.missing import found, weighted_median
+from torch_backend.freeze.instant.missing import missing_pixels, weighted_median
 from torch_backend.freeze.views.source_views import VisibilityConfig
 
 HEIGHT, WIDTH, WALL, ARM = 120, 160, 4.0, 2.0
@@ -24,7 +24,7 @@ def seen(*things):
 
 def asked(plate, scene, matte=1.0):
     matte = torch.full((HEIGHT, WIDTH), matte)
-    return found(seen(*plate)[0], seen(*scene)[1], seen()[1], matte, 1.0, VisibilityConfig())
+    return missing_pixels(seen(*plate)[0], seen(*scene)[1], seen()[1], matte, 1.0, VisibilityConfig())
 
 
 def test_a_hand_that_the_scene_lacks_is_as_deep_as_its_arm():
