@@ -19,20 +19,14 @@ from numpy.typing import NDArray
 from ...scene import Scene, resize_intrinsics
 from ...train import LoadedRun
 from ..frozen import FrozenGaussians, render_frozen
-from .surface_depth import KeyView, SurfaceDepthConfig, rays_of, seen_in
+from .surface_depth import LEAST_INVERSE, SAME, TO_SIGMA, KeyView, SurfaceDepthConfig, rays_of, seen_in
 
 Array = NDArray[Any]
 """float32 unless it says otherwise."""
-_LEAST = 1e-4
-"""Least inverse depth, 1 / scene units, as in `surface_depth`."""
-_SAME = 3.0
-"""Standard deviations within which two depths are those of one surface."""
 _UNKNOWN = 1.0
 """Relative standard deviation from which on a map counts as knowing nothing: so holes are filled, see `_instant`."""
 _AROUND = 15
 """Side in pixels of the windows whose mean correction a mover's pixel takes that has none of its own: its outline."""
-_TO_SIGMA = 1.4826
-"""Standard deviation over median deviation, of Gaussian errors."""
 
 
 @dataclass
@@ -55,12 +49,12 @@ class InstantDepth:
             view: the frame's camera with its splats' inverse depth [h, w].
             moving: bool [h, w] where these move; elsewhere the factor is 1.
         """
-        rays, inverse = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, _LEAST).astype(np.float32)
+        rays, inverse = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
         shown, _ = seen_in(self.splats, view, rays, inverse)
         found, sigma = seen_in(self.measured, view, rays, inverse)
-        own = np.maximum(sigma / np.maximum(found, _LEAST), 1e-4)
-        near = _SAME * np.sqrt(np.square(own) + self.splat_noise**2)
-        known = moving & (sigma > 0) & (own < _UNKNOWN) & (np.abs(shown / inverse - 1.0) < _SAME * self.noise)
+        own = np.maximum(sigma / np.maximum(found, LEAST_INVERSE), 1e-4)
+        near = SAME * np.sqrt(np.square(own) + self.splat_noise**2)
+        known = moving & (sigma > 0) & (own < _UNKNOWN) & (np.abs(shown / inverse - 1.0) < SAME * self.noise)
         known &= np.abs(found / inverse - 1.0) < near
         weight, prior = 1.0 / np.square(own), 1.0 / self.splat_noise**2
         factor = 1.0 + weight / (weight + prior) * (found / inverse - 1.0)
@@ -100,14 +94,14 @@ class MeasuredDepths:
         i, (height, width) = scene.frames.index(frame), found.shape[1:]
         K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
         image = render_frozen(frozen, scene.viewmats[i], K, width, height)
-        splats = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / _LEAST)).numpy()
+        splats = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
         inverse, sigma = found.numpy()
         there = inverse > 0
         moving = there & (image.motion.numpy() > 0.5)
         if not moving.any():
             return None
         own = float(np.median(sigma[moving] / inverse[moving]))
-        apart = _TO_SIGMA * float(np.median(np.abs(inverse[moving] / splats[moving] - 1.0)))
+        apart = TO_SIGMA * float(np.median(np.abs(inverse[moving] / splats[moving] - 1.0)))
         splat_noise = float(np.sqrt(max(apart**2 - own**2, self.config.noise**2)))
         pose = scene.viewmats[i].double().numpy(), K.double().numpy()
         # Where the map knows nothing it agrees with the splats, and is not sure of it.

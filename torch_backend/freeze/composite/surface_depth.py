@@ -5,21 +5,23 @@ the depth behind them is taken. What stands still is measured instead, once for 
 
 1. Key views, spread over the clip, start from the splats' inverse depth of what stands still.
 2. Each plate is compared with the plates of the key views around it. Inverse depth takes Gauss-Newton steps that make
-   them agree (Lucas and Kanade 1981, along epipolar lines). What mattes call moving takes no part.
-3. After each step inverse depth is fitted by planes in windows, weighted by how much the plates tell. Inverse depth of
-   a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows around it that fit
-   best: a window that reaches over an edge does not (Kuwahara et al. 1976).
+   them agree (Lucas and Kanade 1981, along epipolar lines). What mattes call moving takes no part. The noise of two
+   plates is measured around each pixel, so that its inverse depth has a variance.
+3. After each step planes are fitted to inverse depth in windows of two sizes, weighted by 1 / variance. Inverse depth of
+   a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows around it whose
+   deviations their variances explain: a window that reaches over an edge is no plane (Kuwahara et al. 1976).
 
-A frame takes that depth from the key views nearest to it, and the splats' for what moves or what they do not show.
-Planes are fitted once more in small windows, and each pixel takes those of its neighbours that are about as deep as the
-splats there and have its own colour in the frame's picture: a joint bilateral filter of planes.
+A frame takes depth from the key views nearest to it: of their values and the splats', that on which most agree. What
+moves, and what they do not show, is the splats'. Planes are fitted once more in small windows, and each pixel takes
+those of its neighbours that are about as deep as the splats there and have its colour in the frame's picture: a joint
+bilateral filter of planes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -40,9 +42,17 @@ from ..views.working_plates import MEASURED_WIDTH, VIEWS
 Array = NDArray[Any]
 """float32 unless it says otherwise."""
 
-_LEAST = 1e-4
+LEAST_INVERSE = 1e-4
 """Least inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so what is farther than
 10,000 of them has no parallax."""
+TO_SIGMA = 1.4826
+"""Standard deviation over median deviation, of Gaussian errors."""
+SAME = 3.0
+"""Standard deviations within which two depths, or two plates' brightness, are those of one surface."""
+_QUANTUM = 1.0 / 255.0
+"""Least standard deviation of a plate's brightness: a step of 8 bits."""
+_SLOPE_NOISE = 12.0**0.5 / 8.0
+"""Standard deviation of `_slope` over that of the picture, if the noise of its pixels is independent."""
 
 
 @dataclass(frozen=True)
@@ -53,29 +63,21 @@ class SurfaceDepthConfig:
     """Width in pixels at which surfaces are measured; less for smaller plates."""
     keys: int = VIEWS
     """Number of key views, spread evenly over the clip."""
-    reach: int = 6
-    """Each key view is compared with this many before and after it."""
+    around: int = 6
+    """Each key view is compared with this many before and after it, and a frame takes its depth from the nearest so
+    many."""
     steps: int = 4
     """Number of Gauss-Newton steps."""
-    radius: int = 6
-    """Radius in pixels of the windows in which planes are fitted to what the plates tell."""
+    radii: tuple[int, ...] = (3, 8)
+    """Radii in pixels of the windows in which planes are fitted to what the plates show. In a frame they have the
+    first, and each pixel takes those of nine windows that lie as far apart."""
     detail: float = 1.5
     """Standard deviation in pixels of the blur that is subtracted from plates, so that light and exposure cancel."""
-    contrast: float = 0.1
-    """Difference of two plates, display-referred, at which they no longer count as showing the same point."""
     noise: float = 0.03
-    """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.7 % on the
-    tuning scenes arm-000 and arm-001. What is farther off is another surface."""
-    flat: float = 0.01
-    """Deviation from its plane, as a share of the median inverse depth, from which on a window counts less."""
-    occluded: float = 1.15
-    """Ratio of inverse depths from which on a key view shows something in front of a point."""
-    nearest: int = 4
-    """Number of key views from which a frame takes its depth."""
-    tap: int = 3
-    """Offset in pixels, along rows and columns, of the nine windows from which a pixel of a frame chooses."""
-    frame_radius: int = 2
-    """Radius in pixels of the windows in which planes are fitted in a frame."""
+    """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.8 % on the
+    tuning scenes arm-000 and arm-001."""
+    uneven: float = 0.1
+    """Mean square deviation of a window from its plane, in variances, from which on it counts less."""
     outlier: float = 1e-6
     """Chance that a pixel's splats belong to another surface than the pixel: where the picture's colour is that surely
     another one, edges are the picture's."""
@@ -109,7 +111,7 @@ class StillSurfaces:
         self.config, self.keys = config or SurfaceDepthConfig(), keys
         found: list[tuple[Array, Array]] = []
         for i, key in enumerate(keys):
-            reach = range(max(0, i - self.config.reach), min(len(keys), i + self.config.reach + 1))
+            reach = range(max(0, i - self.config.around), min(len(keys), i + self.config.around + 1))
             found.append(refined(key, [keys[j] for j in reach if j != i], self.config))
         for key, (inverse, sigma) in zip(keys, found, strict=True):
             key.inverse, key.sigma = inverse, sigma
@@ -122,7 +124,7 @@ class StillSurfaces:
             off = float(np.linalg.norm(-key.viewmat[:3, :3].T @ key.viewmat[:3, 3] - centre))
             return off + float(np.linalg.norm(key.viewmat[2, :3] - viewmat[2, :3]))
 
-        return sorted(self.keys, key=away)[: self.config.nearest]
+        return sorted(self.keys, key=away)[: self.config.around]
 
 
 def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
@@ -136,39 +138,45 @@ def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
 def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig) -> tuple[Array, Array]:
     """Inverse depth [h, w] of a key view at which plates agree, and its standard deviation [h, w]."""
     start, inverse = key.inverse, key.inverse.copy()
-    flat = config.flat * float(np.median(start))
-    sigma = start
+    prior = 1.0 / np.square(start)  # off by as much as it is: splats count only where plates say nothing
+    variance = 1.0 / prior
     for _ in range(config.steps if others else 1):
-        information, pull = gauss_newton(key, others, inverse, config)
-        prior = 1.0 / np.square(start)  # off by as much as it is: splats count where plates tell nothing
+        information, pull, parallax = gauss_newton(key, others, inverse, config)
         weight = information + prior
-        wanted = (information * inverse + pull + prior * start) / weight
-        wanted = np.clip(wanted, 0.9 * inverse, 1.1 * inverse)  # a linear step is not believed beyond that
-        planes = fit_planes(wanted, weight / np.median(weight), config.radius)
-        inverse, spread = planes.around(flat, config.radius)
-        inverse = np.maximum(inverse, _LEAST).astype(np.float32)
-        known = key.still * _means([information], config.radius)[0] * (2 * config.radius + 1)
-        sigma = np.sqrt(spread + 1.0 / np.maximum(known, 1e-6))
-    return inverse, sigma.astype(np.float32)
+        step = (pull + prior * (start - inverse)) / weight
+        pixel = 1.0 / np.maximum(parallax, 1e-3)  # a linear step is not believed beyond that
+        inverse, variance = smoothed(inverse + np.clip(step, -pixel, pixel), weight, config.radii, config.uneven)
+        inverse = np.maximum(inverse, LEAST_INVERSE).astype(np.float32)
+    return inverse, np.sqrt(variance).astype(np.float32)
 
 
 def gauss_newton(
     key: KeyView, others: Sequence[KeyView], inverse: Array, config: SurfaceDepthConfig
-) -> tuple[Array, Array]:
-    """What the plates of `others` tell of a key view's inverse depth, [h, w] each: how much (1 / variance), and that
-    times the step by which they would agree."""
-    information, pull = np.zeros_like(inverse), np.zeros_like(inverse)
+) -> tuple[Array, Array, Array]:
+    """What the plates of `others` say of a key view's inverse depth, [h, w] each: 1 / its variance, that times the step
+    by which they would agree, and the pixels by which a point moves in any of them with inverse depth."""
+    information, pull, parallax = np.zeros_like(inverse), np.zeros_like(inverse), np.zeros_like(inverse)
     rays = rays_of(key.K, inverse.shape)
     for other in others:
         place = Place.of(key, other, rays, inverse)
         shift = place.look(other.picture) - key.picture
         slope = place.look(_slope(other.picture, 1)) * place.dx + place.look(_slope(other.picture, 0)) * place.dy
-        seen = place.look(other.still) * key.still
-        clear = place.look(other.inverse) < config.occluded * place.inverse
-        weight = seen * clear / np.square(1.0 + np.square(shift / config.contrast))
+        clear = place.look(other.inverse) < (1.0 + SAME * config.noise) * place.inverse
+        weight = place.look(other.still) * key.still * clear
+        seen = weight > 0.5
+        if not seen.any():
+            continue
+        count, square = _means([weight, weight * np.square(shift)], 2)
+        noise = np.sqrt(np.maximum(square / np.maximum(count, 1e-6), _QUANTUM**2))
+        # From so many deviations on, two plates show two points.
+        weight /= np.square(noise * (1.0 + np.square(shift / (SAME * noise))))
+        # A slope within two deviations of what steps of 8 bits make says nothing of depth.
+        steps = np.square(2.0 * _SLOPE_NOISE * _QUANTUM) * (np.square(place.dx) + np.square(place.dy))
+        weight *= np.maximum(1.0 - steps / np.maximum(np.square(slope), 1e-20), 0.0)
         information += weight * slope * slope
         pull -= weight * slope * shift
-    return information / config.contrast**2, pull / config.contrast**2
+        np.maximum(parallax, np.where(seen, np.hypot(place.dx, place.dy), 0.0), out=parallax)
+    return information, pull, parallax
 
 
 @dataclass
@@ -226,8 +234,7 @@ def _slope(picture: Array, axis: int) -> Array:
     return cv2.Sobel(picture, cv2.CV_32F, axis, 1 - axis, ksize=3, scale=0.125)
 
 
-@dataclass
-class Planes:
+class Planes(NamedTuple):
     """Inverse depth around each pixel as a plane: value + along * (x - its column) + down * (y - its row)."""
 
     value: Array
@@ -236,35 +243,36 @@ class Planes:
     """[h, w] change per pixel to the right."""
     down: Array
     """[h, w] change per pixel downwards."""
-    variance: Array
-    """[h, w] mean square of what the window's values are off the plane."""
+    chi: Array
+    """[h, w] mean square of what the window's values are off the plane, in their variances."""
+    information: Array
+    """[h, w] 1 / variance of the value, if the window's values are a plane."""
 
-    def where(self, mask: Array, other: Planes) -> Planes:
-        """Those of `other` in `mask`, bool [h, w]."""
-        return Planes(
-            np.where(mask, other.value, self.value),
-            np.where(mask, other.along, self.along),
-            np.where(mask, other.down, self.down),
-            np.where(mask, other.variance, self.variance),
-        )
+    def fits(self, uneven: float) -> Array:
+        """[h, w] in 0..1: how well a window is a plane; `uneven` is a `chi` that is no fault."""
+        return np.square(np.square(uneven / (uneven + self.chi)))
 
-    def fits(self, flat: float) -> Array:
-        """[h, w] in 0..1: how well a window is a plane; `flat` is a deviation that is no fault."""
-        return np.square(np.square(flat * flat / (flat * flat + self.variance)))
 
-    def around(self, flat: float, radius: int) -> tuple[Array, Array]:
-        """(inverse depth [h, w], variance [h, w]) of the planes of all windows that hold a pixel, those that fit."""
-        rows, columns = _grid(self.value.shape)
-        fit = np.maximum(self.fits(flat), 1e-20)
-        level = self.value - self.along * columns - self.down * rows
-        total, level, along, down, variance = _means(
-            [fit, fit * level, fit * self.along, fit * self.down, fit * self.variance], radius
-        )
-        return (level + along * columns + down * rows) / total, variance / total
+def smoothed(values: Array, weight: Array, radii: Sequence[int], uneven: float) -> tuple[Array, Array]:
+    """(inverse depth [h, w], variance [h, w]) of the planes of all windows that hold a pixel, those that fit.
+
+    `values` [h, w] is inverse depth, `weight` [h, w] 1 / its variance.
+    """
+    rows, columns = _grid(values.shape)
+
+    def weighted(radius: int) -> list[Array]:
+        planes = fit_planes(values, weight, radius)
+        fit = np.maximum(planes.fits(uneven) * planes.information, 1e-20)
+        offset = planes.value - planes.along * columns - planes.down * rows
+        spread = (1.0 + planes.chi) / planes.information
+        return _means([fit, fit * offset, fit * planes.along, fit * planes.down, fit * spread], radius)
+
+    total, level, along, down, variance = np.sum([weighted(radius) for radius in radii], axis=0)
+    return (level + along * columns + down * rows) / total, variance / total
 
 
 def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
-    """The planes that fit `values` [h, w], each weighted by `weight` [h, w], in the windows around all pixels."""
+    """The planes that fit `values` [h, w], weighted by 1 / their variance [h, w], in the windows around all pixels."""
     rows, columns = _grid(values.shape)
     near = weight.astype(np.float64)
     terms = [near * f for f in (1.0, columns, rows, columns**2, columns * rows, rows**2)]
@@ -272,14 +280,14 @@ def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
     total, *moments = _means(terms, radius)
     total = np.maximum(total, 1e-12)
     x, y, xx, xy, yy, v, vx, vy, vv = (moment / total for moment in moments)
-    least = 0.1  # a third of a pixel, squared: slopes stay finite where all the weight lies in one pixel
+    least = 1.0 / 12.0  # the variance within a pixel: slopes stay finite where all the weight lies in one
     xx, xy, yy = xx - x * x + least, xy - x * y, yy - y * y + least
     vx, vy, vv = vx - v * x, vy - v * y, vv - v * v
     determinant = xx * yy - xy * xy
     along, down = (yy * vx - xy * vy) / determinant, (xx * vy - xy * vx) / determinant
-    variance = np.maximum(vv - along * vx - down * vy, 0.0)
+    chi = np.maximum(vv - along * vx - down * vy, 0.0) * total
     value = v + along * (columns - x) + down * (rows - y)
-    return Planes(*(a.astype(np.float32) for a in (value, along, down, variance)))
+    return Planes(*(a.astype(np.float32) for a in (value, along, down, chi, total * (2 * radius + 1) ** 2)))
 
 
 def _grid(size: tuple[int, ...]) -> tuple[Array, Array]:
@@ -345,42 +353,49 @@ def frame_depth(
         inverse = np.asarray(inverse * factor, np.float32)
         factor = np.asarray(cv2.resize(factor, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
         whole = np.where(splats.moving > 0.5, whole * factor, whole)
-    values, sigma, weight = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, inverse), noise)
+    sigma = noise * np.maximum(inverse, LEAST_INVERSE)
+    inverse, _ = smoothed(inverse, 1.0 / np.square(sigma), (2,), config.uneven)  # single splats jut out
+    values, sigma = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, sigma))
     # What moves and what stands still are surfaces of their own, however near they are.
-    weight = weight / float(np.median(weight))
-    still, moved = (fit_planes(values, weight * of + 1e-9, config.frame_radius) for of in (~mover, mover))
-    planes = still.where(mover, moved)
+    weight = 1.0 / np.square(np.maximum(sigma, LEAST_INVERSE * config.noise))
+    still, moved = (fit_planes(values, weight * (of + 1e-9), config.radii[0]) for of in (~mover, mover))
+    planes = Planes(*(np.where(mover, *each) for each in zip(moved, still, strict=True)))
     guide = np.concatenate([picture, (4.0 * config.color * (splats.moving > 0.5))[..., None]], axis=2, dtype=np.float32)
     small = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
     small = np.concatenate([small, (4.0 * config.color * mover)[..., None]], axis=2, dtype=np.float32)
     return selected(planes, sigma, small, whole, guide, config)
 
 
-def combined(surfaces: StillSurfaces, view: KeyView, noise: Array) -> tuple[Array, Array, Array]:
-    """(inverse depth, its standard deviation, weight), [h, w] each: the key views' where they agree with the splats,
-    whose own relative standard deviation is `noise` [h, w]."""
-    config, radius = surfaces.config, surfaces.config.frame_radius
-    rough = fit_planes(view.inverse, np.ones_like(view.inverse), radius)
-    smooth = rough.around(config.noise * float(np.median(view.inverse)), radius)[0]
-    smooth = np.maximum(smooth, _LEAST).astype(np.float32)
-    rays = rays_of(view.K, view.inverse.shape)
-    total, mean, square = np.zeros_like(smooth), np.zeros_like(smooth), np.zeros_like(smooth)
-    for key in surfaces.near(view.viewmat):
-        found, sigma = seen_in(key, view, rays, smooth)
-        off = (found - smooth) / (config.noise * smooth)
-        weight = view.still * np.exp(-0.5 * np.square(off)) * (sigma > 0) / np.maximum(np.square(sigma), 1e-12)
-        total += weight
-        mean += weight * (found - smooth)
-        square += weight * np.square(found - smooth)
-    known = np.maximum(total, 1e-12)
-    spread = np.maximum(square / known - np.square(mean / known), 0.0)
-    # Key views that disagree know little, however sure each of them is.
-    information = total / (1.0 + total * spread)
-    splats = 1.0 / np.square(smooth)
-    share = information / (information + splats)
-    variance = share * share / np.maximum(information, 1e-12) + np.square((1.0 - share) * noise * smooth)
-    value = smooth + share * mean / known + (1.0 - share) * (view.inverse - smooth)
-    return value, np.sqrt(variance), information + splats
+def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
+    """(inverse depth, its standard deviation), [h, w] each: that on which most of the key views and the splats agree.
+
+    `view` has the splats' inverse depth and its standard deviation. Splats say alone what moves.
+    """
+    rays, splats = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
+    seen = [(splats, view.sigma), *(seen_in(key, view, rays, splats) for key in surfaces.near(view.viewmat))]
+    values, sigmas = (np.stack(each) for each in zip(*seen, strict=True))
+    votes = (sigmas > 0).astype(np.float32)
+    votes[1:] *= (view.still > 0) / max(len(values) - 1, 1)  # key views share plates: all together count as one
+    all_votes = np.maximum(votes.sum(0), 1e-12)
+    variances = np.square(np.maximum(sigmas, 1e-4 * splats))
+    densities, means, spreads = (np.zeros_like(values) for _ in range(3))
+    for i, (value, variance) in enumerate(zip(values, variances, strict=True)):
+        off = np.square(values - value)
+        densities[i] = (votes[i] > 0) * (votes * np.exp(-0.5 * off / variances) / np.sqrt(variances)).sum(0)
+        agree = votes * np.exp(-0.5 * off / (variances + variance))
+        weight = agree / variances
+        total = np.maximum(weight.sum(0), 1e-12)
+        means[i] = (weight * values).sum(0) / total
+        # Those that disagree may be right: as likely as they have votes.
+        doubt = agree * weight / total + (votes - agree) / all_votes
+        spreads[i] = 1.0 / total + (doubt * np.square(values - means[i])).sum(0)
+    # The densest of all values: one that knows little agrees with everything, and shall not win by that. A high
+    # power instead of the largest alone, so that rounding decides nothing.
+    share = (densities / np.maximum(densities.max(0), 1e-12)) ** 8
+    share /= np.maximum(share.sum(0), 1e-12)
+    mean = (share * means).sum(0)
+    variance = (share * (spreads + np.square(means - mean))).sum(0)
+    return mean.astype(np.float32), np.sqrt(variance).astype(np.float32)
 
 
 def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[Array, Array]:
@@ -395,8 +410,8 @@ def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[A
         place = Place.of(view, key, rays, inverse)
         depth = place.look(key.inverse)
         better = depth * ahead / np.maximum(1.0 - depth * shift[2], 1e-3)
-        better = np.maximum(np.where(depth > 0, better, inverse), _LEAST).astype(np.float32)
-        return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, _LEAST), 0.0)
+        better = np.maximum(np.where(depth > 0, better, inverse), LEAST_INVERSE).astype(np.float32)
+        return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, LEAST_INVERSE), 0.0)
 
     return once(once(inverse)[0])
 
@@ -416,9 +431,9 @@ def selected(
     height, width = splats.shape
     rows, columns = (axis.astype(np.float32) for axis in _grid(planes.value.shape))
     level = planes.value - planes.along * columns - planes.down * rows
-    fit = planes.fits(config.flat * float(np.median(planes.value)))
+    fit = planes.fits(config.uneven)
     maps = [level, planes.along, planes.down, fit, np.square(sigma), *np.moveaxis(small, -1, 0)]
-    windows = [np.pad(m.astype(np.float32), config.tap, mode="edge") for m in maps]
+    windows = [np.pad(m.astype(np.float32), config.radii[0], mode="edge") for m in maps]
     rough = np.asarray(cv2.medianBlur(splats, 3), np.float32)
     out, deviation = np.zeros_like(splats), np.zeros_like(splats)
     for part in bands(height, width):
@@ -439,17 +454,17 @@ def _from_windows(
     """
     import cv2
 
-    (h, w, height), (rows, width), border = size, rough.shape, config.tap
+    (h, w, height), (rows, width), border = size, rough.shape, config.radii[0]
     down = (np.arange(top, top + rows, dtype=np.float32) + 0.5) * (h / height)
     at = border + down.astype(np.int64)
     y = (down - 0.5 - 0.5 * h)[:, None]
     x = ((np.arange(width, dtype=np.float32) + 0.5) * (w / width) - 0.5 - 0.5 * w)[None]
-    near = 1.0 / np.maximum(config.noise * rough, config.noise * _LEAST)
+    near = 1.0 / (config.noise * np.maximum(rough, LEAST_INVERSE))
     total = np.full_like(rough, 1e-20)
     mean, square, spread = np.zeros_like(rough), np.zeros_like(rough), np.zeros_like(rough)
-    for dy in (-config.tap, 0, config.tap):
+    for dy in (-config.radii[0], 0, config.radii[0]):
         lines = [m[at + dy] for m in windows]
-        for dx in (-config.tap, 0, config.tap):
+        for dx in (-config.radii[0], 0, config.radii[0]):
             columns = slice(border + dx, border + dx + w)
             level, along, below, fit, variance, *there = (
                 cv2.resize(m[:, columns], (width, rows), interpolation=cv2.INTER_NEAREST) for m in lines
@@ -503,11 +518,11 @@ class FrameDepths:
             measured: what the artist's depth maps say of the instant, if anything.
         """
         there = depth < NO_DEPTH
-        inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / _LEAST), 0.0)
+        inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE), 0.0)
         splats = Splats(viewmat.double().numpy(), K.double().numpy(), inverse.numpy(), motion.numpy())
         shown = picture.clamp(0.0, 1.0).numpy()
         found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, shown, measured))
-        refined = torch.where(there, 1.0 / found.clamp_min(_LEAST), NO_DEPTH)
+        refined = torch.where(there, 1.0 / found.clamp_min(LEAST_INVERSE), NO_DEPTH)
         return refined, torch.where(there, sigma * refined.square(), 0.0)
 
     def _key(self, shot: Shot, frame: int, still: FrozenGaussians) -> KeyView:
@@ -518,7 +533,7 @@ class FrameDepths:
         height = max(8, round(scene.height * width / scene.width))
         K = resize_intrinsics(scene.Ks[i][None], scene.width, scene.height, width, height)[0]
         image = render_frozen(still, scene.viewmats[i], K, width, height)
-        inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / _LEAST)).numpy()
+        inverse = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
         plate = read_image(shot.plate(frame), width, height, scene.display).numpy()
         moving = load_motion(shot, frame)
         clear = np.ones((height, width), np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -11,13 +12,13 @@ from numpy.typing import NDArray
 
 from torch_backend.freeze.composite.surface_depth import (
     KeyView,
-    Planes,
     Splats,
     StillSurfaces,
     SurfaceDepthConfig,
-    fit_planes,
+    combined,
     frame_depth,
     key_picture,
+    smoothed,
 )
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
@@ -84,10 +85,11 @@ def test_windows_over_an_edge_do_not_smear_it() -> None:
     columns = np.arange(60, dtype=np.float32)[None].repeat(40, 0)
     true = np.where(columns < 30, 0.5 + 0.002 * columns, 0.2).astype(np.float32)
     noisy = true + np.random.default_rng(1).normal(0.0, 0.01, true.shape).astype(np.float32)
-    smooth, _ = fit_planes(noisy, np.ones_like(noisy), 4).around(0.01, 4)
+    smooth, variance = smoothed(noisy, np.full_like(noisy, 1e4), (2, 4), SurfaceDepthConfig().uneven)
     off = np.abs(smooth - true)[5:-5]
     assert off[:, 5:27].max() < 0.02 and off[:, 33:-5].max() < 0.02
     assert off[:, 29:31].mean() < 0.05, "the step of 0.36 stays within a pixel"
+    assert (off < 2.0 * np.sqrt(variance)[5:-5])[:, 5:27].mean() > 0.9
 
 
 def test_a_ragged_edge_takes_the_pictures_line() -> None:
@@ -104,7 +106,24 @@ def test_a_ragged_edge_takes_the_pictures_line() -> None:
     assert ((found > 0.35) != (columns < 40)).mean() < 0.5 * wrong_before
 
 
-def test_planes_of_a_mask_are_the_others() -> None:
-    one, two = (Planes(*(np.full((2, 2), value, np.float32) for _ in range(4))) for value in (1.0, 2.0))
-    mask = np.array([[True, False], [False, False]])
-    assert one.where(mask, two).value.tolist() == [[2.0, 1.0], [1.0, 1.0]]
+def test_key_views_that_agree_outvote_splats_that_are_wrong() -> None:
+    """A wall whose splats are a tenth too far: two key views know better, a third is as wrong as the splats."""
+    true = np.full((HEIGHT, WIDTH), 0.25, np.float32)
+    K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+
+    def key(shift: float, inverse: float) -> KeyView:
+        viewmat = np.eye(4)
+        viewmat[0, 3] = -shift
+        still, value = np.ones_like(true), np.full_like(true, inverse)
+        return KeyView(viewmat, K, 0.0 * still, still, value, 0.004 * value)
+
+    surfaces = StillSurfaces.__new__(StillSurfaces)
+    surfaces.config, surfaces.keys = SurfaceDepthConfig(), [key(0.1, 0.2501), key(0.2, 0.2499), key(-0.1, 0.22)]
+    view = key(0.0, 0.225)
+    view.sigma = 0.03 * view.inverse
+    inverse, _ = combined(surfaces, view)
+    middle = np.s_[8:-8, 16:-16]
+    assert np.abs(inverse / true - 1.0)[middle].max() < 0.01
+    alone = combined(surfaces, replace(view, still=0.0 * view.still))
+    np.testing.assert_allclose(alone[0], view.inverse, rtol=1e-6)
+    np.testing.assert_allclose(alone[1], view.sigma, rtol=1e-3)
