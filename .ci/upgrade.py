@@ -89,13 +89,13 @@ def main(blender: str, archive: Path, folder: Path) -> int:
 
 
 class Runs:
-    """A Blender with a profile and a home folder of its own."""
+    """A Blender, with the profile and the home folder that it uses."""
 
     def __init__(self, program: str, folder: Path) -> None:
         self.program, self.folder = program, folder
         self.profile, self.home, self.work = folder / "profile", folder / "home", folder / "work"
-        for made in (self.profile, self.home, self.work):
-            made.mkdir(parents=True)
+        for place in (self.profile, self.home, self.work):
+            place.mkdir(parents=True)
 
     def blender(self, *words: str) -> str:
         """Runs Blender; returns what it printed."""
@@ -153,7 +153,7 @@ class Runs:
         return sorted(name for name in installed if name not in names and "__pycache__" not in name)
 
     def same_profile(self, start: dict[str, Any]) -> None:
-        """Raises Harm if the profile has other preferences or files than before the add-on was first installed."""
+        """Raises Harm if the profile differs from what it was before the add-on was first installed."""
         end = self.seen()
         if end["preferences"] != start["preferences"]:
             raise Harm("removed: preferences differ from those before the first install")
@@ -166,11 +166,11 @@ def without_addon(state: dict[str, Any]) -> dict[str, Any]:
     """Preferences with those of all add-ons but ours; files as they are."""
     if "addons" not in state:
         return state
-    return {**state, "addons": {name: told for name, told in state["addons"].items() if name != MODULE}}
+    return {**state, "addons": {name: values for name, values in state["addons"].items() if name != MODULE}}
 
 
 def files_of(folder: Path, leave_out: tuple[str, ...]) -> dict[str, str]:
-    """SHA-256 of each file below a folder, by its path there; but for paths that begin with one of `leave_out`."""
+    """SHA-256 of each file below a folder, by its path in it, but for paths that begin with one of `leave_out`."""
     found: dict[str, str] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -227,11 +227,11 @@ def in_blender(step: str, folder: Path, *words: str) -> None:
 
     file = folder / "work" / "artist.blend"
     if step == "preferences":
-        told = values_of(bpy.context.preferences)
-        told["addons"] = {
+        values = values_of(bpy.context.preferences)
+        values["addons"] = {
             a.module: values_of(a.preferences) if a.preferences else {} for a in bpy.context.preferences.addons
         }
-        (folder / "preferences.json").write_text(json.dumps(told, sort_keys=True), encoding="utf-8")
+        (folder / "preferences.json").write_text(json.dumps(values, sort_keys=True), encoding="utf-8")
     elif step == "prepare":
         prepare(folder)
     elif step == "work":
@@ -311,16 +311,17 @@ def look(step: str, folder: Path) -> None:
     if step == "without":
         assert not hasattr(scene, "splannequin")
         return
-    told = scene.splannequin
-    assert (told.t_star, told.choose_t_star, told.run_name) == (6, True, "main")
-    assert Path(bpy.path.abspath(told.shot_path)).resolve() == next((folder / "work").glob("*.splannequin")).resolve()
-    state = sys.modules[f"{MODULE}.splannequin_addon.shot.inventory"].read(Path(bpy.path.abspath(told.shot_path)))
+    settings = scene.splannequin
+    assert (settings.t_star, settings.choose_t_star, settings.run_name) == (6, True, "main")
+    shot = Path(bpy.path.abspath(settings.shot_path))
+    assert shot.resolve() == next((folder / "work").glob("*.splannequin")).resolve()
+    state = sys.modules[f"{MODULE}.splannequin_addon.shot.inventory"].read(shot)
     assert state.runs and state.takes, state
 
 
 if __name__ == "__main__":
     if "--" in sys.argv:
-        name, place, *others = sys.argv[sys.argv.index("--") + 1 :]
-        in_blender(name, Path(place), *others)
+        name, place, *words = sys.argv[sys.argv.index("--") + 1 :]
+        in_blender(name, Path(place), *words)
     else:
         sys.exit(main(sys.argv[1], Path(sys.argv[2]).absolute(), Path(sys.argv[3]).absolute()))

@@ -69,10 +69,10 @@ def find_blender() -> tuple[str, str] | None:
 def blender_version(path: str) -> tuple[tuple[int, int], str] | None:
     """((major, minor), whole version) of the Blender at `path`; None if it does not run, or is no Blender."""
     try:
-        asked = subprocess.run([path, "--version"], capture_output=True, text=True, errors="replace", timeout=60)
+        done = subprocess.run([path, "--version"], capture_output=True, text=True, errors="replace", timeout=60)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    found = re.search(r"^Blender (\d+)\.(\d+)(\S*)", asked.stdout, re.M)
+    found = re.search(r"^Blender (\d+)\.(\d+)(\S*)", done.stdout, re.M)
     if not found:
         return None
     return (int(found.group(1)), int(found.group(2))), f"{found.group(1)}.{found.group(2)}{found.group(3)}"

@@ -73,7 +73,7 @@ def parser() -> argparse.ArgumentParser:
         if name == "package":
             command.add_argument(
                 "--blender", metavar="PATH", action="append", default=[],
-                help="the Blender that builds it (default: one that is found); repeated: others that validate it",
+                help="the Blender that builds it (default: one that is found); repeated: more that validate it",
             )  # fmt: skip
         names = ("--output", "--results") if name == "bench" else ("--output",)
         command.add_argument(*names, metavar="DIR", help="folder for summary.json and results (output/...)")

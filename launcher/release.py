@@ -54,7 +54,7 @@ class Source:
     commit: str
     """Hash of the commit that is checked out."""
     time: datetime.datetime
-    """When that commit was made, in UTC."""
+    """Time of that commit, in UTC."""
     changed: int
     """How many files differ from the commit."""
 
@@ -67,7 +67,7 @@ def package(blenders: Sequence[str], output: Path) -> int:
         output: folder in which the package appears, with blender.log and summary.json.
 
     Raises:
-        LauncherError: no package was made; an older one of the same version is still there.
+        LauncherError: there is no new package; an older one of the same version stays as it was.
     """
     started = time.monotonic()
     chosen = [named_blender(path) for path in blenders] or [get_blender()[0]]
@@ -99,7 +99,9 @@ def copy_source(folder: Path) -> Source:
     if not (ROOT / ".git").exists():
         raise LauncherError(f"A package is built from a Git checkout, and {ROOT} is none: clone the repository.")
     commit, seconds = _git("log", "-1", "--format=%H %ct").decode().split()
-    changed = [line for line in _git("status", "--porcelain", "-z", "--no-renames").split(b"\0") if line]
+    # Named, as a user's settings may leave untracked files out of the status.
+    status = _git("status", "--porcelain", "-z", "--no-renames", "--untracked-files=all")
+    changed = [line for line in status.split(b"\0") if line]
     names = _git("ls-files", "-z", "--cached", "--others", "--exclude-standard").split(b"\0")
     for name in filter(None, map(os.fsdecode, names)):
         path = ROOT / name
@@ -114,8 +116,8 @@ def _git(*words: str) -> bytes:
     command = [program("git") or "git", "--no-optional-locks", "-C", str(ROOT), *words]
     done = subprocess.run(command, capture_output=True)
     if done.returncode:
-        said = (done.stderr.decode("utf-8", "replace").strip().splitlines() or ["no reason given"])[0]
-        raise LauncherError(f"Git cannot read {ROOT}: {said.removeprefix('fatal: ').rstrip('.')}.")
+        reasons = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["it printed nothing"]
+        raise LauncherError(f"Git cannot read {ROOT}: {reasons[0].removeprefix('fatal: ').rstrip('.')}.")
     return done.stdout
 
 
@@ -156,7 +158,7 @@ def read_manifest(path: Path) -> dict[str, str]:
 
 
 class _Tool:
-    """Blender's tool for extensions, run with user folders of its own: it changes nothing of the user's Blender."""
+    """Blender's tool for extensions, run with empty user folders, so that the user's Blender stays as it is."""
 
     def __init__(self, user: Path, log: Path) -> None:
         self.user = user
@@ -186,8 +188,8 @@ class _Tool:
 def repack(built: Path, target: Path, when: datetime.datetime) -> None:
     """Writes Blender's zip anew with its files in order of name, one time and one set of attributes.
 
-    Blender packs files in the order in which the disk lists them, with the time and attributes that each has there. The
-    new zip has the same bytes for the same commit, as long as the launcher's Python has the same zlib.
+    Blender packs files in the order in which the disk lists them, with the time and attributes of each. The new zip has
+    the same bytes for the same commit, as long as the launcher's Python has the same zlib.
 
     Args:
         built: the zip that Blender built.

@@ -27,7 +27,7 @@ class Package:
     name: str
     """Name as pip compares it."""
     version: str
-    """Version, with the build of torch's own index ("2.13.0+cpu")."""
+    """Version, with the build of torch ("2.13.0+cpu")."""
     marker: str
     """Systems and Pythons that it is installed on (PEP 508); empty for all."""
     hashes: tuple[str, ...]
@@ -58,7 +58,7 @@ def read_lock(path: Path) -> list[Package]:
             packages[-1] = Package(last.name, last.version, last.marker, (*last.hashes, digest["digest"]))
         elif not line.startswith("#"):
             raise _damaged(path, f"line {number} is neither a package nor a hash")
-        # A backslash promises another hash. A file that was cut off ends with one.
+        # After a backslash another hash follows. In a file that was cut short none does.
         if line.endswith("\\") and (number == len(lines) or not _HASH.fullmatch(lines[number])):
             raise _damaged(path, f"a hash is missing after line {number}")
     without = [one.name for one in packages if not one.hashes]

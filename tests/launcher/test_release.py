@@ -49,7 +49,7 @@ def _checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def checkout(_checkout: Path, tmp_path: Path) -> Path:
-    """A repository of the test's own, with the files of this one."""
+    """A new repository with the files of this one."""
     return Path(shutil.copytree(_checkout, tmp_path / "checkout"))
 
 
