@@ -9,7 +9,8 @@
     environments    the virtual environments
     blender         a Blender for the add-on
     summary         DIR/summary.json
-    doctor, testing, commands   what can be asked for
+    sbom            what a set-up downloads, as a bill of materials
+    doctor, testing, commands, release   what can be asked for
     main            the command line
 
 Each imports only from those above it. Standard library, `torch_backend.contract`, `.shot` and `.cards` only.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import re
 import subprocess
@@ -9,7 +10,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from torch_backend.contract import ExitCode, program
+from torch_backend.contract import ExitCode, program, site_packages
 
 from .children import say
 from .environments import bpy_environment, set_up
@@ -41,20 +42,60 @@ class Blender:
         safe, apart = (("-P",), ()) if self.is_wheel else ((), ("--",))
         return [*self.command, *safe, str(script), *apart, *arguments]
 
+    def extension_tool(self, *arguments: str) -> list[str]:
+        """The command line that runs Blender's tool for extensions (`build`, `validate`, `server-generate`).
+
+        Raises LauncherError if a bpy wheel has no such tool.
+        """
+        if not self.is_wheel:
+            return [self.command[0], "--background", "--factory-startup", "--command", "extension", *arguments]
+        python = self.command[0]
+        packages = site_packages(Path(python).parent.parent)
+        tools = sorted(packages.glob("bpy/*/scripts/addons_core/bl_pkg/cli/blender_ext.py")) if packages else []
+        if not tools:
+            raise LauncherError(f"{self.label} of {python} has no tool for extensions: name a Blender with --blender.")
+        return [python, "-P", str(tools[0]), *arguments]
+
 
 def find_blender() -> tuple[str, str] | None:
     """(path, version) of a `blender` on the PATH that is new enough."""
     path = program("blender")
-    if path is None:
+    version = blender_version(path) if path else None
+    if path is None or version is None or version[0] < OLDEST_BLENDER:
         return None
+    return path, version[1]
+
+
+def blender_version(path: str) -> tuple[tuple[int, int], str] | None:
+    """((major, minor), whole version) of the Blender at `path`; None if it does not run, or is no Blender."""
     try:
-        asked = subprocess.run([path, "--version"], capture_output=True, text=True, errors="replace", timeout=60)
+        done = subprocess.run([path, "--version"], capture_output=True, text=True, errors="replace", timeout=60)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    found = re.search(r"Blender (\d+)\.(\d+)(\S*)", asked.stdout)
-    if not found or (int(found.group(1)), int(found.group(2))) < OLDEST_BLENDER:
+    found = re.search(r"^Blender (\d+)\.(\d+)(\S*)", done.stdout, re.M)
+    if not found:
         return None
-    return path, f"{found.group(1)}.{found.group(2)}{found.group(3)}"
+    return (int(found.group(1)), int(found.group(2))), f"{found.group(1)}.{found.group(2)}{found.group(3)}"
+
+
+def named_blender(path: str) -> Blender:
+    """The Blender at a path that the user named. LauncherError if it is none, or older than the add-on supports."""
+    place = os.path.abspath(path)
+    if not os.path.isfile(place):
+        raise LauncherError(f"There is no Blender at {place}: give the path of its program.", ExitCode.USAGE)
+    version = blender_version(place)
+    if version is None:
+        raise LauncherError(f"{place} does not run as a Blender: give the path of its program.", ExitCode.USAGE)
+    if version[0] < OLDEST_BLENDER:
+        oldest = dotted(OLDEST_BLENDER)
+        raise LauncherError(f"{place} is Blender {version[1]}: name one of version {oldest} or newer.", ExitCode.USAGE)
+    return program_at(place, version[1])
+
+
+def program_at(path: str, version: str) -> Blender:
+    """The Blender whose program is at `path`."""
+    options = ("--background", "--factory-startup", "--python-exit-code", str(int(ExitCode.BAKE)), "--python")
+    return Blender(f"Blender {version}", (path, *options))
 
 
 def choose_wheels() -> list[tuple[str, str]]:
@@ -97,8 +138,7 @@ def get_blender(testing: bool = False, wheels: Path | None = None) -> tuple[Blen
         return Blender(f"bpy {series}", (environment.python,)), took
     found = find_blender()
     if found:
-        options = ("--background", "--factory-startup", "--python-exit-code", str(ExitCode.BAKE), "--python")
-        return Blender(f"Blender {found[1]}", (found[0], *options)), took
+        return program_at(*found), took
     if refused:
         raise refused
     raise LauncherError(

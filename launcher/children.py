@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from torch_backend.contract import GRACE_SECONDS, ExitCode
 
@@ -110,15 +110,20 @@ def close_input(child: subprocess.Popen[Any]) -> None:
             child.stdin.close()
 
 
-def run_child(command: Sequence[str], cwd: Path | None = None, tied: bool = False, **environ: str) -> int:
+def run_child(
+    command: Sequence[str], cwd: Path | None = None, tied: bool = False, log: BinaryIO | None = None, **environ: str
+) -> int:
     """Runs a child with our output; returns its exit code. On Ctrl-C it is cancelled and KeyboardInterrupt goes on.
 
     `cwd`: where it stands, if not beside its program.
     `tied`: its standard input stays open as long as this process lives, however that ends; the child watches it.
+    `log`: an open file that takes its output instead.
     """
     streams: dict[str, Any] = {"stdin": subprocess.PIPE} if tied else {}
     if cwd is not None:
         streams["cwd"] = cwd
+    if log is not None:
+        streams.update(stdout=log, stderr=subprocess.STDOUT)
     child = start_child(command, child_environ(**environ), **streams)
     try:
         while True:

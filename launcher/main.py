@@ -24,6 +24,7 @@ from .doctor import doctor
 from .environments import backend_environment
 from .errors import LauncherError
 from .places import DEMO_CLIP, HERE
+from .release import package
 from .summary import failed_job, read_summary
 from .testing import run_sensitive_tests, run_tests
 
@@ -34,6 +35,7 @@ COMMANDS = {
     "bench": "the method against ground truth; other options go to benchmarks/bench.py (--quick, --jobs N, ...)",
     "doctor": "say what this machine can do",
     "setup": "make the environments and stop",
+    "package": "build a release: the extension's zip, a repository folder, checksums and an SBOM",
     "farm": "shots as a job for a render farm, and what it will cost; its options are the backend's",
 }
 """Command -> what it does."""
@@ -68,6 +70,11 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument("--tests", action="store_true", help="with what `test` needs")
             command.add_argument("--backend", action="store_true", help="the backend alone (for the add-on)")
             command.add_argument("--wheels", metavar="FOLDER", help="install from this folder of wheels, not online")
+        if name == "package":
+            command.add_argument(
+                "--blender", metavar="PATH", action="append", default=[],
+                help="the Blender that builds it (default: one that is found); repeated: more that validate it",
+            )  # fmt: skip
         names = ("--output", "--results") if name == "bench" else ("--output",)
         command.add_argument(*names, metavar="DIR", help="folder for summary.json and results (output/...)")
     return top
@@ -91,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if module and {"-h", "--help"} & set(words) and backend_environment().ready():
         return run_child([backend_environment().python, "-P", "-m", *module, "--help"], cwd=HERE)
     args, rest = parser().parse_known_args(words)
-    if rest and args.command in ("doctor", "setup"):
+    if rest and args.command in ("doctor", "setup", "package"):
         parser().error(f"unrecognized arguments: {' '.join(rest)}")
     for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
@@ -173,6 +180,8 @@ def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
         return freeze(args.clip, output, rest)
     if args.command == "setup":
         return setup(args.bpy, args.tests, args.backend, output, args.wheels)
+    if args.command == "package":
+        return package(args.blender, output)
     if args.command == "bench":
         return bench(rest, output)
     if args.command == "test":

@@ -21,23 +21,27 @@ if TYPE_CHECKING:
     _Animated = bpy.types.Scene | bpy.types.Object | bpy.types.Camera
     """What is keyed here."""
 
-HAS_COMPOSITING_GROUP = bpy.app.version >= (5, 0, 0)
+# A feature is looked up where Blender lists it, which also works in a Blender that was never tried. A behaviour is not
+# listed, so it goes by the version.
+HAS_COMPOSITING_GROUP = "compositing_node_group" in bpy.types.Scene.bl_rna.properties
 """True where the compositor is a node group of the scene (5.0 on)."""
-HAS_TEXTURE_NODE = not HAS_COMPOSITING_GROUP
+HAS_TEXTURE_NODE = hasattr(bpy.types, "CompositorNodeTexture")
 """True where the compositor has a Texture node, which knows a pixel's place in the frame (until 5.0)."""
 CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
 """True where a Scale node that crops sets every pixel: before 4.5 a row or column at the border is left unset."""
 TURNS_VIDEOS = bpy.app.version >= (4, 5, 0)
 """True if a video is turned by quarter turns as its header says. 4.2 and 4.3 show it as stored; 4.4 was not tried."""
 
-HAS_PATH_TEMPLATES = bpy.app.version >= (4, 5, 0)
+HAS_PATH_TEMPLATES = "is_path_supports_templates" in bpy.types.Property.bl_rna.properties
 """True where braces in an output path are templates (4.5 on)."""
 
 POINT_SHADERS = ("POINT_FLAT_COLOR", "FLAT_COLOR") if bpy.app.version >= (4, 5, 0) else ("FLAT_COLOR",)
 """Built-in shaders that colour points, the best first: points have one of their own since 4.5."""
 
-PATH_OPTIONS: set[PropertyFlagItems] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+PATH_OPTIONS: set[PropertyFlagItems] = set()
 """Options of a path property that may hold a path relative to the .blend (`//`); said aloud since 4.5."""
+if "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties:
+    PATH_OPTIONS.add("PATH_SUPPORTS_BLEND_RELATIVE")
 
 
 def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree | None:

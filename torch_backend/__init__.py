@@ -3,4 +3,4 @@
 This file stays light: Blender reads `torch_backend.contract` through it.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

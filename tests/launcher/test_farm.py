@@ -20,7 +20,8 @@ def told(capsys) -> dict[str, str]:
     return dict(line.split("=", 1) for line in lines)
 
 
-def test_a_host_that_is_given_its_python_and_blender_sets_nothing_up(tmp_path, capsys):
+def test_a_host_that_is_given_its_python_and_blender_sets_nothing_up(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("SPLANNEQUIN_HOME", "")  # the host sets it in this process; later tests get back what it was
     blender = tmp_path / "my blender"
     blender.touch()
     home = tmp_path / "home"

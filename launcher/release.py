@@ -1,0 +1,274 @@
+"""The command `package`: the extension's zip, a repository folder for it, checksums and an SBOM, whole or not at all.
+
+A package is a folder `splannequin-VERSION`, ready to be uploaded to any web server:
+
+    splannequin-VERSION.zip   the extension, built and validated by Blender
+    index.json, index.html    Blender's listing of the folder, which makes it an extension repository
+    sbom.cdx.json             what a set-up downloads (`sbom`)
+    SHA256SUMS                SHA-256 of each file
+
+Nothing in it is signed with a key.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import time
+import tomllib
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch_backend.contract import ExitCode, program, replacing_folder
+from torch_backend.shot import locked, write_json
+
+from .blender import BPY_WHEELS, Blender, get_blender, named_blender
+from .children import run_child, say
+from .environments import TORCH_LOCKS
+from .errors import LauncherError
+from .places import ROOT, WINDOWS
+from .sbom import bill_of_materials
+
+LOCKS = ("backend", *TORCH_LOCKS, *(f"bpy-{series}" for series in sorted(BPY_WHEELS)))
+"""Locks of what a user's set-up downloads. Those of tests and benchmarks are not in the zip."""
+SUMS = "SHA256SUMS"
+SBOM = "sbom.cdx.json"
+_LISTING = ("index.json", "index.html")
+_FILE_MODE = 0o100644 << 16
+"""Attributes of every file in the zip: a regular file, readable by all. Those on disk depend on the umask."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """The files that a package is built from."""
+
+    folder: Path
+    """A copy of the files that Git tracks, or would add."""
+    commit: str
+    """Hash of the commit that is checked out."""
+    time: datetime.datetime
+    """Time of that commit, in UTC."""
+    changed: int
+    """How many files differ from the commit."""
+
+
+def package(blenders: Sequence[str], output: Path) -> int:
+    """Builds the package of the tree that is checked out; returns an exit code.
+
+    Args:
+        blenders: programs of Blender. The first builds, all of them validate. None: the one that the launcher finds.
+        output: folder in which the package appears, with blender.log and summary.json.
+
+    Raises:
+        LauncherError: there is no new package; an older one of the same version stays as it was.
+    """
+    started = time.monotonic()
+    chosen = [named_blender(path) for path in blenders] or [get_blender()[0]]
+    work = output / ".work"
+    with locked(output / ".package.lock", lambda: say("another `package` is at work in this folder; waiting for it")):
+        shutil.rmtree(work, ignore_errors=True)  # of a run that was killed
+        try:
+            source = copy_source(work / "source")
+            product = read_manifest(source.folder / "blender_manifest.toml")
+            name = f"{product['id']}-{product['version']}"
+            target = output / (f"{name}-uncommitted" if source.changed else name)
+            with replacing_folder(target) as fresh:
+                digest = _fill(fresh, name, product, source, chosen, output / "blender.log")
+                flush(fresh)
+            flush(output)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    _report(target, name, digest, source, chosen, output, time.monotonic() - started)
+    return ExitCode.OK
+
+
+def copy_source(folder: Path) -> Source:
+    """Copies the files of the checkout that Git tracks or would add, so that nothing else gets into a zip.
+
+    Raises LauncherError if the launcher is not in a Git checkout, or Git fails.
+    """
+    if program("git") is None:
+        raise LauncherError("A package is built from a Git checkout, and there is no `git` on the PATH: install it.")
+    if not (ROOT / ".git").exists():
+        raise LauncherError(f"A package is built from a Git checkout, and {ROOT} is none: clone the repository.")
+    commit, seconds = _git("log", "-1", "--format=%H %ct").decode().split()
+    # Named, as a user's settings may leave untracked files out of the status.
+    status = _git("status", "--porcelain", "-z", "--no-renames", "--untracked-files=all")
+    changed = [line for line in status.split(b"\0") if line]
+    names = _git("ls-files", "-z", "--cached", "--others", "--exclude-standard").split(b"\0")
+    for name in filter(None, map(os.fsdecode, names)):
+        path = ROOT / name
+        if path.is_file() and not path.is_symlink():  # Blender packs no links
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(path.read_bytes())
+    return Source(folder, commit, datetime.datetime.fromtimestamp(int(seconds), datetime.UTC), len(changed))
+
+
+def _git(*words: str) -> bytes:
+    # Without optional locks `git status` writes nothing into the checkout.
+    command = [program("git") or "git", "--no-optional-locks", "-C", str(ROOT), *words]
+    done = subprocess.run(command, capture_output=True)
+    if done.returncode:
+        reasons = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["it printed nothing"]
+        raise LauncherError(f"Git cannot read {ROOT}: {reasons[0].removeprefix('fatal: ').rstrip('.')}.")
+    return done.stdout
+
+
+def _fill(
+    fresh: Path, name: str, product: dict[str, str], source: Source, blenders: Sequence[Blender], log: Path
+) -> str:
+    """Writes every file of a package into an empty folder and checks it; returns the SHA-256 of the zip."""
+    archive, built = fresh / f"{name}.zip", source.folder.parent / "built.zip"
+    tool = _Tool(source.folder.parent / "user", log)
+    tool.run(blenders[0], built, "build", "--source-dir", str(source.folder), "--output-filepath", str(built))
+    repack(built, archive, source.time)
+    for blender in blenders:
+        tool.run(blender, archive, "validate", str(archive))
+    tool.run(blenders[0], fresh / _LISTING[0], "server-generate", "--repo-dir", str(fresh), "--html")
+    digest = sha256(archive)
+    check_listing(fresh, archive.name, digest)
+    when = source.time.strftime("%Y-%m-%dT%H:%M:%SZ")
+    bill = bill_of_materials(source.folder / "requirements", LOCKS, product, digest, when)
+    write_json(fresh / SBOM, bill)
+    names = (archive.name, *_LISTING, SBOM)
+    sums = "".join(f"{sha256(fresh / one)}  {one}\n" for one in sorted(names))
+    (fresh / SUMS).write_text(sums, encoding="utf-8", newline="\n")
+    found = {path.name for path in fresh.iterdir()}
+    if found != {*names, SUMS}:
+        raise LauncherError(f"Blender left files in {fresh} that were not expected: {', '.join(sorted(found))}.")
+    return digest
+
+
+def read_manifest(path: Path) -> dict[str, str]:
+    """id, version, name and licence (SPDX) of the extension. LauncherError if its manifest is damaged."""
+    try:
+        manifest = tomllib.loads(path.read_text(encoding="utf-8"))
+        product = {key: str(manifest[key]) for key in ("id", "version", "name")}
+        product["licence"] = str(manifest["license"][0]).removeprefix("SPDX:")
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise LauncherError(f"{ROOT / path.name} cannot be read ({error!r}): correct it, and start again.") from error
+    return product
+
+
+class _Tool:
+    """Blender's tool for extensions, run with empty user folders, so that the user's Blender stays as it is."""
+
+    def __init__(self, user: Path, log: Path) -> None:
+        self.user = user
+        self.log = log
+        log.write_bytes(b"")
+
+    def run(self, blender: Blender, result: Path, *arguments: str) -> None:
+        """Runs one command of the tool. LauncherError if it fails, or leaves no file `result`."""
+        begin = self.log.stat().st_size
+        with open(self.log, "ab") as log:
+            command = blender.extension_tool(*arguments)
+            code = run_child(command, cwd=ROOT, log=log, BLENDER_USER_RESOURCES=str(self.user))
+        if code == 0 and result.is_file():
+            return
+        with open(self.log, "rb") as log:
+            log.seek(begin)
+            lines = [line.strip() for line in log.read().decode("utf-8", "replace").splitlines() if line.strip()]
+        errors = [line for line in lines if "error" in line.lower()] or lines or ["it printed nothing"]
+        reason = errors[-1].removeprefix("FATAL_ERROR: ").removeprefix("Error: ").rstrip(".")
+        full = any("No space left" in line for line in lines)
+        raise LauncherError(
+            f"{blender.label} cannot {arguments[0]} the extension: {reason}; all it printed is in {self.log}.",
+            ExitCode.DISK if full else ExitCode.ENVIRONMENT,
+        )
+
+
+def repack(built: Path, target: Path, when: datetime.datetime) -> None:
+    """Writes Blender's zip anew with its files in order of name, one time and one set of attributes.
+
+    Blender packs files in the order in which the disk lists them, with the time and attributes of each. The new zip has
+    the same bytes for the same commit, as long as the launcher's Python has the same zlib.
+
+    Args:
+        built: the zip that Blender built.
+        target: the zip to write.
+        when: time of all files in the zip.
+
+    Raises:
+        LauncherError: Blender's zip, or the new one, is damaged.
+    """
+    try:
+        _write_sorted(built, target, when)
+        with zipfile.ZipFile(target) as packed:
+            damaged = packed.testzip()
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise LauncherError(f"Blender's zip {built} is damaged ({error}): start again.") from error
+    if damaged is not None:
+        raise LauncherError(f"{target} is damaged after it was written ({damaged}): check the disk, and start again.")
+
+
+def _write_sorted(built: Path, target: Path, when: datetime.datetime) -> None:
+    with zipfile.ZipFile(built) as source, zipfile.ZipFile(target, "w", compresslevel=9) as packed:
+        for name in sorted(source.namelist()):
+            info = zipfile.ZipInfo(name, when.timetuple()[:6])
+            info.compress_type, info.external_attr, info.create_system = zipfile.ZIP_DEFLATED, _FILE_MODE, 3
+            packed.writestr(info, source.read(name))
+
+
+def check_listing(folder: Path, archive: str, digest: str) -> None:
+    """LauncherError unless index.json lists the zip, and nothing else, with its size and SHA-256."""
+    try:
+        listed = json.loads((folder / "index.json").read_text(encoding="utf-8"))["data"]
+        facts = [(one["archive_url"], one["archive_size"], one["archive_hash"]) for one in listed]
+    except (ValueError, KeyError, TypeError) as error:
+        raise LauncherError(f"Blender's listing {folder / 'index.json'} cannot be read: {error!r}.") from error
+    wanted = (f"./{archive}", (folder / archive).stat().st_size, f"sha256:{digest}")
+    if facts != [wanted]:
+        raise LauncherError(f"Blender's listing {folder / 'index.json'} does not describe {archive}: {facts}.")
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def flush(folder: Path) -> None:
+    """Waits until the files of a folder, and their names in it, are on the disk."""
+    for path in folder.iterdir():
+        if path.is_file():
+            with open(path, "rb+") as file:
+                os.fsync(file.fileno())
+    if not WINDOWS:  # where a folder cannot be opened
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _report(
+    target: Path, name: str, digest: str, source: Source, blenders: Sequence[Blender], output: Path, seconds: float
+) -> None:
+    """Writes summary.json and prints the last lines."""
+    archive, labels = target / f"{name}.zip", [blender.label for blender in blenders]
+    summary = {
+        "command": "package",
+        "exit_code": 0,
+        "package": str(target),
+        "zip": str(archive),
+        "sha256": digest,
+        "commit": source.commit,
+        "changed_files": source.changed,
+        "blender": labels,
+        "wall_seconds": round(seconds, 2),
+    }
+    write_json(output / "summary.json", summary)
+    say(f"Package:    {target}")
+    say(f"Extension:  {archive.name}, {archive.stat().st_size / 1e6:.1f} MB, SHA-256 {digest}")
+    say(f"Built by {labels[0]} from commit {source.commit[:12]}; valid for {', '.join(labels)}.")
+    if source.changed:
+        say(f"This is no release: {source.changed} files differ from the commit. Commit them and start again.")
+    say(f"Nothing is signed with a key: {SUMS} shows whether a file is damaged, not who made it.")
