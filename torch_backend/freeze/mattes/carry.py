@@ -88,8 +88,8 @@ def carry(
 
 def _refined(votes: Tensor, frozen: FrozenGaussians, frame: TakeFrame, config: SegmentConfig | None) -> Matte:
     """The matte [H, W] of what votes [N, 2] are about, at a frame."""
-    depth = from_numpy(frame.depth)
-    shown = render_members(frozen, membership(votes), frame.viewmat, frame.K, depth, frame.beyond)
+    height, width = frame.depth.shape
+    shown = render_members(frozen, membership(votes), frame.viewmat, frame.K, width, height, frame.beyond)
     return refine(frame.picture, frame.depth, shown[..., 0].numpy(), shown[..., 1].numpy(), config)
 
 

@@ -39,7 +39,7 @@ from .segment import Matte, SegmentConfig
 
 MATTES_VERSION = 1
 """Of mattes.json."""
-_METHOD = 2
+_METHOD = 3
 """Rises when mattes made before are not to be used any more; their lassos stay."""
 
 

@@ -12,10 +12,14 @@ from ...torch_types import from_numpy
 from ...train.model import gathered, render
 from ..frozen import FrozenGaussians
 from ..views.reproject import inside, look_up, project
-from ..views.source_views import VisibilityConfig
 
 SEEN = 0.05
 """Pixels of a Gaussian that cameras have to see before mattes can say whether it is a member."""
+
+THICK = 0.1
+"""Gaussians farther behind the surface than this share of its depth are behind the thing: 0.3 m, a body, at 3 m. At the
+3 % by which depth is off, a thing's own Gaussians counted as hidden, and small things lost what the lassoed frame hid
+(docs/benchmarks.md, "Mattes by pointing")."""
 
 RIM = 0.25
 """Gaussians that no lassoed frame shows can belong to the thing within this share of its diagonal from its members: a
@@ -41,12 +45,11 @@ def vote(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, weights: Tensor, d
 def in_front(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, depth: Tensor) -> Tensor:
     """[N] bool: False for Gaussians behind the surface that a picture shows there; `depth` [H, W] as in `vote`.
 
-    Splats of a person are not opaque. A wall that shines through them would become a part of them; once it is known as
-    wall, it would lower their share at thin parts and outlines.
+    Splats of a person are not opaque. A wall that shines through them would become a part of them.
     """
     pixels, away = project(frozen.state["means"], viewmat, K)
     surface = look_up(depth.to(pixels.device), pixels, "nearest")
-    return away < surface * (1.0 + VisibilityConfig().depth_tolerance)
+    return away < surface * (1.0 + THICK)
 
 
 def membership(votes: Tensor) -> Tensor:
@@ -83,21 +86,18 @@ def rule_out(votes: Tensor, means: Tensor) -> Tensor:
 
 @torch.no_grad()
 def render_members(
-    frozen: FrozenGaussians, members: Tensor, viewmat: Tensor, K: Tensor, depth: Tensor,
+    frozen: FrozenGaussians, members: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int,
     overscan: tuple[float, float] = (0.0, 0.0),
 ) -> Tensor:  # fmt: skip
-    """[H, W, 2] in 0..1, on the CPU: `members` [N, 2] as one camera sees them, as shares of what is `in_front`.
+    """[H, W, 2] in 0..1, on the CPU: `members` [N, 2] as one camera sees them, as shares of what is modelled.
 
-    The first is a share of what is known: a pixel that is half unknown and half the thing is the thing. `depth` [H, W]
-    is that of the frame, as in `vote`.
+    The first is a share of what is known: a pixel that is half unknown and half the thing is the thing.
     """
-    device, (height, width) = frozen.support.device, depth.shape
-    camera = viewmat.to(device), K.to(device)
-    colors = torch.nn.functional.pad(members.to(device), (0, 1), value=1.0) * in_front(frozen, *camera, depth)[:, None]
+    device = frozen.support.device
     out = render(
-        frozen.state, 0, *camera, width, height, colors=colors, with_contributions=False,
-        settings=RasterSettings(overscan=overscan),
+        frozen.state, 0, viewmat.to(device), K.to(device), width, height, colors=members.to(device),
+        with_contributions=False, settings=RasterSettings(overscan=overscan),
     )  # fmt: skip
-    members_of, known, shown = out.colors[0, ..., 3:].unbind(-1)
-    shares = torch.stack([members_of / known.clamp_min(1e-4), known / shown.clamp_min(1e-4)], dim=-1)
-    return torch.where(shown[..., None] > 1e-3, shares, 0.0).clamp(0.0, 1.0).cpu()
+    alpha, (members_of, known) = out.alphas[0], out.colors[0, ..., 3:].unbind(-1)
+    shares = torch.stack([members_of / known.clamp_min(1e-4), known / alpha.clamp_min(1e-4)], dim=-1)
+    return torch.where(alpha[..., None] > 1e-3, shares, 0.0).clamp(0.0, 1.0).cpu()

@@ -45,8 +45,8 @@ def test_who_stands_outside_of_the_picture_is_not_seen():
 
 
 def test_a_wall_that_shines_through_a_person_is_none_of_them():
-    """A person 2 in front of the camera, a wall at 3: one Gaussian behind the person, one beside them."""
-    means = [[0.0, 0.0, 2.0], [0.0, 0.0, 2.05], [0.0, 0.0, 3.0], [1.3, 0.0, 3.0]]
+    """A person 2 in front of the camera, their back at 2.15, a wall at 3: one Gaussian behind the person, one aside."""
+    means = [[0.0, 0.0, 2.0], [0.0, 0.0, 2.15], [0.0, 0.0, 3.0], [1.3, 0.0, 3.0]]
     frozen = scene(means, [0.2, 0.2, 0.2, 0.1], [0.0] * 4)
     person = torch.zeros(24, 32)
     person[4:20, 8:24] = 1.0
@@ -56,9 +56,6 @@ def test_a_wall_that_shines_through_a_person_is_none_of_them():
     assert shares[:2].tolist() == pytest.approx([1.0, 1.0], abs=0.05) and known[:2].tolist() == [1.0, 1.0]
     assert votes[2].tolist() == [0.0, 0.0], "nothing is said of what a person hides"
     assert known[3] == 1.0 and shares[3] < 0.05
-    wall = votes + torch.tensor([[0.0, 0.0], [0.0, 0.0], [0.0, 40.0], [0.0, 0.0]])  # as another camera sees it
-    shown = render_members(frozen, membership(wall), VIEW, K, torch.where(person > 0.0, 2.0, 3.0))
-    assert shown[12, 16].tolist() == pytest.approx([1.0, 1.0], abs=0.05), "a person through whom it shines stays whole"
 
 
 def test_members_are_rendered_as_shares_of_what_is_known():
@@ -66,10 +63,8 @@ def test_members_are_rendered_as_shares_of_what_is_known():
     votes = torch.tensor([[0.0, 0.0], [8.0, 10.0]])  # nobody saw the first
     members = membership(votes)
     assert members.tolist() == [[0.0, 0.0], [0.800000011920929, 1.0]]
-    middle = render_members(frozen, members, VIEW, K, torch.full((24, 32), 3.0))[12, 16]
+    middle = render_members(frozen, members, VIEW, K, 32, 24)[12, 16]
     assert abs(float(middle[0]) - 0.8) < 1e-3 and 0.3 < float(middle[1]) < 0.7
-    middle = render_members(frozen, members, VIEW, K, torch.full((24, 32), 2.0))[12, 16]
-    assert middle.tolist() == [0.0, 0.0], "what is known is behind what the frame shows"
 
 
 def test_what_is_far_from_a_thing_and_was_not_seen_is_none_of_it():
