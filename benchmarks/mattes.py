@@ -4,12 +4,12 @@ SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 t
 cameras, an `auto` run and a take for each instant are made in DIR if they are missing. Truth are the pixels whose
 centre shows a person, by rays through the scene's triangles.
 
-Each person is lassoed once per instant, at the frame of the instant itself. The lasso is the outline of the truth
-there, a corner every `--corner` pixels, each moved by up to `--sloppy` pixels in any direction; a person whom something
-parts has a polygon for each part of a twentieth or more. Judged are all other frames of the take (every `--every`-th
-of the clip, t* among them) that show at least `LEAST` pixels of the person: intersection over union of truth and the
-matte, cut at half. Seconds are those of the job up to its first matte, loading of the run included, and of each further
-frame with all its mattes.
+Each person is lassoed once per instant, at the frame that shows the largest share of them (`--lasso-at t-star`: at
+that of the instant, which may show a sliver). The lasso is the outline of the truth there, a corner every `--corner`
+pixels, each moved by up to `--sloppy` pixels in any direction; a person whom something parts has a polygon for each
+part of a twentieth or more. Judged are all other frames of the take (every `--every`-th of the clip, t* among them)
+that show at least `LEAST` pixels of the person: intersection over union of truth and the matte, cut at half. Seconds
+are those of the job up to its first matte, loading of the run included, and of each further frame with all its mattes.
 
 DIR gets mattes-NAME.json.
 """
@@ -24,6 +24,7 @@ import statistics
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from numpy.typing import NDArray
 from benchmarks.detail_truth import scene_arguments, trained
 from benchmarks.sources import Log, SyntheticTruth, load_source
 from benchmarks.synthetic.folder import SyntheticScene
+from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.regions import Geometry, View
 from torch_backend.contract import FreezeParams, JobError, MatteParams, TakeFolder
 from torch_backend.freeze import freeze_shot
@@ -48,6 +50,8 @@ from torch_backend.shot import Shot, write_json
 
 LEAST = 200
 """Pixels of a person below which a pose says little: half a pixel of outline is a tenth of it."""
+WIDE = 120
+"""Width of the pictures, in pixels, on which silhouettes are counted."""
 PERSON = "person"
 """What the names of movers that are people begin with."""
 
@@ -63,6 +67,29 @@ def person_masks(scene: SyntheticScene, t_star: int, poses: Sequence[int]) -> di
         face = standing.cast(np.broadcast_to(view.eye, rays.shape), rays).face.reshape(scene.height, scene.width)
         for name, (first, last) in faces.items():
             found[name][pose] = (face >= first) & (face < last)
+    return found
+
+
+def best_poses(scene: SyntheticScene, t_star: int, masks: dict[str, dict[int, NDArray[np.bool_]]]) -> dict[str, int]:
+    """Person -> the pose that shows most of them: of those with the largest share seen, to a twentieth, the nearest.
+
+    The share is that of their silhouette, as nothing hid it and as the frame went on for its size on all sides.
+    """
+    geometry, small = Geometry.load(scene.root), WIDE / scene.width
+    standing, K = geometry.at(scene.frames.index(t_star)), scene.K * [[small], [small], [1.0]]
+    width, height = round(scene.width * small), round(scene.height * small)
+    K[:2, 2] += width, height
+    found: dict[str, int] = {}
+    for name, (first, last) in faces_of_people(scene.root).items():
+        alone = RayScene(standing.vertices, standing.triangles[first:last])
+        score: dict[int, tuple[float, int]] = {}
+        for pose, mask in masks[name].items():
+            view = View(scene.world_to_camera[pose], K, 3 * width, 3 * height)
+            rays = view.rays()
+            whole = int((alone.cast(np.broadcast_to(view.eye, rays.shape), rays).face >= 0).sum())
+            seen = int(mask.sum())
+            score[pose] = round(20.0 * seen * small**2 / max(1, whole)) / 20.0, seen
+        found[name] = max(score, key=lambda pose: score[pose])
     return found
 
 
@@ -123,17 +150,35 @@ class Watch(Log):
         """Nothing: figures are the benchmark's own."""
 
 
-def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> list[dict[str, Any]]:
-    """One row per person and pose that is judged: {t_star, person, pose, pixels, iou, first, others}."""
+@dataclass
+class MatteTake:
+    """A take of an instant with a matte of each person whom its lassoed frame shows."""
+
+    folder: TakeFolder
+    masks: dict[str, dict[int, NDArray[np.bool_]]]
+    """Truth, as of `person_masks`."""
+    lassoed: dict[str, int]
+    """Person -> the pose at which they were lassoed."""
+    seconds: dict[str, float]
+    """{first, others}: until the first frame with mattes, and per further frame."""
+
+    def matte(self, name: str, pose: int) -> NDArray[np.bool_]:
+        """[H, W]: a person's matte, cut at half."""
+        return read_matte(matte_file(self.folder, name, pose, "exr"), (0, 0)) > 0.5
+
+
+def make(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> MatteTake:
+    """Freezes an instant if its take is missing, and makes the mattes of its people anew."""
     take = f"mattes{t_star}"
     freeze_shot(shot, FreezeParams(run=run, take=take, t_star=t_star, step=args.every, only_missing=True), Log())
     folder = TakeFolder(shot.take(take))
     masks = person_masks(scene, t_star, frames_of(folder))
-    masks = {name: of for name, of in masks.items() if of[t_star].sum() >= LEAST}
+    at = dict.fromkeys(masks, t_star) if args.lasso_at == "t-star" else best_poses(scene, t_star, masks)
+    masks = {name: of for name, of in masks.items() if of[at[name]].sum() >= LEAST}
     rows = [
-        {"name": name, "frame": t_star, "polygon": polygon}
+        {"name": name, "frame": at[name], "polygon": polygon}
         for seed, name in enumerate(masks)
-        for polygon in lassos(masks[name][t_star], args.corner, args.sloppy, 100 * seed)
+        for polygon in lassos(masks[name][at[name]], args.corner, args.sloppy, 100 * seed)
     ]
     shutil.rmtree(folder.mattes, ignore_errors=True)  # kept ones would take no time
     path = args.results.absolute() / f"lassos-{shot.root.stem}-{t_star}.json"
@@ -144,14 +189,19 @@ def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argpar
     seconds = (
         {"first": round(watch.at[0] - watch.began, 2), "others": round(float(steps.mean()), 3)} if len(steps) else {}
     )
+    return MatteTake(folder, masks, {name: at[name] for name in masks}, seconds)
+
+
+def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> list[dict[str, Any]]:
+    """One row per person and pose that is judged: {t_star, person, pose, pixels, iou, first, others}."""
+    made = make(shot, scene, run, t_star, args)
     found: list[dict[str, Any]] = []
-    for name, of in masks.items():
+    for name, of in made.masks.items():
         for pose, mask in of.items():
-            if pose == t_star or mask.sum() < LEAST:
+            if pose == made.lassoed[name] or mask.sum() < LEAST:
                 continue
-            matte = read_matte(matte_file(folder, name, pose, "exr"), (0, 0)) > 0.5
             row = {"t_star": t_star, "person": name, "pose": pose, "pixels": int(mask.sum())}
-            found.append({**row, "iou": round(overlap(matte, mask), 4), **seconds})
+            found.append({**row, "iou": round(overlap(made.matte(name, pose), mask), 4), **made.seconds})
     return found
 
 
@@ -175,13 +225,19 @@ def _cells(rows: Sequence[dict[str, Any]]) -> str:
     return f"{len(rows)} | {statistics.fmean(overlaps):.3f} | {min(overlaps):.3f} | {first:.1f} | {others:.2f}"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def matte_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of every benchmark that lassoes people in synthetic scenes."""
     scene_arguments(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the training")
     parser.add_argument("--corner", type=float, default=8.0, help="pixels of outline between two corners of a lasso")
     parser.add_argument("--sloppy", type=float, default=3.0, help="pixels by which a corner may be off the outline")
+    parser.add_argument("--lasso-at", choices=("most", "t-star"), default="most", help="which frame of the take")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line; returns an exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    matte_arguments(parser)
     args = parser.parse_args(argv)
     torch.set_num_threads(default_threads())
     found: dict[str, list[dict[str, Any]]] = {}

@@ -101,7 +101,7 @@ def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: C
         say(f"{size.name}/{folder.name}: geometry and textures")
         write_geometry(folder, seed, kind, size, key, bodies())
     made = time.perf_counter()
-    _render(folder, bpy, lambda text: say(f"{size.name}/{folder.name}: {text}"))
+    render_pictures(folder, bpy, lambda text: say(f"{size.name}/{folder.name}: {text}"))
     rendered = time.perf_counter()
     write_regions(folder, seed, kind, size, _Eta(say, f"{size.name}/{folder.name}: regions"))
     seconds = {"geometry": made - began, "pictures": rendered - made, "regions": time.perf_counter() - rendered}
@@ -110,7 +110,7 @@ def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: C
     return folder
 
 
-def _render(folder: Path, bpy: Path, say: Say) -> None:
+def render_pictures(folder: Path, bpy: Path, say: Say) -> None:
     """Runs the renderer as a child that ends when this process does."""
     log = folder / "render.log"
     last: list[str] = []

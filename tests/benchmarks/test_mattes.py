@@ -5,10 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.mattes import faces_of_people, lassos, overlap, table
+from benchmarks.mattes import best_poses, faces_of_people, lassos, overlap, person_masks, table
 from benchmarks.synthetic.draw import AMBIENT, LIGHT, Painter, draw
+from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.sizes import SIZES
+from benchmarks.two_instants import BASE, INSTANT, UNKNOWN, figures, owners
 from torch_backend.footage.images import write_png
 
 
@@ -37,6 +39,46 @@ def test_people_are_found_by_the_order_of_the_movers(tmp_path):
     assert faces_of_people(tmp_path) == {"person0": (7, 12), "person2": (15, 19)}
 
 
+SIDES = {"person0": ((0, 4), (-1, 3)), "person1": ((0, 5), (-2, 6))}
+"""Person -> (x, depth in metres) at two instants, of squares with sides of 1 m that face the cameras."""
+
+
+@pytest.fixture
+def squares(tmp_path):
+    """A wall 8 m away and two persons, square and flat; cameras 1 to 3 stand at x = -2, 0, 9."""
+    (tmp_path / "geometry").mkdir()
+
+    def square(x, z, half):
+        return np.array([[x - half, -half, z], [x + half, -half, z], [x + half, half, z], [x - half, half, z]], "f4")
+
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    np.savez(tmp_path / "geometry" / "static.npz", vertices=square(0, 8, 40), triangles=faces)
+    for name, moments in SIDES.items():
+        np.savez(tmp_path / "geometry" / f"{name}.npz", triangles=faces)
+        np.save(tmp_path / "geometry" / f"{name}.npy", np.stack([square(*at, 0.5) for at in moments]))
+    plan = {"movers": [{"name": name, "in_view": True} for name in SIDES]}
+    (tmp_path / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
+    K = np.array([[60.0, 0.0, 60.0], [0.0, 60.0, 30.0], [0.0, 0.0, 1.0]])
+    views = {n: np.eye(4) for n in (1, 2, 3)}
+    for n, x in ((1, -2.0), (2, 0.0), (3, 9.0)):
+        views[n][0, 3] = -x
+    return SyntheticScene(tmp_path, "x", 0, "plain", "quick", 120, 60, 8.0, [1, 2], K, views, [1, 2], [1, 2, 3], {})
+
+
+def test_a_lasso_is_drawn_where_most_of_a_person_is_seen(squares):
+    masks = person_masks(squares, 1, [1, 2, 3])
+    assert masks["person1"][2].sum() == 0 < masks["person1"][1].sum()  # person0 stands in front of them
+    assert best_poses(squares, 1, masks)["person1"] == 1
+
+
+def test_a_pixel_belongs_to_the_instant_that_shows_its_surface(squares):
+    owner = owners(squares, "person0", 1, 2, 2)  # person0 as at 2, all else as at 1, from x = 0
+    assert owner[30, 40] == INSTANT, "person0 at the instant"
+    assert owner[30, 60] == UNKNOWN, "person1, whom person0 hid at the base, stood elsewhere at the instant"
+    assert owner[23, 60] == INSTANT, "the wall that person0 hid at the base"
+    assert owner[5, 5] == BASE, "the wall, which both show"
+
+
 def test_overlap_and_table():
     one, two = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
     one[:2], two[1:3] = True, True
@@ -46,6 +88,12 @@ def test_overlap_and_table():
         "| quick arm | person0 | 2 | 0.850 | 0.800 | 2.0 | 0.50 |",
         "| all | | 2 | 0.850 | 0.800 | 2.0 | 0.50 |",
     ]
+
+
+def test_what_two_instants_cost_is_counted_over_all_pixels():
+    rows = [{"regions": {"whole": [10, 0.1, 0.01]}}, {"regions": {"whole": [10, 0.1, 0.19]}}]
+    assert figures(rows, "whole") == pytest.approx((20.0, 20.0))
+    assert figures([{"regions": {"person": [0, 0.0, 0.0]}}], "person") is None
 
 
 def test_a_drawn_picture_has_the_texture_of_the_surface_and_the_sky(tmp_path):

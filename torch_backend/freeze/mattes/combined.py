@@ -36,7 +36,7 @@ from ..take.folder import frames_of
 from ..take.video import write_video
 from .files import is_current, matte_file, read_matte
 
-VERSION = 1
+VERSION = 2
 """Rises when pictures combined before are not to be used any more."""
 GROW = 4.0
 """Pixels of pictures 640 wide by which a matte grows: its edge is soft, and hair reaches beyond it."""
@@ -73,6 +73,12 @@ class Source:
                 f"The matte {name} of take {self.name} lacks frame {frame}.", "Make the mattes again.", ExitCode.FREEZE
             )
         return read_matte(path, self.margin)
+
+    def matte_in_motion(self, name: str, frame: int, motion: Array) -> Array:
+        """[H, W] in 0..1: a matte `with_motion` [H, W] of this take's frame."""
+        matte = self.matte(name, frame)
+        others = [self.matte(other, frame) for other in self.matte_keys if other != name]
+        return with_motion(matte, np.maximum.reduce([np.zeros_like(matte), *others]), motion)
 
 
 def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, Any]:
@@ -158,15 +164,24 @@ def grown(matte: Array, width: int) -> Array:
     return np.asarray(cv2.GaussianBlur(cv2.dilate(matte, kernel), (0, 0), 0.5 * reach), np.float32)
 
 
-def with_motion(matte: Array, motion: Array) -> Array:
+def with_motion(matte: Array, others: Array, motion: Array) -> Array:
     """A matte [H, W] with all that moves (`motion` [H, W]) and touches it: a hand that the matte missed, or where the
-    thing is while it lives.
+    thing is while it lives. What is nearer to `others` [H, W], the mattes of all other things, is theirs.
 
     `motion` is the layer of a frozen frame: what moves at t* or in the frame's own plate.
     """
-    _, labels = cv2.connectedComponents(((matte > 0.5) | (motion > 0.5)).astype(np.uint8))
-    touched = np.unique(labels[matte > 0.5])
+    its, theirs = matte > 0.5, (others > 0.5) & (others > matte)
+    joined = its | (motion > 0.5)
+    if theirs.any():
+        joined &= _distance(its) <= _distance(theirs)
+    _, labels = cv2.connectedComponents(joined.astype(np.uint8))
+    touched = np.unique(labels[its & joined])
     return np.maximum(matte, np.isin(labels, touched[touched > 0]).astype(np.float32))
+
+
+def _distance(mask: NDArray[np.bool_]) -> Array:
+    """[H, W] pixels to the nearest one of a mask."""
+    return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
 def _opened(shot: Shot, name: str) -> Source:
@@ -230,7 +245,7 @@ def _write_frame(
     """Writes a frame and its preview, unless they are there, made of the same."""
     key = content_key(
         VERSION, GROW, read_key(base.folder.frame(number)), None if live is None else live.key,
-        [[matte, take, base.matte_keys[matte], *_keys(sources[take], matte, number)] for matte, take in things.items()],
+        [[matte, take, base.matte_keys, *_keys(sources[take], number)] for matte, take in things.items()],
     )  # fmt: skip
     if is_current(folder.preview(number), key) and is_current(folder.frame(number), key):
         return
@@ -239,7 +254,7 @@ def _write_frame(
     (height, width), (across, down) = frame.depth.shape, base.margin
     inner = slice(down, height - down), slice(across, width - across)
     for matte, take in things.items():
-        source, mask = sources[take], with_motion(base.matte(matte, number), frame.motion)
+        source, mask = sources[take], base.matte_in_motion(matte, number, frame.motion)
         if source is None:
             assert live is not None
             whole, mask = grown(mask, width), np.zeros_like(mask)
@@ -248,7 +263,7 @@ def _write_frame(
             picture = np.asarray(live.display(number).clamp(0.0, 1.0).numpy() * 255.0, np.float32)
         else:
             other = read_frozen_exr(source.folder.frame(number))
-            mask = grown(np.maximum(mask, with_motion(source.matte(matte, number), other.motion)), width)
+            mask = grown(np.maximum(mask, source.matte_in_motion(matte, number, other.motion)), width)
             picture = read_png(source.folder.preview(number)).astype(np.float32)
         share = mask[inner][..., None]
         shown = shown * (1.0 - share) + picture * share
@@ -260,9 +275,9 @@ def _write_frame(
     )  # fmt: skip
 
 
-def _keys(source: Source | None, matte: str, number: int) -> list[str | None]:
-    """What a thing's pixels come from: frame and matte of another take; nothing more for the plate."""
-    return [] if source is None else [read_key(source.folder.frame(number)), source.matte_keys[matte]]
+def _keys(source: Source | None, number: int) -> list[Any]:
+    """What a thing's pixels come from: frame and mattes of another take; nothing more for the plate."""
+    return [] if source is None else [read_key(source.folder.frame(number)), source.matte_keys]
 
 
 def _living_frame(base: FrozenFrame, plates: Plates, number: int, inner: tuple[slice, slice]) -> FrozenFrame:

@@ -147,8 +147,12 @@ def frame_like(value):
 def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
     matte, motion = np.zeros((40, 60), np.float32), np.zeros((40, 60), np.float32)
     matte[10:20, 10:20], motion[15:30, 18:25], motion[5:10, 50:55] = 1.0, 1.0, 1.0
-    alive = with_motion(matte, motion)
+    alive = with_motion(matte, np.zeros_like(matte), motion)
     assert alive[25, 22] == 1.0 and alive[7, 52] == 0.0 and alive[12, 12] == 1.0
+    behind = np.zeros_like(matte)
+    behind[18:34, 22:28] = 1.0  # another thing, which moves and is touched
+    parted = with_motion(matte, behind, motion)
+    assert parted[15, 19] == 1.0 and parted[25, 22] == 0.0 and np.array_equal(parted[matte > 0.5], matte[matte > 0.5])
     soft = grown(matte, 640)
     assert soft[15, 15] == pytest.approx(1.0, abs=1e-3) and 0.2 < soft[15, 23] < 1.0 and soft[15, 32] == 0.0
     assert torch.from_numpy(soft).isfinite().all()

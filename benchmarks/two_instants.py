@@ -1,0 +1,196 @@
+"""One picture of two instants against its rendered truth: `python -m benchmarks.two_instants SCENE ... --results DIR`.
+
+SCENE and DIR are as for `benchmarks.mattes`, which makes the takes and the mattes. For each ordered pair of instants
+(base, instant) and each person whom both lassoed frames show, `combine` lets the person stand as at `instant` in the
+take of `base`. The truth of that picture is rendered from the scene with this one person at `instant`; that needs a
+Python with bpy (`--bpy`, else the one that set-up made).
+
+What is lost by combining is the PSNR of the two takes by themselves less that of the combined picture. A pixel belongs
+to the take whose instant shows the surfaces of the combined scene there, by `SAMPLES` squared rays: to the base where
+it does, else to the instant. Its error by itself is that take's against the truth of that take's instant. In the
+remaining pixels neither instant shows the surface (the person stands in front of somebody who moved, or was hidden at
+`instant`): they are judged in the combined picture alone, as *unknown*. Poses that have a truth count.
+
+DIR gets two-instants-NAME.json, and a picture of each frame (truth, combined, base, instant) in DIR/two-instants.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.detail_truth import trained
+from benchmarks.mattes import LEAST, faces_of_people, make, matte_arguments, overlap
+from benchmarks.sources import Log, in_words, load_synthetic
+from benchmarks.synthetic.folder import SyntheticScene
+from benchmarks.synthetic.make import find_bpy, render_pictures
+from benchmarks.synthetic.rays import Hits, RayScene
+from benchmarks.synthetic.regions import Geometry, View
+from torch_backend.contract import CombineParams, TakeFolder
+from torch_backend.footage.color import linear_to_srgb8
+from torch_backend.footage.images import read_png, write_png
+from torch_backend.freeze.exr import read_frozen_exr
+from torch_backend.freeze.mattes.combined import combine
+from torch_backend.freeze.take.folder import frames_of
+from torch_backend.shot import Shot, write_json
+
+SAMPLES = 3
+"""Rays a side by which a pixel is judged: an edge that only one instant shows makes it that instant's."""
+SAME_METRES = 1e-3
+"""Two hits of one ray closer than this are one surface: people who hold still sway by more between two instants."""
+BASE, INSTANT, UNKNOWN = range(3)
+"""Whose instant shows a pixel of the combined scene."""
+
+Mask = NDArray[np.bool_]
+
+
+def owners(scene: SyntheticScene, person: str, base: int, instant: int, pose: int) -> NDArray[np.uint8]:
+    """[H, W] of `BASE`, `INSTANT`, `UNKNOWN`: whose truth shows what the combined scene shows at a pose."""
+    geometry, index = Geometry.load(scene.root), scene.frames.index
+    first, last = faces_of_people(scene.root)[person]
+    mixed = geometry.at(index(base))
+    corners = np.unique(mixed.triangles[first:last])
+    moved = mixed.vertices.copy()
+    moved[corners] = geometry.at(index(instant)).vertices[corners]
+    scenes = RayScene(moved, mixed.triangles), mixed, geometry.at(index(instant))
+    view = View(scene.world_to_camera[pose], scene.K, scene.width, scene.height)
+    shows = np.ones((2, view.height * view.width), bool)
+    offsets = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    for dx, dy in itertools.product(offsets, offsets):
+        rays = view.rays(dx, dy)
+        truth, *each = (one.cast(np.broadcast_to(view.eye, rays.shape), rays) for one in scenes)
+        shows &= np.stack([_same(truth, one) for one in each])
+    return np.where(shows[0], BASE, np.where(shows[1], INSTANT, UNKNOWN)).astype(np.uint8).reshape(view.height, -1)
+
+
+def _same(one: Hits, other: Hits) -> Mask:
+    """[R] whether rays met the same surface, or nothing, in two scenes."""
+    near = np.abs(np.where(one.face < 0, 0.0, one.distance) - np.where(other.face < 0, 0.0, other.distance))
+    return (one.face == other.face) & (near < SAME_METRES)
+
+
+def rendered(scene: SyntheticScene, person: str, base: int, instant: int, args: argparse.Namespace) -> Path:
+    """Folder of the pictures NNNNNN.png of `base` with one person at `instant`, rendered if they are missing."""
+    folder = args.results.absolute() / "two-instants" / f"{scene.name}-{person}-{base}-{instant}"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("geometry", "textures", "meter.json"):
+        if not (folder / name).exists():
+            (folder / name).symlink_to(scene.root.absolute() / name)
+    plan = json.loads((scene.root / "plan.json").read_text(encoding="utf-8"))
+    start = f"truth/{base:06d}/"
+    jobs = [job for job in plan["jobs"] if job["out"].startswith(start) and "box" not in job]
+    elsewhen = {person: float(scene.frames.index(instant))}
+    plan["jobs"] = [{**job, "out": job["out"].removeprefix(start), "elsewhen": elsewhen} for job in jobs]
+    write_json(folder / "plan.json", plan)
+    render_pictures(folder, find_bpy(args.bpy), lambda text: None)
+    return folder
+
+
+def picture_of(folder: TakeFolder, pose: int) -> NDArray[np.uint8]:
+    """[H, W, 3] sRGB of a take's frame."""
+    return linear_to_srgb8(np.clip(read_frozen_exr(folder.frame(pose)).rgba[..., :3], 0.0, 1.0))
+
+
+def judge(
+    shot: Shot, scene: SyntheticScene, person: str, takes: dict[int, TakeFolder], pair: tuple[int, int],
+    args: argparse.Namespace,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """One row per pose: {person, base, instant, pose, regions: {name: [pixels, squared error combined, apart]}}."""
+    base, instant = pair
+    name = f"two{base}-{instant}-{person}"
+    things = f"{person}={takes[instant].root.name}"
+    combine(shot, CombineParams(base=takes[base].root.name, things=things, take=name), Log())
+    folder, pictures = TakeFolder(shot.take(name)), rendered(scene, person, base, instant, args)
+    rows: list[dict[str, Any]] = []
+    for pose in scene.poses:
+        if pose not in frames_of(folder):
+            continue
+        owner, truth = owners(scene, person, base, instant, pose), read_png(pictures / f"{pose:06d}.png")
+        shown, one, two = (picture_of(each, pose) for each in (folder, takes[base], takes[instant]))
+        write_png(pictures / f"shown-{pose:06d}.png", np.concatenate([truth, shown, one, two], axis=1))
+        error = _squares(shown, truth)
+        apart = np.where(
+            owner == BASE, _squares(one, scene.truth(base, pose)), _squares(two, scene.truth(instant, pose))
+        )
+        regions = {"whole": owner != UNKNOWN, "person": owner == INSTANT, "unknown": owner == UNKNOWN}
+        found = {key: [int(of.sum()), float(error[of].sum()), float(apart[of].sum())] for key, of in regions.items()}
+        rows.append({"person": person, "base": base, "instant": instant, "pose": pose, "regions": found})
+    return rows
+
+
+def _squares(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """[H, W] mean squared difference of two pictures, in 0..1."""
+    return np.square((one.astype(np.float64) - other) / 255.0).mean(-1)
+
+
+def figures(rows: Sequence[dict[str, Any]], region: str) -> tuple[float, float] | None:
+    """PSNR (combined, two takes by themselves) of a region, pixels of all poses together; None if it is empty."""
+    pixels, error, apart = np.sum([row["regions"][region] for row in rows], axis=0)
+    return (_db(error / pixels), _db(apart / pixels)) if pixels else None
+
+
+def _db(square: float) -> float:
+    return float(-10.0 * np.log10(max(square, 1e-10)))
+
+
+def table(found: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """Figures by scene, pair and person, in Markdown."""
+    lines = [
+        "| scene | base, instant | person | matte IoU | whole: apart, combined, lost | person: apart, combined, lost "
+        "| unknown: share, combined |",
+        "|---|---|---|---:|---:|---:|---:|",
+    ]
+    for scene, rows in found.items():
+        for key in dict.fromkeys((row["base"], row["instant"], row["person"]) for row in rows):
+            of = [row for row in rows if (row["base"], row["instant"], row["person"]) == key]
+            iou = statistics.fmean(row["iou"] for row in of)
+            cells = [_cell(figures(of, region)) for region in ("whole", "person")]
+            pixels = {name: sum(row["regions"][name][0] for row in of) for name in ("whole", "unknown")}
+            lone = figures(of, "unknown")
+            unknown = f"{100.0 * pixels['unknown'] / sum(pixels.values()):.1f} %" + (f", {lone[0]:.2f}" if lone else "")
+            lines.append(f"| {scene} | {key[0]}, {key[1]} | {key[2]} | {iou:.2f} | {' | '.join(cells)} | {unknown} |")
+    return lines
+
+
+def _cell(of: tuple[float, float] | None) -> str:
+    return "" if of is None else f"{of[1]:.2f}, {of[0]:.2f}, {of[1] - of[0]:+.2f}"
+
+
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    matte_arguments(parser)
+    parser.add_argument("--bpy", help="Python of Blender's module, which renders the truth")
+    args = parser.parse_args(argv)
+    found: dict[str, list[dict[str, Any]]] = {}
+    for folder in args.scenes:
+        truth, scene = load_synthetic(folder, args.results), SyntheticScene.load(folder)
+        run = trained(truth, f"exact:{folder.absolute()}", args)
+        made = {t: make(truth.shot, scene, run, t, args) for t in args.t_star or truth.t_stars}
+        takes = {t: of.folder for t, of in made.items()}
+        rows = found[truth.name] = []
+        for pair in itertools.permutations(takes, 2):
+            for person in [name for name in made[pair[0]].masks if name in made[pair[1]].masks]:
+                for row in judge(truth.shot, scene, person, takes, pair, args):
+                    each = [(made[t].masks[person][row["pose"]], made[t].matte(person, row["pose"])) for t in pair]
+                    iou = [overlap(matte, mask) for mask, matte in each if mask.sum() >= LEAST]
+                    rows.append({**row, "iou": statistics.fmean(iou) if iou else 1.0})
+        write_json(args.results / f"two-instants-{truth.name.replace(' ', '-')}.json", {"version": 1, "rows": rows})
+    print("\n".join(["", *table(found)]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
