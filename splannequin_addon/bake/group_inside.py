@@ -18,6 +18,9 @@ _EVEN, _SOFT = 0.005, 0.01
 """Shares of the frozen depth: as far behind it CG is still in front, and within so much more it goes behind. The first
 is the median error of frozen depth on truth (docs/benchmarks.md, "Depth"): without it the frozen comes through what
 stands on it, and through a quarter of the rims and a twelfth of the shadows on a frozen surface."""
+_SHADOW = 0.05
+"""Share of its depth by which a caught shadow, black CG, counts as nearer: a take's surface lies up to 3 % behind its
+frames (docs/benchmarks.md, "The frozen scene as a mesh"), where shadows had holes."""
 
 
 def fill(
@@ -179,7 +182,27 @@ def _cg_depth(group: bpy.types.NodeTree, enter: bpy.types.Node) -> bpy.types.Nod
     group.links.new(far.outputs[0], depth.inputs[1])
     for column, node in enumerate((around, there, far, depth)):
         node.location = (GAP * (column - 3), -1100.0)
-    return depth.outputs[0]
+    return _shadows_nearer(group, enter, depth.outputs[0])
+
+
+def _shadows_nearer(
+    group: bpy.types.NodeTree, enter: bpy.types.Node, depth: bpy.types.NodeSocket
+) -> bpy.types.NodeSocket:
+    """Socket of the depth of CG, less by `_SHADOW` of itself where CG is black, as what a catcher shows of a shadow."""
+    red, green, blue = compat.separated(group, enter.outputs["CG"])
+    brighter, brightest = (compat.new_math_node(group, "MAXIMUM") for _ in range(2))
+    black, share, nearer = (compat.new_math_node(group, o) for o in ("LESS_THAN", "MULTIPLY_ADD", "MULTIPLY"))
+    black.inputs[1].default_value, share.inputs[1].default_value, share.inputs[2].default_value = 1e-6, -_SHADOW, 1.0
+    nearer.label = "Depth of CG, shadows nearer"
+    for source, target in (
+        (red, brighter.inputs[0]), (green, brighter.inputs[1]), (brighter.outputs[0], brightest.inputs[0]),
+        (blue, brightest.inputs[1]), (brightest.outputs[0], black.inputs[0]), (black.outputs[0], share.inputs[0]),
+        (depth, nearer.inputs[0]), (share.outputs[0], nearer.inputs[1]),
+    ):  # fmt: skip
+        group.links.new(source, target)
+    for column, node in enumerate((brighter, brightest, black, share, nearer)):
+        node.location = (GAP * (column - 3), -1500.0)
+    return nearer.outputs[0]
 
 
 def _nearer(
