@@ -491,7 +491,9 @@ def in_front(cg: float | np.ndarray, frozen: np.ndarray, softness: float = 0.0) 
 @pytest.mark.parametrize(
     ("alpha", "softness", "bright"), [(1.0, 0.0, 1.0), (0.5, 0.0, 1.0), (0.5, 6.0, 1.0), (0.5, 0.0, 0.0)]
 )
-def test_cg_stands_in_front_and_behind_by_depth(addon, scene, take, tmp_path, layers, pictures, alpha, softness, bright):
+def test_cg_stands_in_front_and_behind_by_depth(
+    addon, scene, take, tmp_path, layers, pictures, alpha, softness, bright
+):
     """A wall of CG at depth 12 among frames whose depth grows downwards: pixel by pixel the nearer is in front.
 
     A black one is a caught shadow, which falls on what is up to 5 % nearer, too.

@@ -36,10 +36,12 @@ from ..take.folder import frames_of
 from ..take.video import write_video
 from .files import is_current, matte_file, read_matte
 
-VERSION = 2
+VERSION = 3
 """Rises when pictures combined before are not to be used any more."""
 GROW = 4.0
 """Pixels of pictures 640 wide by which a matte grows: its edge is soft, and hair reaches beyond it."""
+FAR = 2.0
+"""What moves belongs to a standing thing up to so many times its depth."""
 
 Array = NDArray[np.float32]
 
@@ -74,10 +76,13 @@ class Source:
             )
         return read_matte(path, self.margin)
 
-    def matte_in_motion(self, name: str, frame: int, motion: Array) -> Array:
-        """[H, W] in 0..1: a matte `with_motion` [H, W] of this take's frame."""
-        matte = self.matte(name, frame)
-        others = [self.matte(other, frame) for other in self.matte_keys if other != name]
+    def matte_in_motion(self, name: str, number: int, frame: FrozenFrame, lives: bool) -> Array:
+        """[H, W] in 0..1: a matte `with_motion` of this take's frame `number`. Of a thing that stands, nothing is
+        `FAR` behind it, such as sky that the search took for moving."""
+        matte, motion = self.matte(name, number), frame.motion
+        if not lives and (matte > 0.5).any():
+            motion = motion * (frame.depth < FAR * np.quantile(frame.depth[matte > 0.5], 0.9))
+        others = [self.matte(other, number) for other in self.matte_keys if other != name]
         return with_motion(matte, np.maximum.reduce([np.zeros_like(matte), *others]), motion)
 
 
@@ -254,7 +259,8 @@ def _write_frame(
     (height, width), (across, down) = frame.depth.shape, base.margin
     inner = slice(down, height - down), slice(across, width - across)
     for matte, take in things.items():
-        source, mask = sources[take], base.matte_in_motion(matte, number, frame.motion)
+        source = sources[take]
+        mask = base.matte_in_motion(matte, number, frame, lives=source is None)
         if source is None:
             assert live is not None
             whole, mask = grown(mask, width), np.zeros_like(mask)
@@ -263,7 +269,7 @@ def _write_frame(
             picture = np.asarray(live.display(number).clamp(0.0, 1.0).numpy() * 255.0, np.float32)
         else:
             other = read_frozen_exr(source.folder.frame(number))
-            mask = grown(np.maximum(mask, source.matte_in_motion(matte, number, other.motion)), width)
+            mask = grown(np.maximum(mask, source.matte_in_motion(matte, number, other, lives=False)), width)
             picture = read_png(source.folder.preview(number)).astype(np.float32)
         share = mask[inner][..., None]
         shown = shown * (1.0 - share) + picture * share

@@ -1,5 +1,6 @@
 """Takes put together of others, against the world's truth: a thing at an instant of its own, a thing that lives on."""
 
+import dataclasses
 import json
 
 import cv2
@@ -12,7 +13,7 @@ from torch_backend.footage.color import srgb_to_linear
 from torch_backend.footage.images import read_png
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.exr import read_frozen_exr
-from torch_backend.freeze.mattes.combined import combine, combined, grown, with_motion
+from torch_backend.freeze.mattes.combined import Source, combine, combined, grown, with_motion
 from torch_backend.freeze.mattes.job import make_mattes
 from torch_backend.freeze.surface.job import make_surface
 from torch_backend.raster import rasterize
@@ -144,6 +145,17 @@ def frame_like(value):
     return FrozenFrame(np.repeat(flat[..., None], 4, 2), flat, flat, flat, meta, (0, 0), None, None, more)
 
 
+class Lone(Source):
+    """A take with one matte, which is no file."""
+
+    def __init__(self, matte):
+        super().__init__("take", TakeFolder("."), {}, {"it": ""}, "exr")
+        object.__setattr__(self, "kept", matte)
+
+    def matte(self, name, frame):
+        return self.kept
+
+
 def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
     matte, motion = np.zeros((40, 60), np.float32), np.zeros((40, 60), np.float32)
     matte[10:20, 10:20], motion[15:30, 18:25], motion[5:10, 50:55] = 1.0, 1.0, 1.0
@@ -153,6 +165,11 @@ def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
     behind[18:34, 22:28] = 1.0  # another thing, which moves and is touched
     parted = with_motion(matte, behind, motion)
     assert parted[15, 19] == 1.0 and parted[25, 22] == 0.0 and np.array_equal(parted[matte > 0.5], matte[matte > 0.5])
+    depth = np.where(motion > 0.5, 5.0, 2.0).astype(np.float32)  # all that moves and touches is far behind
+    frame = dataclasses.replace(frame_like(0.0), motion=motion, depth=depth)
+    alone = Lone(matte)
+    assert alone.matte_in_motion("it", 1, frame, lives=False)[25, 22] == 0.0
+    assert alone.matte_in_motion("it", 1, frame, lives=True)[25, 22] == 1.0
     soft = grown(matte, 640)
     assert soft[15, 15] == pytest.approx(1.0, abs=1e-3) and 0.2 < soft[15, 23] < 1.0 and soft[15, 32] == 0.0
     assert torch.from_numpy(soft).isfinite().all()
