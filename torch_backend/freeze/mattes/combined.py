@@ -36,7 +36,7 @@ from ..take.folder import frames_of
 from ..take.video import write_video
 from .files import is_current, matte_file, read_matte
 
-VERSION = 3
+VERSION = 4
 """Rises when pictures combined before are not to be used any more."""
 GROW = 4.0
 """Pixels of pictures 640 wide by which a matte grows: its edge is soft, and hair reaches beyond it."""
@@ -76,14 +76,16 @@ class Source:
             )
         return read_matte(path, self.margin)
 
-    def matte_in_motion(self, name: str, number: int, frame: FrozenFrame, lives: bool) -> Array:
-        """[H, W] in 0..1: a matte `with_motion` of this take's frame `number`. Of a thing that stands, nothing is
-        `FAR` behind it, such as sky that the search took for moving."""
+    def shows(self, name: str, number: int, frame: FrozenFrame, lives: bool) -> Array:
+        """[3, H, W] in 0..1 of this take's frame `number`: a thing's matte, those of all others, and what moves.
+
+        `FAR` behind a thing that stands nothing is of it, such as sky that the search took for moving.
+        """
         matte, motion = self.matte(name, number), frame.motion
+        others = [self.matte(other, number) for other in self.matte_keys if other != name]
         if not lives and (matte > 0.5).any():
             motion = motion * (frame.depth < FAR * np.quantile(frame.depth[matte > 0.5], 0.9))
-        others = [self.matte(other, number) for other in self.matte_keys if other != name]
-        return with_motion(matte, np.maximum.reduce([np.zeros_like(matte), *others]), motion)
+        return np.stack([matte, np.maximum.reduce([np.zeros_like(matte), *others]), motion])
 
 
 def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, Any]:
@@ -260,16 +262,16 @@ def _write_frame(
     inner = slice(down, height - down), slice(across, width - across)
     for matte, take in things.items():
         source = sources[take]
-        mask = base.matte_in_motion(matte, number, frame, lives=source is None)
+        shows = base.shows(matte, number, frame, lives=source is None)
         if source is None:
             assert live is not None
-            whole, mask = grown(mask, width), np.zeros_like(mask)
+            whole, mask = grown(with_motion(*shows), width), np.zeros_like(frame.depth)
             mask[inner] = whole[inner]  # the plate ends where the frame does
             other = _living_frame(frame, live, number, inner)
             picture = np.asarray(live.display(number).clamp(0.0, 1.0).numpy() * 255.0, np.float32)
         else:
             other = read_frozen_exr(source.folder.frame(number))
-            mask = grown(np.maximum(mask, source.matte_in_motion(matte, number, other, lives=False)), width)
+            mask = grown(with_motion(*np.maximum(shows, source.shows(matte, number, other, lives=False))), width)
             picture = read_png(source.folder.preview(number)).astype(np.float32)
         share = mask[inner][..., None]
         shown = shown * (1.0 - share) + picture * share
