@@ -76,14 +76,14 @@ class Source:
             )
         return read_matte(path, self.margin)
 
-    def shows(self, name: str, number: int, frame: FrozenFrame, lives: bool) -> Array:
+    def shows(self, name: str, number: int, frame: FrozenFrame, is_live: bool) -> Array:
         """[3, H, W] in 0..1 of this take's frame `number`: a thing's matte, those of all others, and what moves.
 
-        `FAR` behind a thing that stands nothing is of it, such as sky that the search took for moving.
+        Nothing that lies `FAR` behind a standing thing moves with it, such as sky that the search took for moving.
         """
         matte, motion = self.matte(name, number), frame.motion
         others = [self.matte(other, number) for other in self.matte_keys if other != name]
-        if not lives and (matte > 0.5).any():
+        if not is_live and (matte > 0.5).any():
             motion = motion * (frame.depth < FAR * np.quantile(frame.depth[matte > 0.5], 0.9))
         return np.stack([matte, np.maximum.reduce([np.zeros_like(matte), *others]), motion])
 
@@ -173,16 +173,16 @@ def grown(matte: Array, width: int) -> Array:
 
 def with_motion(matte: Array, others: Array, motion: Array) -> Array:
     """A matte [H, W] with all that moves (`motion` [H, W]) and touches it: a hand that the matte missed, or where the
-    thing is while it lives. What is nearer to `others` [H, W], the mattes of all other things, is theirs.
+    thing is while it lives. What is nearer to `others` [H, W], the mattes of all further things, belongs to those.
 
     `motion` is the layer of a frozen frame: what moves at t* or in the frame's own plate.
     """
-    its, theirs = matte > 0.5, (others > 0.5) & (others > matte)
-    joined = its | (motion > 0.5)
-    if theirs.any():
-        joined &= _distance(its) <= _distance(theirs)
+    in_thing, in_others = matte > 0.5, (others > 0.5) & (others > matte)
+    joined = in_thing | (motion > 0.5)
+    if in_others.any():
+        joined &= _distance(in_thing) <= _distance(in_others)
     _, labels = cv2.connectedComponents(joined.astype(np.uint8))
-    touched = np.unique(labels[its & joined])
+    touched = np.unique(labels[in_thing & joined])
     return np.maximum(matte, np.isin(labels, touched[touched > 0]).astype(np.float32))
 
 
@@ -262,7 +262,7 @@ def _write_frame(
     inner = slice(down, height - down), slice(across, width - across)
     for matte, take in things.items():
         source = sources[take]
-        shows = base.shows(matte, number, frame, lives=source is None)
+        shows = base.shows(matte, number, frame, is_live=source is None)
         if source is None:
             assert live is not None
             whole, mask = grown(with_motion(*shows), width), np.zeros_like(frame.depth)
@@ -271,7 +271,7 @@ def _write_frame(
             picture = np.asarray(live.display(number).clamp(0.0, 1.0).numpy() * 255.0, np.float32)
         else:
             other = read_frozen_exr(source.folder.frame(number))
-            mask = grown(with_motion(*np.maximum(shows, source.shows(matte, number, other, lives=False))), width)
+            mask = grown(with_motion(*np.maximum(shows, source.shows(matte, number, other, is_live=False))), width)
             picture = read_png(source.folder.preview(number)).astype(np.float32)
         share = mask[inner][..., None]
         shown = shown * (1.0 - share) + picture * share

@@ -168,8 +168,8 @@ def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
     depth = np.where(motion > 0.5, 5.0, 2.0).astype(np.float32)  # all that moves and touches is far behind
     frame = dataclasses.replace(frame_like(0.0), motion=motion, depth=depth)
     alone = Lone(matte)
-    assert alone.shows("it", 1, frame, lives=False)[2, 25, 22] == 0.0
-    assert alone.shows("it", 1, frame, lives=True)[2, 25, 22] == 1.0
+    assert alone.shows("it", 1, frame, is_live=False)[2, 25, 22] == 0.0
+    assert alone.shows("it", 1, frame, is_live=True)[2, 25, 22] == 1.0
     soft = grown(matte, 640)
     assert soft[15, 15] == pytest.approx(1.0, abs=1e-3) and 0.2 < soft[15, 23] < 1.0 and soft[15, 32] == 0.0
     assert torch.from_numpy(soft).isfinite().all()
