@@ -16,7 +16,8 @@ VALUES: tuple[Any, ...] = (
 WORDS = (
     struct.pack("<I", 0), struct.pack("<I", 0xFFFFFFFF), struct.pack("<I", 0x7FFFFFFF), struct.pack("<Q", 1 << 40),
     struct.pack("<Q", (1 << 64) - 1), struct.pack("<f", float("nan")), struct.pack("<f", float("inf")),
-    struct.pack(">I", 0x7FFFFFFF), b"\0", b"\xff" * 8, b"nan ", b"-1 ", b"1e999 ", b"99999999999 ", b"\n", b"%s", b"[" * 3000,
+    struct.pack(">I", 0x7FFFFFFF), b"\0", b"\xff" * 8, b"nan ", b"-1 ", b"1e999 ", b"99999999999 ", b"\n", b"%s",
+    b"[" * 3000,
 )  # fmt: skip
 """What bytes of a file are overwritten with."""
 

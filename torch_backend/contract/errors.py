@@ -96,7 +96,7 @@ def incomplete(lacks: str) -> JobError:
 
 
 def is_disk_full(error: OSError) -> bool:
-    """True if the system refused to write: no space, no quota, or a file larger than the disk allows (4 GB on FAT32)."""
+    """True if the system refused to write: no space, no quota, or a file larger than the disk allows (FAT32: 4 GB)."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

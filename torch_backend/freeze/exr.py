@@ -243,7 +243,7 @@ def write_beside(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bo
             output.close()  # a file that is open cannot be removed everywhere
             raise
         if not (good and output.close()):
-            raise _os_error(output.geterror(), path, spec.height * spec.width * 4 * spec.nchannels)
+            raise write_error(output.geterror(), path, spec.height * spec.width * 4 * spec.nchannels)
     return path
 
 
@@ -483,8 +483,8 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> FrameMetadata:
     )
 
 
-def _os_error(message: str, path: Path, byte_count: int) -> OSError:
-    """OSError with the system's reason, which OpenImageIO hands on only in words, if at all."""
+def write_error(message: str, path: Path, byte_count: int) -> OSError:
+    """OSError with the system's reason, which libraries pass on only in words, if at all. `byte_count`: of the file."""
     code = next((c for c in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(c) in message), None)
     if code is None:
         code = errno.ENOSPC if shutil.disk_usage(path.parent).free < byte_count else errno.EIO
