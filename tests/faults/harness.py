@@ -127,7 +127,7 @@ class Prepared:
 
 @dataclass
 class Child:
-    """A job or a command that runs in a process and a session of its own."""
+    """A job or a command that runs in a new process and session."""
 
     process: subprocess.Popen[bytes]
     output: Path
@@ -212,7 +212,7 @@ def _scratch() -> Path:
 
 
 def begun(child: Child) -> float:
-    """Waits until the job told its first event, or ended; a command tells none. Seconds since it was started."""
+    """Waits until the job wrote its first event, or ended; a command writes none. Seconds since it was started."""
     while child.process.poll() is None and child.job is not None:
         events = child.job / contract.EVENTS_FILE
         if (events.is_file() and events.stat().st_size) or time.monotonic() - child.began > PATIENCE_SECONDS:

@@ -79,7 +79,7 @@ class Parser:
     errors: tuple[type[Exception], ...] = (JobError,)
     """What it may raise: `JobError` where a person reads, `ValueError` where the parser documents that."""
     share: float = 1.0
-    """Share of the files that the others get: parsers of large files are slow."""
+    """Share of the `--fuzz` files: parsers of large files are slow."""
 
 
 def shot_of(root: Path) -> Shot:
@@ -181,7 +181,7 @@ PARSERS: dict[str, Parser] = {
     "status.json": Parser(in_shot("jobs/*/status.json"), lambda _, path: status_of(path)),
     "events.jsonl": Parser(in_shot("jobs/*/events.jsonl"), lambda _, path: list(contract.read_lines(path))),
     "camera path": Parser(named("path.json"), lambda _, path: CameraPath.load(path)),
-    "camera path of elsewhere": Parser(named("path.json"), lambda _, path: foreign.read(path)),
+    "camera path to import": Parser(named("path.json"), lambda _, path: foreign.read(path)),
     "transforms.json": Parser(named("nerfstudio/transforms.json"), lambda _, path: foreign.read(path)),
     **{
         f"COLMAP {name}": Parser(named(f"{folder}/{name}"), lambda _, path: foreign.read(path.parent))
