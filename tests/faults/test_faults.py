@@ -20,6 +20,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from torch_backend import contract
@@ -147,7 +149,17 @@ def check_again(case: Case, prepared: Prepared, folder: Path) -> list[str]:
     if code != 0:
         return [*wrong, f"the second job ended with {code}: {complaints_about(child, code, folder)}"]
     found = snapshot(folder)
-    return wrong + [f"after the second job {n} differs" for n in differences(found, prepared.expected[case.kind])]
+    different = differences(found, prepared.expected[case.kind])
+    return wrong + [f"after the second job {n} differs {how_far(case, prepared, folder, n)}" for n in different]
+
+
+def how_far(case: Case, prepared: Prepared, folder: Path, name: str) -> str:
+    """For a picture that differs from the expected one: by how much at most."""
+    files = [root / name for root in (folder, prepared.finished[case.kind])]
+    if not all(file.suffix == ".exr" and file.is_file() for file in files):
+        return ""
+    pixels = [np.nan_to_num(oiio.ImageBuf(str(file)).get_pixels(oiio.FLOAT)) for file in files]
+    return f"by {np.abs(pixels[0] - pixels[1]).max():.3g}" if pixels[0].shape == pixels[1].shape else "in shape"
 
 
 # ------------------------------------------------------------------------------------------------- faults
