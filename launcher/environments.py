@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import json
 import os
 import platform
 import queue
@@ -35,6 +34,7 @@ from torch_backend.contract import (
     package_name,
     program,
     python_child,
+    read_json,
     record_packages,
     torch_index,
 )
@@ -112,7 +112,7 @@ class Environment:
     def finished(self) -> dict[str, Any]:
         """The stamp of the last finished set-up, {} if none finished or the venv was made anew since."""
         try:
-            stamp = json.loads(self.stamp.read_text(encoding="utf-8"))
+            stamp = read_json(self.stamp)
             same = stamp["venv"] == (self.folder / "pyvenv.cfg").read_text(encoding="utf-8")
             whole = isinstance(stamp["files"], dict) and isinstance(stamp["packages"], dict)
             return stamp if same and whole and not self.begun.exists() else {}

@@ -28,6 +28,7 @@ from ..contract import (
     printable,
     read_json,
 )
+from ..contract.files import is_json_object
 from ..footage.pairing import Counted, Pairing, pair, pairing_words
 from ..footage.sources import frame_words
 from .colmap_files import ColmapModel, model_files, read_model
@@ -164,12 +165,12 @@ def read(path: str | Path) -> ForeignSolve:
             return _from_colmap(files[0].parent)
         data = read_json(files[0])
         frames = data.get("frames")
-        if not isinstance(frames, list) or not frames or not isinstance(frames[0], dict):
-            raise ValueError(f"{files[0]} lists no frames")
+        if not isinstance(frames, list) or not frames or not all(map(is_json_object, cast("list[Any]", frames))):
+            raise ValueError(f"{files[0]} lists no frames, or something else among them")
         return _from_path(files[0], data) if "viewmat" in frames[0] else _from_transforms(files[0], data)
     except (ValueError, TypeError) as error:
         raise _refusal(
-            f"These cameras cannot be used: {str(error).rstrip('.')}.", "Export them again, or solve here."
+            f"These cameras cannot be used: {printable(str(error)).rstrip('.')}.", "Export them again, or solve here."
         ) from error
 
 

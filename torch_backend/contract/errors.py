@@ -76,7 +76,7 @@ class Cancelled(Exception):
     """Raised by `Reporter.check_cancelled` when someone asked the job to stop."""
 
 
-def disk_error(folder: str | Path, detail: str = "the disk is full") -> JobError:
+def disk_error(folder: str | Path, detail: str = "the disk is full, or limits the size of a file") -> JobError:
     """The one sentence for a full disk."""
     return JobError(
         f"No space left in {folder}: {detail}.",
@@ -96,8 +96,8 @@ def incomplete(lacks: str) -> JobError:
 
 
 def is_disk_full(error: OSError) -> bool:
-    """True if the system refused to write for want of space or quota."""
-    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+    """True if the system refused to write: no space, no quota, or a file larger than the disk allows (FAT32: 4 GB)."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 _REFUSED = {
@@ -119,6 +119,9 @@ def path_error(error: OSError) -> JobError | None:
     where = error.filename2 or error.filename
     if is_disk_full(error):
         return disk_error(where or "the output folder")
+    if where and error.errno == errno.EIO:
+        message = f"{where} could not be read or written: the disk reports an error."
+        return JobError(message, "Check the disk, then start again: finished work is kept.", ExitCode.DISK)
     if not where or error.errno not in _REFUSED:
         return None
     what, hint = _REFUSED[error.errno]

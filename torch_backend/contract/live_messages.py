@@ -87,7 +87,10 @@ def read_message(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
     text, body = _read_exactly(stream, long), _read_exactly(stream, size)
     if text is None or body is None:
         return None
-    header = json.loads(text)
+    try:
+        header = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("a live message's header is nested too deeply") from error
     if not is_json_object(header):
         raise ValueError("a live message's header should be a JSON object")
     return header, body

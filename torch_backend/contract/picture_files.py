@@ -7,6 +7,7 @@ Each format is checked by what its specification says about its end: a trailer, 
 
 from __future__ import annotations
 
+import errno
 import struct
 import zlib
 from collections.abc import Callable
@@ -33,8 +34,12 @@ def is_whole_picture(path: Path) -> bool:
             return size > 0 and (check is None or check(file, size))
     except FileNotFoundError:
         return False
-    except (ValueError, struct.error, IndexError, KeyError):
+    except (ValueError, struct.error, IndexError, KeyError, OverflowError):
         return False  # what it states of itself makes no sense
+    except OSError as error:
+        if error.errno == errno.EINVAL:  # an offset that no file can have
+            return False
+        raise
 
 
 def _check_of(head: bytes, suffix: str) -> Callable[[BinaryIO, int], bool] | None:

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..contract import FRAME_LAYERS, UserError, channels_of, layers_of, parse_timecode, regular_file
 from ..contract.timecode import smpte_bits
 from ..footage.color import LIGHTS, PRIMARIES, InputSpace, in_light, light_matrix, light_of_chromaticities
+from ..footage.images import error_of
 from ..shot import atomic_path
 
 CHANNELS = channels_of("")
@@ -242,7 +243,7 @@ def write_beside(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bo
             output.close()  # a file that is open cannot be removed everywhere
             raise
         if not (good and output.close()):
-            raise _os_error(output.geterror(), path, spec.height * spec.width * 4 * spec.nchannels)
+            raise write_error(output.geterror(), path, spec.height * spec.width * 4 * spec.nchannels)
     return path
 
 
@@ -271,7 +272,7 @@ def read_layers(
         raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
     image = oiio.ImageInput.open(regular_file(path))
     if image is None:
-        raise UserError(f"{path}: cannot be read as EXR: {oiio.geterror()}")
+        raise UserError(f"{path}: cannot be read as EXR: {error_of()}")
     try:
         spec = image.spec()
         names = channel_names(spec)
@@ -281,7 +282,7 @@ def read_layers(
         facts = metadata(spec, path)
         pixels = image.read_image(oiio.FLOAT)
         if pixels is None:
-            raise UserError(f"{path}: damaged, {image.geterror()}")
+            raise UserError(f"{path}: damaged, {error_of(image)}")
     finally:
         image.close()
     return spec, names, facts, np.asarray(pixels, dtype=np.float32)
@@ -482,8 +483,8 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> FrameMetadata:
     )
 
 
-def _os_error(message: str, path: Path, byte_count: int) -> OSError:
-    """OSError with the system's reason, which OpenImageIO hands on only in words, if at all."""
+def write_error(message: str, path: Path, byte_count: int) -> OSError:
+    """OSError with the system's reason, which libraries pass on only in words, if at all. `byte_count`: of the file."""
     code = next((c for c in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(c) in message), None)
     if code is None:
         code = errno.ENOSPC if shutil.disk_usage(path.parent).free < byte_count else errno.EIO

@@ -18,6 +18,7 @@ from ..cameras.placement import SENSOR_MM, Similarity, camera_to_world, lens_of,
 from ..contract import CameraPath
 from ..gaussians.ply import PlyGaussians
 from ..shot import atomic_path
+from .exr import write_error
 
 ROOT, SPLATS, CAMERA = "/frozen", "/frozen/splats", "/frozen/camera"
 """Paths of the prims."""
@@ -72,10 +73,15 @@ def write_usd(
                 _add_splats(UsdVol.ParticleField3DGaussianSplat.Define(stage, SPLATS), Vt, gaussians)
             written = layer.Export(str(beside), args={"format": path.suffix.removeprefix(".")})
         except Tf.ErrorException as error:
-            raise OSError(f"{path} cannot be written: {error}") from error
+            raise write_error(str(error), path, _size_of(gaussians)) from error
         if not written:
-            raise OSError(f"{path} cannot be written")
+            raise write_error("", path, _size_of(gaussians))
     return path
+
+
+def _size_of(gaussians: PlyGaussians | None) -> int:
+    """Bytes that a stage takes at least, about; one block of a disk more."""
+    return 4096 + (0 if gaussians is None else gaussians.means.nbytes + gaussians.sh.nbytes)
 
 
 def _describe(stage: Any, geometry: Any, cameras: CameraPath, metres_per_unit: float, fps: float) -> None:

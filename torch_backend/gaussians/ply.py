@@ -88,7 +88,7 @@ def write_ply(
     path = Path(path)
     with atomic_path(path) as beside, open(beside, "wb") as handle:
         handle.write(header.encode("ascii"))
-        rows.tofile(handle)
+        handle.write(rows.data)  # `tofile` would not say that the disk is full
     return path
 
 

@@ -243,5 +243,5 @@ def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
             inner: dict[str, Any] = {k: _as_tuple(v) for k, v in values[name].items()}
             values[name] = cls(**inner)
         return TrainConfig(**values)
-    except (TypeError, KeyError) as error:
+    except (TypeError, KeyError, AttributeError) as error:
         raise UserError(f"the run's config.json does not fit this version: {error}") from error

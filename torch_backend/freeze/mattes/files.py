@@ -9,7 +9,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ...contract import MATTE_FORMATS, TakeFolder, UserError, frame_file, is_whole_picture, regular_file
-from ...footage.images import write_png
+from ...footage.images import error_of, write_png
 from ..exr import linear_spec, read_key, set_margin, write_exr
 
 
@@ -42,7 +42,7 @@ def read_matte(path: Path, margin: tuple[int, int]) -> NDArray[np.float32]:
     buffer = oiio.ImageBuf(regular_file(path))
     pixels = None if buffer.has_error else buffer.get_pixels(oiio.FLOAT)
     if pixels is None or buffer.has_error:
-        raise UserError(f"matte {path} cannot be read: {buffer.geterror()}")
+        raise UserError(f"matte {path} cannot be read: {error_of(buffer)}")
     matte = np.ascontiguousarray(np.asarray(pixels, np.float32)[..., 0])
     across, down = margin
     return np.pad(matte, ((down, down), (across, across))) if path.suffix == ".png" else matte

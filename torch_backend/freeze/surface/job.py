@@ -162,8 +162,8 @@ def write_surface(path: Path, header: SurfaceHeader, vertices: NDArray[np.float3
         faces[corner] = surface.triangles[:, n]
     with atomic_path(path) as beside, open(beside, "wb") as handle:
         handle.write(header.to_bytes())
-        points.tofile(handle)
-        faces.tofile(handle)
+        handle.write(points.data)  # `tofile` would not say that the disk is full
+        handle.write(faces.data)
 
 
 def read_surface(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:

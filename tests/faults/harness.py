@@ -1,0 +1,317 @@
+"""Runs jobs of a small shot in real child processes, disturbs them, and checks what is left on disk.
+
+A case is drawn from a seed: a fault, a kind of job and a moment. Each case works on a copy of one prepared shot. A job
+counts as whole if its files equal those of the same job undisturbed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import av
+
+from torch_backend import contract
+from torch_backend.contract import (
+    CombineParams,
+    ExitCode,
+    FreezeParams,
+    ImportParams,
+    LightParams,
+    MatteParams,
+    SurfaceParams,
+    TrainParams,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE_SECONDS = 300.0
+"""A job that runs longer hangs; the slowest takes 20 s on one core."""
+ORPHAN_SECONDS = 20.0
+"""How long processes of an ended job may take to notice that it ended."""
+VOLATILE = {"seconds", "created", "ms_per_step", "train_seconds", "trained_seconds", "beside"}
+"""Keys of JSON files that differ between two undisturbed runs: times, and the path from the shot to its footage."""
+
+
+# ------------------------------------------------------------------------------------------------- what runs
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of job that is disturbed."""
+
+    params: Callable[[Path], Any]
+    """Its parameters, from the folder with footage and lassos."""
+    is_import: bool = False
+    """True if it works on an empty shot instead of the prepared one."""
+    words: tuple[str, ...] = ()
+    """Words of the command line instead of a job; OUT stands for the output folder, SHOT for the shot."""
+
+
+TAKE: dict[str, Any] = {"t_star": 108, "first": 104, "last": 107, "develop": "off", "device": "cpu"}
+KINDS: dict[str, Kind] = {
+    "import": Kind(lambda files: ImportParams(source=str(files / "clip")), is_import=True),
+    "train": Kind(lambda _: TrainParams(run="second", iterations=40, holdout=8, max_gaussians=900, device="cpu")),
+    "freeze": Kind(lambda _: FreezeParams(take="new", detail="off", **TAKE)),
+    "freeze of plates": Kind(lambda _: FreezeParams(take="new", **{**TAKE, "last": 105})),
+    "mattes": Kind(lambda files: MatteParams(take="base", polygons=str(files / "lassos.json"), device="cpu")),
+    "combine": Kind(lambda _: CombineParams(take="both", base="base", things="drawn=base")),
+    "surface": Kind(lambda _: SurfaceParams(take="base")),
+    "light": Kind(lambda _: LightParams(take="base", position="0,0,0")),
+    "export": Kind(lambda _: None, words=("export", "SHOT", "--format", "ply", "--take", "base", "--output", "OUT")),
+}
+FAULTS = (
+    "kill", "stop and continue", "interrupt", "disk full", "file size limit", "read-only", "memory limit",
+    "truncated file", "bit flips", "two at once", "clock", "renamed shot",
+)  # fmt: skip
+NEEDS_MOUNT = {"disk full", "read-only"}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One disturbed job, repeatable from (seed, number)."""
+
+    number: int
+    fault: str
+    kind: str
+    early: bool
+    """True if the fault strikes while the process starts, not while the job works."""
+    moment: float
+    """When it strikes, as a share of the undisturbed time."""
+    seed: str
+
+    def __str__(self) -> str:
+        when = "at the start" if self.early else "at work"
+        return f"case {self.number}: {self.fault}, {self.kind}, {when} {self.moment:.2f}"
+
+
+def draw(seed: int, number: int) -> Case:
+    """The case of a number: faults take turns, kinds and moments are drawn."""
+    drawn = random.Random(f"{seed}-{number}")
+    turn = random.Random(f"{seed}-turn-{number // len(FAULTS)}").sample(FAULTS, len(FAULTS))
+    kind = drawn.choice(list(KINDS))
+    return Case(number, turn[number % len(FAULTS)], kind, drawn.random() < 0.15, drawn.random(), f"{seed}-{number}")
+
+
+@dataclass
+class Prepared:
+    """Files that all cases copy, and what undisturbed jobs make of them."""
+
+    shot: Path
+    """Shot with frames, cameras, mattes, the run `main`, and the take `base` with the matte `drawn`."""
+    files: Path
+    """Folder with footage and lassos for the jobs."""
+    finished: dict[str, Path] = field(default_factory=dict[str, Path])
+    """Kind -> a folder as it is after the undisturbed job."""
+    expected: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    """Kind -> `snapshot` of that folder."""
+    spans: dict[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+    """Kind -> seconds until the undisturbed job began to work, and while it did."""
+
+
+# ------------------------------------------------------------------------------------------------- one process
+
+
+@dataclass
+class Child:
+    """A job or a command that runs in a new process and session."""
+
+    process: subprocess.Popen[bytes]
+    output: Path
+    """What it printed."""
+    job: Path | None
+    """Folder of the job, None for a command."""
+    began: float
+
+    def wait(self) -> int:
+        """Its exit code. AssertionError if it hangs."""
+        try:
+            return self.process.wait(PATIENCE_SECONDS)
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+            raise AssertionError("the process hung") from None
+
+    def printed(self) -> str:
+        return self.output.read_text(encoding="utf-8", errors="replace")
+
+    def orphans(self) -> list[int]:
+        """Processes of its session that still live after `ORPHAN_SECONDS`; they are ended."""
+        until = time.monotonic() + ORPHAN_SECONDS
+        while (left := _session(self.process.pid)) and time.monotonic() < until:
+            time.sleep(0.05)
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+        return left
+
+
+def _session(leader: int) -> list[int]:
+    """Living processes of a session."""
+    found: list[int] = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, _, session = stat.read_text(encoding="utf-8").rpartition(")")[2].split()[:4]
+        except (OSError, ValueError):
+            continue  # it ended meanwhile
+        if int(session) == leader and state != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+def start(folder: Path, kind: str, prepared: Prepared, limits: Mapping[int, int] | None = None) -> Child:
+    """Starts a job as the add-on does. `folder` holds the shot as `shot.splannequin`."""
+    limits = limits or {}
+    shot, job, what = folder / "shot.splannequin", None, KINDS[kind]
+    words = [w.replace("SHOT", str(shot)).replace("OUT", str(folder / "out")) for w in what.words]
+    if not words:
+        job = contract.new_job(shot, kind.partition(" ")[0], what.params(prepared.files))
+        words = ["run-job", str(job)]
+    return start_words(words, job, limits)
+
+
+def start_words(words: list[str], job: Path | None, limits: Mapping[int, int]) -> Child:
+    """Starts `python -m torch_backend WORDS`."""
+    command = contract.python_child(sys.executable, "torch_backend", *words)
+    output = _scratch() / f"{time.monotonic_ns()}.txt"
+
+    def limit() -> None:
+        for what, value in limits.items():
+            resource.setrlimit(what, (value, value))
+
+    with open(output, "wb") as stream:
+        process = subprocess.Popen(
+            command["args"],
+            cwd=command["cwd"],
+            env=contract.child_environment(ROOT) | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            preexec_fn=limit if limits else None,
+        )
+    return Child(process, output, job, time.monotonic())
+
+
+def _scratch() -> Path:
+    folder = Path(os.environ["SPLANNEQUIN_FAULTS_SCRATCH"])
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def begun(child: Child) -> float:
+    """Waits until the job wrote its first event, or ended; a command writes none. Seconds since it was started."""
+    while child.process.poll() is None and child.job is not None:
+        events = child.job / contract.EVENTS_FILE
+        if (events.is_file() and events.stat().st_size) or time.monotonic() - child.began > PATIENCE_SECONDS:
+            break
+        time.sleep(0.005)
+    return time.monotonic() - child.began
+
+
+def await_moment(child: Child, case: Case, prepared: Prepared) -> None:
+    """Waits for the moment of a case, or the end of the child."""
+    before, during = prepared.spans[case.kind]
+    if case.early:
+        until = child.began + case.moment * before
+    else:
+        begun(child)
+        until = time.monotonic() + case.moment * during
+    while child.process.poll() is None and time.monotonic() < until:
+        time.sleep(0.005)
+
+
+# ------------------------------------------------------------------------------------------------- what is on disk
+
+
+def snapshot(folder: Path) -> dict[str, str]:
+    """Path -> digest of each file, without jobs, locks and files that are not renamed yet. JSON by its values."""
+    found: dict[str, str] = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if not path.is_file() or path.is_symlink() or "/jobs/" in f"/{name}" or contract.is_half_written(path.name):
+            continue
+        if path.name in (contract.WRITER_FILE, contract.METRICS_FILE):
+            continue  # metrics hold seconds in each line
+        if ".kept." in path.name:
+            continue  # pictures that a damaged frames.json no longer lists: an import keeps them, see strangers.py
+        found[name] = _digest(path, str(folder))
+    return found
+
+
+def _digest(path: Path, folder: str) -> str:
+    data = path.read_bytes()
+    with contextlib.suppress(ValueError, KeyError, struct.error):  # damaged: compared as it is
+        if path.suffix == ".json":
+            data = _steady_text(json.loads(data.decode().replace(folder, "")))
+        if path.name == contract.CHECKPOINT_FILE:
+            (length,) = struct.unpack("<Q", data[:8])
+            facts = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["splannequin"])
+            data = _steady_text(facts) + data[8 + length :]
+        # The same frames come out as one of two videos, by how their memory is aligned: compared by what is decoded.
+        if path.suffix == ".mp4" and contract.is_whole_picture(path):
+            with av.open(str(path)) as video:
+                data = str([(frame.width, frame.height) for frame in video.decode(video=0)]).encode()
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def _steady_text(value: Any) -> bytes:
+    return json.dumps(_steady(value), sort_keys=True).encode()
+
+
+def _steady(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _steady(v) for k, v in value.items() if k not in VOLATILE}
+    return [_steady(v) for v in value] if isinstance(value, list) else value
+
+
+def differences(found: Mapping[str, str], expected: Mapping[str, str]) -> list[str]:
+    """Files that lack, are more, or differ."""
+    return sorted(name for name in {*found, *expected} if found.get(name) != expected.get(name))
+
+
+def copy_of(prepared: Prepared, kind: str, folder: Path, finished: bool = False) -> Path:
+    """A folder for a case: with the prepared shot, an empty one for an import, or that of a finished job."""
+    folder.mkdir(parents=True, exist_ok=True)
+    target = folder / "shot.splannequin"
+    if finished:
+        shutil.copytree(prepared.finished[kind], folder, dirs_exist_ok=True)
+    elif KINDS[kind].is_import:
+        target.mkdir()
+        shutil.copy(prepared.files / "empty.json", target / "shot.json")
+    else:
+        shutil.copytree(prepared.shot, target)
+    return folder
+
+
+def complaints_about(child: Child, code: int, folder: Path, may_break: bool = False) -> list[str]:
+    """What is wrong with how a child ended with a code other than 0. `may_break`: an internal error is accepted."""
+    wrong: list[str] = []
+    text = child.printed()
+    if "Traceback" in text:
+        wrong.append("a traceback was printed: " + text.strip().splitlines()[-1][:200])
+    status: dict[str, Any] = {}
+    if child.job is not None and (child.job / contract.STATUS_FILE).is_file():
+        status = contract.read_json(child.job / contract.STATUS_FILE)
+    sentence = str(status.get("message") or text.strip())
+    if code == ExitCode.INTERNAL and not may_break:
+        wrong.append(f"ended as a bug: {sentence[:300]}")
+    if code > 0 and not sentence:
+        wrong.append("no sentence says why it ended")
+    if code > 0 and status and status.get("state") not in ("failed", "cancelled", "running"):
+        wrong.append(f"exit code {code}, but the status says {status.get('state')}")
+    if code == 0 and child.job is not None and status.get("state") != "done":
+        wrong.append(f"exit code 0, but the status says {status.get('state')}")
+    return wrong

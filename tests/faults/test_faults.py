@@ -1,0 +1,347 @@
+"""Disturbs jobs and checks: nothing finished is lost, no process is left, and no half file is believed.
+
+pytest tests/faults/test_faults.py --faults 200               # nightly
+pytest tests/faults/test_faults.py --faults 1 --faults-from N # one case again
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from torch_backend import contract
+from torch_backend.contract import ExitCode
+
+from .harness import (
+    FAULTS,
+    KINDS,
+    NEEDS_MOUNT,
+    Case,
+    Child,
+    Prepared,
+    await_moment,
+    complaints_about,
+    copy_of,
+    differences,
+    draw,
+    snapshot,
+    start,
+    start_words,
+)
+from .prepare import run_undisturbed
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, limits and /proc as Linux has them")
+
+
+def test_jobs_survive_faults(
+    small_shot: Prepared, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+):
+    option = request.config.getoption
+    seed, first, count = option("--seed", 65), option("--faults-from", 0), option("--faults", 30)
+    monkeypatch.setenv("SPLANNEQUIN_FAULTS_SCRATCH", str(tmp_path / "printed"))
+    cases = [draw(seed, n) for n in range(first, first + count)]
+    if not can_mount(tmp_path):
+        cases = [case for case in cases if case.fault not in NEEDS_MOUNT]
+    prepared = dataclasses.replace(small_shot, finished={}, expected={}, spans={})
+    run_undisturbed(prepared, tmp_path, {case.kind for case in cases})
+    failed: dict[Case, list[str]] = {}
+    with ThreadPoolExecutor(2) as pool:
+        for case, wrong in zip(cases, pool.map(lambda case: run(case, prepared, tmp_path), cases), strict=True):
+            if wrong:
+                failed[case] = wrong
+                print(f"FAILED  {case}\n        " + "\n        ".join(wrong), flush=True)
+    print(f"\nseed {seed}, cases {first} to {first + count - 1}\n{table(cases, failed)}")
+    assert not failed, f"seed {seed}: " + "; ".join(f"{case}: {wrong[0]}" for case, wrong in failed.items())
+
+
+def table(cases: list[Case], failed: dict[Case, list[str]]) -> str:
+    """Fault, cases and failures, a line each."""
+    ran, bad = (collections.Counter(case.fault for case in some) for some in (cases, failed))
+    return "\n".join(f"{fault:<20} {ran[fault]:>4} cases, {bad[fault]} failed" for fault in FAULTS if ran[fault])
+
+
+def run(case: Case, prepared: Prepared, root: Path) -> list[str]:
+    """What is wrong after one case; empty if all holds."""
+    folder = root / f"case {case.number}"
+    folder.mkdir()
+    is_mounted = case.fault in NEEDS_MOUNT
+    try:
+        if is_mounted:
+            mount(folder)
+        return FAULT[case.fault](case, prepared, folder, random.Random(f"{case.seed}-fault"))
+    except Exception as error:  # of the harness, or of a file that is not as a job should leave it
+        return [f"{type(error).__name__}: {error}"]
+    finally:
+        if is_mounted:
+            subprocess.run(["umount", "-l", str(folder)], check=False)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def mount(folder: Path) -> None:
+    """Mounts an empty disk on a folder. CalledProcessError without the permission."""
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512M", "tmpfs", str(folder)], check=True, capture_output=True)
+
+
+def can_mount(folder: Path) -> bool:
+    """True if `mount` is permitted: for root on Linux."""
+    probe = folder / "probe"
+    probe.mkdir()
+    try:
+        mount(probe)
+    except (OSError, subprocess.CalledProcessError):
+        return False
+    subprocess.run(["umount", str(probe)], check=True)
+    return True
+
+
+# ------------------------------------------------------------------------------------------------- what must hold
+
+
+def check_end(child: Child, case: Case, prepared: Prepared, folder: Path, may_break: bool = False) -> list[str]:
+    """After a disturbed child: its exit code is true, it left no process, and what it found is as it was."""
+    code = child.wait()
+    wrong = [f"process {pid} was left" for pid in child.orphans()]
+    if code != -signal.SIGKILL:
+        wrong += complaints_about(child, code, folder, may_break)
+    if code == 0:
+        wrong += [
+            f"exit code 0, but {name} differs" for name in differences(snapshot(folder), prepared.expected[case.kind])
+        ]
+    return wrong + check_kept(case, prepared, folder)
+
+
+def check_kept(case: Case, prepared: Prepared, folder: Path) -> list[str]:
+    """Files of before the fault, as they were or as the whole job leaves them."""
+    before, after = snapshot_of_start(case, prepared), prepared.expected[case.kind]
+    found = snapshot(folder)
+    # A job of mattes writes all lassos before it begins, with `finished` false: a file of a third kind.
+    wanted = [name for name in before if not (name.endswith("mattes/mattes.json") and name in found)]
+    return [f"{name} was lost or changed" for name in wanted if found.get(name) not in (before[name], after.get(name))]
+
+
+def snapshot_of_start(case: Case, prepared: Prepared) -> dict[str, str]:
+    """Of what a case begins with."""
+    if KINDS[case.kind].is_import:
+        return {}
+    return {f"shot.splannequin/{name}": digest for name, digest in snapshot(prepared.shot).items()}
+
+
+def check_again(case: Case, prepared: Prepared, folder: Path) -> list[str]:
+    """The same job once more, undisturbed: whole, and as if nothing had happened."""
+    child = start(folder, case.kind, prepared)
+    code = child.wait()
+    wrong = [f"process {pid} was left by the second job" for pid in child.orphans()]
+    if code != 0:
+        return [*wrong, f"the second job ended with {code}: {complaints_about(child, code, folder)}"]
+    found = snapshot(folder)
+    different = differences(found, prepared.expected[case.kind])
+    return wrong + [f"after the second job {n} differs {how_far(case, prepared, folder, n)}" for n in different]
+
+
+def how_far(case: Case, prepared: Prepared, folder: Path, name: str) -> str:
+    """For a picture that differs from the expected one: by how much at most."""
+    files = [root / name for root in (folder, prepared.finished[case.kind])]
+    if not all(file.suffix == ".exr" and file.is_file() for file in files):
+        return ""
+    pixels = [np.nan_to_num(oiio.ImageBuf(str(file)).get_pixels(oiio.FLOAT)) for file in files]
+    return f"by {np.abs(pixels[0] - pixels[1]).max():.3g}" if pixels[0].shape == pixels[1].shape else "in shape"
+
+
+# ------------------------------------------------------------------------------------------------- faults
+
+
+def signalled(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
+    """SIGKILL, SIGTERM, or SIGSTOP with SIGCONT a second later."""
+    copy_of(prepared, case.kind, folder)
+    child = start(folder, case.kind, prepared)
+    await_moment(child, case, prepared)
+    if child.process.poll() is None:
+        if case.fault == "stop and continue":
+            os.kill(child.process.pid, signal.SIGSTOP)
+            time.sleep(1.0)
+            os.kill(child.process.pid, signal.SIGCONT)
+        else:
+            os.kill(child.process.pid, signal.SIGTERM if case.fault == "interrupt" else signal.SIGKILL)
+    wrong = check_end(child, case, prepared, folder)
+    if case.fault == "stop and continue" and child.process.returncode != 0:
+        wrong.append(f"ended with {child.process.returncode} after it was continued")
+    return wrong + check_again(case, prepared, folder)
+
+
+def clock(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
+    """Killed, then all files are dated years back or ahead, as a wrong clock does."""
+    copy_of(prepared, case.kind, folder)
+    child = start(folder, case.kind, prepared)
+    await_moment(child, case, prepared)
+    child.process.kill()
+    wrong = check_end(child, case, prepared, folder)
+    years = drawn.choice((-20, -1, 1, 20))
+    for path in folder.rglob("*"):
+        at = time.time() + years * 365 * 86400 + drawn.random()
+        os.utime(path, (at, at))
+    return wrong + check_again(case, prepared, folder)
+
+
+def disk_full(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
+    """A disk with less room than the job writes."""
+    copy_of(prepared, case.kind, folder)
+    child_room = max(4096, int(drawn.random() * growth(case, prepared)))
+    with open(folder / "ballast", "wb") as ballast:
+        ballast.write(bytes(max(0, shutil.disk_usage(folder).free - child_room - 64 * 1024)))
+    child = start(folder, case.kind, prepared)
+    code = child.wait()
+    (folder / "ballast").unlink()
+    wrong = check_end(child, case, prepared, folder)
+    if code not in (0, ExitCode.DISK):
+        wrong.append(f"ended with {code}, not {int(ExitCode.DISK)}: {child.printed()[-300:]}")
+    return wrong + check_again(case, prepared, folder)
+
+
+def growth(case: Case, prepared: Prepared) -> int:
+    """Bytes that the undisturbed job adds, without its job folder."""
+    finished = prepared.finished[case.kind]
+    started = 0 if KINDS[case.kind].is_import else size_of(prepared.shot)
+    return max(0, size_of(finished) - started)
+
+
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def limited(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
+    """A limit on the size of each file (as a quota or FAT has), or on the process's memory."""
+    copy_of(prepared, case.kind, folder)
+    if case.fault == "memory limit":
+        limits = {resource.RLIMIT_AS: int(drawn.uniform(0.2, 8.0) * 1e9)}
+    else:
+        limits = {resource.RLIMIT_FSIZE: int(10 ** drawn.uniform(3.0, 6.5))}
+    child = start(folder, case.kind, prepared, limits)
+    wrong = check_end(child, case, prepared, folder, may_break=case.fault == "memory limit")
+    return wrong + check_again(case, prepared, folder)
+
+
+def read_only(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
+    """The disk becomes read-only after the job was requested."""
+    copy_of(prepared, case.kind, folder)
+    if KINDS[case.kind].words:
+        subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+        child = start(folder, case.kind, prepared)
+    else:
+        job = contract.new_job(
+            folder / "shot.splannequin", case.kind.partition(" ")[0], KINDS[case.kind].params(prepared.files)
+        )
+        subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+        child = start_words(["run-job", str(job)], job, {})
+    code = child.wait()
+    wrong = check_end(child, case, prepared, folder)
+    if code == 0:
+        wrong.append("exit code 0 on a disk that cannot be written")
+    subprocess.run(["mount", "-o", "remount,rw", str(folder)], check=True)
+    return wrong + check_again(case, prepared, folder)
+
+
+def damaged(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
+    """One file of a finished job is cut short or has some bits changed; the job is started again.
+
+    A cut file is noticed or rebuilt. Changed bits may stay unnoticed where a format has no checksum, but never break.
+    """
+    copy_of(prepared, case.kind, folder, finished=True)
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and "jobs" not in p.parts and p.stat().st_size]
+    victim = drawn.choice(files)
+    whole = victim.read_bytes()
+    if case.fault == "truncated file":
+        victim.write_bytes(whole[: drawn.randrange(len(whole))])
+    else:
+        changed = bytearray(whole)
+        for _ in range(drawn.choice((1, 8, 64))):
+            changed[drawn.randrange(len(changed))] ^= 1 << drawn.randrange(8)
+        victim.write_bytes(changed)
+    name = victim.relative_to(folder).as_posix()
+    child = start_or_refuse(case, prepared, folder)
+    if child is None:
+        victim.write_bytes(whole)
+        return check_again(case, prepared, folder)
+    code = child.wait()
+    wrong = [f"process {pid} was left" for pid in child.orphans()] + complaints_about(child, code, folder)
+    if code == 0 and case.fault == "truncated file":
+        expected = prepared.expected[case.kind]
+        made = expected.keys() - snapshot_of_start(case, prepared).keys()
+        wrong += [
+            f"exit code 0, but {n} differs" for n in differences(snapshot(folder), expected) if n != name or n in made
+        ]
+    victim.write_bytes(whole)
+    wrong += check_again(case, prepared, folder)
+    return [f"{name}: {one}" for one in wrong]
+
+
+def start_or_refuse(case: Case, prepared: Prepared, folder: Path) -> Child | None:
+    try:
+        return start(folder, case.kind, prepared)
+    except contract.JobError:
+        return None
+
+
+def two_at_once(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
+    """Two jobs of one shot: the second is refused in a sentence, or runs after the first."""
+    copy_of(prepared, case.kind, folder)
+    first = start(folder, case.kind, prepared)
+    if not case.early:
+        await_moment(first, case, prepared)
+    second = start(folder, case.kind, prepared)
+    codes = sorted([first.wait(), second.wait()])
+    wrong = [] if codes in ([0, 0], [0, ExitCode.USAGE]) else [f"ended with {codes}"]
+    for child in (first, second):
+        wrong += complaints_about(child, child.wait(), folder) + [f"process {pid} was left" for pid in child.orphans()]
+    wrong += [f"{name} differs" for name in differences(snapshot(folder), prepared.expected[case.kind])]
+    return wrong + check_again(case, prepared, folder)
+
+
+def renamed(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
+    """The shot's folder is renamed while the job works, and later named as before."""
+    copy_of(prepared, case.kind, folder)
+    child = start(folder, case.kind, prepared)
+    await_moment(child, case, prepared)
+    shot, moved = folder / "shot.splannequin", folder / "renamed.splannequin"
+    shot.rename(moved)
+    code = child.wait()
+    wrong = [f"process {pid} was left" for pid in child.orphans()]
+    if "Traceback" in child.printed():
+        wrong.append("a traceback was printed")
+    if shot.exists():
+        wrong.append(f"the job made {[p.name for p in shot.rglob('*')][:3]} under the old name")
+        shutil.rmtree(shot)
+    moved.rename(shot)
+    if code == 0:
+        wrong += [f"exit code 0, but {n} differs" for n in differences(snapshot(folder), prepared.expected[case.kind])]
+    return wrong + check_kept(case, prepared, folder) + check_again(case, prepared, folder)
+
+
+FAULT: dict[str, Callable[[Case, Prepared, Path, random.Random], list[str]]] = {
+    "kill": signalled,
+    "stop and continue": signalled,
+    "interrupt": signalled,
+    "clock": clock,
+    "disk full": disk_full,
+    "file size limit": limited,
+    "memory limit": limited,
+    "read-only": read_only,
+    "truncated file": damaged,
+    "bit flips": damaged,
+    "two at once": two_at_once,
+    "renamed shot": renamed,
+}
