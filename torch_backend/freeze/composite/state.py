@@ -46,8 +46,9 @@ class StateWeights:
 class StateConfig:
     """How evidence is scaled, and how log-odds become a matte."""
 
-    noise: float = 0.02
-    """Standard deviation of a low-passed difference between two renders or plates of one surface, display-referred."""
+    noise: float = 0.01
+    """Standard deviation of a low-passed difference between two plates of one surface, display-referred. That between a
+    plate and a render is larger by what the model leaves unexplained of plate t*."""
     travel: float = 0.5
     """Scene flow in pixels of 640 at which its evidence is log(2): below it flow is mostly the field's noise."""
     smoothing: float = 8.0
@@ -84,8 +85,9 @@ def evidence(
     plate = torch.lerp(render, look_up(view.picture.float(), seen.pixels), inside[..., None])
     change = source_views.difference(plate, render)
     misfit = look_up(view.missed.float()[..., None], seen.pixels)[..., 0] * inside
-    contradiction = torch.zeros_like(change)
+    contradiction, noise = torch.zeros_like(change), torch.full_like(change, config.noise)
     if instant is not None:
+        noise += _unexplained(source_views, target.t, instant, config.smoothing * unit)
         carried = look_up(source_views.view(target.t).picture.float(), instant.pixels)
         ours, theirs = (blurred(each * instant.visible[..., None], unit) for each in (plate, carried))
         reach = max(1, round(MARGIN * unit))  # by which depth may misplace plate t*
@@ -94,8 +96,8 @@ def evidence(
     return {
         "plate_matte": seen.moving,
         "scene_flow": torch.log1p(_travel(source_views, target, frame) / config.travel),
-        "change": torch.log1p(change / config.noise),
-        "gain": gain.sign() * torch.log1p(2.0 * gain.abs() / config.noise),
+        "change": torch.log1p(change / noise),
+        "gain": gain.sign() * torch.log1p(2.0 * gain.abs() / noise),
         "contradiction": torch.log1p(contradiction / config.noise),
     }
 
@@ -110,6 +112,17 @@ def log_odds(of: Evidence, config: StateConfig, unit: float) -> Tensor:
 def let_go(odds: Tensor, config: StateConfig) -> Tensor:
     """[h, w] in 0..1: the share of each pixel that the plate does not give, of log-odds [h, w]."""
     return (0.5 + 0.5 * odds / config.softness).clamp(0.0, 1.0)
+
+
+def _unexplained(source_views: SourceViews, t_star: int, instant: Visibility, sigma: float) -> Tensor:
+    """[h, w] what the model leaves unexplained of plate t* around each pixel, display-referred: how noisy it is.
+
+    Where plate t* sees nothing it is the mean of what it sees.
+    """
+    missed = look_up(source_views.view(t_star).missed.float()[..., None], instant.pixels)[..., 0] * instant.visible
+    seen, least = blurred(instant.visible, sigma), 1e-3
+    mean = missed.sum() / instant.visible.sum().clamp_min(1.0)
+    return (blurred(missed, sigma) + least * mean) / (seen + least)
 
 
 def _travel(source_views: SourceViews, target: TargetView, frame: int) -> Tensor:

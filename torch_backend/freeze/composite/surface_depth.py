@@ -7,8 +7,8 @@ the depth behind them is taken. What stands still is measured instead, once for 
 2. Each plate is compared with the plates of the key views around it. Inverse depth takes Gauss-Newton steps that make
    them agree (Lucas and Kanade 1981, along epipolar lines). What mattes call moving takes no part. The noise of two
    plates is measured around each pixel, so that its inverse depth has a variance.
-3. After each step planes are fitted to inverse depth in windows of two sizes, weighted by 1 / variance. Inverse depth of
-   a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows around it whose
+3. After each step planes are fitted to inverse depth in windows of two sizes, weighted by 1 / variance. Inverse depth
+   of a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows around it whose
    deviations their variances explain: a window that reaches over an edge is no plane (Kuwahara et al. 1976).
 
 A frame takes depth from the key views nearest to it: of their values and the splats', that on which most agree. What

@@ -46,7 +46,7 @@ from .passes import Passes
 
 TAKE_VERSION = 3
 """Rises when frames rendered before must not stand beside new ones."""
-COMPOSITE_VERSION = 22
+COMPOSITE_VERSION = 23
 """The same, of frames made of plates."""
 DEEP_VERSION = 1
 """The same, of deep pictures."""

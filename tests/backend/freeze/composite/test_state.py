@@ -48,7 +48,7 @@ def test_each_piece_of_evidence_is_large_where_it_should_be(found):
     moved = told["scene_flow"].numpy()
     assert moved[there].mean() > 2.0 and moved[still].max() < 0.1
     assert not alone["contradiction"].any(), "plate t* may not be used"
-    assert torch.equal(alone["change"], told["change"])
+    assert (told["change"] <= alone["change"]).all(), "plate t* says how noisy renders are"
 
 
 def test_odds_are_a_weighted_sum_and_a_still_world_keeps_its_plate_to_the_bit(found):
