@@ -244,20 +244,33 @@ def read_only(case: Case, prepared: Prepared, folder: Path, drawn: random.Random
     """The disk becomes read-only after the job was requested."""
     copy_of(prepared, case.kind, folder)
     if KINDS[case.kind].words:
-        subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+        remount(folder, "ro")
         child = start(folder, case.kind, prepared)
     else:
         job = contract.new_job(
             folder / "shot.splannequin", case.kind.partition(" ")[0], KINDS[case.kind].params(prepared.files)
         )
-        subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+        remount(folder, "ro")
         child = start_words(["run-job", str(job)], job, {})
     code = child.wait()
     wrong = check_end(child, case, prepared, folder)
     if code == 0:
         wrong.append("exit code 0 on a disk that cannot be written")
-    subprocess.run(["mount", "-o", "remount,rw", str(folder)], check=True)
+    remount(folder, "rw")
     return wrong + check_again(case, prepared, folder)
+
+
+def remount(folder: Path, how: str) -> None:
+    """Makes the disk at a folder read-only (`ro`) or writable (`rw`).
+
+    It is busy for as long as a process that another case forks holds what was open for writing here.
+    """
+    for _ in range(50):
+        done = subprocess.run(["mount", "-o", f"remount,{how}", str(folder)], check=False, capture_output=True)
+        if done.returncode == 0:
+            return
+        time.sleep(0.1)
+    raise AssertionError(f"{folder} stays busy: {done.stderr.decode()}")
 
 
 def damaged(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:

@@ -113,6 +113,11 @@ def deep_samples(
         weight.scatter_add_(0, at, (left * image.alpha)[None])
         light.scatter_add_(0, at[..., None].expand(1, height, width, 3), (left[..., None] * shown[..., :3])[None])
         left *= 1.0 - image.alpha
+    total = weight.sum(0)
+    share = torch.where(total > 0.0, weight[0] / total.clamp_min(1e-8), 1.0)
+    # A pixel that keeps one sample is as deep as the frame, though a neighbour is nearer or farther.
+    depth[0] = torch.where(share > 1.0 - _LEAST, surface, depth[0])
+    depth[1] = torch.where(share < _LEAST, surface, depth[1])
     return DeepSamples(weight, light, depth)
 
 

@@ -48,7 +48,7 @@ TAKE_VERSION = 3
 """Rises when frames rendered before must not stand beside new ones."""
 COMPOSITE_VERSION = 23
 """The same, of frames made of plates."""
-DEEP_VERSION = 1
+DEEP_VERSION = 2
 """The same, of deep pictures."""
 
 

@@ -88,7 +88,8 @@ def test_the_splats_of_a_take_lie_on_its_camera(taken, kind):
         solid = (alpha > 0.9) & (image.rgba[..., 3] > 0.9)
         assert solid.mean() > 0.5
         # Z is measured from the plates, the splats' is that of single Gaussians: medians agree, single pixels do less.
-        assert abs(np.median((depth / 2.5 / image.depth)[solid]) - 1.0) < 2e-3, "depth"
+        # Between neighbouring plates of 64 x 48 pixels a parallax of 0.4 % is less than a hundredth of a pixel.
+        assert abs(np.median((depth / 2.5 / image.depth)[solid]) - 1.0) < 4e-3, "depth"
 
 
 def test_both_files_hold_the_same_splats_and_the_take_says_where(taken):
