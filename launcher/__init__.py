@@ -10,7 +10,7 @@
     blender         a Blender for the add-on
     summary         DIR/summary.json
     sbom            what a set-up downloads, as a bill of materials
-    doctor, testing, commands, release   what can be asked for
+    doctor, testing, commands, release   the commands
     main            the command line
 
 Each imports only from those above it. Standard library, `torch_backend.contract`, `.shot` and `.cards` only.

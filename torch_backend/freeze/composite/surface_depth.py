@@ -51,6 +51,8 @@ SAME = 3.0
 """Standard deviations within which two depths, or two plates' brightness, are those of one surface."""
 _QUANTUM = 1.0 / 255.0
 """Least standard deviation of a plate's brightness: a step of 8 bits."""
+_SURE = 2.0
+"""Deviations of the slopes that steps of 8 bits make from which on a slope is the picture's."""
 _SLOPE_NOISE = 12.0**0.5 / 8.0
 """Standard deviation of `_slope` over that of the picture, if the noise of its pixels is independent."""
 
@@ -71,6 +73,8 @@ class SurfaceDepthConfig:
     radii: tuple[int, ...] = (3, 8)
     """Radii in pixels of the windows in which planes are fitted to what the plates show. In a frame they have the
     first, and each pixel takes those of nine windows that lie as far apart."""
+    small: int = 2
+    """Radius in pixels of the windows in which the noise of plates is measured, and splats of a frame are smoothed."""
     detail: float = 1.5
     """Standard deviation in pixels of the blur that is subtracted from plates, so that light and exposure cancel."""
     noise: float = 0.03
@@ -166,12 +170,12 @@ def gauss_newton(
         seen = weight > 0.5
         if not seen.any():
             continue
-        count, square = _means([weight, weight * np.square(shift)], 2)
+        count, square = _means([weight, weight * np.square(shift)], config.small)
         noise = np.sqrt(np.maximum(square / np.maximum(count, 1e-6), _QUANTUM**2))
         # From so many deviations on, two plates show two points.
         weight /= np.square(noise * (1.0 + np.square(shift / (SAME * noise))))
-        # A slope within two deviations of what steps of 8 bits make says nothing of depth.
-        steps = np.square(2.0 * _SLOPE_NOISE * _QUANTUM) * (np.square(place.dx) + np.square(place.dy))
+        # A slope that steps of 8 bits may have made says nothing of depth.
+        steps = np.square(_SURE * _SLOPE_NOISE * _QUANTUM) * (np.square(place.dx) + np.square(place.dy))
         weight *= np.maximum(1.0 - steps / np.maximum(np.square(slope), 1e-20), 0.0)
         information += weight * slope * slope
         pull -= weight * slope * shift
@@ -354,7 +358,7 @@ def frame_depth(
         factor = np.asarray(cv2.resize(factor, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
         whole = np.where(splats.moving > 0.5, whole * factor, whole)
     sigma = noise * np.maximum(inverse, LEAST_INVERSE)
-    inverse, _ = smoothed(inverse, 1.0 / np.square(sigma), (2,), config.uneven)  # single splats jut out
+    inverse, _ = smoothed(inverse, 1.0 / np.square(sigma), (config.small,), config.uneven)  # single splats jut out
     values, sigma = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, sigma))
     # What moves and what stands still are surfaces of their own, however near they are.
     weight = 1.0 / np.square(np.maximum(sigma, LEAST_INVERSE * config.noise))
