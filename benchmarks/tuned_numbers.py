@@ -1,4 +1,4 @@
-"""How many numbers is the freeze tuned by? `python -m benchmarks.numbers [--list]`.
+"""How many numbers is the freeze tuned by? `python -m benchmarks.tuned_numbers [--list]`.
 
 Counts the numbers of `views`, `instant` and `composite` in torch_backend/freeze: those of fields and constants (each
 one of a tuple), and those written in the code. A number counts as tuned unless it is one of these:

@@ -1,6 +1,6 @@
 """What counts as a tuned number of the freeze."""
 
-from benchmarks.numbers import UNTUNED, numbers_of
+from benchmarks.tuned_numbers import UNTUNED, numbers_of
 
 TEXT = '''
 _LIMIT = 0.25
