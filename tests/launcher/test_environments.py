@@ -38,7 +38,8 @@ def test_set_up_once_then_nothing_is_started(
     assert set_up(environment, "no such python") == 0
 
 
-def test_changed_requirements_are_installed(environment: Environment, write_lock, write_wheel):
+def test_changed_requirements_are_installed(environment: Environment, write_lock, write_wheel, made):
+    made(environment.folder)
     set_up(environment, sys.executable)
     write_lock("small", write_wheel("smallthing", "2.0", "value = 2"))
     assert not environment.ready()
@@ -46,7 +47,8 @@ def test_changed_requirements_are_installed(environment: Environment, write_lock
     assert value_of(environment) == "2"
 
 
-def test_a_superset_of_the_requirements_is_ready_for_the_subset(environment: Environment, write_lock, write_wheel):
+def test_a_superset_of_the_requirements_is_ready_for_the_subset(environment: Environment, write_lock, write_wheel, made):
+    made(environment.folder)
     write_lock("more", write_wheel("otherthing", "1.0", ""))
     more = dataclasses.replace(environment, requirements=("small", "more"))
     set_up(environment, sys.executable)
@@ -122,6 +124,7 @@ def test_torch_alone_is_asked_of_its_index(
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", index.as_uri())
     monkeypatch.setenv("PIP_NO_INDEX", "0")
     monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")
+    monkeypatch.setenv("PIP_RETRIES", "0")
     set_up(with_torch, sys.executable)
     assert with_torch.ready() and value_of(with_torch) == "1"
     assert (site_packages(with_torch) / "torch.py").read_text() == "build = 'cpu'"
@@ -197,7 +200,8 @@ def test_what_somebody_installs_besides_is_no_change(environment: Environment, w
     assert environment.ready()
 
 
-def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment):
+def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Environment, made):
+    made(environment.folder)
     set_up(environment, sys.executable)
     packages = site_packages(environment)
     # What a kill in the middle of pip leaves: the marker, a package whose files are not all there, no RECORD.
@@ -235,7 +239,8 @@ def test_a_folder_of_someone_else_is_left_alone(environment: Environment):
     assert refused.value.exit_code == 9
 
 
-def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Environment, requirements: Path):
+def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Environment, requirements: Path, made):
+    made(environment.folder)
     (requirements / "small.lock").write_text(f"there-is-no-such-package==1.0 --hash=sha256:{'0' * 64}\n")
     with pytest.raises(LauncherError) as refused:
         set_up(environment, sys.executable)
@@ -248,7 +253,8 @@ def test_a_package_that_cannot_be_had_names_step_log_and_remedy(environment: Env
     assert not environment.ready()
 
 
-def test_a_package_that_does_not_import_is_not_ready(environment: Environment, write_lock, write_wheel):
+def test_a_package_that_does_not_import_is_not_ready(environment: Environment, write_lock, write_wheel, made):
+    made(environment.folder)
     write_lock("small", write_wheel("smallthing", "3.0", "import absent_library"))
     with pytest.raises(LauncherError, match="absent_library"):
         set_up(environment, sys.executable)
@@ -264,7 +270,7 @@ def test_a_full_disk_is_said_before_anything_is_written(environment: Environment
 
 @pytest.mark.parametrize(("index", "needed"), [("/whl/cpu", 4), ("/whl/cu130", 9)])
 def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
-    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, index: str, needed: int
+    with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made, index: str, needed: int
 ):
     backend = with_torch
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", f"file://{tmp_path}{index}")
@@ -275,6 +281,7 @@ def test_the_disk_that_a_set_up_needs_is_that_of_the_torch_it_will_install(
     assert refused.value.exit_code == 8
     assert not backend.folder.exists()
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=int(needed * 1e9 + 1e8)))
+    made(backend.folder)
     set_up(backend, sys.executable)
     assert backend.ready()
 
