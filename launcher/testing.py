@@ -174,13 +174,11 @@ def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -
     legs: list[Leg] = []
     pytest = [backend.python, "-P", "-m", "pytest"]
     apart = BACKEND_APART if not pytest_args and not series else ()
-    if apart:  # the longest first
+    if apart:  # the longest first, so that no core waits for one at the end
         legs.append(Leg("backend, one half", [*pytest, *apart], output / "junit-backend-half.xml"))
     if backend_paths:
         ignored = [f"--ignore={path}" for path in ("tests/addon", *apart)]
         legs.append(Leg("backend", [*pytest, *ignored, *backend_paths, *rest], output / "junit-backend.xml"))
-    if not pytest_args and not series:
-        legs += checkers(backend.python)
     if addon_paths:
         blenders = [set_up_wheel(one, True)[0] for one in series] or [get_blender(testing=True)[0]]
         for blender in blenders:
@@ -189,6 +187,8 @@ def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -
             command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
             report = output / f"junit-{blender.label.replace(' ', '-')}.xml"
             legs.append(Leg(f"add-on in {blender.label}", command, report))
+    if not pytest_args and not series:
+        legs += checkers(backend.python)
     output.mkdir(parents=True, exist_ok=True)
     run_legs(legs, backend.python, output, min(AT_ONCE, cores()))
     return _close_tests(legs, output)
