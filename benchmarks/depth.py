@@ -35,9 +35,9 @@ from torch.nn import functional as F
 
 from benchmarks.detail_clip import DetailClip
 from benchmarks.detail_figures import dilate
-from benchmarks.detail_truth import scene_arguments, trained
+from benchmarks.detail_truth import scene_arguments, trained_scenes
 from benchmarks.report.truth import PANES
-from benchmarks.sources import SyntheticTruth, in_words, load_synthetic
+from benchmarks.sources import SyntheticTruth, in_words
 from torch_backend.contract import SWITCH
 from torch_backend.shot import write_json
 
@@ -208,15 +208,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--develop", default="on", choices=SWITCH, help="off: instants stay as the run has them")
     args = parser.parse_args(argv)
     found: dict[str, dict[str, dict[str, float | None]]] = {}
-    results = args.results.absolute()
-    for folder in args.scenes:
-        truth, source = load_synthetic(folder, results, args.cameras), f"{args.cameras}:{folder.absolute()}"
+    for truth, runs in trained_scenes(args, args.seeds):
         of: dict[str, Any] = {}
-        for seed in args.seeds:
-            run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
+        for seed, run in runs.items():
             of[f"seed {seed}"] = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on")
         found[truth.name] = mean_of(list(of.values()))
-        write_json(results / f"depth-{truth.name.replace(' ', '-')}.json", {"version": 1, **of})
+        write_json(args.results / f"depth-{truth.name.replace(' ', '-')}.json", {"version": 1, **of})
     print("\n".join(["", *table(found)]))
 
 

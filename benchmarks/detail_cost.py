@@ -29,8 +29,8 @@ import torch
 
 from benchmarks.detail import develop_argument, name_of
 from benchmarks.detail_clip import DetailClip, open_clip
-from benchmarks.sources import child_environ
-from torch_backend.contract import JobError, frame_file, from_dict, read_json
+from benchmarks.sources import child_environ, in_words
+from torch_backend.contract import frame_file, from_dict, read_json
 from torch_backend.footage import FootageConfig
 from torch_backend.footage.images import read_png, write_png
 from torch_backend.footage.importing import import_key
@@ -198,8 +198,9 @@ def table(sizes: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shot", type=Path, nargs="?")
     parser.add_argument("--run", default="main", metavar="NAME")
@@ -213,33 +214,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if args.work:
         print(json.dumps(measure(**json.loads(args.work))))
-        return 0
+        return
     if args.shot is None or args.results is None:
         parser.error("SHOT and --results are needed")
     sizes: list[dict[str, Any]] = []
-    try:
-        clip = open_clip(args.shot, args.run)
-        for width in args.widths:
-            if width % clip.scene.width:
-                raise ValueError(f"{width} is no multiple of the clip's {clip.scene.width} pixels")
-            with tempfile.TemporaryDirectory(prefix="splannequin-cost-") as folder:
-                counts = args.frames or PATHS.get(width, (12, 36))
-                poses = middle_poses(clip, max(counts))
-                shot = enlarged(Shot.open(args.shot), Path(folder), width // clip.scene.width, poses)
-                if args.develop == "on":  # here, whose memory is not told: that is done once for a take
-                    large = DetailClip(shot, args.run)
-                    large.frozen(large.instants()[0], keep=True)
-                for count in counts:
-                    found = in_child(shot, args.run, width, poses[:count], args.develop == "on")
-                    sizes.append(found | {"summary": summary(found)})
-                    print(f"{width}, {count} frames: {sizes[-1]['summary']}", flush=True)
-    except (JobError, OSError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    clip = open_clip(args.shot, args.run)
+    for width in args.widths:
+        if width % clip.scene.width:
+            raise ValueError(f"{width} is no multiple of the clip's {clip.scene.width} pixels")
+        with tempfile.TemporaryDirectory(prefix="splannequin-cost-") as folder:
+            counts = args.frames or PATHS.get(width, (12, 36))
+            poses = middle_poses(clip, max(counts))
+            shot = enlarged(Shot.open(args.shot), Path(folder), width // clip.scene.width, poses)
+            if args.develop == "on":  # here, whose memory is not told: that is done once for a take
+                large = DetailClip(shot, args.run)
+                large.frozen(large.instants()[0], keep=True)
+            for count in counts:
+                found = in_child(shot, args.run, width, poses[:count], args.develop == "on")
+                sizes.append(found | {"summary": summary(found)})
+                print(f"{width}, {count} frames: {sizes[-1]['summary']}", flush=True)
     name = name_of(args.shot)
     write_json(args.results / f"cost-{name}.json", {"version": 1, "shot": str(args.shot), "sizes": sizes})
     print("\n".join(["", *table(sizes)]))
-    return 0
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import argparse
 import os
 import statistics
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from benchmarks.report.metrics import WHOLE, score
 from benchmarks.report.records import DELIVERED, DEVELOPED, SPLATS, WITHHELD
 from benchmarks.report.things import overall, recall_of
 from benchmarks.report.truth import HELD, REGIONS, TruthScene
-from benchmarks.sources import in_words, load_source
+from benchmarks.sources import SyntheticTruth, in_words, load_synthetic
 from torch_backend.contract import SWITCH
 from torch_backend.shot import write_json
 from torch_backend.train import load_run
@@ -47,16 +47,23 @@ WITHHELD_GOAL = 2.0
 """dB that the whole frame should gain with the plate of its pose withheld."""
 
 
-def trained(truth: TruthScene, source: str, args: argparse.Namespace) -> str:
+def trained(truth: TruthScene, source: str, seed: int, iterations: int, gaussians: int) -> str:
     """Name of the scene's run, trained first if it is not. RuntimeError if that fails."""
     spec = RunSpec(
-        source, truth.key, "auto", "support", "preview", seed=args.seed, iterations=args.iterations,
-        max_gaussians=args.gaussians, holdout_phase=hold_out_phase(truth),
+        source, truth.key, "auto", "support", "preview", seed=seed, iterations=iterations, max_gaussians=gaussians,
+        holdout_phase=hold_out_phase(truth),
     )  # fmt: skip
     code, _, _ = train_spec(spec, truth, 1)
     if code:
         raise RuntimeError(f"the run of {truth.name} could not be trained (exit code {code})")
     return spec.run_name
+
+
+def trained_scenes(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[tuple[SyntheticTruth, dict[int, str]]]:
+    """Each scene of `scene_arguments`, and the names of its runs by training seed; what is missing is trained."""
+    for folder in args.scenes:
+        truth, source = load_synthetic(folder, args.results, args.cameras), f"{args.cameras}:{folder.absolute()}"
+        yield truth, {seed: trained(truth, source, seed, args.iterations, args.gaussians) for seed in seeds}
 
 
 def judge(
@@ -199,10 +206,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--train-only", action="store_true")
     args = parser.parse_args(argv)
     found, seen, there, results = {}, {}, {}, args.results.absolute()
-    for folder in args.scenes:
-        source = f"{args.cameras}:{folder.absolute()}"
-        truth = load_source(source, results)
-        run = trained(truth, source, args)
+    for truth, runs in trained_scenes(args, [args.seed]):
+        run = runs[args.seed]
         print(f"{truth.name}: {truth.shot.run(run)}", flush=True)
         if args.train_only:
             continue

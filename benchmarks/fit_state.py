@@ -18,7 +18,6 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -28,14 +27,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from benchmarks.detail_clip import DetailClip
-from benchmarks.detail_truth import trained
+from benchmarks.detail_truth import scene_arguments, trained_scenes
+from benchmarks.report.metrics import psnr_of
 from benchmarks.report.truth import TruthScene
-from benchmarks.sources import load_source
+from benchmarks.sources import in_words
 from torch_backend.freeze.composite.state import StateConfig, StateWeights, evidence, let_go
 from torch_backend.freeze.frozen import OutputFrame
 from torch_backend.freeze.views.reproject import blurred, resized
 from torch_backend.freeze.views.target_view import target_view
-from torch_backend.native import default_threads
 from torch_backend.train import load_run
 
 NAMES = [f.name for f in fields(StateWeights) if f.name != "bias"]
@@ -84,11 +83,11 @@ class Case:
         return ((off - low) / (high - low)).clamp(0.0, 1.0)
 
 
-def collect(truth: TruthScene, run: str, name: str, every: int) -> Case:
-    """All instants and every `every`-th pose of a scene, by one run."""
+def collect(truth: TruthScene, run: str, name: str, t_stars: Sequence[int], every: int) -> Case:
+    """The instants and every `every`-th pose of a scene, by one run."""
     clip = DetailClip(truth.shot, run, load_run(truth.shot, run, torch.device("cpu")).width)
     rows: list[tuple[Tensor, ...]] = []
-    for t_star in truth.t_stars:
+    for t_star in t_stars:
         clip.frozen(t_star)  # developed here: rows are made without gradients
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             rows.append(_row(clip, truth, pose, t_star))
@@ -150,40 +149,31 @@ def judged(case: Case, weights: StateWeights) -> dict[str, float]:
     found = {"let go": float(share.mean())}
     for name, picture in {"mixed": mixed, "plate": case.plate, "fill": case.filled}.items():
         error = (picture - case.truth).square().mean(-1)
-        found[f"{name} whole"] = _db([float(each.mean()) for each in error])
-        found[f"{name} moving"] = _db([float(e[m].mean()) for e, m in zip(error, case.moving, strict=True) if m.any()])
+        moving = [e[m] for e, m in zip(error, case.moving, strict=True) if m.any()]
+        for region, errors in (("whole", [*error]), ("moving", moving)):
+            found[f"{name} {region}"] = float(np.mean([psnr_of(float(each.mean())) for each in errors]))
     return found
 
 
-def _db(errors: Sequence[float]) -> float:
-    return float(np.mean([-10.0 * np.log10(max(error, 1e-10)) for error in errors]))
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
-    parser.add_argument("--results", type=Path, required=True, metavar="DIR")
+    scene_arguments(parser)
+    parser.set_defaults(every=2)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the training")
-    parser.add_argument("--every", type=int, default=2, metavar="K", help="only every K-th pose")
-    parser.add_argument("--iterations", type=int, default=1500)
-    parser.add_argument("--gaussians", type=int, default=10_000)
     parser.add_argument("--cross", action="store_true", help="judge each scene by weights fitted on the others")
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
-    cases: list[Case] = []
-    for folder in args.scenes:
-        source = f"exact:{folder.absolute()}"
-        truth = load_source(source, args.results.absolute())
-        for seed in args.seeds:
-            run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
-            cases.append(collect(truth, run, f"{truth.name} s{seed}", args.every))
+    cases = [
+        collect(truth, run, f"{truth.name} s{seed}", args.t_star or truth.t_stars, args.every)
+        for truth, runs in trained_scenes(args, args.seeds)
+        for seed, run in runs.items()
+    ]
     print(fit(cases))
     for case in cases:
         others = [other for other in cases if other.name.split(" s")[0] != case.name.split(" s")[0]]
         figures = judged(case, fit(others if args.cross and others else cases))
         print(f"{case.name}: " + ", ".join(f"{name} {value:.2f}" for name, value in figures.items()), flush=True)
-    return 0
 
 
 if __name__ == "__main__":

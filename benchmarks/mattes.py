@@ -32,20 +32,18 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from benchmarks.detail_truth import scene_arguments, trained
-from benchmarks.sources import Log, SyntheticTruth, load_source
+from benchmarks.detail_truth import scene_arguments, trained_scenes
+from benchmarks.sources import Log, in_words
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.regions import Geometry, View
-from torch_backend.contract import FreezeParams, JobError, MatteParams, TakeFolder
+from torch_backend.contract import FreezeParams, MatteParams, TakeFolder
 from torch_backend.freeze import freeze_shot
 from torch_backend.freeze.mattes.files import matte_file, read_matte
 from torch_backend.freeze.mattes.job import make_mattes
 from torch_backend.freeze.take.folder import frames_of
-from torch_backend.native import default_threads
 from torch_backend.shot import Shot, write_json
 
 LEAST = 200
@@ -234,28 +232,23 @@ def matte_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lasso-at", choices=("most", "t-star"), default="most", help="which frame of the take")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     matte_arguments(parser)
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
+    if args.cameras != "exact":
+        raise ValueError("people are only known by exact cameras")
     found: dict[str, list[dict[str, Any]]] = {}
-    try:
-        for folder in args.scenes:
-            source = f"{args.cameras}:{folder.absolute()}"
-            truth = load_source(source, args.results.absolute())
-            if not isinstance(truth, SyntheticTruth) or args.cameras != "exact":
-                raise ValueError(f"{folder}: people are only known of scenes of benchmarks/synthetic, by exact cameras")
-            run, scene = trained(truth, source, args), SyntheticScene.load(folder)
-            rows = [row for t in args.t_star or truth.t_stars for row in judge(truth.shot, scene, run, t, args)]
-            found[truth.name] = rows
-            write_json(args.results / f"mattes-{truth.name.replace(' ', '-')}.json", {"version": 1, "rows": rows})
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    for truth, runs in trained_scenes(args, [args.seed]):
+        rows = found[truth.name] = [
+            row
+            for t_star in args.t_star or truth.t_stars
+            for row in judge(truth.shot, truth.scene, runs[args.seed], t_star, args)
+        ]
+        write_json(args.results / f"mattes-{truth.name.replace(' ', '-')}.json", {"version": 1, "rows": rows})
     print("\n".join(["", *table(found)]))
-    return 0
 
 
 if __name__ == "__main__":

@@ -34,8 +34,9 @@ from torch.nn import functional as F
 
 from benchmarks.detail_figures import induced_places, inside, sampled, still_pixels
 from benchmarks.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
+from benchmarks.sources import in_words
 from benchmarks.training_step import _Silent
-from torch_backend.contract import JobError, TrainParams
+from torch_backend.contract import TrainParams
 from torch_backend.deformation import planes
 from torch_backend.footage.images import write_png
 from torch_backend.freeze.frozen import FrozenGaussians, FrozenImage, freeze_at, render_frozen
@@ -307,8 +308,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shot", type=Path)
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
@@ -330,16 +332,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     args.results.mkdir(parents=True, exist_ok=True)
-    try:
-        result = run(args)
-    except (JobError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    result = run(args)
     write_json(args.results / f"{args.name}.json", result)
     figures = " ".join(f"{n} {v:.2f}" if v is not None else f"{n} -" for n, v in result["figures"].items())
     facts = f"{result['gaussians']} Gaussians, {result['open']} open, SH {result['sh_degree']}"
     print(f"{args.name}: {figures}; {result['cpu_seconds']:.0f} s, {result['iterations']} steps, {facts}", flush=True)
-    return 0
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
+from benchmarks.sources import in_words
 from torch_backend.cameras.stored import load_cameras
 from torch_backend.contract import JobError
 from torch_backend.footage import load_frames
@@ -116,7 +117,8 @@ def judged(shot: Shot, take: str, clip: Path, videos: Sequence[Path], half: str)
     return found
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
     """Prints a row for the take, its splats and each video."""
     parser = argparse.ArgumentParser(description="Our frozen frames beside published ones of the same clip.")
     parser.add_argument("shot", type=Path)
@@ -126,16 +128,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--half", choices=("left", "right"), default="", help="where in the videos the frozen frame is")
     parser.add_argument("--results", type=Path, help="JSON file of the figures")
     args = parser.parse_args(argv)
-    try:
-        found = judged(Shot.open(args.shot), args.take, args.clip, args.videos, args.half)
-    except (JobError, FileNotFoundError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    found = judged(Shot.open(args.shot), args.take, args.clip, args.videos, args.half)
     for name, row in found.items():
         print(f"{name}: " + ", ".join(f"{figure} {value:.4f}" for figure, value in row.items()))
     if args.results:
         write_json(args.results, {"version": 1, "figures": found})
-    return 0
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Times the rasteriser on four seeded workloads: `python -m benchmarks.raster [W0 W1 ...] [--json FILE]`.
 
-Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). `--scaling`,
-`--memory` and `--errors` add tables.
+Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). Errors are measured by
+`benchmarks/numerics.py`.
 
 The workloads are those of `benchmarks/workload.py`. Bodies are run in turn, round by round, so that whatever else the
 machine does falls on all of them alike.
@@ -11,13 +11,11 @@ import argparse
 import datetime
 import importlib
 import json
-import multiprocessing
 import os
 import pathlib
 import platform
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
@@ -35,11 +33,6 @@ from torch_backend.raster import RasterSettings, rasterize
 SLOW_MS = 1000.0
 """A body whose first frame takes longer is given SLOW_ROUNDS rounds at most."""
 SLOW_ROUNDS = 5
-SCALING = {
-    "N": [(n, 640, 360) for n in (5_000, 20_000, 50_000, 100_000, 200_000)],
-    "pixels": [(50_000, 160 * s, 90 * s) for s in (1, 2, 4, 8)],
-}
-"""Gaussians, width, height along which `--scaling` goes."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +47,6 @@ class Body:
     """Of the harmonics; None for plain colours."""
     peer: str = ""
     """Import path of the peer's module."""
-    dtype: torch.dtype = torch.float32
     graph: bool = False
     """A frame and its gradient are one CUDA graph, as a training step's are (`train.recorder`)."""
 
@@ -63,7 +55,7 @@ class Body:
             return _peer(self.peer).prepare(work, self.device)
 
         def put(array: np.ndarray) -> torch.Tensor:
-            return torch.tensor(array).to(self.device, self.dtype)
+            return torch.tensor(array).to(self.device, torch.float32)
 
         leaves = {
             "means": put(work.means),
@@ -77,7 +69,7 @@ class Body:
         else:
             generator = torch.Generator().manual_seed(1)
             sh = 0.2 * torch.randn(len(work.means), (self.degree + 1) ** 2, 3, generator=generator)
-            leaves["sh"] = sh.to(self.device, self.dtype)
+            leaves["sh"] = sh.to(self.device, torch.float32)
         for leaf in leaves.values():
             leaf.requires_grad_()
         Ks, settings = torch.tensor(work.K)[None].to(self.device), RasterSettings(threads=self.threads)
@@ -111,7 +103,7 @@ class _Case:
 
     def __init__(self, work: Workload, body: Body):
         self.body, self.prepared = body, body.prepare(work)
-        self.g = torch.tensor(work.g).to(body.device, body.dtype)
+        self.g = torch.tensor(work.g).to(body.device, torch.float32)
         self._graph = self._captured() if body.graph else None
 
     def _captured(self) -> torch.cuda.CUDAGraph:
@@ -198,58 +190,6 @@ def measure(size: tuple[int, int, int], bodies: dict[str, Body], rivals: list[st
     return result
 
 
-def errors(name: str, bodies: dict[str, Body]) -> dict[str, Any]:
-    """Against the float64 oracle: PSNR of the image (dB), relative L2 of the gradient of each input."""
-    work = room(*WORKLOADS[name])
-    oracle = _Case(work, Body("reference", dtype=torch.float64))
-    truth, result = oracle.image(), {}
-    for label, body in bodies.items():
-        case = _Case(work, body)
-        error = case.image().cpu().double() - truth
-        gradients = {
-            key: leaf.grad.cpu().double() for key, leaf in case.prepared.leaves.items() if leaf.grad is not None
-        }
-        expected = {key: leaf.grad for key, leaf in oracle.prepared.leaves.items() if leaf.grad is not None}
-        result[label] = {
-            "psnr_db": float(-10 * error.square().mean().log10()),
-            "gradient_relative_l2": {
-                key: float((value - expected[key]).norm() / expected[key].norm())
-                for key, value in gradients.items()
-                if key in expected
-            },
-        }
-    return result
-
-
-def _peak(size: tuple[int, int, int], body: Body) -> float:
-    """Most MiB that two frames hold beyond the workload itself (CUDA: the most that torch held)."""
-    torch.set_num_threads(body.threads)
-    case = _Case(room(*size), body)
-    if body.device == "cuda":
-        case.image()
-        case.image()
-        return torch.cuda.max_memory_allocated() / 2**20
-    _Case(room(100, 32, 32), body).image()  # compiler and libraries are no part of a frame
-
-    def resident(name: str) -> float:  # not getrusage's ru_maxrss, which a child inherits
-        lines = pathlib.Path("/proc/self/status").read_text().splitlines()
-        return next(float(line.split()[1]) for line in lines if line.startswith(name)) / 2**10
-
-    before = resident("VmRSS:")
-    pathlib.Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
-    case.image()
-    case.image()
-    return resident("VmHWM:") - before
-
-
-def memory(size: tuple[int, int, int], bodies: dict[str, Body]) -> dict[str, float]:
-    """Peak MiB of each body, each in a process of its own."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # a spawned Python takes its first modules from where it stands otherwise
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
-        return {label: pool.submit(_peak, size, body).result() for label, body in bodies.items()}
-
-
 def machine(device: str) -> dict[str, Any]:
     """What the figures were measured on, and when."""
     model = platform.processor()
@@ -306,9 +246,6 @@ def _arguments() -> argparse.Namespace:
         metavar="MODULE",
         help="time this peer too, e.g. benchmarks.peers.gsplat; may be given again",
     )
-    parser.add_argument("--scaling", action="store_true", help="also time along N, pixels and threads")
-    parser.add_argument("--memory", action="store_true", help="also measure each body's peak memory (Linux, or CUDA)")
-    parser.add_argument("--errors", action="store_true", help="also compare with the float64 oracle on W0 and W1")
     parser.add_argument("--json", type=pathlib.Path, metavar="FILE", help="write all figures there as well")
     arguments = parser.parse_args()
     unknown = [w for w in arguments.workloads if w not in WORKLOADS]
@@ -316,8 +253,6 @@ def _arguments() -> argparse.Namespace:
         parser.error(f"no such workload: {', '.join(unknown)}; there are {', '.join(WORKLOADS)}")
     if arguments.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch finds no CUDA device on this machine")
-    if arguments.memory and arguments.device == "cpu" and not pathlib.Path("/proc/self/clear_refs").exists():
-        parser.error("--memory: on the CPU it needs Linux's /proc")
     return arguments
 
 
@@ -343,28 +278,6 @@ def main() -> None:
         result = measure(WORKLOADS[name], ours | rivals, list(rivals), arguments.rounds)
         report["workloads"][name] = result
         _print_times(name, result)
-        if arguments.memory:
-            result["peak_mib"] = memory(WORKLOADS[name], ours | rivals)
-            for label, peak in result["peak_mib"].items():
-                print(f"{name}  {label:24s} peak memory {peak:8.1f} MiB")
-    if arguments.scaling:
-        fastest = list(plain)[-1]
-        report["scaling"] = {
-            axis: [measure(size, {fastest: plain[fastest]}, [], arguments.rounds) for size in sizes]
-            for axis, sizes in SCALING.items()
-        }
-        if device == "cpu":
-            every = {f"cpu, {t} threads": Body("cpu", threads=t) for t in range(1, (os.cpu_count() or 1) + 1)}
-            report["scaling"]["threads"] = [measure(WORKLOADS["W2"], every, [], arguments.rounds)]
-        for axis, results in report["scaling"].items():
-            for result in results:
-                _print_times(f"{axis}: {result['gaussians']} at {result['width']}x{result['height']}", result)
-    if arguments.errors:
-        report["errors"] = {name: errors(name, plain | rivals) for name in ("W0", "W1")}
-        for name, rows in report["errors"].items():
-            for label, row in rows.items():
-                gradients = ", ".join(f"{k} {v:.1e}" for k, v in row["gradient_relative_l2"].items())
-                print(f"{name}  {label:24s} PSNR {row['psnr_db']:.1f} dB; gradients' relative L2: {gradients}")
     if arguments.json:
         arguments.json.write_text(json.dumps(report, indent=1) + "\n")
 

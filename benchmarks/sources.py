@@ -63,31 +63,31 @@ class SyntheticTruth:
 
     def __init__(self, folder: str | Path, cameras: str, shots: Path) -> None:
         """FileNotFoundError if the scene is not finished; JobError if its cameras cannot be solved."""
-        self._scene = SyntheticScene.load(folder)
+        self.scene = SyntheticScene.load(folder)
         self.cameras = cameras
-        self.name = f"{self._scene.size} {self._scene.name}"
-        place = shots / f"{self._scene.size}-{self._scene.name}-{cameras}{SHOT_SUFFIX}"
-        self.shot = (exact_shot if cameras == "exact" else solved_shot)(self._scene, place, Log())
+        self.name = f"{self.scene.size} {self.scene.name}"
+        place = shots / f"{self.scene.size}-{self.scene.name}-{cameras}{SHOT_SUFFIX}"
+        self.shot = (exact_shot if cameras == "exact" else solved_shot)(self.scene, place, Log())
         # Exact cameras come without; the motion mattes drive the training.
         find_motion(self.shot, Log())
         self._pixels = SolvedPixels(self.shot)
-        self.t_stars, self._poses = list(self._scene.t_stars), list(self._scene.poses)
+        self.t_stars, self._poses = list(self.scene.t_stars), list(self.scene.poses)
         steps = np.diff(self._poses)
-        self.fps = self._scene.fps / float(steps[0]) if len(steps) and (steps == steps[0]).all() else 0.0
-        made = {name: self._scene.info[name] for name in ("version", "key") if name in self._scene.info}
+        self.fps = self.scene.fps / float(steps[0]) if len(steps) and (steps == steps[0]).all() else 0.0
+        made = {name: self.scene.info[name] for name in ("version", "key") if name in self.scene.info}
         self.key = content_key(made, read_json(self.shot.solve / "cameras.json"))
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
         """All poses that have a truth and a camera."""
-        return [pose for pose in self._poses if pose in self._scene.world_to_camera]
+        return [pose for pose in self._poses if pose in self.scene.world_to_camera]
 
     def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
         """The rendered truth, through the undistortion that the clip's frames went through."""
-        return self._resampled(self._scene.truth(t_star, pose), width, height)
+        return self._resampled(self.scene.truth(t_star, pose), width, height)
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
         """By truth: seen at t* or not, moving or static, and a hard scene's things; of the nearest pixel."""
-        regions = self._pixels.regions(self._scene.regions(t_star, pose))
+        regions = self._pixels.regions(self.scene.regions(t_star, pose))
         seen, moving = (_nearest(mask, width, height) for mask in (regions.seen, regions.moving))
         things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
         return {"seen": seen, "never_seen": ~seen, "moving": moving, "static": ~moving, **things}
@@ -95,18 +95,18 @@ class SyntheticTruth:
     @property
     def metres_per_unit(self) -> float:
         """Metres per solve unit of the shot: 1 with exact cameras."""
-        return 1.0 if self.cameras == "exact" else similarity_to_exact(self._scene, self.shot).scale
+        return 1.0 if self.cameras == "exact" else similarity_to_exact(self.scene, self.shot).scale
 
     def depth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
         """[height, width] metres along the camera's axis, to a millimetre, inf for sky; of the nearest pixel."""
-        depth = self._pixels.regions(self._scene.regions(t_star, pose)).depth
+        depth = self._pixels.regions(self.scene.regions(t_star, pose)).depth
         return torch.nn.functional.interpolate(
             torch.from_numpy(depth)[None, None], (height, width), mode="nearest-exact"
         )[0, 0]
 
     def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
         """{thing: what was rendered without it, or with it in its other state}, as `truth` is."""
-        pixels, info = self._scene.behind(t_star, pose), self._scene.info
+        pixels, info = self.scene.behind(t_star, pose), self.scene.info
         names = [each["thing"] for each in info.get("held", [])] + ([info["thing"]] if "thing" in info else [])
         return {} if pixels is None else dict.fromkeys(names, self._resampled(pixels, width, height))
 
@@ -118,7 +118,7 @@ class SyntheticTruth:
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
         """Moving or static in the clip's own frame and a hard scene's things, by truth; of the nearest pixel."""
-        regions = self._pixels.regions(self._scene.frame_regions(frame))
+        regions = self._pixels.regions(self.scene.frame_regions(frame))
         moving = _nearest(regions.moving, width, height)
         things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
         return {"moving": moving, "static": ~moving, **things}
@@ -128,7 +128,7 @@ def load_synthetic(folder: Path, results: Path, cameras: str = "exact") -> Synth
     """The scene of benchmarks/synthetic in a folder; ValueError for any other."""
     truth = load_source(f"{cameras}:{folder.absolute()}", results.absolute())
     if not isinstance(truth, SyntheticTruth):
-        raise ValueError(f"{folder}: depth is only known of scenes of benchmarks/synthetic")
+        raise ValueError(f"{folder}: this is only known of scenes of benchmarks/synthetic")
     return truth
 
 

@@ -26,10 +26,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.detail_truth import scene_arguments, trained
+from benchmarks.detail_truth import scene_arguments, trained_scenes
 from benchmarks.shadow import Set, likeness, places_of
-from benchmarks.sources import Log, SyntheticTruth, in_words, load_synthetic
-from benchmarks.synthetic.folder import SyntheticScene
+from benchmarks.sources import Log, SyntheticTruth, in_words
 from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.regions import Geometry, View
 from torch_backend.cameras.placement import Similarity
@@ -77,14 +76,12 @@ def figures(off: NDArray[np.float64]) -> dict[str, float]:
     return told
 
 
-def judge(
-    truth: SyntheticTruth, scene: SyntheticScene, run: str, t_star: int, every: int
-) -> dict[str, dict[str, float]]:
+def judge(truth: SyntheticTruth, run: str, t_star: int, every: int) -> dict[str, dict[str, float]]:
     """Part -> `figures`: room and people of the surface, of it at the frames' pixels, and of the frames themselves.
 
     And "shadow" -> number of pictures of it, mean and worst likeness.
     """
-    shot, take = truth.shot, f"surface-{run}-{t_star}"
+    shot, scene, take = truth.shot, truth.scene, f"surface-{run}-{t_star}"
     folder = TakeFolder(shot.take(take))
     params = FreezeParams(run=run, take=take, t_star=t_star, step=every, only_missing=True)
     freeze_shot(shot, params, Log())
@@ -149,14 +146,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     ends = [""]
     if args.cameras != "exact":
         raise ValueError("the surface is judged in metres: only exact cameras have them")
-    for folder in args.scenes:
-        truth, source = load_synthetic(folder, args.results), f"exact:{folder.absolute()}"
+    for truth, runs in trained_scenes(args, args.seeds):
         told: dict[str, Any] = {}
-        scene = SyntheticScene.load(folder)
-        for seed in args.seeds:
-            run = trained(truth, source, argparse.Namespace(**{**vars(args), "seed": seed}))
+        for seed, run in runs.items():
             for t_star in args.t_star or truth.t_stars:
-                found = told[f"seed {seed}, t* {t_star}"] = judge(truth, scene, run, t_star, args.every)
+                found = told[f"seed {seed}, t* {t_star}"] = judge(truth, run, t_star, args.every)
                 shaded = found["shadow"]
                 cells = [f"{shaded[k]:.3f}" if k in shaded else "–" for k in ("mean", "worst")]
                 where = f"{truth.name}, seed {seed}, t* {t_star}"

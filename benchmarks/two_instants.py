@@ -31,9 +31,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.detail_truth import trained
+from benchmarks.detail_truth import trained_scenes
 from benchmarks.mattes import LEAST, faces_of_people, make, matte_arguments, overlap
-from benchmarks.sources import Log, in_words, load_synthetic
+from benchmarks.report.metrics import psnr_of
+from benchmarks.sources import Log, in_words
 from benchmarks.synthetic.folder import SyntheticScene
 from benchmarks.synthetic.make import find_bpy, render_pictures
 from benchmarks.synthetic.rays import Hits, RayScene
@@ -138,11 +139,7 @@ def _squares(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.flo
 def figures(rows: Sequence[dict[str, Any]], region: str) -> tuple[float, float] | None:
     """PSNR (combined, two takes by themselves) of a region, pixels of all poses together; None if it is empty."""
     pixels, error, apart = np.sum([row["regions"][region] for row in rows], axis=0)
-    return (_db(error / pixels), _db(apart / pixels)) if pixels else None
-
-
-def _db(square: float) -> float:
-    return float(-10.0 * np.log10(max(square, 1e-10)))
+    return (psnr_of(error / pixels), psnr_of(apart / pixels)) if pixels else None
 
 
 def table(found: dict[str, list[dict[str, Any]]]) -> list[str]:
@@ -176,9 +173,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--bpy", help="Python of Blender's module, which renders the truth")
     args = parser.parse_args(argv)
     found: dict[str, list[dict[str, Any]]] = {}
-    for folder in args.scenes:
-        truth, scene = load_synthetic(folder, args.results), SyntheticScene.load(folder)
-        run = trained(truth, f"exact:{folder.absolute()}", args)
+    for truth, runs in trained_scenes(args, [args.seed]):
+        scene, run = truth.scene, runs[args.seed]
         made = {t: make(truth.shot, scene, run, t, args) for t in args.t_star or truth.t_stars}
         takes = {t: of.folder for t, of in made.items()}
         rows = found[truth.name] = []

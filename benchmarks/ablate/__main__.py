@@ -22,7 +22,6 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-import torch
 
 from benchmarks.ablate.cases import Case, clip_case, pairs_of, scene_case
 from benchmarks.ablate.instants import Instants
@@ -30,8 +29,7 @@ from benchmarks.ablate.masks import judge_masks
 from benchmarks.ablate.measures import FrameMaker, Row, judge, poses_of
 from benchmarks.ablate.switches import of_frames, variants
 from benchmarks.ablate.table import CLIPS, MASKS, TRUTH, Store, case_table, code_version, sweep_table, table
-from torch_backend.contract import JobError
-from torch_backend.native import default_threads
+from benchmarks.sources import in_words
 
 ROOT = Path(__file__).resolve().parents[2]
 SHOWN_BY_CASE = ("today", "null", "P")
@@ -139,26 +137,21 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     args = _parser().parse_args(argv)
-    torch.set_num_threads(default_threads())
     how = f"every{args.every}-pairs{args.pairs}-draw{args.draw}"
     store = Store(args.results / "ablate" / f"{code_version(ROOT)}-{how}")
-    try:
-        if not args.table:
-            results = args.results.absolute()
-            cases = [scene_case(folder, seed, results, args.lent) for seed in args.seeds for folder in args.scenes]
-            cases += [clip_case(path, args.run, args.draw) for path in args.clip]
-            for case in cases if args.masks else ():
-                judge_masks(case, store)
-            if cases and not args.masks:
-                Ablation(store, args.results / "ablate" / "instants", args).run(cases)
-    except (FileNotFoundError, JobError, RuntimeError, ValueError) as error:
-        print(f"Error: {error}", file=sys.stderr)
-        return 1
+    if not args.table:
+        results = args.results.absolute()
+        cases = [scene_case(folder, seed, results, args.lent) for seed in args.seeds for folder in args.scenes]
+        cases += [clip_case(path, args.run, args.draw) for path in args.clip]
+        for case in cases if args.masks else ():
+            judge_masks(case, store)
+        if cases and not args.masks:
+            Ablation(store, args.results / "ablate" / "instants", args).run(cases)
     print("\n".join(["", *tables(store)]))
-    return 0
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import shutil
 import zlib
@@ -55,8 +54,7 @@ def scene_case(folder: Path, seed: int, results: Path, lent: Path | None = None)
         shutil.copytree(theirs, own, dirs_exist_ok=True)
         (own / f"copied-{seed}").touch()
     truth = load_source(source, results)
-    how = argparse.Namespace(seed=seed, iterations=ITERATIONS, gaussians=GAUSSIANS)
-    run = trained(truth, source, how)
+    run = trained(truth, source, seed, ITERATIONS, GAUSSIANS)
     width = load_run(truth.shot, run, torch.device("cpu")).width
     return Case(f"{name} s{seed}", DetailClip(truth.shot, run, width), list(truth.t_stars), truth)
 

@@ -25,8 +25,7 @@ import torch
 
 from benchmarks.detail import develop_argument, name_of, save_strip
 from benchmarks.detail_clip import DetailClip, View, open_clip
-from torch_backend.contract import JobError
-from torch_backend.native import default_threads
+from benchmarks.sources import in_words
 from torch_backend.shot import write_json
 
 from .masks import CLIPS, OTHER, SAME, Labels, Painted, load_masks, sha256_of
@@ -105,8 +104,9 @@ def run(clip: DetailClip, masks: Painted, pictures: Path | None) -> list[Row]:
     return rows
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; returns an exit code."""
+@in_words
+def main(argv: Sequence[str] | None = None) -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shots", type=Path, nargs="+", metavar="SHOT")
     parser.add_argument("--run", default="main", metavar="NAME")
@@ -115,21 +115,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--pictures", action="store_true", help="a picture of each pair")
     develop_argument(parser)
     args = parser.parse_args(argv)
-    torch.set_num_threads(default_threads())
     for shot in args.shots:
-        try:
-            clip = open_clip(shot, args.run, develop=args.develop == "on")
-            masks, name, since = masks_of(clip, args.clip), name_of(shot), time.perf_counter()
-            rows = run(clip, masks, args.results / f"other-state-{name}" if args.pictures else None)
-        except (JobError, ValueError) as error:
-            print(f"Error: {shot}: {error}", file=sys.stderr)
-            return 1
+        clip = open_clip(shot, args.run, develop=args.develop == "on")
+        masks, name, since = masks_of(clip, args.clip), name_of(shot), time.perf_counter()
+        rows = run(clip, masks, args.results / f"other-state-{name}" if args.pictures else None)
         summed = summary(rows)
         result = {"version": 1, "shot": str(shot), "run": args.run, "develop": args.develop, "clip": masks.clip}
         result |= {"rows": [row.figures() for row in rows], **summed, "seconds": time.perf_counter() - since}
         write_json(args.results / f"other-state-{name}.json", result)
         print("\n".join(["", *table(name, rows, summed), ""]))
-    return 0
 
 
 if __name__ == "__main__":

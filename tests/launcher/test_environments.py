@@ -47,7 +47,9 @@ def test_changed_requirements_are_installed(environment: Environment, write_lock
     assert value_of(environment) == "2"
 
 
-def test_a_superset_of_the_requirements_is_ready_for_the_subset(environment: Environment, write_lock, write_wheel, made):
+def test_a_superset_of_the_requirements_is_ready_for_the_subset(
+    environment: Environment, write_lock, write_wheel, made
+):
     made(environment.folder)
     write_lock("more", write_wheel("otherthing", "1.0", ""))
     more = dataclasses.replace(environment, requirements=("small", "more"))
