@@ -87,21 +87,22 @@ def test_the_same_command_again_only_looks(frozen):
         (("solve", "nowhere"), ExitCode.USAGE, "nowhere"),
     ],
 )
-def test_wrong_input_is_one_sentence(tmp_path, arguments, code, word):
-    done = run(*arguments, *(("--output", tmp_path / "o") if arguments[0] == "freeze" else ()))
-    text = done.stdout + done.stderr
-    assert done.returncode in (code, ExitCode.FOOTAGE)
+def test_wrong_input_is_one_sentence(tmp_path, capsys, arguments, code, word):
+    output = ("--output", str(tmp_path / "o")) if arguments[0] == "freeze" else ()
+    assert cli.main([*arguments, *output]) in (code, ExitCode.FOOTAGE)
+    text = "".join(capsys.readouterr())
     assert word in text
     assert "Traceback" not in text
 
 
-def test_hosts_are_known_by_their_files_alone():
+def test_hosts_are_known_by_their_files_alone(capsys):
     from torch_backend.deformation import hosts
 
     assert HOSTS == host_names() == tuple(hosts())
-    refused = run("train", "no.splannequin", "--method", "nerf")
-    assert refused.returncode == ExitCode.USAGE
-    assert "control_points" in refused.stderr
+    with pytest.raises(SystemExit) as refused:
+        cli.main(["train", "no.splannequin", "--method", "nerf"])
+    assert refused.value.code == ExitCode.USAGE
+    assert "control_points" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -188,12 +189,13 @@ def test_a_shot_of_another_clip_is_not_used_again(tmp_path, capsys):
     assert "t* is frame 99" in capsys.readouterr().err, "it was taken for the same clip"
 
 
-def test_a_shot_folder_that_cannot_be_is_one_sentence(tmp_path):
+def test_a_shot_folder_that_cannot_be_is_one_sentence(tmp_path, capsys):
     (tmp_path / "file").touch()
     for where in ("file/s.splannequin", "s" * 300):
-        done = run("import", tmp_path / where, CLIP)
-        assert done.returncode == ExitCode.USAGE and "Traceback" not in done.stderr
-        assert done.stderr.startswith("Error: ") and str(tmp_path / where) in done.stderr
-        assert "Choose" in done.stderr and done.stderr.count("\n") == 1
-        done = run("train", tmp_path / where)
-        assert done.returncode != 0 and done.stderr.startswith("Error: ") and done.stderr.count("\n") == 1
+        assert cli.main(["import", str(tmp_path / where), str(CLIP)]) == ExitCode.USAGE
+        said = capsys.readouterr().err
+        assert said.startswith("Error: ") and str(tmp_path / where) in said and "Choose" in said
+        assert said.count("\n") == 1
+        assert cli.main(["train", str(tmp_path / where)]) != 0
+        said = capsys.readouterr().err
+        assert said.startswith("Error: ") and said.count("\n") == 1

@@ -66,12 +66,6 @@ def test_what_is_asked_for_without_an_option_is_each_fields_default_but_for_fini
             assert other == ({"only_missing"} if isinstance(params, contract.FreezeParams) else set())
 
 
-def test_an_overscan_that_cannot_be_is_refused_in_its_own_words(capsys):
-    with pytest.raises(SystemExit):
-        cli.parser().parse_args(["take", "s.splannequin", "--overscan", "much"])
-    assert "overscan is 0 to 100 percent, or lens, got 'much'" in capsys.readouterr().err
-
-
 def test_every_option_says_what_it_does():
     for cls in contract.PARAMS.values():
         for one, told in option_table.options_of(cls):

@@ -27,16 +27,12 @@ def test_a_measurement_is_two_numbers():
 
 @pytest.mark.parametrize(
     "verdict",
-    [
-        "good",
-        {"word": "good", "sentences": []},
-        {"word": "splendid", "sentences": ["It holds."]},
-        {"word": "good", "sentences": ["It holds.", 3]},
-        {"word": "good", "sentences": "It holds."},
-    ],
-)
+    [None, 7, "good", {}, {"word": "good"}, {"word": "best", "sentences": ["A."]}, {"word": "good", "sentences": []},
+     {"word": "good", "sentences": ["A.", 3]}, {"word": "good", "sentences": ["A."], "more": 1},
+     {"word": "good", "sentences": "A."}],
+)  # fmt: skip
 def test_a_verdict_that_cannot_be_shown_is_none(verdict):
-    assert verdict_of({"verdict": verdict}) is None
+    assert verdict_of({"verdict": verdict}) is None and verdict_lines({"verdict": verdict}, {}) == []
 
 
 def test_lines_of_two_verdicts_say_each_thing_once():

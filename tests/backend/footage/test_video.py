@@ -46,31 +46,6 @@ def test_variable_rate_has_real_timestamps(tmp_path, pan, write_video):
     assert np.allclose([f.seconds for f in got], np.array(at) / 1000)
 
 
-@pytest.mark.parametrize(("degrees", "turns"), [(90, 1), (-90, 3), (180, 2)])
-def test_rotation_metadata_is_applied(tmp_path, pan, write_video, degrees, turns):
-    frames = pan(8)
-    write_video(tmp_path / "a.mp4", frames, rotation=degrees)
-    source, got = decoded(tmp_path / "a.mp4")
-    upright = np.rot90(frames[0], turns)  # display matrices turn counterclockwise, as does rot90
-    assert (source.info.height, source.info.width) == upright.shape[:2]
-    assert close(got[0].pixels, upright, 2)
-
-
-def test_anamorphic_pixels_become_square(tmp_path, pan, write_video):
-    write_video(tmp_path / "a.mp4", pan(8), aspect=Fraction(2, 1))
-    source, got = decoded(tmp_path / "a.mp4")
-    assert (source.info.width, source.info.height) == (128, 48)
-    assert got[0].pixels.shape == (48, 128, 3)
-
-
-def test_odd_sizes(tmp_path, pan, write_video):
-    frames = pan(8, height=47, width=63)
-    write_video(tmp_path / "a.mp4", frames)
-    _, got = decoded(tmp_path / "a.mp4")
-    assert got[0].pixels.shape == (47, 63, 3)
-    assert close(got[0].pixels, frames[0], 2)
-
-
 def test_ten_bit_video_keeps_its_depth(tmp_path, frame_of_planes):
     """Planes of our own: FFmpeg's scaler writes what it reads, off by 1 of 256 both ways."""
     luma = np.linspace(64, 940, 64).round().astype(np.uint16)
@@ -86,26 +61,6 @@ def test_ten_bit_video_keeps_its_depth(tmp_path, frame_of_planes):
     assert got[0].pixels.dtype == np.uint16
     # 10 bits: one step is 64 of 65535; 8 bits would err by up to 128.
     assert np.abs(got[0].pixels[20, :, 0] - (luma - 64.0) * (65535 / 876)).max() < 16
-
-
-@pytest.mark.parametrize(("matrix", "tag"), [("bt709", 1), ("smpte170m", 6)])
-def test_the_tagged_colour_matrix_is_used(tmp_path, matrix, tag):
-    colour = np.array([200, 40, 90])
-    kr, kb = {1: (0.2126, 0.0722), 6: (0.299, 0.114)}[tag]
-    y = colour @ [kr, 1 - kr - kb, kb]
-    cb, cr = (colour[2] - y) / (2 * (1 - kb)), (colour[0] - y) / (2 * (1 - kr))
-    planes = [16 + y * 219 / 255, 128 + cb * 224 / 255, 128 + cr * 224 / 255]
-    raw = np.stack([np.full((48, 64), round(p), np.uint8) for p in planes])
-    with av.open(str(tmp_path / "a.mp4"), "w") as container:
-        stream = container.add_stream("libx264", rate=24)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
-        stream.options = {"crf": "0", "colormatrix": matrix}
-        stream.codec_context.colorspace = tag
-        for _ in range(8):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(raw, "yuv444p", channel_last=False)))
-        container.mux(stream.encode())
-    _, got = decoded(tmp_path / "a.mp4")
-    assert np.abs(got[0].pixels[24, 32].astype(int) - colour).max() <= 3
 
 
 @pytest.fixture

@@ -77,51 +77,13 @@ def test_forward_is_deterministic_and_passes_keep_their_own_state(tools, device)
     assert all(tools.relative(leaf.grad, other[name].grad) < 1e-5 for name, leaf in leaves.items())
 
 
-@pytest.mark.parametrize("cameras", [0, 1])
-@pytest.mark.parametrize("n", [0, 3])
-def test_nothing_to_see(tools, device, cameras, n):
-    scene = tools.cloud(n, 19, 18, with_depth=True, with_contributions=True, with_top=True, channels=5, degree=1)
-    scene.tensors["means"][:, 2] = -3.0
-    scene.tensors["viewmats"], scene.Ks = scene.tensors["viewmats"][:cameras], scene.Ks[:cameras]
-    out, grads = gradients(scene, device)
-    assert out.colors.shape == (cameras, 18, 19, 5)
-    assert torch.equal(out.colors, scene.tensors["background"].float().expand(cameras, 18, 19, 5))
-    assert (out.alphas == 0).all()
-    assert (out.depth_median == 1e10).all()
-    assert (out.top_ids == -1).all()
-    assert out.radii.shape == (cameras, n)
-    assert all((grad == 0).all() for name, grad in grads.items() if name != "background")
-
-
-def test_invalid_gaussians_and_cameras_leave_no_trace(tools, device):
-    scene = tools.cloud(40, 30, 22, seed=3, channels=6, degree=1)
-    truth = on_host(run(scene, device))
-    for name, value in (
-        ("means", math.nan),
-        ("quats", math.inf),
-        ("quats", 0.0),
-        ("log_scales", math.inf),
-        ("opacity_logits", math.nan),
-        ("colors", math.inf),
-        ("sh", math.nan),
-    ):
-        bad = torch.full_like(scene.tensors[name][:1], value)
-        for key, tensor in scene.tensors.items():
-            if key not in ("viewmats", "background"):
-                scene.tensors[key] = torch.cat([tensor, bad if key == name else tensor[:1]])
-    out, grads = gradients(scene, device)
-    assert torch.equal(out.colors, truth.colors)
-    assert all(
-        torch.isfinite(grad).all() and (grad[40:] == 0).all()
-        for name, grad in grads.items()
-        if name not in ("viewmats", "background")
-    )
-    # Values on a GPU are not checked; there a broken camera sees nothing.
+def test_a_camera_that_is_no_number_is_refused_on_fibers_and_sees_nothing_on_a_gpu(tools, device):
+    """Values on a GPU are not checked: the host would wait for them."""
+    scene = tools.cloud(40, 30, 22, seed=3)
+    scene.Ks = scene.Ks * math.nan
     if device.type == "cuda":
-        scene.Ks = scene.Ks * math.nan
         assert (run(scene, device).alphas == 0).all()
     else:
-        scene.Ks = scene.Ks * math.nan
         with pytest.raises(ValueError, match="must be finite"):
             run(scene, device)
 

@@ -3,22 +3,7 @@
 import pytest
 import torch
 
-from torch_backend.train.losses import photometric, psnr, ssim
-
-
-def test_ssim_range_is_one():
-    """The published code ran SSIM with data_range 255 on [0, 1] images, which made it inert."""
-    x = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(1))
-    noisy = (x + 0.1 * torch.randn(32, 32, 3, generator=torch.Generator().manual_seed(2))).clamp(0, 1)
-    assert float(1 - ssim(noisy, x)) > 0.03
-    assert float(ssim(x, x)) == pytest.approx(1.0, abs=1e-6)
-
-
-def test_small_images_fall_back_to_l1():
-    x, y = torch.zeros(7, 30, 3), torch.full((7, 30, 3), 0.25)
-    assert float(photometric(x, y, 0.2)) == pytest.approx(0.25)
-    with pytest.raises(ValueError, match="11"):
-        ssim(x, y)
+from torch_backend.train.losses import photometric, psnr
 
 
 def test_psnr_value():

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from torch_backend.contract import Verdict, summarise, verdict_lines, verdict_of
+from torch_backend.contract import Verdict, summarise, verdict_lines
 from torch_backend.freeze.take.verdict import judge_take, unsure
 
 FRAMES = list(range(1, 41))
@@ -110,16 +110,6 @@ def test_the_summary_of_a_whole_run_has_verdict_and_shares():
     assert summary["plate_share"] == pytest.approx(0.98) and summary["invented_share"] == pytest.approx(0.02)
     old = summarise("s", "c", results(), {}, 1.0)
     assert (old["verdict"], old["plate_share"], old["invented_share"]) == (["Fair. A.", "B."], None, None)
-
-
-@pytest.mark.parametrize(
-    "damaged",
-    [None, 7, "good", {}, {"word": "good"}, {"word": "best", "sentences": ["A."]}, {"word": "good", "sentences": []},
-     {"word": "good", "sentences": [3]}, {"word": "good", "sentences": ["A."], "more": 1},
-     {"word": "good", "sentences": "A."}],
-)  # fmt: skip
-def test_a_verdict_that_is_none_is_not_shown(damaged):
-    assert verdict_of({"verdict": damaged}) is None and verdict_lines({"verdict": damaged}, {}) == []
 
 
 def test_a_verdict_from_a_strange_file_is_cut_and_has_no_control_characters():
