@@ -84,13 +84,6 @@ def test_detail_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon,
     assert steps.STEPS["bake"].params(with_shot).detail == "on"
 
 
-def test_the_command_line_takes_detail(addon, tmp_path):
-    headless = addon("command_line.headless")
-    for words, expected in (([], "on"), (["--detail", "off"], "off")):
-        args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
-        assert headless.asked(args)["freeze"].detail == expected
-
-
 def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(addon, with_shot, shot):
     steps, props, take = addon("process.steps"), with_shot.splannequin, shot / "takes" / "freeze" / "take.json"
     asked = []
@@ -104,13 +97,6 @@ def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(ad
     for frames in ([6], []):  # of a ramp with many instants none is
         add(take, developed=frames)
         assert steps.STEPS["bake"].params(with_shot).develop == "on"
-
-
-def test_the_command_line_takes_develop(addon, tmp_path):
-    headless = addon("command_line.headless")
-    for words, expected in (([], "on"), (["--develop", "off"], "off")):
-        args = headless.parser().parse_args(["freeze", "a.mp4", "--output", str(tmp_path), "--device", "cpu", *words])
-        assert headless.asked(args)["freeze"].develop == expected
 
 
 def test_a_figure_stays_with_its_unit(addon):
