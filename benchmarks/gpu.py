@@ -6,7 +6,7 @@ Stages, of at most 8 minutes each; docs/gpu.md says what each answers:
   raster       W2, W3 and W4 against gsplat in one run, where a step's time goes, what a list that is too short costs,
                what a field's planes take
   training     a solved shot (--shot) on both devices, two seeds: PSNR, ms a step, how often the host waits
-  limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, views a second, a CUDA graph
+  limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, views a second
 
 Each writes DIR/gpu-STAGE.json. A part that fails is a sentence there, and the others go on; so is a part for which no
 time was left. `--only PART ...` asks for some parts of a stage. `--dry-run` carries the same code out on the processor,
@@ -531,7 +531,6 @@ def limits(stage: Stage) -> None:
     stage.part("resume", lambda: _resumed(stage), needs=30.0)
     stage.part("freeze", lambda: _frozen(stage), needs=60.0)
     stage.part("live", lambda: _live(stage), needs=20.0)
-    stage.part("graph", lambda: _graph(stage), needs=20.0)
 
 
 def _memory(stage: Stage, gb: int) -> dict[str, Any]:
@@ -632,52 +631,6 @@ def _live(stage: Stage) -> dict[str, Any]:
         session.draw(view)
         spent.append(time.perf_counter() - since)
     return {"views_per_second": round(count / sum(spent), 1), "median_ms": round(1e3 * sorted(spent)[count // 2], 2)}
-
-
-def _graph(stage: Stage) -> dict[str, Any]:
-    """A frame and its gradient captured as a CUDA graph, against the same launched one by one."""
-    size = (60, 24, 17) if stage.dry else WORKLOADS["W2"]
-    case = raster_bench._Case(room(*size), raster_bench.Body("cuda", stage.device.type))
-
-    def once() -> torch.Tensor:
-        for leaf in case.prepared.leaves.values():
-            leaf.grad = None
-        image = case.prepared.forward()
-        torch.autograd.backward(image, case.g)
-        return image.detach()
-
-    plain = once().clone()
-    gradient = case.prepared.leaves["means"].grad
-    assert gradient is not None
-    truth = gradient.clone()
-    if stage.device.type != "cuda":
-        return {"same": bool(torch.equal(plain, once())), "captured": False}
-    side = torch.cuda.Stream()
-    with torch.cuda.stream(side):
-        for _ in range(3):
-            once()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        image = once()
-    graph.replay()
-    torch.cuda.synchronize()
-    captured = case.prepared.leaves["means"].grad
-    assert captured is not None
-    since = time.perf_counter()
-    for _ in range(50):
-        graph.replay()
-    torch.cuda.synchronize()
-    replayed = (time.perf_counter() - since) / 50
-    since = time.perf_counter()
-    for _ in range(50):
-        once()
-    torch.cuda.synchronize()
-    return {
-        "same": bool(torch.equal(plain, image)), "gradient_relative": float((captured - truth).norm() / truth.norm()),
-        "captured": True, "replay_ms": round(1e3 * replayed, 3),
-        "launched_ms": round(1e3 * (time.perf_counter() - since) / 50, 3),
-    }  # fmt: skip
 
 
 STAGES: dict[str, Callable[[Stage], None]] = {

@@ -49,16 +49,6 @@ def test_a_scene_in_use_is_left_alone_without_consent(addon, scene, shot):
     assert (scene.render.resolution_x, scene.frame_end) == (16, 7)
 
 
-def test_a_button_says_what_is_wrong(addon, scene, tmp_path):
-    wrong = tmp_path / "text.mp4"
-    wrong.write_text("no video")
-    scene.splannequin.clip = str(wrong)
-    with pytest.raises(RuntimeError, match=r"text\.mp4"):
-        bpy.ops.splannequin.import_clip()
-    watch = addon("process.job_timer").watch_of(tmp_path / "text.splannequin")
-    assert watch.jobs["import"].state == "failed"
-
-
 def test_no_clip_is_said_in_words(scene):
     with pytest.raises(RuntimeError, match=r"No clip is chosen\. Choose a video or image sequence\."):
         bpy.ops.splannequin.import_clip()

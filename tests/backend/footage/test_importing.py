@@ -214,11 +214,6 @@ def test_a_step_that_leaves_too_few_is_refused(shot, clip, recorder):
     assert error.message == "A step of 10 leaves 3 frames to solve, at least 8 are needed."
 
 
-def test_negative_settings_name_their_values(shot, clip, recorder):
-    with pytest.raises(ValueError, match="-2"):
-        import_footage(shot, clip, FootageConfig(step=-2), recorder())
-
-
 @pytest.fixture
 def sequence(tmp_path, pan):
     """sequence(first): twelve numbered PNG of a pan, from that number on, alone in their folder."""
