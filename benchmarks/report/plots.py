@@ -24,8 +24,7 @@ COSTS: dict[str, tuple[str, Callable[[RunRecord], float | None]]] = {
     "megabytes": ("model, megabytes", lambda run: run.model_bytes / 1e6),
 }
 """File stem -> axis, figure of a run; less is better in all of them."""
-THEMES = {"light": ("#1d1d1f", "#d5d5da", "white"), "dark": ("#e9e9ec", "#45454c", "#1b1b1f")}
-"""Ink, grid and ground."""
+_INK, _GRID, _GROUND = "#1d1d1f", "#d5d5da", "white"
 _COLOURS = {
     "hexplane": "#2f7ed8",
     "mlp": "#c9721a",
@@ -41,7 +40,7 @@ def available() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
 
 
-def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str, theme: str = "light") -> Path | None:
+def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str) -> Path | None:
     """Mean PSNR of frozen frames against a cost in `COSTS`, one point per setting; None if no setting has both."""
     axis, read = COSTS[cost]
     points: list[tuple[Setting, float, float]] = []
@@ -51,28 +50,27 @@ def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str, t
             points.append((s, price, psnr.mean))
     if not points:
         return None
-    ink, grid, ground = THEMES[theme]
-    figure, axes = _figure((7.2, 5.0), theme)
+    figure, axes = _figure((7.2, 5.0))
     front = pareto_front([p[1] for p in points], [p[2] for p in points])
-    axes.step([points[i][1] for i in front], [points[i][2] for i in front], where="post", color=ink, lw=1, ls=":")
+    axes.step([points[i][1] for i in front], [points[i][2] for i in front], where="post", color=_INK, lw=1, ls=":")
     for i, (s, price, psnr) in enumerate(points):
-        colour = _COLOURS.get(s.host, ink)
+        colour = _COLOURS.get(s.host, _INK)
         axes.scatter(price, psnr, s=70, marker=_MARKERS[s.supervision], zorder=3, edgecolors=colour, linewidths=1.6,
-                     facecolors=colour if i in front else ground)  # fmt: skip
+                     facecolors=colour if i in front else _GROUND)  # fmt: skip
     axes.set_xscale("log")
     _limits(axes, [p[1] for p in points])
     named = [p for p in points if p[0].host == "auto" or p[0].variant != "default"]
     # Colour and marker say which host; the names of six published ones would cover one another.
     texts = [p[0].variant if p[0].variant == "reference" else p[0].label for p in named]
-    points_of = [(p[1], p[2], text, _COLOURS.get(p[0].host, ink)) for p, text in zip(named, texts, strict=True)]
+    points_of = [(p[1], p[2], text, _COLOURS.get(p[0].host, _INK)) for p, text in zip(named, texts, strict=True)]
     _labels(axes, points_of)
-    _legend(figure, [p[0] for p in points], ink)
+    _legend(figure, [p[0] for p in points])
     paces = ", ".join(sorted({pace(run) for s, _, _ in points for run in s.runs}))
     measured = "" if cost == "megabytes" else f"; threads × runs at once: {paces}"
     axes.set_xlabel(f"{axis} (logarithmic, less is better{measured})")
     axes.set_ylabel("PSNR of frozen frames, dB")
-    axes.set_title("Filled and joined: no other is better in both", fontsize=9, color=ink, loc="left")
-    axes.grid(color=grid, lw=0.6, which="both")
+    axes.set_title("Filled and joined: no other is better in both", fontsize=9, color=_INK, loc="left")
+    axes.grid(color=_GRID, lw=0.6, which="both")
     return _save(figure, path)
 
 
@@ -91,19 +89,19 @@ def _plain(value: float, position: int) -> str:
     return f"{value:g}"
 
 
-def _legend(figure: Any, settings: Sequence[Setting], ink: str) -> None:
+def _legend(figure: Any, settings: Sequence[Setting]) -> None:
     """Colours of the hosts and markers of the supervisions, under the plot."""
     Line2D: Any = importlib.import_module("matplotlib.lines").Line2D
 
     plain = {"color": "none", "markersize": 7}
     hosts = dict.fromkeys(s.host for s in settings)
-    keys = [Line2D([], [], marker="o", markerfacecolor=_COLOURS.get(h, ink), markeredgecolor="none", **plain,
+    keys = [Line2D([], [], marker="o", markerfacecolor=_COLOURS.get(h, _INK), markeredgecolor="none", **plain,
                    label=HOST_NAMES.get(h, h)) for h in hosts]  # fmt: skip
     kinds = {"none": "no anchors", "paper": "paper", "support": "support"}
     used = [name for name in kinds if any(s.supervision == name for s in settings)]
-    keys += [Line2D([], [], marker=_MARKERS[name], markerfacecolor="none", markeredgecolor=ink, **plain,
+    keys += [Line2D([], [], marker=_MARKERS[name], markerfacecolor="none", markeredgecolor=_INK, **plain,
                     label=kinds[name]) for name in used]  # fmt: skip
-    figure.legend(handles=keys, loc="outside lower center", ncols=4, frameon=False, fontsize=8, labelcolor=ink)
+    figure.legend(handles=keys, loc="outside lower center", ncols=4, frameon=False, fontsize=8, labelcolor=_INK)
 
 
 def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
@@ -229,17 +227,16 @@ def _pyplot() -> Any:
     return importlib.import_module("matplotlib.pyplot")
 
 
-def _figure(size: tuple[float, float], theme: str) -> tuple[Any, Any]:
+def _figure(size: tuple[float, float]) -> tuple[Any, Any]:
     plt = _pyplot()
-    ink, grid, ground = THEMES[theme]
-    figure, axes = plt.subplots(figsize=size, facecolor=ground, layout="constrained")
-    axes.set_facecolor(ground)
-    axes.tick_params(colors=ink, which="both", labelsize=8)
-    axes.xaxis.label.set_color(ink)
-    axes.yaxis.label.set_color(ink)
+    figure, axes = plt.subplots(figsize=size, facecolor=_GROUND, layout="constrained")
+    axes.set_facecolor(_GROUND)
+    axes.tick_params(colors=_INK, which="both", labelsize=8)
+    axes.xaxis.label.set_color(_INK)
+    axes.yaxis.label.set_color(_INK)
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(grid)
+        spine.set_color(_GRID)
     return figure, axes
 
 

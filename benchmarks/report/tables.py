@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from .hard_table import PANE_HEADER, PANE_NOTE, THING_HEADER, THING_NOTE, pane_rows, thing_rows
@@ -49,14 +49,14 @@ _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
 
 @dataclass
 class Table:
-    """A table of text, for Markdown and for the page."""
+    """A table of text, for Markdown and for report.json."""
 
     title: str
     header: list[str]
     rows: list[list[str]]
     note: str = ""
-    marks: dict[int, str] = field(default_factory=dict[int, str])
-    """Row -> win, loss or best, which the page shows in colour beside the words."""
+    best: int | None = None
+    """The row that is printed bold."""
 
 
 def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
@@ -251,14 +251,10 @@ def _who_wins(settings: Sequence[Setting]) -> Table:
     """The claims one by one: mean paired difference, its standard error, and what it cost."""
     header = ["a against b", "where", "cost a / b", "PSNR a - b, dB", "standard error", "n", "frames", "verdict"]
     rows: list[list[str]] = []
-    marks: dict[int, str] = {}
 
     def add(a: Setting, b: Setting, where: str, result: Paired | None, cost: str = "") -> None:
-        if result is None:
-            return
-        if result.verdict != "undecided":
-            marks[len(rows)] = result.verdict
-        rows.append([f"{a.label} against {b.label}", where, cost, *_paired_cells(result)])
+        if result is not None:
+            rows.append([f"{a.label} against {b.label}", where, cost, *_paired_cells(result)])
 
     for a, b in comparisons(settings):
         seconds = _times("training", a.ratio(b, lambda r: r.train_seconds))
@@ -286,7 +282,7 @@ def _who_wins(settings: Sequence[Setting]) -> Table:
         "nothing. Costs are geometric means over runs of the same scene and seed; a step's are those of the last third "
         f"of a run. {QUERY_NOTE}"
     )
-    return Table("Who wins", header, rows, note, marks)
+    return Table("Who wins", header, rows, note)
 
 
 def _frame_seconds(run: RunRecord) -> float | None:
@@ -332,7 +328,6 @@ def _paired_cells(result: Paired) -> list[str]:
 def _ablations(ablations: Sequence[Setting], main: Sequence[Setting]) -> Table:
     header = ["ablation", "of", "region", "PSNR a - b, dB", "standard error", "independent units", "frames", "verdict"]
     rows: list[list[str]] = []
-    marks: dict[int, str] = {}
     for s in ablations:
         alone = [m for m in main if m.shown == SPLATS]
         same = [m for m in alone if (m.cameras, m.preset, m.host) == (s.cameras, s.preset, s.host)]
@@ -342,11 +337,9 @@ def _ablations(ablations: Sequence[Setting], main: Sequence[Setting]) -> Table:
         for region in (WHOLE, "never_seen", "moving"):
             result = s.against(base, "psnr_db", region)
             if result is not None:
-                if result.verdict != "undecided":
-                    marks[len(rows)] = result.verdict
                 rows.append([s.variant, base.label, REGION_NAMES[region], *_paired_cells(result)])
     note = "Below zero: what was taken away helped."
-    return Table("Ablations", header, rows, note, marks)
+    return Table("Ablations", header, rows, note)
 
 
 def _real_extra(settings: Sequence[Setting]) -> Table:
@@ -379,9 +372,9 @@ def pace(run: RunRecord) -> str:
     return NONE if run.threads is None or run.jobs is None else f"{run.threads} × {run.jobs}"
 
 
-def _best(values: Sequence[float | None]) -> dict[int, str]:
+def _best(values: Sequence[float | None]) -> int | None:
     known = [(v, i) for i, v in enumerate(values) if v is not None]
-    return {max(known)[1]: "best"} if len(known) > 1 else {}
+    return max(known)[1] if len(known) > 1 else None
 
 
 def to_be_seen(setting: Setting) -> bool:
@@ -394,6 +387,6 @@ def markdown(table: Table) -> str:
     lines = [f"### {table.title}", "", "| " + " | ".join(table.header) + " |"]
     lines += ["|" + "|".join("---" if i == 0 else "---:" for i in range(len(table.header))) + "|"]
     for i, row in enumerate(table.rows):
-        cells = [f"**{c}**" if table.marks.get(i) == "best" else c for c in row]
+        cells = [f"**{c}**" if i == table.best else c for c in row]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join([*lines, "", table.note, ""])

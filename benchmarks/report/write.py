@@ -1,4 +1,4 @@
-"""The report's folder from a folder of records: report.json, report.md, plots and strips, report.html."""
+"""The report's folder from a folder of records: report.json, report.md, plots and strips."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from torch_backend.shot import write_atomic, write_json
 
 from . import plots
 from .metrics import WHOLE
-from .page import page
 from .records import DELIVERED, RunRecord, load_records, machine_facts
 from .setting import NONE, Setting
 from .tables import Table, all_tables, markdown, pace, settings_of, to_be_seen
@@ -42,22 +41,19 @@ def write_report(
     folder.mkdir(parents=True, exist_ok=True)
     tables = all_tables(records)
     settings = [s for kind in ("synthetic", "real") for s in settings_of(records, kind)]
-    drawn: list[tuple[str, Path, Path]] = []
-    figures: list[tuple[str, Path]] = []
+    pictures: list[tuple[str, Path]] = []
     if plots.available():
-        drawn, figures = _plots(records, folder), _figures(settings, results, folder)
+        pictures = [*_plots(records, folder), *_figures(settings, results, folder)]
     else:
         missing.append("There are no plots: matplotlib is not installed (requirements/bench.txt).")
     facts = _facts(records, command)
     write_json(folder / "report.json", _json(records, tables, missing, command))
-    _write(folder / "report.md", _markdown(facts, missing, tables, drawn, figures, folder))
-    if plots.available():
-        _write(folder / "report.html", page(TITLE, facts, missing, tables, drawn, figures, settings, results))
+    write_atomic(folder / "report.md", _markdown(facts, missing, tables, pictures, folder).encode("utf-8"))
     return folder / "report.md"
 
 
 def _facts(records: Sequence[RunRecord], command: str) -> list[str]:
-    """Lines of HTML (which Markdown takes as well): runs, machines, dates, command."""
+    """Lines of Markdown, with HTML in it: runs, machines, dates, command."""
     machines = sorted({f"{r.machine['processor']}, {r.machine['cores']} cores" for r in records if r.machine})
     dates = sorted(r.finished for r in records if r.finished)
     scenes = sorted({f"{r.scene} ({r.kind}, {r.cameras} cameras)" for r in records})
@@ -70,17 +66,14 @@ def _facts(records: Sequence[RunRecord], command: str) -> list[str]:
     return [*lines, f"Command: <code>{html.escape(command)}</code>"] if command else lines
 
 
-def _plots(records: Sequence[RunRecord], folder: Path) -> list[tuple[str, Path, Path]]:
-    drawn: list[tuple[str, Path, Path]] = []
+def _plots(records: Sequence[RunRecord], folder: Path) -> list[tuple[str, Path]]:
+    drawn: list[tuple[str, Path]] = []
     for kind, region in (("synthetic", WHOLE), ("real", RIGID)):
         settings = [s for s in settings_of(records, kind) if s.variant in ("default", "reference") and to_be_seen(s)]
         for cost, (axis, _) in plots.COSTS.items():
-            paths = [
-                plots.cost_plot(folder / f"{kind}_{cost}{suffix}.png", settings, cost, region, theme)
-                for suffix, theme in (("", "light"), ("_dark", "dark"))
-            ]
-            if paths[0] and paths[1]:
-                drawn.append((f"PSNR of frozen frames ({kind}) against {axis}", paths[0], paths[1]))
+            path = plots.cost_plot(folder / f"{kind}_{cost}.png", settings, cost, region)
+            if path is not None:
+                drawn.append((f"PSNR of frozen frames ({kind}) against {axis}", path))
     return drawn
 
 
@@ -117,15 +110,13 @@ def _markdown(
     facts: Sequence[str],
     missing: Sequence[str],
     tables: Sequence[Table],
-    drawn: Sequence[tuple[str, Path, Path]],
-    figures: Sequence[tuple[str, Path]],
+    pictures: Sequence[tuple[str, Path]],
     folder: Path,
 ) -> str:
     lines = [f"# {TITLE}", "", "  \n".join(facts), ""]
     if missing:
         lines += ["## What is missing", "", *(f"- {sentence}" for sentence in missing), ""]
     lines += ["## Tables", "", *(markdown(table) for table in tables)]
-    pictures = [(name, light) for name, light, _ in drawn] + list(figures)
     if pictures:
         lines += ["## Pictures", ""]
         lines += [f"![{name}]({path.relative_to(folder).as_posix()})\n" for name, path in pictures]
@@ -144,7 +135,3 @@ def _json(
         "tables": [dataclasses.asdict(table) for table in tables],
         "runs": [dataclasses.asdict(record) for record in records],
     }
-
-
-def _write(path: Path, text: str) -> None:
-    write_atomic(path, text.encode("utf-8"))

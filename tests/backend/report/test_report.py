@@ -4,8 +4,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -143,7 +141,7 @@ def test_means_are_those_of_the_frames(results, report):
     assert float(row[4]) == pytest.approx(np.mean(values), abs=0.006)
     assert float(row[7]) == pytest.approx(np.mean(sorted(values)[:6]), abs=0.006)
     assert float(row[8]) == pytest.approx(min(values), abs=0.006)
-    assert quality["marks"] == {str([r[0] for r in quality["rows"]].index("auto (ours), plate detail")): "best"}
+    assert quality["rows"][quality["best"]][0] == "auto (ours), plate detail"
 
 
 def test_what_is_compared_with_what(results):
@@ -232,67 +230,10 @@ def test_no_record_no_report(tmp_path):
 
 def test_plots_strips_and_pictures_are_there(report):
     names = {p.name for p in report.glob("*.png")}
-    assert {f"synthetic_{c}{t}.png" for c in ("seconds", "frame_ms", "megabytes") for t in ("", "_dark")} <= names
+    assert {f"synthetic_{cost}.png" for cost in ("seconds", "frame_ms", "megabytes")} <= names
     for scene in ("room-3-exact", "ground-1-exact"):
         assert {f"{scene}_{what}.png" for what in ("methods", "worst", "two_instants")} <= names
     text = (report / "report.md").read_text()
+    assert "bench &lt;quick&gt;" in text and "<quick>" not in text
     for name in re.findall(r"\]\(([^)]+)\)", text):
         assert (report / name).is_file()
-
-
-class Outside(HTMLParser):
-    """Collects addresses that a page would load, and whether every picture and slider says what it is."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.loads: list[str] = []
-        self.pictures: list[str] = []
-        self.sliders = 0
-
-    def handle_starttag(self, tag, attrs):
-        values = dict(attrs)
-        for name in ("src", "srcset", "href", "data"):
-            if values.get(name) and not values[name].startswith(("data:", "#")):
-                self.loads.append(values[name])
-        if tag == "img":
-            assert values.get("alt")
-            self.pictures += [values["data-picture"]] if "data-picture" in values else []
-        if tag == "input":
-            assert values["type"] == "range" and values["aria-label"]
-            self.sliders += 1
-
-
-def test_the_page_needs_nothing_from_outside(report):
-    text = (report / "report.html").read_text()
-    page = Outside()
-    page.feed(text)
-    assert page.loads == [] and "http://" not in text and "https://" not in text and "@import" not in text
-    # 20 runs of six pictures; the four of `auto` as splats, developed and delivered.
-    assert page.sliders == (20 + 2 * 4) * 6 and len(page.pictures) == 2 * page.sliders
-    data = json.loads(re.search(r'id="pictures">(.*?)</script>', text, re.S).group(1))
-    assert set(page.pictures) == set(data) and all(v.startswith("data:image/jpeg;base64,") for v in data.values())
-    assert "bench &lt;quick&gt;" in text and "<quick>" not in text
-
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-def test_the_page_works_in_a_browser(report, tmp_path):
-    """Chromium runs its script: every picture decodes, and a slider that is moved moves its cut."""
-    probe = """<script>addEventListener("load", () => {
-      const images = [...document.images].filter((i) => i.loading !== "lazy");
-      const bad = images.filter((i) => !i.complete || !i.naturalWidth).length;
-      const slider = document.querySelector(".frame input");
-      slider.value = 20; slider.dispatchEvent(new Event("input"));
-      const cut = getComputedStyle(slider.previousElementSibling).getPropertyValue("--cut");
-      document.title = `bad ${bad} of ${images.length}, cut ${cut}, wide ${document.body.scrollWidth > innerWidth}`;
-    });</script></body>"""
-    page = tmp_path / "probe.html"
-    page.write_text((report / "report.html").read_text().replace("</body>", probe))
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"]
-    command += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
-    command += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1200,900", "--virtual-time-budget=20000"]
-    ran = subprocess.run([*command, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=180)
-    title = re.search(r"<title>(.*?)</title>", ran.stdout).group(1)
-    assert re.fullmatch(r"bad 0 of \d+, cut 20%, wide false", title), title
