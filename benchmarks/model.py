@@ -38,7 +38,6 @@ from benchmarks.sources import in_words
 from benchmarks.training_step import _Silent
 from torch_backend.contract import TrainParams
 from torch_backend.deformation import planes
-from torch_backend.footage.images import write_png
 from torch_backend.freeze.frozen import FrozenGaussians, FrozenImage, freeze_at, render_frozen
 from torch_backend.freeze.instant.instants import config_for, developed
 from torch_backend.freeze.instant.repairs import Moment, repaired, repairs
@@ -179,16 +178,6 @@ def nearest_trained(trainer: Trainer, frame: int) -> int:
     return min(trainer.train_ids, key=lambda i: abs(trainer.scene.frames[i] - frame))
 
 
-def strips(judge: Judge, folder: Path, scenes: Sequence[FrozenGaussians]) -> None:
-    """Plate, and each frozen scene: a picture per held-out frame, at 100 %."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, plate in judge.images.items():
-        shown = [plate, *(over_grey(judge.seen(frozen, index)) for frozen in scenes)]
-        strip = torch.cat(shown, dim=1).clamp(0.0, 1.0)
-        name = f"{judge.scene.frames[index]:06d}.png"
-        write_png(folder / name, (strip * 255.0).round().byte().contiguous().numpy())
-
-
 def configured(args: argparse.Namespace, shot: Shot) -> TrainConfig:
     """The configuration that is asked for, or that of the trained run that is."""
     if args.run:
@@ -205,7 +194,7 @@ def trained(args: argparse.Namespace, shot: Shot, config: TrainConfig) -> tuple[
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     images, mattes = load_images(scene, train, width, height), functools.partial(load_motion, shot)
-    movers = None if args.no_mattes else load_movers(mattes, scene, train, width, height)
+    movers = load_movers(mattes, scene, train, width, height)
     for module in (raster_cpu, ssim, adam, planes):
         module.warm_up()
     since, left = time.process_time(), args.results / f"{args.name}.safetensors"
@@ -256,16 +245,12 @@ def spread(indices: Sequence[int], count: int) -> list[int]:
 def judged(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge], t_stars: list[int]) -> dict[str, Any]:
     """Rows of the frozen frames by size, before and after developing: {"field": {"small": [...], ...}, ...}."""
     rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    scenes = []
     for kind in ("field", "developed") if args.develop else ("field",):
         rows[kind] = {size: [] for size in judges}
         for index in t_stars:
             frozen = getattr(freezer, kind)(index)
-            scenes.append(frozen)
             for size, judge in judges.items():
                 rows[kind][size] += [{"t_star": index, **row} for row in judge.frozen(frozen, index)]
-    if args.strips:
-        strips(judges["large"], args.results / f"strips-{args.name}", scenes)
     return rows
 
 
@@ -322,8 +307,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--iterations", type=int, default=0, help="0: the preset's")
     parser.add_argument("--width", type=int, default=0, help="0: the preset's")
     parser.add_argument("--t-star", type=int, default=8, help="frame; the other instant is half a clip away")
-    parser.add_argument("--no-mattes", action="store_true", help="train without the motion mattes (they still judge)")
-    parser.add_argument("--strips", action="store_true", help="write pictures")
     parser.add_argument("--set", nargs="*", default=[], metavar="FIELD=VALUE")
     parser.add_argument("--again", action="store_true", help="judge what an earlier call trained")
     parser.add_argument("--develop", action="store_true", help="develop the instants too")

@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.mattes import best_poses, faces_of_people, lassos, overlap, person_masks, table
-from benchmarks.synthetic.draw import AMBIENT, LIGHT, Painter, draw
 from benchmarks.synthetic.folder import SyntheticScene
-from benchmarks.synthetic.rays import RayScene
-from benchmarks.synthetic.sizes import SIZES
 from benchmarks.two_instants import BASE, INSTANT, UNKNOWN, figures, owners
-from torch_backend.footage.images import write_png
 
 
 def disc(radius=20.0, size=64):
@@ -94,31 +90,3 @@ def test_what_two_instants_cost_is_counted_over_all_pixels():
     rows = [{"regions": {"whole": [10, 0.1, 0.01]}}, {"regions": {"whole": [10, 0.1, 0.19]}}]
     assert figures(rows, "whole") == pytest.approx((20.0, 20.0))
     assert figures([{"regions": {"person": [0, 0.0, 0.0]}}], "person") is None
-
-
-def test_a_drawn_picture_has_the_texture_of_the_surface_and_the_sky(tmp_path):
-    (tmp_path / "geometry").mkdir()
-    (tmp_path / "textures").mkdir()
-    picture = np.zeros((2, 2, 3), np.uint8)
-    picture[0, 0], picture[1, 1] = (255, 0, 0), (0, 255, 0)  # top left, bottom right
-    write_png(tmp_path / "textures" / "one.png", picture)
-    plan = {"materials": [{"file": "one.png"}], "movers": [], "seed": 0, "kind": "plain", "key": ""}
-    (tmp_path / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
-    corners = np.array([[-1, -1, 2], [3, -1, 2], [-1, 3, 2]], np.float32)
-    uv = np.array([[[0, 1], [2, 1], [0, -1]]], np.float32)  # v goes up, y goes down: a texture is a square of 2
-    material = np.zeros(1, int)
-    np.savez(tmp_path / "geometry" / "static.npz", vertices=corners, triangles=[[0, 1, 2]], uv=uv, material=material)
-    rays = np.array([[-0.4, -0.4, 1.0], [0.1, 0.1, 1.0], [0.0, 0.0, -1.0]])
-    shown = Painter(tmp_path).paint(RayScene(corners, np.array([[0, 1, 2]])), np.zeros(3), rays)
-    lit = AMBIENT + (1.0 - AMBIENT) * LIGHT[2] / np.linalg.norm(LIGHT)
-    assert np.allclose(shown[:2], [[lit, 0.0, 0.0], [0.0, lit, 0.0]], atol=1e-5) and shown[2, 2] == 1.0
-    with pytest.raises(ValueError, match="other frames"):
-        draw(_named(tmp_path), tmp_path, SIZES["paper"])
-
-
-def _named(folder):
-    """A scene folder in a folder that is called like its size."""
-    place = folder / "quick" / "x"
-    place.mkdir(parents=True)
-    (place / "plan.json").write_text((folder / "plan.json").read_text(encoding="utf-8"), encoding="utf-8")
-    return place
