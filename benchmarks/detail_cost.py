@@ -169,19 +169,8 @@ def summary(found: dict[str, Any]) -> dict[str, Any]:
             "splats": splats}  # fmt: skip
 
 
-def linear_fit(pixels: Sequence[float], seconds: Sequence[float]) -> tuple[float, float, float]:
-    """(seconds at no pixels, seconds per million pixels, greatest deviation as a share of the seconds measured).
-
-    Sizes count alike: deviations are taken relative to what was measured.
-    """
-    x, y = np.array(pixels) / 1e6, np.array(seconds)
-    design = np.stack([np.ones_like(x), x], axis=1) / y[:, None]
-    (base, slope), *_ = np.linalg.lstsq(design, np.ones_like(y), rcond=None)
-    return float(base), float(slope), float(np.abs((base + slope * x) / y - 1.0).max())
-
-
 def table(sizes: Sequence[dict[str, Any]]) -> list[str]:
-    """A row per size and number of frames in Markdown, and the line through the sizes."""
+    """A row per size and number of frames in Markdown."""
     header = ["size", "frames", "s per frame, median", "least", "most", "the first", "of it splats", "allowed"]
     header += ["peak MB", "before"]
     lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
@@ -190,11 +179,6 @@ def table(sizes: Sequence[dict[str, Any]]) -> list[str]:
         cells = [f"{s[name]:.2f}" for name in ("median", "least", "most", "first", "splats")]
         cells += ["–" if allowed is None else f"{allowed:g}", f"{of['peak_mb']:.0f}", f"{of['before_mb']:.0f}"]
         lines.append(f"| {of['width']}x{of['height']} | {len(of['frames'])} | {' | '.join(cells)} |")
-    longest = list({of["width"]: of for of in sizes}.values())
-    if len(longest) > 1:
-        points = [of["width"] * of["height"] for of in longest], [of["summary"]["median"] for of in longest]
-        base, slope, off = linear_fit(*points)
-        lines += ["", f"{base:.2f} s + {slope:.2f} s per million pixels; off by {100 * off:.0f} % at most."]
     return lines
 
 

@@ -228,26 +228,6 @@ def excesses(freeze: dict[str, Any], what: str) -> list[float]:
     return [row[what]["excess"] for row in freeze["frames"] if row[what]["excess"] is not None]
 
 
-def verdicts(freezes: Sequence[dict[str, Any]]) -> list[str]:
-    """Sentences: whether each freeze is as still, and as steady, as acceptance asks."""
-    sentences = []
-    for freeze in freezes:
-        delivered, plate = freeze["clip"]["delivered"], freeze["clip"]["plate"]
-        more = excesses(freeze, "delivered")
-        if not more:
-            sentences.append(f"t* {freeze['t_star']}: nothing moves in these frames, or nothing is still.")
-            continue
-        mean, together = statistics.fmean(more), delivered["excess_px"]
-        steady = delivered["moving"]["unsteady_255"] <= plate["still"]["unsteady_255"]
-        reading = f"{mean:+.2f} px against still pixels of the same frame ({together:+.2f} over all frames together)"
-        sentences.append(
-            f"t* {freeze['t_star']}: what moved reads {reading}, which is "
-            f"{'within' if mean <= ALLOWED else 'more than'} {ALLOWED} px; it is "
-            f"{'no less' if steady else 'less'} steady than the plate's still pixels."
-        )
-    return sentences
-
-
 def pairs_of(clip: DetailClip, args: argparse.Namespace) -> list[tuple[int, int]]:
     """Neighbouring frames of the clip: all, those from each of `--frames`, or every `--every`-th pair."""
     frames = clip.frames
@@ -272,7 +252,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     result = {"version": 1, "shot": str(args.shot), "run": args.run, "develop": args.develop, "freezes": freezes}
     result["motion_from"] = clip.motion_from
     write_json(args.results / f"flow-{name}.json", result | {"seconds": time.perf_counter() - since})
-    print("\n".join(["", *table(name, freezes), "", *verdicts(freezes), f"What moves: {clip.motion_from}."]))
+    print("\n".join(["", *table(name, freezes), "", f"What moves: {clip.motion_from}."]))
 
 
 if __name__ == "__main__":
