@@ -60,6 +60,7 @@ SECONDS = 480.0
 """Of a stage."""
 TESTS = (
     "tests/backend/raster/test_cuda.py",
+    "tests/backend/deformation/test_planes.py",
     "tests/backend/deformation/test_planes_cuda.py",
     "tests/backend/raster/test_ssim_cuda.py",
     "tests/backend/train/test_device.py",

@@ -1,112 +1,178 @@
-"""The compiled planes against torch's grid_sample and autograd at float64."""
+"""The compiled planes of each body against torch's grid_sample and autograd at float64: the processor's, and the GPU's
+on Warp's cpu device everywhere and on a GPU if there is one.
+
+What a GPU compiles of them, run on the CPU: tests/backend/raster/test_device_text.py.
+"""
+
+import math
 
 import pytest
 import torch
 
-from torch_backend.deformation import HexPlane, HexPlaneConfig, planes
+from torch_backend.deformation import HexPlane, HexPlaneConfig, planes, planes_cuda
+
+BODIES = {"cpu": (planes, "cpu"), "fibers": (planes_cuda, "cpu"), "gpu": (planes_cuda, "cuda")}
+"""Body: module, device."""
+BOUNDS = {"cpu": (1e-5, 1e-4), "fibers": (2e-6, 1e-5), "gpu": (2e-6, 1e-5)}
+"""Body: relative error of values and gradients of planes, and of gradients of points."""
+no_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 
 
-def field(features=16, levels=(1, 2), dtype=torch.float32, seed=0, published=False):
-    config = HexPlaneConfig(features=features, resolution=9, levels=levels, time_nodes=7, published=published)
-    made = HexPlane(config, torch.tensor([[-1.0, -2, -1], [1, 1, 3]]), torch.Generator().manual_seed(seed))
-    g = torch.Generator().manual_seed(seed + 1)
-    with torch.no_grad():
-        for plane in [*made.spatial, *made.temporal]:
-            plane += 0.3 * torch.randn(plane.shape, generator=g)
-    return made.to(dtype)
+def on_every_body(*rows):
+    """Parameters (body, *row) of the rows that a body takes: the processor's wants a multiple of 16 features."""
+    return [
+        pytest.param(body, *row, marks=no_gpu if body == "gpu" else ())
+        for body in BODIES
+        for row in rows
+        if body != "cpu" or row[0] % 16 == 0
+    ]
+
+
+def fields(features=16, levels=(1, 2), time_nodes=7, **more):
+    """The same field twice, with planes that nothing repeats in: float32 and float64. Published: points are pulled."""
+    made = []
+    for dtype in (torch.float32, torch.float64):
+        config = HexPlaneConfig(
+            features=features, resolution=9, levels=levels, time_nodes=time_nodes, published=True, **more
+        )
+        field = HexPlane(config, torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), torch.Generator().manual_seed(0))
+        g = torch.Generator().manual_seed(1)
+        with torch.no_grad():
+            for plane in field._by_level():
+                plane += 0.3 * torch.randn(plane.shape, generator=g)
+        made.append(field.to(dtype))
+    return made
 
 
 def points(count=301):
-    """Means inside and beyond the box, some exactly on nodes and rims, and times at both ends."""
-    g = torch.Generator().manual_seed(2)
-    means = 1.5 * torch.randn(count, 3, generator=g)
-    means[:3] = torch.tensor([[-1.0, -2, -1], [1, 1, 3], [0, -0.5, 1]])
-    times = torch.rand(count, generator=g)
-    times[:2] = torch.tensor([0.0, 1.0])
-    return means, times
+    """[count, 4] in and beyond [-1, 1]; the first lie on nodes and rims."""
+    where = 1.2 * torch.randn(count, 4, generator=torch.Generator().manual_seed(2))
+    where[:4] = torch.tensor([[-1.0, -1, -1, -1], [1, 1, 1, 1], [0, 0.25, -0.5, 0], [1, -1, 1, 0]])
+    return where
 
 
-@pytest.mark.parametrize("features", [16, 48])
-def test_samples_and_their_gradients_match_float64(features):
-    ours, exact = field(features), field(features, dtype=torch.float64)
-    assert planes.supports(ours._by_level())
-    assert not planes.supports(exact._by_level())
-    means, times = points()
-    got, want = ours.features_at(means, times), exact.features_at(means.double(), times.double())
-    torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-5)  # products of planes round 1
-    pull = torch.randn(got.shape, generator=torch.Generator().manual_seed(3))
-    got.backward(pull)
-    want.backward(pull.double())
-    for p, q in zip(ours._by_level(), exact._by_level(), strict=True):
-        assert float((p.grad - q.grad).norm()) <= 1e-5 * float(q.grad.norm())
+def on(device, field):
+    return [p.detach().to(device).requires_grad_() for p in field._by_level()]
 
 
-@pytest.mark.parametrize("features", [16, 48])
-def test_the_published_lookup_pulls_points_as_float64_does(features):
-    ours, exact = field(features, published=True), field(features, dtype=torch.float64, published=True)
-    means, times = points()
-    # On a node and on the rim the slope is one-sided, and rounding decides which side.
-    means, times = means[3:], times[3:]
-    x, y = means.clone().requires_grad_(), means.double().requires_grad_()
-    s, t = times.clone().requires_grad_(), times.double().requires_grad_()
-    pull = torch.randn(len(means), 2 * features, generator=torch.Generator().manual_seed(3))
-    ours.features_at(x, s).backward(pull)
-    exact.features_at(y, t).backward(pull.double())
-    assert float(y.grad.norm()) > 1.0
-    assert float((x.grad - y.grad).norm()) <= 1e-4 * float(y.grad.norm())
-    assert float((s.grad - t.grad).norm()) <= 1e-4 * float(t.grad.norm())
-    outside = ((means < ours.box[0]) | (means > ours.box[1])).all(1)
-    assert bool(outside.any())
-    assert not x.grad[outside].any()
+def relative(value, truth):
+    return float((value.detach().cpu().double() - truth.detach()).norm() / truth.detach().norm())
 
 
-def test_penalty_and_its_gradient_match_float64():
-    ours, exact = field(), field(dtype=torch.float64)
-    got, want = ours.regularisation(), exact.regularisation()
-    assert float(got.detach()) == pytest.approx(float(want.detach()), rel=1e-6)
+@pytest.mark.parametrize(
+    ("body", "features", "levels", "time_nodes"),
+    on_every_body((16, (1, 2), 7), (5, (1,), 7), (48, (1, 2), 2), (8, (1,), 1)),
+)
+def test_samples_and_every_gradient_match_float64(body, features, levels, time_nodes):
+    module, device = BODIES[body]
+    ours, exact = fields(features, levels, time_nodes)
+    where, (bound, bound_of_points) = points(), BOUNDS[body]
+    got = module.features(where.to(device), on(device, ours))
+    want = exact.features_at(where[:, :3].double(), where[:, 3].double())
+    assert got.shape == (len(where), features * len(levels))
+    assert relative(got, want) <= bound
+    # On a node and on the rim a point's slope is one-sided, and rounding decides which side.
+    here, leaves = where[4:].to(device).requires_grad_(), on(device, ours)
+    there, time = (where[4:, part].double().requires_grad_() for part in (slice(0, 3), 3))
+    pull = torch.randn(len(here), got.shape[1], generator=torch.Generator().manual_seed(3))
+    module.features(here, leaves).backward(pull.to(device))
+    exact.features_at(there, time).backward(pull.double())
+    for p, q in zip(leaves, exact._by_level(), strict=True):
+        assert p.grad.stride() == p.stride()
+        assert relative(p.grad, q.grad) <= bound
+    assert relative(here.grad[:, :3], there.grad) <= bound_of_points
+    if time_nodes > 1:
+        assert relative(here.grad[:, 3], time.grad) <= bound_of_points
+    else:
+        assert not here.grad[:, 3].any()
+    outside = (where[4:].abs() > 1).all(1)
+    assert bool(outside.any()) and not here.grad.cpu()[outside].any()
+
+
+@pytest.mark.parametrize(("body", "features"), on_every_body((16,), (5,)))
+def test_the_penalty_and_its_gradient_match_float64(body, features):
+    module, device = BODIES[body]
+    ours, exact = fields(features, time_l1=0.1, smooth_space=0.3, smooth_time=0.2)
+    leaves = on(device, ours)
+    got = module.penalty(leaves, [*[(0.3, 0.0, 0.0)] * 3, *[(0.2, 0.0, 0.1)] * 3] * 2)
+    want = exact.regularisation()
+    assert relative(got, want) <= 1e-6
     (3.0 * got).backward()
     (3.0 * want).backward()
-    for p, q in zip(ours._by_level(), exact._by_level(), strict=True):
-        assert float((p.grad - q.grad).norm()) <= 1e-5 * float(q.grad.norm())
+    for p, q in zip(leaves, exact._by_level(), strict=True):
+        assert relative(p.grad, q.grad) <= BOUNDS[body][0]
 
 
-def test_planes_of_two_nodes_do_not_bend():
-    flat = torch.nn.Parameter(torch.rand(1, 16, 2, 2).contiguous(memory_format=torch.channels_last))
-    value = planes.penalty([flat], [(1.0, 1.0, 0.0)])
+def test_the_penalty_bends_along_rows_on_both_bodies():
+    ours, _ = fields()
+    weights = [(0.3, 0.7, 0.2)] * 12
+    leaves, others = on("cpu", ours), on("cpu", ours)
+    got, want = planes_cuda.penalty(leaves, weights), planes.penalty(others, weights)
+    assert float(got.detach()) == pytest.approx(float(want.detach()), rel=1e-6)
+    got.backward()
+    want.backward()
+    for p, q in zip(leaves, others, strict=True):
+        torch.testing.assert_close(p.grad, q.grad, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("module", "shape"),
+    [(planes, (1, 16, 2, 2)), *((planes_cuda, s) for s in ((1, 16, 2, 2), (1, 4, 1, 1), (1, 4, 3, 1)))],
+)
+def test_planes_of_few_nodes_bend_where_they_have_three(module, shape):
+    leaf = torch.rand(shape, generator=torch.Generator().manual_seed(5))
+    leaf = leaf.contiguous(memory_format=torch.channels_last).requires_grad_()
+    value = module.penalty([leaf], [(1.0, 1.0, 0.0)])
     value.backward()
-    assert float(value.detach()) == 0.0
-    assert float(flat.grad.abs().max()) == 0.0
+    bends = shape[2] >= 3
+    assert (float(value.detach()) > 0.0) == bends == bool(leaf.grad.any())
 
 
 def test_any_number_of_threads_gives_the_same_bits():
-    where = torch.rand(501, 4, generator=torch.Generator().manual_seed(4)) * 2.4 - 1.2
+    where, (field, _) = points(501), fields()
     results = []
     for threads in (1, 2, 3, 8):
-        ours, at = field()._by_level(), where.clone().requires_grad_()
+        ours, at = on("cpu", field), where.clone().requires_grad_()
         value = planes.features(at, ours, threads)
         (value.square().sum() + planes.penalty(ours, [(1.0, 0.5, 0.2)] * 12, threads)).backward()
         results.append(torch.cat([value.detach().flatten(), *(p.grad.flatten() for p in (at, *ours))]))
     assert all(torch.equal(results[0], other) for other in results[1:])
 
 
-def test_a_gaussian_at_nan_stays_inside_the_planes():
-    value = planes.features(torch.full((3, 4), float("nan")), field()._by_level())
-    assert bool(torch.isfinite(value).all())
-
-
-def test_no_points_at_all():
-    ours = field()
-    value = ours.features_at(torch.zeros(0, 3), torch.zeros(0))
+@pytest.mark.parametrize("module", [planes, planes_cuda])
+@pytest.mark.parametrize("odd", [math.nan, math.inf, -math.inf])
+def test_a_point_that_is_nowhere_stays_on_the_rim(module, odd):
+    ours, _ = fields()
+    leaves, where = on("cpu", ours), torch.full((3, 4), odd, requires_grad=True)
+    value = module.features(where, leaves)
+    rim = module.features(torch.full((3, 4), 1.0 if odd > 0 else -1.0), leaves)
+    assert torch.equal(value, rim)
     value.sum().backward()
-    assert value.shape == (0, 32)
-    assert float(ours.spatial[0].grad.abs().max()) == 0.0
+    assert not where.grad.any() and all(bool(p.grad.isfinite().all()) for p in leaves)
 
 
-def test_other_planes_are_refused_here_and_taken_by_torch():
-    odd = field(features=5)
+@pytest.mark.parametrize(("body", "features"), on_every_body((16,)))
+def test_no_points_at_all(body, features):
+    module, device = BODIES[body]
+    ours, _ = fields(features)
+    leaves = on(device, ours)
+    value = module.features(torch.zeros(0, 4, device=device), leaves)
+    value.sum().backward()
+    assert value.shape == (0, 32) and not any(bool(p.grad.any()) for p in leaves)
+
+
+def test_other_planes_are_refused_by_the_processors_body_and_taken_by_torch():
+    (ours, exact), (odd, _) = fields(), fields(features=5)
+    assert planes.supports(ours._by_level()) and not planes.supports(exact._by_level())
     with pytest.raises(ValueError, match="16"):
         planes.features(torch.zeros(1, 4), odd._by_level())
     with pytest.raises(ValueError, match="16"):
         planes.penalty(odd._by_level(), [(1.0, 1.0, 1.0)] * 12)
-    assert odd.features_at(*points(3)).shape == (3, 10)
+    assert odd.features_at(torch.zeros(3, 3), torch.zeros(3)).shape == (3, 10)
     assert float(odd.regularisation().detach()) > 0.0
+
+
+def test_a_field_gives_its_planes_to_the_compiled_body():
+    ours, _ = fields()
+    where = points()
+    assert torch.equal(ours.features_at(where[:, :3], where[:, 3]), planes.features(where, ours._by_level()))
