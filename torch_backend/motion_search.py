@@ -67,6 +67,7 @@ def find_motion(
     with scored_ahead(clip, config, written, report) as scored:
         labels_of = Labels(clip, _static_views(shot, static_model, report), config)
         for count, frame in enumerate(scored, start=len(written) + 1):
+            report.check_cancelled()
             n, labels = frame.index, labels_of(frame)
             ignored, people = (load_mask(shot, kind, clip.frames[n]) for kind in (IGNORE, PEOPLE))
             if frame.evidence is not None:
