@@ -43,6 +43,8 @@ class Request:
         """The pictures have no lens any more: the model's bend stays at nothing."""
         self.masks = data.get("masks", "")
         """Folder of COLMAP's masks; empty: nothing is masked."""
+        self.match: list[str] = data.get("match", [])
+        """Pairs of names that this worker is to match, and nothing else; empty: it solves."""
         self.known: dict[str, Any] | None = data.get("known")
         self.peak: float = data.get("peak", 0.0)
         """Least contrast of a feature; 0: COLMAP's own."""

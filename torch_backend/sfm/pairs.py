@@ -1,0 +1,109 @@
+"""Matches of listed image pairs, by several processes: OpenBLAS in pycolmap's wheel does not bear two threads.
+
+Two threads at once in the sgemm of pycolmap 4.2.1 get wrong products (18 of 15,000; alone 0 of 6000): now and then two
+pairs lose half of their matches, and the cameras differ. So one thread of each process matches, another one verifies.
+A pair's matches depend on its two images alone: the database is the same to the byte for any number of processes.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import pycolmap
+
+from ..contract import REQUEST_FILE, python_child
+from . import colmap_types as colmap
+from .request import SEED, Request, closing_database, say
+
+MOST_PROCESSES = 4
+"""Each has a copy of the database, of 0.5 MB a frame, and builds the search trees of its frames anew."""
+LEAST_PAIRS = 100
+"""Pairs for which a process is worth its start of about a second; a pair takes 12 to 30 ms."""
+
+BLOCK = 64
+"""Pairs between which COLMAP tells its progress and forgets the search trees: of 405 pairs, blocks of 8 take 9.5 s of
+the processor, of 64 7.6, of 1024 7.6."""
+
+
+def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str = "other matches") -> None:
+    """Matches each image with those that it is listed with; what the database has of them stays."""
+    say(stage=stage)
+    lines = [f"{name} {other}" for name, others in pairs.items() for other in others]
+    count = max(1, min(request.threads, MOST_PROCESSES, len(lines) // LEAST_PAIRS))
+    parts = [lines[len(lines) * n // count : len(lines) * (n + 1) // count] for n in range(count)]
+    with ExitStack() as stack:
+        others = [stack.enter_context(_Helper(request, part, number)) for number, part in enumerate(parts[1:], start=1)]
+        match_lines(request, parts[0])
+        left = [line for other in others if not other.done() for line in other.lines]
+    if left:  # a helper that broke, maybe for want of memory
+        match_lines(request, left)
+
+
+def match_lines(request: Request, lines: Sequence[str]) -> None:
+    """Matches the pairs "name other" in this process."""
+    listing = request.scratch / "pairs.txt"
+    listing.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = 1
+    geometry = pycolmap.TwoViewGeometryOptions()
+    geometry.ransac.random_seed = SEED
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listing
+    pairing.block_size = BLOCK
+    colmap.match_image_pairs(request.database, options, pairing, geometry)
+
+
+class _Helper:
+    """A worker that matches some of the pairs in a copy of the database, which is gone after a `with` block."""
+
+    def __init__(self, request: Request, lines: Sequence[str], number: int) -> None:
+        self.lines, self._request = lines, request
+        self._folder = request.scratch / f"pairs_{number}"
+
+    def __enter__(self) -> _Helper:
+        self._folder.mkdir()
+        shutil.copyfile(self._request.database, self._folder / self._request.database.name)
+        asked = json.loads((self._request.scratch / REQUEST_FILE).read_text(encoding="utf-8"))
+        file = self._folder / REQUEST_FILE
+        file.write_text(json.dumps({**asked, "match": self.lines}), encoding="utf-8")
+        command = python_child(sys.executable, "torch_backend.sfm.start_worker", str(file))
+        # Its input closes when this process ends, however it does: then it ends as well.
+        self._process = subprocess.Popen(**command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.communicate()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def done(self) -> bool:
+        """Waits for it and takes its matches over; False if it broke."""
+        if self._process.wait() != 0:
+            return False
+        ids = _ids(self._request.database)
+        pairs = [(ids[one], ids[other]) for one, other in (line.split(" ") for line in self.lines)]
+        part = colmap.open_database(self._folder / self._request.database.name)
+        with closing_database(self._request) as database, pycolmap.DatabaseTransaction(database):
+            for pair in pairs:
+                if part.exists_matches(*pair) and not database.exists_matches(*pair):
+                    database.write_matches(*pair, part.read_matches(*pair))
+                if part.exists_two_view_geometry(*pair) and not database.exists_two_view_geometry(*pair):
+                    database.write_two_view_geometry(*pair, part.read_two_view_geometry(*pair))
+        part.close()
+        return True
+
+
+def _ids(file: Path) -> dict[str, int]:
+    database = colmap.open_database(file)
+    try:
+        return {image.name: image.image_id for image in database.read_all_images()}
+    finally:
+        database.close()
