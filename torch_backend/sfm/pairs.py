@@ -70,9 +70,8 @@ class _Helper:
     def __enter__(self) -> _Helper:
         self._folder.mkdir()
         shutil.copyfile(self._request.database, self._folder / self._request.database.name)
-        asked = json.loads((self._request.scratch / REQUEST_FILE).read_text(encoding="utf-8"))
         file = self._folder / REQUEST_FILE
-        file.write_text(json.dumps({**asked, "match": self.lines}), encoding="utf-8")
+        file.write_text(json.dumps({**self._request.asked, "match": self.lines}), encoding="utf-8")
         command = python_child(sys.executable, "torch_backend.sfm.start_worker", str(file))
         # Its input closes when this process ends, however it does: then it ends as well.
         self._process = subprocess.Popen(**command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)

@@ -21,6 +21,8 @@ class Request:
 
     def __init__(self, path: Path) -> None:
         data = json.loads(path.read_text(encoding="utf-8"))
+        self.asked: dict[str, Any] = data
+        """All of it."""
         self.scratch = path.parent
         self.database = self.scratch / "database.db"
         self.images = Path(data["images"])
