@@ -23,6 +23,7 @@ from .request import SEED, Request, closing_database, say
 
 MOST_PROCESSES = 4
 """Each has a copy of the database, of 0.5 MB a frame, and builds the search trees of its frames anew."""
+
 LEAST_PAIRS = 100
 """Pairs for which a process is worth its start of about a second; a pair takes 12 to 30 ms."""
 
@@ -37,6 +38,8 @@ def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str
     lines = [f"{name} {other}" for name, others in pairs.items() for other in others]
     count = max(1, min(request.threads, MOST_PROCESSES, len(lines) // LEAST_PAIRS))
     parts = [lines[len(lines) * n // count : len(lines) * (n + 1) // count] for n in range(count)]
+    if not lines:  # a single frame
+        return
     with ExitStack() as stack:
         others = [stack.enter_context(_Helper(request, part, number)) for number, part in enumerate(parts[1:], start=1)]
         match_lines(request, parts[0])
@@ -49,15 +52,20 @@ def match_lines(request: Request, lines: Sequence[str]) -> None:
     """Matches the pairs "name other" in this process."""
     listing = request.scratch / "pairs.txt"
     listing.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    options = pycolmap.FeatureMatchingOptions()
-    options.use_gpu = False
-    options.num_threads = 1
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = SEED
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listing
     pairing.block_size = BLOCK
-    colmap.match_image_pairs(request.database, options, pairing, geometry)
+    colmap.match_image_pairs(request.database, one_thread(), pairing, geometry)
+
+
+def one_thread() -> pycolmap.FeatureMatchingOptions:
+    """Options of a process that matches."""
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = 1
+    return options
 
 
 class _Helper:
