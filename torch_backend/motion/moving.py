@@ -38,7 +38,7 @@ _LEFT_EVERY = 2
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 _AHEAD = 32
-"""Most frames whose scores wait for their labels: at 640 x 480 they take 100 MB."""
+"""Most frames that are scored before the static model can label them. At 640 x 480 they take 100 MB."""
 
 
 StaticViews = Callable[[int], NDArray[np.uint8] | None]
@@ -149,7 +149,7 @@ def _typical_depth(points: NDArray[Any], viewmat: NDArray[Any]) -> float:
 
 @dataclass(frozen=True)
 class Scored:
-    """What optical flow tells of a frame. Maps are [h, w] on the grid."""
+    """How surely the points of a frame move, by optical flow. Maps are [h, w] on the grid."""
 
     index: int
     """Of the frame, in `Clip.frames`."""
@@ -221,8 +221,8 @@ def _scores(clip: Clip, config: FlowConfig, written: Collection[int], report: Re
                     score, inverse = final[key], own[key][2]
                 else:
                     score, inverse = _between(clip, matches, picture, key, final, own)
-                told = evidences.get(key) if is_key else None
-                yield Scored(n, picture, sight, *score, inverse, matches.grid, told)
+                evidence = evidences.get(key) if is_key else None
+                yield Scored(n, picture, sight, *score, inverse, matches.grid, evidence)
         for store in (own, evidences, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
@@ -286,7 +286,7 @@ def _between(
 
 
 class Labels:
-    """From the scores of frames, and from what a static model of the clip shows if there is one, to their mattes."""
+    """Labels frames by their scores and, if there is one, by a static model of the clip."""
 
     def __init__(self, clip: Clip, static: StaticViews | None, config: FlowConfig) -> None:
         self._clip, self._static, self._config, self._rest = clip, static, config, MisfitConfig()

@@ -1,8 +1,8 @@
-"""Matches of listed image pairs, by several processes: OpenBLAS in pycolmap's wheel does not bear two threads.
+"""Matches listed image pairs in several processes, because OpenBLAS in pycolmap's wheel is not thread-safe.
 
-Two threads at once in the sgemm of pycolmap 4.2.1 get wrong products (18 of 15,000; alone 0 of 6000): now and then two
-pairs lose half of their matches, and the cameras differ. So one thread of each process matches, another one verifies.
-A pair's matches depend on its two images alone: the database is the same to the byte for any number of processes.
+In pycolmap 4.2.1 two threads that call sgemm at once get wrong products (18 of 15,000; one thread 0 of 6000). Two pairs
+then lose half of their matches, and the cameras differ. So one thread of each process matches and another verifies.
+The matches of a pair depend only on its two images: any number of processes makes the same database, to the byte.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from . import colmap_types as colmap
 from .request import SEED, Request, closing_database, say
 
 MOST_PROCESSES = 4
-"""Each has a copy of the database, of 0.5 MB a frame, and builds the search trees of its frames anew."""
+"""Each process has a copy of the database (0.5 MB a frame) and builds the search trees of its frames again."""
 
 LEAST_PAIRS = 100
-"""Pairs for which a process is worth its start of about a second; a pair takes 12 to 30 ms."""
+"""Fewest pairs for which a process is started. Its start takes about a second, a pair 12 to 30 ms."""
 
 BLOCK = 64
-"""Pairs between which COLMAP tells its progress and forgets the search trees: of 405 pairs, blocks of 8 take 9.5 s of
-the processor, of 64 7.6, of 1024 7.6."""
+"""Pairs after which COLMAP reports progress and drops its search trees. 405 pairs take 9.5 CPU seconds in blocks of 8,
+7.6 in blocks of 64 or 1024."""
 
 
 def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str = "other matches") -> None:
@@ -41,10 +41,10 @@ def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str
     if not lines:  # a single frame
         return
     with ExitStack() as stack:
-        others = [stack.enter_context(_Helper(request, part, number)) for number, part in enumerate(parts[1:], start=1)]
+        helpers = [stack.enter_context(_Helper(request, part, n)) for n, part in enumerate(parts[1:], start=1)]
         match_lines(request, parts[0])
-        left = [line for other in others if not other.done() for line in other.lines]
-    if left:  # a helper that broke, maybe for want of memory
+        left = [line for helper in helpers if not helper.done() for line in helper.lines]
+    if left:  # of a helper that failed, for example for lack of memory
         match_lines(request, left)
 
 
@@ -69,7 +69,7 @@ def one_thread() -> pycolmap.FeatureMatchingOptions:
 
 
 class _Helper:
-    """A worker that matches some of the pairs in a copy of the database, which is gone after a `with` block."""
+    """A worker process that matches some of the pairs in a copy of the database. A `with` block removes both."""
 
     def __init__(self, request: Request, lines: Sequence[str], number: int) -> None:
         self.lines, self._request = lines, request
@@ -79,9 +79,9 @@ class _Helper:
         self._folder.mkdir()
         shutil.copyfile(self._request.database, self._folder / self._request.database.name)
         file = self._folder / REQUEST_FILE
-        file.write_text(json.dumps({**self._request.asked, "match": self.lines}), encoding="utf-8")
+        file.write_text(json.dumps({**self._request.data, "match": self.lines}), encoding="utf-8")
         command = python_child(sys.executable, "torch_backend.sfm.start_worker", str(file))
-        # Its input closes when this process ends, however it does: then it ends as well.
+        # The helper ends when its input closes, so it does not outlive this process.
         self._process = subprocess.Popen(**command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
         return self
 
@@ -92,7 +92,7 @@ class _Helper:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def done(self) -> bool:
-        """Waits for it and takes its matches over; False if it broke."""
+        """Waits for the process and copies its matches; False if it failed."""
         if self._process.wait() != 0:
             return False
         ids = _ids(self._request.database)

@@ -53,7 +53,7 @@ def weights_of(frames: Mapping[str, Any]) -> dict[str, float]:
         "other matches": 0.1 * others,
         "undistort": 0.04 * size * every,
         "still world": 0.03 * max(400.0, 2.0 * every),  # steps of its training
-        "motion": 0.26 * every,  # what is left once the still world is learnt: flow has begun beside it
+        "motion": 0.26 * every,  # after the still world, during which flow has begun
     }
 
 

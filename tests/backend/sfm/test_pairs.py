@@ -42,11 +42,11 @@ def alone(solved, tmp_path_factory):
     """(A folder with a request, and the database that one process makes.)"""
     folder = tmp_path_factory.mktemp("alone")
     names = sorted(path.name for path in solved.shot.raw.glob("*.png"))[:8]
-    asked = {
+    request = {
         "images": str(solved.shot.raw), "solved": names, "others": [], "camera_model": "SIMPLE_RADIAL", "overlap": 15,
         "features": 500, "neighbours": 2, "threads": 3,
     }  # fmt: skip
-    (folder / REQUEST_FILE).write_text(json.dumps(asked))
+    (folder / REQUEST_FILE).write_text(json.dumps(request))
     return folder, matched(folder, least=1000)
 
 
