@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from .cameras.stored import load_cameras
 from .contract import MOTION_FILE, MOTION_UNFINISHED_FILE, PICTURE, SURFACE, Cancelled, JobError, Reporter
 from .footage.images import is_whole_png
-from .motion.flow import FlowConfig, Map
+from .motion.flow import FlowConfig
 from .motion.mattes import MOTION_VERSION, MOVING, STILL, UNKNOWN, read_found, record_of, solve_key, write_matte
-from .motion.moving import Clip, StaticViews, mattes
-from .motion.still import Evidence
+from .motion.moving import Clip, Labels, StaticViews, scored_ahead
 from .motion.surface import AWAY, KeyEvidence, surface_points, write_surface
 from .sfm.masks import IGNORE, PEOPLE, limited, load_mask
 from .sfm.verdict import doubt_of
@@ -60,29 +59,23 @@ def find_motion(
         return MotionResult(**done["result"])
     need_disk(shot.root, 0.1 * path.width * path.height * len(files), "The motion matte")
     _begin(folder, key)
-    clip = Clip(shot, _static_views(shot, static_model, report))
+    clip = Clip(shot)
     written = {n for n, frame in enumerate(clip.frames) if not anew and is_whole_png(files[frame])}
     shares = np.zeros((len(files), 3))
     for n in written:
         shares[n] = _shares(read_found(files[clip.frames[n]]))
-
-    told: dict[int, KeyEvidence] = {}
-    """By frame index: of the key frames whose mattes are to come."""
-
-    def hear(key: int, grid: tuple[Map, Map], evidence: Evidence) -> None:
-        sight = clip.sight(key)
-        if sight is not None:
-            told[clip.keys[key]] = KeyEvidence(evidence, grid, sight)
-
-    found = mattes(clip, config, written, report, hear)
-    for count, (n, labels) in enumerate(found, start=len(written) + 1):
-        ignored, people = (load_mask(shot, kind, clip.frames[n]) for kind in (IGNORE, PEOPLE))
-        if n in told:
-            _keep_surface(shot, clip, n, told.pop(n), labels, ignored)
-        limited(labels, ignored, people)
-        write_matte(files[clip.frames[n]], labels)
-        shares[n] = _shares(labels)
-        report.progress("solve: motion", count, len(files), f"frame {clip.frames[n]}")
+    with scored_ahead(clip, config, written, report) as scored:
+        labels_of = Labels(clip, _static_views(shot, static_model, report), config)
+        for count, frame in enumerate(scored, start=len(written) + 1):
+            report.check_cancelled()
+            n, labels = frame.index, labels_of(frame)
+            ignored, people = (load_mask(shot, kind, clip.frames[n]) for kind in (IGNORE, PEOPLE))
+            if frame.evidence is not None:
+                _keep_surface(shot, clip, n, frame.evidence, labels, ignored)
+            limited(labels, ignored, people)
+            write_matte(files[clip.frames[n]], labels)
+            shares[n] = _shares(labels)
+            report.progress("solve: motion", count, len(files), f"frame {clip.frames[n]}")
     mean = shares.mean(0)
     result = MotionResult(motion_pixels_share=round(float(mean[2]), 4), unknown_share=round(float(mean[1]), 4))
     write_json(folder / MOTION_FILE, {"version": MOTION_VERSION, "key": key, "result": result})

@@ -6,7 +6,11 @@ through a window of a few seconds, so a clip of any length takes the same memory
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+import contextlib
+from collections import deque
+from collections.abc import Callable, Collection, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -23,6 +27,7 @@ from .flow import FlowConfig, Map, Matches, neighbours, sample
 from .leftover import Leftover
 from .misfit import MisfitConfig, Sight, misfit, seeded
 from .still import Evidence, Look, StillTest, evidence
+from .surface import KeyEvidence
 
 _FLOW_WIDTH = 640
 _LARGEST_SCALE = 2.0
@@ -32,6 +37,8 @@ _LEFT_EVERY = 2
 """In every so manieth key frame what is left of motion is looked for: sways are slow."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
+_AHEAD = 32
+"""Most frames that are scored before the static model can label them. At 640 x 480 they take 100 MB."""
 
 
 StaticViews = Callable[[int], NDArray[np.uint8] | None]
@@ -41,11 +48,11 @@ StaticViews = Callable[[int], NDArray[np.uint8] | None]
 class Clip:
     """Frames and cameras of a solved shot, in the flow's size."""
 
-    def __init__(self, shot: Shot, static: StaticViews | None = None) -> None:
+    def __init__(self, shot: Shot) -> None:
         """JobError if it is not solved."""
         path = load_cameras(shot)
         seconds = {int(row["frame"]): float(row["seconds"]) for row in load_frames(shot)["frames"]}
-        self._shot, self._static = shot, static
+        self._shot = shot
         self.frames = [camera.frame for camera in path.frames]
         """Numbers of the delivered frames, ascending."""
         self.width, self.height = path.width, path.height
@@ -75,10 +82,6 @@ class Clip:
         """Grey picture of a key in the flow's size. JobError if the frame is damaged."""
         return self.shown(key)[0]
 
-    def sight(self, key: int) -> Sight | None:
-        """A key in colour, with its camera; None if its pose was not solved."""
-        return None if self.guessed[key] else self.shown(key)[1]
-
     def shown(self, key: int) -> tuple[NDArray[np.uint8], Sight]:
         """A key, as `frame` returns it."""
         if key not in self._pictures:
@@ -102,15 +105,10 @@ class Clip:
         colors = _sized(pixels, (self.flow_size[0] // 2, self.flow_size[1] // 2))
         return grey, Sight(colors, self._cameras[0][index], self._cameras[1][index])
 
-    def static(self, index: int) -> NDArray[np.uint8] | None:
-        """[h, w, 3] what a static model of the clip shows in a frame, on the grid; None if there is none."""
-        shown = None if self._static is None else self._static(self.frames[index])
-        return None if shown is None else _sized(shown, (self.flow_size[0] // 2, self.flow_size[1] // 2))
-
     def references(self, count: int) -> dict[int, Sight]:
-        """Key -> so many keys of solved poses, evenly spaced; none if there is no static model."""
+        """Key -> so many keys of solved poses, evenly spaced."""
         solved = [key for key, guessed in enumerate(self.guessed) if not guessed]
-        if self._static is None or not solved:
+        if not solved:
             return {}
         chosen = {solved[n * (len(solved) - 1) // (count - 1)] for n in range(count)}
         return {key: self.frame(self.keys[key])[1] for key in sorted(chosen)}
@@ -149,14 +147,49 @@ def _typical_depth(points: NDArray[Any], viewmat: NDArray[Any]) -> float:
     return float(np.median(z)) if len(z) else 1.0
 
 
-def mattes(
-    clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter,
-    tell: Callable[[int, tuple[Map, Map], Evidence], None] | None = None,
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:  # fmt: skip
-    """(index, labels [H, W] uint8: 0 still, 128 unknown, 255 moving) of all frames but the `written` ones, in order.
+@dataclass(frozen=True)
+class Scored:
+    """How surely the points of a frame move, by optical flow. Maps are [h, w] on the grid."""
 
-    `tell` hears each key's evidence and the grid it is on, before the key's matte comes.
-    """
+    index: int
+    """Of the frame, in `Clip.frames`."""
+    picture: NDArray[np.uint8]
+    """Grey, in the flow's size."""
+    sight: Sight
+    score: Map
+    """How surely a point moves, 0 to 1."""
+    weight: Map
+    """How much is known of it."""
+    inverse: Map
+    """Inverse depths of still points, 1 / solve units."""
+    grid: tuple[Map, Map]
+    """Positions of the grid's points in flow pixels."""
+    evidence: KeyEvidence | None
+    """Of a key frame whose pose was solved."""
+
+
+@contextlib.contextmanager
+def scored_ahead(
+    clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter
+) -> Generator[Iterator[Scored]]:
+    """`_scores`, computed by a thread from the start of the block on, at most `_AHEAD` frames before they are taken."""
+    scores = _scores(clip, config, written, report)
+    with ThreadPoolExecutor(1, "optical flow") as pool:
+        waiting = deque(pool.submit(next, scores, None) for _ in range(_AHEAD))
+
+        def taken() -> Iterator[Scored]:
+            while (scored := waiting.popleft().result()) is not None:
+                waiting.append(pool.submit(next, scores, None))
+                yield scored
+
+        try:
+            yield taken()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _scores(clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter) -> Iterator[Scored]:
+    """All frames but the `written` ones, in order."""
     keys, reach = clip.keys, config.reach * config.baselines[-1]
     groups = [range(keys[k - 1] + 1 if k else 0, keys[k] + 1) for k in range(len(keys))]
     wanted = [any(n not in written for n in group) for group in groups]
@@ -164,9 +197,8 @@ def mattes(
         return
     first, last = wanted.index(True), len(wanted) - 1 - wanted[::-1].index(True)
     matches = Matches(clip.picture, config, clip.unit)
-    rest = MisfitConfig()
-    references = clip.references(rest.references)
     own: dict[int, tuple[Map, Map, Map]] = {}
+    evidences: dict[int, KeyEvidence] = {}
     final: dict[int, tuple[Map, Map]] = {}
     start = max(0, first - 1 - reach)
     left: tuple[Map, Map] | None = None
@@ -175,22 +207,23 @@ def mattes(
         if turn < len(keys):
             left = None if turn % _LEFT_EVERY == 0 else left
             own[turn], left, found = _own_score(clip, matches, turn, config, left)
-            if tell is not None:
-                tell(turn, matches.grid, found)
+            if not clip.guessed[turn]:
+                evidences[turn] = KeyEvidence(found, matches.grid, clip.shown(turn)[1])
         key = turn - reach
         if key < max(0, first - 1) or not (wanted[key] or wanted[min(key + 1, last)]):
             continue
         final[key] = _followed(matches, key, own, len(keys), reach, config)
         for n in groups[key] if wanted[key] else ():
             if n not in written:
-                picture, sight = clip.shown(key) if n == keys[key] else clip.frame(n)
-                if n == keys[key]:
+                is_key = n == keys[key]
+                picture, sight = clip.shown(key) if is_key else clip.frame(n)
+                if is_key:
                     score, inverse = final[key], own[key][2]
                 else:
                     score, inverse = _between(clip, matches, picture, key, final, own)
-                unlike = _misfit(clip, n, sight, inverse, references, matches.grid, rest)
-                yield n, _labels(clip, picture, *score, unlike, config, rest)
-        for store in (own, final):
+                evidence = evidences.get(key) if is_key else None
+                yield Scored(n, picture, sight, *score, inverse, matches.grid, evidence)
+        for store in (own, evidences, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
         matches.forget(key - config.baselines[-1] + 1, key - config.links * config.baselines[-1])
@@ -252,36 +285,42 @@ def _between(
     return (total / np.maximum(weight, 1e-6), weight), inverse / count
 
 
-def _misfit(
-    clip: Clip, n: int, sight: Sight, inverse: Map, references: Mapping[int, Sight], grid: tuple[Map, Map],
-    config: MisfitConfig,
-) -> Map:  # fmt: skip
-    """`misfit` of frame `n` on the grid; 0 without a static model and where the pose was guessed."""
-    shown = None if clip.is_guessed(n) else clip.static(n)
-    if shown is None:
-        return np.zeros(inverse.shape, np.float32)
-    others = [other for key, other in references.items() if clip.keys[key] != n]
-    return misfit(sight, inverse, shown, others, grid, 0.5 * clip.unit, config)
+class Labels:
+    """Labels frames by their scores and, if there is one, by a static model of the clip."""
 
+    def __init__(self, clip: Clip, static: StaticViews | None, config: FlowConfig) -> None:
+        self._clip, self._static, self._config, self._rest = clip, static, config, MisfitConfig()
+        self._references = {} if static is None else clip.references(self._rest.references)
 
-def _labels(
-    clip: Clip, picture: NDArray[np.uint8], score: Map, weight: Map, unlike: Map, config: FlowConfig, rest: MisfitConfig
-) -> NDArray[np.uint8]:
-    """The labels [H, W] of a frame's score and weight on the grid, and of its misfit there."""
-    grey = cv2.resize(picture, score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
-    spread = _Spread(grey, config.radius, config.edge)
-    weight = np.minimum(weight, _ENOUGH)
-    known = np.maximum(spread(weight), 0.0)
-    score = spread(score * weight) / np.maximum(known, 1e-3)
-    size = clip.width, clip.height
-    score, known, unlike = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in (score, known, unlike))
-    least = round((config.blob * clip.width / 640) ** 2)
-    moving = seeded(score > config.grow, score > config.seed, least)
-    moving |= seeded(unlike > rest.weak, unlike > rest.strong, least)
-    still = seeded(~moving, ~moving, least)  # holes are filled
-    unknown = known < _UNKNOWN
-    unknown = seeded(unknown, unknown, least)
-    return np.where(~still, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
+    def __call__(self, frame: Scored) -> NDArray[np.uint8]:
+        """[H, W] 0 still, 128 unknown, 255 moving."""
+        config, rest, size = self._config, self._rest, (self._clip.width, self._clip.height)
+        grey = cv2.resize(frame.picture, frame.score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+        spread = _Spread(grey, config.radius, config.edge)
+        weight = np.minimum(frame.weight, _ENOUGH)
+        known = np.maximum(spread(weight), 0.0)
+        score = spread(frame.score * weight) / np.maximum(known, 1e-3)
+        maps = score, known, self._misfit(frame)
+        score, known, unlike = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in maps)
+        least = round((config.blob * self._clip.width / 640) ** 2)
+        moving = seeded(score > config.grow, score > config.seed, least)
+        moving |= seeded(unlike > rest.weak, unlike > rest.strong, least)
+        still = seeded(~moving, ~moving, least)  # holes are filled
+        unknown = known < _UNKNOWN
+        unknown = seeded(unknown, unknown, least)
+        return np.where(~still, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
+
+    def _misfit(self, frame: Scored) -> Map:
+        """`misfit` of a frame on the grid; 0 without a static model and where the pose was guessed."""
+        clip = self._clip
+        shown = None
+        if self._static is not None and not clip.is_guessed(frame.index):
+            shown = self._static(clip.frames[frame.index])
+        if shown is None:
+            return np.zeros(frame.inverse.shape, np.float32)
+        shown = _sized(shown, (clip.flow_size[0] // 2, clip.flow_size[1] // 2))
+        others = [other for key, other in self._references.items() if clip.keys[key] != frame.index]
+        return misfit(frame.sight, frame.inverse, shown, others, frame.grid, 0.5 * clip.unit, self._rest)
 
 
 class _Spread:

@@ -71,16 +71,6 @@ def extract_features(
     )
 
 
-def match_sequential(
-    database: Path,
-    options: pycolmap.FeatureMatchingOptions,
-    pairing: pycolmap.SequentialPairingOptions,
-    geometry: pycolmap.TwoViewGeometryOptions,
-) -> None:
-    """Matches of images with the next ones, on the CPU."""
-    _colmap.match_sequential(database, options, pairing, geometry, device=pycolmap.Device.cpu)
-
-
 def match_image_pairs(
     database: Path,
     options: pycolmap.FeatureMatchingOptions,

@@ -40,6 +40,8 @@ def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruc
     # two rounds of it, as with one of the local ones, a start from two frames that show little depth was kept, and a
     # whole walk was solved wrongly at an error of 0.9 px (docs/decisions.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+    # Ceres' default. With COLMAP's 0 an adjustment runs on, up to its 50th iteration, when it gains nothing any more.
+    options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-6
     if request.reuse:  # it has placed frames of a try before
         options.image_names = request.solved
     if request.masks:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ..lens.lens_verdict import FISHEYE, FISHEYE_START
 from . import colmap_types as colmap
-from .request import SEED, Request, closing_database, say
+from .pairs import match_pairs
+from .request import Request, closing_database, say
 from .turning import only_turns
 
 STILL_SHARE = 0.008
@@ -71,29 +72,12 @@ def start_params(request: Request) -> str:
     return ", ".join(repr(value) for value in params)
 
 
-def _matching() -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
-    options = pycolmap.FeatureMatchingOptions()
-    options.use_gpu = False
-    # Two threads at once in the sgemm of pycolmap 4.2.1's OpenBLAS get wrong products (18 of 15,000; alone 0 of 6000):
-    # now and then two pairs lose half of their matches, and the cameras differ. One thread matches, one verifies.
-    options.num_threads = 1
-    geometry = pycolmap.TwoViewGeometryOptions()
-    geometry.ransac.random_seed = SEED
-    return options, geometry
-
-
 def match(request: Request) -> None:
     """Matches each frame with those 1, 2, 4, ... frames after it, `overlap` distances (COLMAP's quadratic overlap)."""
     if request.reuse or request.wide:
         match_anew(request)
         return
-    options, geometry = _matching()
-    pairing = pycolmap.SequentialPairingOptions()
-    pairing.overlap = request.overlap
-    pairing.quadratic_overlap = True
-    pairing.num_threads = request.threads
-    say(stage="matches")
-    colmap.match_sequential(request.database, options, pairing, geometry)
+    match_pairs(request, _apart(request.solved, [2**n for n in range(request.overlap)]), "matches")
 
 
 def match_anew(request: Request) -> None:
@@ -135,20 +119,12 @@ def wide_pairs(names: Sequence[str]) -> dict[str, list[str]]:
     distances = list(range(1, len(names) if len(names) <= ALL_PAIRS else 9))
     while distances[-1:] and distances[-1] < len(names):
         distances.append(round(distances[-1] * 2**0.5))
+    return _apart(names, distances)
+
+
+def _apart(names: Sequence[str], distances: Sequence[int]) -> dict[str, list[str]]:
+    """Each name -> those that come so many places after it."""
     return {name: [names[at + d] for d in distances if at + d < len(names)] for at, name in enumerate(names)}
-
-
-def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str = "other matches") -> None:
-    """Matches each image with those that it is listed with; what the database has of them stays."""
-    lines = [f"{name} {other}" for name, others in pairs.items() for other in others]
-    listing = request.scratch / "pairs.txt"
-    listing.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    options, geometry = _matching()
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = listing
-    pairing.block_size = max(4 * request.neighbours, 8)  # COLMAP counts its progress in blocks
-    say(stage=stage)
-    colmap.match_image_pairs(request.database, options, pairing, geometry)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ import pycolmap
 
 from . import colmap_types as colmap
 from .mapping import first_camera, posed
-from .matching import extract, match_pairs
+from .matching import extract
+from .pairs import match_pairs
 from .request import SEED, Request, closing_database
 
 LOCALISE_MAX_ERROR_PX = 4.0

@@ -47,13 +47,13 @@ def weights_of(frames: Mapping[str, Any]) -> dict[str, float]:
         "masks": 0.0,
         "lens": 0.0,
         "features": 0.27 * size * solved,
-        "matches": 0.23 * solved,
-        "cameras": 0.41 * solved,
+        "matches": 0.15 * solved,
+        "cameras": 0.32 * solved,
         "other features": 0.27 * size * others,
         "other matches": 0.1 * others,
-        "undistort": 0.06 * size * every,
+        "undistort": 0.04 * size * every,
         "still world": 0.03 * max(400.0, 2.0 * every),  # steps of its training
-        "motion": 0.38 * every,
+        "motion": 0.26 * every,  # after the still world, during which flow has begun
     }
 
 

@@ -21,6 +21,8 @@ class Request:
 
     def __init__(self, path: Path) -> None:
         data = json.loads(path.read_text(encoding="utf-8"))
+        self.data: dict[str, Any] = data
+        """The whole request, as in the file."""
         self.scratch = path.parent
         self.database = self.scratch / "database.db"
         self.images = Path(data["images"])
@@ -43,6 +45,8 @@ class Request:
         """The pictures have no lens any more: the model's bend stays at nothing."""
         self.masks = data.get("masks", "")
         """Folder of COLMAP's masks; empty: nothing is masked."""
+        self.match: list[str] = data.get("match", [])
+        """Pairs "name name" that this worker matches, and does nothing else; empty: it solves."""
         self.known: dict[str, Any] | None = data.get("known")
         self.peak: float = data.get("peak", 0.0)
         """Least contrast of a feature; 0: COLMAP's own."""

@@ -42,7 +42,9 @@ from .points import filter_points
 from .verdict import FAIR_ERROR_PX, quality_words
 
 SOLVE_VERSION = 1
-_WRITERS = 2
+_WRITERS = 4
+"""Frames undistorted at once. Half of the time is spent in fsync: on two cores 4 take 0.62 to 0.76 of the time of 2, 8
+take 0.52 to 0.62. More would need too much memory: a 4K frame in floats takes 300 MB."""
 
 
 class SolveResult(TypedDict):

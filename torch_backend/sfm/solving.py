@@ -120,9 +120,10 @@ def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Report
     taken = prepare(frames, cameras, report) if cameras else None
     lens = _lens_of_map(config, frames, report)
     _refuse_damaged(shot, frames)
-    # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame.
+    # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame, and copies of
+    # the database while pairs are matched up to 1.5 MB.
     size = (1.2 if lens is None else 2.4) * sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
-    need_disk(shot.root, size + (len(frames["frames"]) << 20), "The camera solve")
+    need_disk(shot.root, size + 2.5 * (len(frames["frames"]) << 20), "The camera solve")
     scratch = shot.solve / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
     make_folder(scratch)

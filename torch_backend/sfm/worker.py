@@ -2,7 +2,7 @@
 
 A process of its own because pycolmap and OpenImageIO cannot share one (see footage/images.py), because COLMAP ends its
 process on a failed check, and because a process can be stopped at any moment. Nothing else imports its parts, which
-load pycolmap: `request.py`, `matching.py`, `mapping.py`, `placing.py`, `answers.py` and `colmap_types.py`.
+load pycolmap: `request.py`, `matching.py`, `pairs.py`, `mapping.py`, `placing.py`, `answers.py` and `colmap_types.py`.
 
 Standard input is held open by the parent: when it closes, the parent is gone and so is the worker. Standard output
 carries JSON lines: {"stage"} when one begins, with {"done", "total"} where COLMAP calls back; {"result": {...}} or
@@ -12,7 +12,7 @@ each lens, undistort_N.npz (the lens, camera of the undistorted frames, where it
 
 A request with "known" cameras ({"lenses": [{"model", "width", "height", "params"}], "images": {name: {"lens",
 "pose"}}, "triangulate"}) is not solved: the lenses are undistorted and, if asked for, points are triangulated with the
-poses held.
+poses held. One with pairs to "match" has them matched in its copy of the database, and nothing else (`pairs.py`).
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ from .mapping import (
     triangulation_angle,
 )
 from .matching import STILL_SHARE, common, extract, match, turning
+from .pairs import match_lines
 from .placing import localise
 from .request import SEED, Request, say
 
@@ -51,6 +52,9 @@ def main(path: str) -> int:
     threading.Thread(target=_die_with_parent, args=(own_input(),), daemon=True).start()
     request = Request(Path(path))
     pycolmap.set_random_seed(SEED)
+    if request.match:
+        match_lines(request, request.match)
+        return 0
     if request.known is not None:
         return take_over(request, request.known)
     if not request.reuse:
