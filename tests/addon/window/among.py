@@ -19,7 +19,8 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -268,33 +269,56 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     scene.splannequin.choose_t_star, scene.splannequin.t_star = True, cube.FRAME
     scene.frame_start = scene.frame_end = cube.FRAME
     scene.frame_set(cube.FRAME)
-    yield from _press(shot, "add_surface", told)
+    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    yield from _press(shot, "add_surface", told, lambda: _entry().surfaces)
     yield from press._shoot(work, "12-surface")
-    for operator in ("insert_freeze", "combine_cg"):
-        yield from _press(shot, operator, told)
+    yield from _press(shot, "insert_freeze", told, _group)
+    yield from _press(shot, "combine_cg", told, lambda: _group().inputs["CG"].is_linked)
     yield from press._shoot(work, "12-combined")
     sockets = Sockets(work)
     depth, frozen = sockets.of_group("Depth")[..., 0], sockets.of_group("Image")
     put(Eye(depth))
-    scene.cycles.samples = plan["samples"]
     yield 1.0
-    yield from _press(shot, "add_light", told)
+    yield from _press(shot, "add_light", told, lambda: _entry().light)
     yield from press._shoot(work, "12-light")
+    scene = _scene()
+    scene.cycles.samples = plan["samples"]
     scene.render.filepath = str(work / "baked" / "######")
     settings = scene.render.image_settings
     settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
     yield from _press(shot, "bake", told)
     picture = cube.pixels_of(next((work / "baked").glob("*.exr")))
     save(picture, Path(plan["output"]))
-    told.update(check(picture, frozen, sockets.cg()))
-    yield from _undo(told)
+    told.update(check(picture, frozen, Sockets(work).cg()))
+    yield from _show_render(work)
 
 
-def _press(shot: Path, operator: str, told: dict[str, Any]) -> Iterator[float]:
-    """Clicks a button of the panel and waits until what it began has ended."""
+def _scene() -> Any:
+    """The window's scene: undo makes another one of it."""
+    return bpy.context.window_manager.windows[0].scene
+
+
+def _entry() -> Any:
+    """What the shot has in the scene."""
+    return _scene().splannequin.made[0]
+
+
+def _group() -> Any:
+    """The freeze's node, if the scene has it."""
+    tree = cube.add_on("compat").compositor_tree(_scene())
+    return None if tree is None else cube.add_on("bake.freeze_group").group_node(tree)
+
+
+def _press(shot: Path, operator: str, told: dict[str, Any], has: Callable[[], Any] | None = None) -> Iterator[float]:
+    """Clicks a button of the panel and waits until what it began has ended. With `has`, which finds what is added,
+    it is undone and redone, too."""
     watch = press._supervisor().watch_of(shot)
+    window = bpy.context.window_manager.windows[0]
+    with bpy.context.temp_override(window=window):
+        bpy.ops.ed.undo_push(message="Before")
     for _ in range(8):  # the end of the sidebar has all of these buttons
         yield from press._scroll_down()
+    began = time.monotonic()
     yield from press._click(f"splannequin.{operator}")
     yield 1.0
     while watch.running() is not None:
@@ -302,13 +326,24 @@ def _press(shot: Path, operator: str, told: dict[str, Any]) -> Iterator[float]:
     yield 1.5
     failed = [sentence for sentence, _ in watch.failures.values()]
     assert not failed, f"{operator}: {failed}"
-    told.setdefault("pressed", []).append(operator)
+    told.setdefault("pressed", {})[operator] = round(time.monotonic() - began)
+    if has is None:
+        return
+    for step, should_be in (("nothing", True), ("undo", False), ("redo", True)):
+        if step != "nothing":
+            with bpy.context.temp_override(window=window):
+                getattr(bpy.ops.ed, step)()
+            yield 1.0
+        assert bool(has()) == should_be, f"{operator} after {step}"
+    told.setdefault("undone and redone", []).append(operator)
 
 
-def _undo(told: dict[str, Any]) -> Iterator[float]:
-    """Undoes what was added and does it again."""
-    told["objects"] = len(bpy.context.scene.objects)
-    yield 0.5
+def _show_render(work: Path) -> Iterator[float]:
+    """A picture of the window with what was baked."""
+    window = bpy.context.window_manager.windows[0]
+    window.workspace = bpy.data.workspaces["Rendering"]
+    yield 2.0
+    yield from press._shoot(work, "12-baked")
 
 
 def main() -> int:

@@ -99,8 +99,8 @@ def _people(triangles: NDArray[np.int32], moves: NDArray[np.bool_], part: float)
     """[T] which triangles are people, from the vertices [V] that move; small islands are what surrounds them."""
     alike = moves[triangles].all(1) | ~moves[triangles].any(1)
     size = _sizes(triangles[alike], len(moves))
-    is_separate = size == _sizes(triangles, len(moves))  # nothing surrounds it
-    is_small = (size < 0.2 * part * len(triangles)) & ~is_separate
+    is_surrounded = size < 0.5 * _sizes(triangles, len(moves))  # else it is most of a separate piece
+    is_small = (size < 0.2 * part * len(triangles)) & is_surrounded
     return np.asarray((moves ^ is_small)[triangles].sum(1) >= 2)
 
 
