@@ -253,7 +253,7 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     """The artist in a window: a surface, light, CG and a bake by the panel's buttons."""
     work = Path(plan["work"])
     shot = work / "sitting.splannequin"
-    shutil.copytree(plan["shot"], shot, ignore=shutil.ignore_patterns("jobs", "surface.ply", "panorama"))
+    shutil.copytree(plan["shot"], shot, ignore=shutil.ignore_patterns("jobs", "lock.json"))
     panel = press.addon_module("ui.step_panel")
     sub_panel = panel.sub_panel
     unfolded = ("takes", "freeze_more", "bake_more")
@@ -269,7 +269,7 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     scene.splannequin.choose_t_star, scene.splannequin.t_star = True, cube.FRAME
     scene.frame_start = scene.frame_end = cube.FRAME
     scene.frame_set(cube.FRAME)
-    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
     yield from _press(shot, "add_surface", told, lambda: _entry().surfaces)
     yield from press._shoot(work, "12-surface")
     yield from _press(shot, "insert_freeze", told, _group)
