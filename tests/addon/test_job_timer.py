@@ -270,6 +270,14 @@ def test_a_render_is_followed_by_its_handlers(addon, supervisor, watch, shot, sm
     assert len(list(Path(bpy.path.abspath(scene.render.filepath)).parent.iterdir())) == 3
 
 
+def test_no_draw_is_interrupted_while_a_render_goes_on(small):
+    """Blender 4.3 takes Python's right to write away for good if a render begins while a panel is drawn."""
+    scene, run = small
+    assert sys.getswitchinterval() >= 1.0
+    run.finish(scene, is_cancelled=True)
+    assert sys.getswitchinterval() == pytest.approx(0.005)
+
+
 @pytest.fixture
 def movie_to_nowhere(scene, tmp_path):
     """The scene writes a movie into a folder that cannot be made: Blender tells no end of such a render."""

@@ -1,34 +1,54 @@
-"""Suzanne, a second one and a chrome ball among the frozen people, with shadows on desk and people: a picture of it.
+"""Suzanne, a second one and a chrome ball among the frozen people, with shadows on desk and lap: a picture of it.
 
     SPLANNEQUIN_BACKEND_PYTHON=.venv/bin/python .venv-bpy-5.0/bin/python tests/addon/window/among.py SHOT.splannequin
+    python tests/addon/window/among.py SHOT.splannequin --blender BLENDER [--pictures DIR]
 
-SHOT is a solved and trained shot of the bundled clip. Its take "among" is frozen at frame 50 and its surface made if
-they are not there. Real Blenders run it as `blender --background --python among.py -- SHOT`; without --background it
-draws its window, too, and quits. Writes docs/images/cg-among-frozen.jpg (`--output FILE` for another place). Where
-things stand, is taken from the take's own depth.
+SHOT is a solved and trained shot of the bundled clip. Its take "among" is frozen at frame 50 and its surface is made if
+they are missing. The first command needs no window and writes docs/images/cg-among-frozen.jpg, or `--output FILE`; a
+Blender without the extension runs it as `blender -b --factory-startup --python among.py -- SHOT`. The second presses
+the panel's buttons in a real window, on a copy of the shot whose take has to be there; see press_steps.py for what it
+needs. Where things stand is taken from the take's depth and surface.
 """
 
+from __future__ import annotations
+
 import argparse
-import importlib.util
+import contextlib
+import json
+import os
+import shutil
 import sys
 import tempfile
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
-import bpy
 import numpy as np
-from mathutils import Matrix, Vector
 
-_SPEC = importlib.util.spec_from_file_location("cube", Path(__file__).with_name("cube.py"))
-cube = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(cube)
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-cube.TAKE, cube.FRAME = "among", 50
-DESK = ((0.33, 0.73), (0.60, 0.735), (0.42, 0.685), (0.55, 0.70))
-"""Places on the desk, 0 to 1 from the upper left of frame 50."""
-SUZANNE, BEHIND, BALL = (0.475, 0.735), (0.285, 0.715), (0.625, 0.735)
-"""Where on the desk the three stand: between the men, behind the left man's hand, before the right man's keyboard."""
-TALL, SMALL, ROUND = 0.13, 0.11, 0.09
-"""How large they are to be seen, in shares of the frame's width."""
+import press_steps as press
+
+with contextlib.suppress(ImportError):  # the host of a window has no bpy
+    import bpy
+    import cube
+    from mathutils import Matrix, Vector
+
+    cube.TAKE, cube.FRAME = "among", 50
+
+DESK = (0.31, 0.77, 0.70, 0.75)
+"""Left, right, top and bottom of the part of frame 50 that shows the desk, 0 to 1 from the upper left."""
+SUZANNE, BEHIND, BALL = (0.46, 0.708), (0.275, 0.735), (0.60, 0.735)
+"""Where on the desk the three stand: between the men, behind the left man's hand, left of the right man's keyboard."""
+TALL, SMALL, ROUND = 0.15, 0.12, 0.09
+"""Their widths in shares of the frame's width."""
+LAP = (0.36, 0.86)
+"""Where on the left man's lap the shadow of Suzanne's forehead falls: the lamp shines along that line."""
+SHADOWS = {"desk": (0.43, 0.46, 0.735, 0.745), "lap": (0.34, 0.40, 0.86, 0.88)}
+"""Left, right, top and bottom of places in Suzanne's shadow."""
+HAND, ABOVE_HAND = (0.25, 0.285, 0.73, 0.755), (0.25, 0.285, 0.66, 0.70)
+"""A place of the left man's hand in front of the second one, and of the second one above it."""
 
 
 class Eye:
@@ -44,8 +64,12 @@ class Eye:
 
     def at(self, place: tuple[float, float]) -> Vector:
         """The frozen surface that is seen at a place of the frame."""
-        ray = self.corner + place[0] * self.right + place[1] * self.down - self.place
+        ray = self.ray(place)
         return self.place + ray * (cube.at(self.depth, place) / ray.dot(self.axis))
+
+    def ray(self, place: tuple[float, float]) -> Vector:
+        """From the camera through a place of the frame."""
+        return self.corner + place[0] * self.right + place[1] * self.down - self.place
 
     def size(self, where: Vector, share: float) -> float:
         """Length in the scene of a share of the frame's width, at a point's distance."""
@@ -53,10 +77,18 @@ class Eye:
         return share * self.right.length * away / (self.corner - self.place).dot(self.axis)
 
 
-def plane_of(points: list[Vector], towards: Vector) -> tuple[Vector, Vector]:
-    """(a point of the plane through points, its normal on the side of a point)."""
-    middle = sum(points, Vector()) / len(points)
-    normal = Vector(np.linalg.svd(np.array([p - middle for p in points]))[2][2])
+def plane_of(points: np.ndarray, towards: Vector) -> tuple[Vector, Vector]:
+    """(a point of the plane through most of the points [N, 3], its normal on the side of `towards`).
+
+    What stands on the desk is no part of the plane: each round leaves out points farther from it than twice the median.
+    """
+    kept = points
+    for _ in range(20):
+        middle = kept.mean(0)
+        normal = np.linalg.svd(kept - middle, full_matrices=False)[2][2]
+        off = np.abs((points - middle) @ normal)
+        kept = points[off <= 2.0 * np.median(off)]
+    middle, normal = Vector(middle), Vector(normal)
     return middle, normal if normal.dot(towards - middle) > 0 else -normal
 
 
@@ -74,11 +106,17 @@ def material_of(name: str, colour: tuple[float, ...], metal: float, rough: float
 def put(eye: Eye) -> None:
     """Suzannes and ball on the desk, in the light of the shot and of a lamp."""
     scene = bpy.context.scene
-    middle, up = plane_of([eye.at(place) for place in DESK], eye.place)
+    left, right, top, bottom = DESK
+    columns, rows = np.linspace(left, right, 60).tolist(), np.linspace(top, bottom, 20).tolist()
+    middle, up = plane_of(np.array([eye.at((x, y)) for x in columns for y in rows]), eye.place)
+    graph = bpy.context.evaluated_depsgraph_get()
 
     def on_desk(place: tuple[float, float]) -> Vector:
-        where = eye.at(place)
-        return where - up * (where - middle).dot(up)
+        """Where the ray of a place meets the desk's plane, dropped onto the surface as snapping to faces does."""
+        ray = eye.ray(place)
+        where = eye.place + ray * ((middle - eye.place).dot(up) / ray.dot(up))
+        is_hit, found, *_ = scene.ray_cast(graph, where + up, -up, distance=2.0)
+        return found if is_hit else where
 
     front = (eye.place - middle).normalized()
     front = (front - up * front.dot(up)).normalized()
@@ -94,6 +132,9 @@ def put(eye: Eye) -> None:
         monkey.matrix_world = Matrix.LocRotScale(middle_of, turn.to_quaternion(), Vector((wide / 1.35,) * 3))
         monkey.data.materials.append(material_of(name, colour, 0.0, 0.4))
         bpy.ops.object.shade_smooth()
+        monkey.modifiers.new("Round", "SUBSURF").render_levels = 2
+        if name == "Suzanne":
+            forehead = middle_of + 0.2 * wide * up
     where = on_desk(BALL)
     radius = 0.5 * eye.size(where, ROUND)
     bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32, radius=radius, location=where + up * radius)
@@ -103,25 +144,45 @@ def put(eye: Eye) -> None:
     lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "SUN"))
     lamp.data.energy, lamp.data.angle = 2.0, 0.1
     lamp.rotation_mode = "QUATERNION"
-    lamp.rotation_quaternion = (up + 0.35 * front - 0.5 * up.cross(front)).to_track_quat("Z", "Y")
+    lamp.rotation_quaternion = (forehead - eye.at(LAP)).to_track_quat("Z", "Y")
     scene.collection.objects.link(lamp)
     scene.cursor.location = middle + up * radius
     scene.splannequin.take_name = cube.TAKE
-    assert bpy.ops.splannequin.add_light() == {"FINISHED"}
     scene.render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.device, scene.cycles.seed = 64, False, "CPU", 0
 
 
-def check(picture: np.ndarray, frozen: np.ndarray, cg: np.ndarray) -> str:
-    """How many pixels of CG and its shadows are as Cycles made them over the frozen frame, where no man is near."""
+def check(picture: np.ndarray, frozen: np.ndarray, cg: np.ndarray) -> dict[str, float]:
+    """Figures of a picture: how much of CG and its shadows is as Cycles made it over the frozen frame, where no man is
+    near, and how dark shadows are. AssertionError if CG, a shadow or the hand in front is missing."""
     covered = cg[..., 3] > 0.01
     covered[:, : int(0.36 * covered.shape[1])] = covered[:, int(0.72 * covered.shape[1]) :] = False
     over = cg[..., :3] + (1.0 - cg[..., 3:]) * frozen[..., :3]
     off = np.abs(display(picture[..., :3]) - display(over)).max(-1)
     assert covered.sum() > 2000, f"things should be seen, {covered.sum()} pixels of them are"
     solid, rims = covered & (cg[..., 3] >= 0.99), covered & (cg[..., 3] < 0.99)
-    parts = {"solid": solid, "rims and shadows": rims}
-    return ", ".join(f"{n}: {of.sum()} px, {100 * (off[of] <= 1).mean():.1f} % within 1" for n, of in parts.items())
+    figures: dict[str, float] = {}
+    for name, part in {"solid": solid, "rims and shadows": rims}.items():
+        figures[f"{name}, px"] = int(part.sum())
+        figures[f"{name}, % within 1/255"] = round(100.0 * float((off[part] <= 1).mean()), 2)
+        figures[f"{name}, 99.9 % within"] = round(float(np.quantile(off[part], 0.999)), 1)
+    for name, place in SHADOWS.items():
+        dark = 1.0 - cut(picture, place)[..., :3].mean() / cut(frozen, place)[..., :3].mean()
+        figures[f"shadow on the {name}, % darker"] = round(100.0 * float(dark), 1)
+    stays = np.abs(display(cut(picture, HAND)) - display(cut(frozen, HAND)))[..., :3].max(-1) <= 1
+    figures["hand in front, % as frozen"] = round(100.0 * float(stays.mean()), 1)
+    figures["second one above the hand, px"] = int((cut(cg, ABOVE_HAND)[..., 3] > 0.99).sum())
+    print(json.dumps(figures, indent=1))
+    assert all(figures[f"shadow on the {name}, % darker"] > 10.0 for name in SHADOWS), "shadows should fall on both"
+    assert stays.mean() > 0.5 and figures["second one above the hand, px"] > 50, "the hand should be in front"
+    return figures
+
+
+def cut(picture: np.ndarray, place: tuple[float, float, float, float]) -> np.ndarray:
+    """A part of a picture: left, right, top, bottom in 0 to 1."""
+    height, width = picture.shape[:2]
+    left, right, top, bottom = place
+    return picture[int(top * height) : int(bottom * height), int(left * width) : int(right * width)]
 
 
 def display(linear: np.ndarray) -> np.ndarray:
@@ -130,36 +191,191 @@ def display(linear: np.ndarray) -> np.ndarray:
     return 255.0 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def main() -> None:
-    """Bakes, adds the surface, puts things, renders, says what is seen."""
+def save(picture: np.ndarray, path: Path) -> None:
+    """A scene-linear picture as a JPEG in sRGB."""
+    height, width = picture.shape[:2]
+    image = bpy.data.images.new("among", width, height)
+    shown = np.concatenate([display(picture[..., :3]) / 255.0, np.ones_like(picture[..., :1])], -1)
+    image.pixels.foreach_set(np.ascontiguousarray(shown[::-1], np.float32).ravel())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.file_format = "JPEG"
+    image.save(filepath=str(path), quality=92)
+    bpy.data.images.remove(image)
+
+
+class Sockets:
+    """Pictures of the compositor's sockets."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        tree = cube.add_on("compat").compositor_tree(bpy.context.scene)
+        self.group = cube.add_on("bake.freeze_group").group_node(tree)
+        self.layers = next(n for n in tree.nodes if n.bl_idname == "CompositorNodeRLayers")
+
+    def of_group(self, output: str) -> np.ndarray:
+        """[H, W, 4] an output of the freeze's group."""
+        return cube.see(self.group.outputs[output], self.folder, output)
+
+    def cg(self) -> np.ndarray:
+        """[H, W, 4] the scene's own render."""
+        return cube.see(self.layers.outputs["Image"], self.folder, "CG")
+
+
+def headless(shot: Path, output: Path, samples: int) -> None:
+    """Bakes, adds the surface, puts things, renders, prints what is seen."""
+    cube.start()
+    scene, shot = bpy.context.scene, shot.absolute()
+    scene.splannequin.shot_path = str(shot)
+    contract = sys.modules["bl_ext.user_default.splannequin.torch_backend.contract"]
+    begin, surfaces = cube.add_on("process.begin"), cube.add_on("freeze.surfaces")
+    whole = contract.FreezeParams(take=cube.TAKE, t_star=cube.FRAME, only_missing=True)
+    if not cube.add_on("freeze.takes").complete(shot, cube.TAKE, [cube.FRAME]):
+        begin.run(scene, "freeze", whole)
+    cube.bake(shot)
+    scene = bpy.context.scene
+    with tempfile.TemporaryDirectory() as name:
+        sockets = Sockets(Path(name))
+        depth, frozen = sockets.of_group("Depth")[..., 0], sockets.of_group("Image")
+        if not surfaces.is_made(shot, cube.TAKE):
+            begin.run(scene, "freeze", contract.SurfaceParams(take=cube.TAKE))
+        print(*surfaces.add(scene, shot, cube.TAKE), sep="\n")
+        put(Eye(depth))
+        assert bpy.ops.splannequin.add_light() == {"FINISHED"}
+        scene.cycles.samples = samples
+        picture = sockets.of_group("Image")
+        save(picture, output)
+        print(bpy.app.version_string)
+        check(picture, frozen, sockets.cg())
+
+
+# ------------------------------------------------------------------------------------------------- in a window
+
+
+def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
+    """The artist in a window: a surface, light, CG and a bake by the panel's buttons."""
+    work = Path(plan["work"])
+    shot = work / "sitting.splannequin"
+    shutil.copytree(plan["shot"], shot, ignore=shutil.ignore_patterns("jobs", "lock.json"))
+    panel = press.addon_module("ui.step_panel")
+    sub_panel = panel.sub_panel
+    unfolded = ("takes", "freeze_more", "bake_more")
+    panel.sub_panel = lambda layout, name, label, folded=True: sub_panel(layout, name, label, name not in unfolded)
+    yield from press._arrange()
+    scene = bpy.context.scene
+    scene.splannequin.shot_path, scene.splannequin.take_name = str(shot), cube.TAKE
+    for item in scene.objects:
+        item.hide_render = item.type != "CAMERA"
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+        bpy.ops.splannequin.load_camera()
+    yield 2.0
+    scene.splannequin.choose_t_star, scene.splannequin.t_star = True, cube.FRAME
+    scene.frame_start = scene.frame_end = cube.FRAME
+    scene.frame_set(cube.FRAME)
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
+    yield from _press(shot, "add_surface", told, lambda: _entry().surfaces)
+    yield from press._shoot(work, "12-surface")
+    yield from _press(shot, "insert_freeze", told, _group)
+    yield from _press(shot, "combine_cg", told, lambda: _group().inputs["CG"].is_linked)
+    yield from press._shoot(work, "12-combined")
+    sockets = Sockets(work)
+    depth, frozen = sockets.of_group("Depth")[..., 0], sockets.of_group("Image")
+    put(Eye(depth))
+    yield 1.0
+    yield from _press(shot, "add_light", told, lambda: _entry().light)
+    yield from press._shoot(work, "12-light")
+    scene = _scene()
+    scene.cycles.samples = plan["samples"]
+    scene.render.filepath = str(work / "baked" / "######")
+    settings = scene.render.image_settings
+    settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
+    yield from _press(shot, "bake", told)
+    picture = cube.pixels_of(next((work / "baked").glob("*.exr")))
+    save(picture, Path(plan["output"]))
+    told.update(check(picture, frozen, Sockets(work).cg()))
+    yield from _show_render(work)
+
+
+def _scene() -> Any:
+    """The window's scene: undo makes another one of it."""
+    return bpy.context.window_manager.windows[0].scene
+
+
+def _entry() -> Any:
+    """What the shot has in the scene."""
+    return _scene().splannequin.made[0]
+
+
+def _group() -> Any:
+    """The freeze's node, if the scene has it."""
+    tree = cube.add_on("compat").compositor_tree(_scene())
+    return None if tree is None else cube.add_on("bake.freeze_group").group_node(tree)
+
+
+def _press(shot: Path, operator: str, told: dict[str, Any], has: Callable[[], Any] | None = None) -> Iterator[float]:
+    """Clicks a button of the panel and waits until what it began has ended. With `has`, which finds what is added,
+    it is undone and redone, too."""
+    watch = press._supervisor().watch_of(shot)
+    window = bpy.context.window_manager.windows[0]
+    with bpy.context.temp_override(window=window):
+        bpy.ops.ed.undo_push(message="Before")
+    for _ in range(8):  # the end of the sidebar has all of these buttons
+        yield from press._scroll_down()
+    began = time.monotonic()
+    yield from press._click(f"splannequin.{operator}")
+    yield 1.0
+    while watch.running() is not None:
+        yield 0.3
+    yield 1.5
+    failed = [sentence for sentence, _ in watch.failures.values()]
+    assert not failed, f"{operator}: {failed}"
+    told.setdefault("pressed", {})[operator] = round(time.monotonic() - began)
+    if has is None:
+        return
+    for step, should_be in (("nothing", True), ("undo", False), ("redo", True)):
+        if step != "nothing":
+            with bpy.context.temp_override(window=window):
+                getattr(bpy.ops.ed, step)()
+            yield 1.0
+        assert bool(has()) == should_be, f"{operator} after {step}"
+    told.setdefault("undone and redone", []).append(operator)
+
+
+def _show_render(work: Path) -> Iterator[float]:
+    """A picture of the window with what was baked."""
+    window = bpy.context.window_manager.windows[0]
+    window.workspace = bpy.data.workspaces["Rendering"]
+    yield 2.0
+    yield from press._shoot(work, "12-baked")
+
+
+def main() -> int:
+    """The command line, of all three ways to run it."""
     words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     parser = argparse.ArgumentParser(description="CG among the frozen people.")
     parser.add_argument("shot", type=Path, help="solved and trained shot folder; a take is added to it")
-    parser.add_argument("--output", type=Path, default=cube.ROOT / "docs" / "images" / "cg-among-frozen.jpg")
+    picture = Path(__file__).resolve().parents[3] / "docs" / "images" / "cg-among-frozen.jpg"
+    parser.add_argument("--output", type=Path, default=picture, help="JPEG of what is rendered")
+    parser.add_argument("--samples", type=int, default=64, help="samples of Cycles")
+    parser.add_argument("--blender", help="Blender with the extension installed, to run in a window of it")
+    parser.add_argument("--pictures", default="docs/images", help="folder for pictures of the window")
+    parser.add_argument("--display", default=":94", help="X display to open")
+    parser.add_argument("--limit", type=float, default=1500.0, help="seconds until Blender is ended")
     args = parser.parse_args(words)
-    cube.start()
-    shot = args.shot.absolute()
-    cube.bake(shot)
-    scene = bpy.context.scene
-    contract = sys.modules["bl_ext.user_default.splannequin.torch_backend.contract"]
-    surfaces = cube.add_on("freeze.surfaces")
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        tree = cube.add_on("compat").compositor_tree(scene)
-        group = cube.add_on("bake.freeze_group").group_node(tree)
-        layers = next(n for n in tree.nodes if n.bl_idname == "CompositorNodeRLayers")
-        depth = cube.see(group.outputs["Depth"], folder, "depth")[..., 0]
-        frozen = cube.see(group.outputs["Image"], folder, "frozen")
-        if not surfaces.is_made(shot, cube.TAKE):
-            cube.add_on("process.begin").run(scene, "freeze", contract.SurfaceParams(take=cube.TAKE))
-        print(*surfaces.add(scene, shot, cube.TAKE), sep="\n")
-        put(Eye(depth))
-        picture = cube.see(group.outputs["Image"], folder, "picture")
-        cg = cube.see(layers.outputs["Image"], folder, "cg")
-        print(check(picture, frozen, cg))
-        cube.keep(args.output, folder)
+    if args.blender is None:
+        headless(args.shot, args.output, args.samples)
+        return 0
+    host = argparse.Namespace(output=args.pictures, display=args.display, blender=args.blender, limit=args.limit)
+    plan = {"shot": str(args.shot.absolute()), "output": str(args.output.absolute()), "samples": args.samples}
+    return 1 if "error" in press._host(__file__, plan, host) else 0
 
 
 if __name__ == "__main__":
-    main()
-    sys.stdout.flush()
+    if press.PLAN in os.environ and "bpy" in sys.modules:
+        facts = json.loads(os.environ[press.PLAN])
+        seen: dict[str, Any] = {"blender": bpy.app.version_string}
+        press.act(play(facts, seen), Path(facts["work"]), seen)
+    else:
+        status = main()
+        sys.stdout.flush()
+        if "bpy" not in sys.modules:
+            sys.exit(status)

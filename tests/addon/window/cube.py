@@ -76,7 +76,12 @@ def see(socket, folder: Path, name: str) -> np.ndarray:
     settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
     add_on("bake.rendering").render(scene, folder / name, png=False)
     tree.links.new(kept, target)
-    image = bpy.data.images.load(str(folder / name / f"{FRAME:06d}.exr"))
+    return pixels_of(folder / name / f"{FRAME:06d}.exr")
+
+
+def pixels_of(path: Path) -> np.ndarray:
+    """[H, W, 4] float32 values of a picture file as they are, top row first."""
+    image = bpy.data.images.load(str(path))
     image.colorspace_settings.name = "Non-Color"
     width, height = image.size
     pixels = np.empty(width * height * 4, np.float32)

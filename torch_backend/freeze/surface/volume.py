@@ -44,7 +44,7 @@ class SurfaceConfig:
     """Largest number of voxels; voxels grow until they are no more. 8 bytes each, and about 12 while a surface is
     extracted."""
     part: float = 0.005
-    """Smallest share of all triangles that a separate piece has; smaller ones are dropped as noise."""
+    """Share of all triangles below which a separate piece is dropped as noise, unless most views confirm it."""
 
 
 @dataclass(frozen=True, eq=False)
