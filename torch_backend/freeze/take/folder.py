@@ -101,6 +101,19 @@ def made_before(take: str) -> tuple[str, str]:
     )
 
 
+def outdated(take: PlannedTake, place: Place, frames: Set[int]) -> tuple[str, str] | None:
+    """A warning that frames of the take go and are not rendered again: they show something else than this take, and
+    are not among its `frames`. None if there are none."""
+    gone = set(frames_of(take.folder)) - place.right_here - frames
+    if not gone:
+        return None
+    return (
+        f"{len(gone)} frames of the take {take.folder.root.name} show another instant or have other settings: they are "
+        "removed, and not rendered again.",
+        "Freeze the whole range to have them again, or name another take to keep them.",
+    )
+
+
 def clear(take: PlannedTake, done: Set[int]) -> None:
     """Removes all frames of before but those that are `done`: nobody shall take old ones for a part of this take."""
     folder = take.folder

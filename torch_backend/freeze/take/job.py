@@ -31,7 +31,7 @@ from ..exr import read_frozen_exr
 from ..frozen import OutputFrame
 from .cameras import in_range, intrinsics
 from .contact_sheet import write_contact_sheet
-from .folder import clear, made_before, place_of, take_over
+from .folder import clear, made_before, outdated, place_of, take_over
 from .footage_facts import footage_facts
 from .frames import make_ready, small_share
 from .plan import FrameSpec, PlannedTake, planned, run_verdict
@@ -51,6 +51,8 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     place = place_of(take, params)
     if place.of_before:
         report.warning(*made_before(params.take))
+    if (warning := outdated(take, place, {f.frame for f in frames})) is not None:
+        report.warning(*warning)
     done = place.right_here | place.right_beside
     make_ready(take, frames, done, report)  # what can fail, or be cancelled, before anything of before goes
     if place.beside is None:

@@ -32,9 +32,12 @@ def test_a_range_with_a_step_then_the_rest_of_it(trained, quiet):
     assert sorted(more) == [102, 104, 105, 106, 108], "frames outside of the range stay"
     assert all(more[n] == some[n] for n in some), "and none of them is rendered again"
     assert (facts["first"], facts["last"], facts["frames"]) == (102, 108, 5)
-    freeze_shot(world.shot, FreezeParams(**ask, first=104, last=104), quiet())
+    same, other = quiet(), quiet()
+    freeze_shot(world.shot, FreezeParams(**ask, first=104, last=104), same)
     assert times(folder) == more
-    freeze_shot(world.shot, FreezeParams(**{**ask, "t_star": 110}, first=104, last=105), quiet())
+    freeze_shot(world.shot, FreezeParams(**{**ask, "t_star": 110}, first=104, last=105), other)
+    warned = [{event[1] for event in report.events if event[0] == "warning"} for report in (same, other)]
+    assert len(warned[1] - warned[0]) == 1, "it says that three frames go"
     assert sorted(times(folder)) == [104, 105], "at another instant none of the others is right"
 
 
