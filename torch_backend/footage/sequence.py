@@ -60,6 +60,14 @@ _NO_ORIENTATION = (
 )
 
 
+def _several_numbers(pattern: str) -> tuple[str, str]:
+    """The warning that more than one number varies in the names of a sequence."""
+    return (
+        f"Several numbers vary in the names: the frame number was read where # stands in {pattern}.",
+        "If another one counts the frames, name the clip by a pattern with # in its place.",
+    )
+
+
 class SequenceSource:
     """A numbered sequence. Frame numbers are those of the files; missing and unreadable ones are left out."""
 
@@ -77,13 +85,7 @@ class SequenceSource:
         if len(self._files) < FEW:
             raise footage_error(f"{sequence.pattern} is a single picture.", "A freeze needs a clip: choose a sequence.")
         if sequence.numbered.others_vary:
-            self.warnings.append(
-                (
-                    f"Several numbers vary in the names: the frame number was read where # stands in "
-                    f"{sequence.pattern}.",
-                    "If another one counts the frames, name the clip by a pattern with # in its place.",
-                )
-            )
+            self.warnings.append(_several_numbers(sequence.pattern))
         first, spec, self._layer, names = self._first_readable(layer)
         self._channels = channel_names(spec)
         self._space = look_space(look) if look else _input_space(first, spec, colours or Colours(), self.warnings)
@@ -97,14 +99,8 @@ class SequenceSource:
         width, height = self._orientation.size(*square_size(*self._stored, self._aspect))
         self._describe(names, layer, (width, height))
         rate = fps or _rate(spec)
-        space, light = self._space, self._space.is_light
-        reading_key = [space.name, self._layer.name, float(self._aspect), "straight", *space.origin.values()]
-        ordinary = space.as_it_stands or space == InputSpace("lin", declared=space.declared)
-        ordinary = ordinary and self._aspect == 1 and self._layer.alpha is None and len(names) == 1
-        reading_key = [] if ordinary else reading_key
-        if self._orientation != UPRIGHT:
-            reading_key.append(f"orientation {self._orientation.code}")
-        stats = [f.stat() for f in self._files.values()]
+        space, reading_key = self._space, self._reading_key(len(names))
+        light = space.is_light
         self.info = SourceInfo(
             width=width,
             height=height,
@@ -116,13 +112,7 @@ class SequenceSource:
             colour="linear" if light else "srgb",
             # By content: footage may be copied or moved. What is read otherwise than it used to be is imported again.
             key=content_key_of(self._files) + reading_key,
-            former_key=[
-                _former_name(sequence),
-                len(stats),
-                sum(s.st_size for s in stats),
-                max(s.st_mtime_ns for s in stats),
-                *reading_key,
-            ],
+            former_key=[*self._former_key(sequence), *reading_key],
             reading={
                 "files": sequence.pattern,
                 "numbers": [min(self._files), max(self._files)],
@@ -135,6 +125,21 @@ class SequenceSource:
             probe=space.probe,
             unlike=_unlike(spec, len(names), self._aspect, self._orientation) or _named_unlike(first.name, self._files),
         )
+
+    def _reading_key(self, layers: int) -> list[Any]:
+        """How the pictures are read, for the clip's key; empty for ordinary ones, of which it did not always say."""
+        space = self._space
+        ordinary = space.as_it_stands or space == InputSpace("lin", declared=space.declared)
+        ordinary = ordinary and self._aspect == 1 and self._layer.alpha is None and layers == 1
+        key: list[Any] = [space.name, self._layer.name, float(self._aspect), "straight", *space.origin.values()]
+        turned = [] if self._orientation == UPRIGHT else [f"orientation {self._orientation.code}"]
+        return ([] if ordinary else key) + turned
+
+    def _former_key(self, sequence: PictureSequence) -> list[Any]:
+        """The key that an earlier version gave these files: by name, size and date."""
+        stats = [file.stat() for file in self._files.values()]
+        size, time = sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
+        return [_former_name(sequence), len(stats), size, time]
 
     def _reading(self, spec: oiio.ImageSpec) -> dict[str, Any]:
         """How the pictures are read, for frames.json."""

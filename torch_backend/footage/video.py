@@ -97,8 +97,7 @@ class VideoSource:
                 raise too_large(path.name, stream.codec_context.width, stream.codec_context.height)
             frame = first_frame(container, stream, path)
             self._is_picture = container.format.name in _ANIMATED_PICTURES
-            matrix = display_matrix(frame)
-            orientation = UPRIGHT if matrix is None else orientation_of_matrix(matrix)
+            orientation = UPRIGHT if (matrix := display_matrix(frame)) is None else orientation_of_matrix(matrix)
             self._orientation, self._rotation = orientation or UPRIGHT, frame.rotation
             # FFmpeg makes the stream's pixel aspect of the matrix: of one that is not applied it means nothing.
             aspect = told.pixel_aspect or pixel_aspect(stream if orientation else stream.codec_context)
@@ -128,9 +127,7 @@ class VideoSource:
                 **self._reading_of(container, stream),
             }
         stat = path.stat()
-        reading_key = _reading_key(self._space) + (["deinterlaced"] if self._interlaced else [])
-        if self._orientation.is_mirrored:
-            reading_key.append(f"orientation {self._orientation.code}")
+        reading_key = self._reading_key()
         self.info = SourceInfo(
             width=width,
             height=height,
@@ -148,6 +145,11 @@ class VideoSource:
             probe=self._space.probe,
             unlike=self._unlike(frame, orientation),
         )
+
+    def _reading_key(self) -> list[Any]:
+        """How the pictures are read, for the clip's key; empty for ordinary ones."""
+        key: list[Any] = _reading_key(self._space) + (["deinterlaced"] if self._interlaced else [])
+        return key + ([f"orientation {self._orientation.code}"] if self._orientation.is_mirrored else [])
 
     def _reading_of(self, container: Any, stream: Any) -> dict[str, Any]:
         """How the stream is read, for frames.json."""
