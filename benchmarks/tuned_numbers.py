@@ -69,7 +69,7 @@ UNTUNED = {
     "composite/surface_depth.py:_QUANTUM": "format",
     "composite/surface_depth.py:_SLOPE_NOISE": "mathematics",
     "composite/surface_depth.py:_slope": "mathematics",
-    "composite/surface_depth.py:fit_planes": "mathematics",
+    "composite/planes.py:fit_planes": "mathematics",
     "composite/surface_depth.py:frame_depth": "guard",
     "composite/surface_depth.py:FrameDepths._key": "guard",
     "composite/transfer.py:to_linear": "format",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from torch_backend.freeze.composite.planes import smoothed
 from torch_backend.freeze.composite.surface_depth import (
     KeyView,
     Splats,
@@ -18,7 +19,6 @@ from torch_backend.freeze.composite.surface_depth import (
     combined,
     frame_depth,
     key_picture,
-    smoothed,
 )
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
