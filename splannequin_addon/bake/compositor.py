@@ -81,8 +81,8 @@ def insert(
         compat.enable_compositor(scene)
         if not before["made_tree"]:
             changes.append("The compositor was switched on.")
-    node, told = _placed(tree, before, behind, where)
-    changes += [f'The node group "{GROUP_NAME}" was {change}.' for change in told]
+    node, done = _placed(tree, before, behind, where)
+    changes += done
     changes += freeze_group.switch_warp(node, wanted, flow is not None)
     changes += freeze_group.give_passes(node, _layers_of(frozen, take))
     group_inside.fill(scene, node, take, frozen, flow)
@@ -95,20 +95,21 @@ def insert(
 def _placed(
     tree: bpy.types.NodeTree, before: dict[str, bool], behind: bpy.types.NodeSocket | None, where: str
 ) -> tuple[bpy.types.CompositorNodeGroup, list[str]]:
-    """(the group's node, what was done with it): a new one, or the one that is there, behind a socket or, with None,
-    before the output."""
+    """(the group's node, a sentence for each change): a new one, or the one that is there, behind a socket or, with
+    None, before the output."""
     node = freeze_group.group_node(tree)
     if node is None:
         node = freeze_group.new_node(tree, before)
         placing.lead_through(tree, node, behind)
         place = "as the plate: what follows it goes on from there" if behind is not None else "before the output"
-        return node, [f"inserted {place}"]
-    moves = where != "AUTO" and placing.stands_in(node) != (behind is not None)
-    if moves:
+        return node, [f'The node group "{GROUP_NAME}" was inserted {place}.']
+    changes: list[str] = []
+    if where != "AUTO" and placing.stands_in(node) != (behind is not None):
         placing.lead_past(tree, node)
         placing.lead_through(tree, node, behind)
+        changes.append(f'The node group "{GROUP_NAME}" was moved.')
     freeze_group.set_defaults(node, freeze_group.give_sockets(present(node.node_tree)))
-    return node, ["moved"] * moves + ["updated"]
+    return node, [*changes, f'The node group "{GROUP_NAME}" was updated.']
 
 
 def _need_own(tree: bpy.types.NodeTree | None) -> None:

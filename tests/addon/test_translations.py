@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 import pytest
 
-NOT_ON_SCREEN = {"headless.py", "cli.py", "run_in_bpy.py"}
+NOT_ON_SCREEN = {"console.py", "headless.py", "cli.py", "run_in_bpy.py"}
 """Modules that speak to a console, in English."""
 NOT_SHOWN = {
     "Splannequin",  # a name
