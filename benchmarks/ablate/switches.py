@@ -86,9 +86,10 @@ def _freeze(module: str) -> Any:
     return importlib.import_module(f"torch_backend.freeze.{module}")
 
 
-def _never_near(config: Any) -> Any:
-    """`StaticBaselineConfig` with which no plate sees anything from near."""
-    return partial(config, nearer=0.0)
+def _baseline(**numbers: Any) -> tuple[Switch, ...]:
+    """The static baseline with other numbers. Its repair is replaced, because that has its configuration by default."""
+    config = dataclasses.replace(StaticBaselineConfig(), **numbers)
+    return (Switch(MAKER, "StaticBaseline", partial(partial, config=config), of_original=True),)
 
 
 def _as_it_was(room: Any, *_: Any) -> dict[str, Tensor]:
@@ -114,7 +115,7 @@ _SCENE = (
     ),
     Rule(
         "baseline from near", "nothing counts as seen from near by the baseline", STAGES[0],
-        (Switch("instant.static_baseline", "StaticBaselineConfig", _never_near, of_original=True),),
+        _baseline(nearer=0.0),
     ),
     Rule("missing movers", "nothing is added", STAGES[1], (Switch(MAKER, STAGES[1], _third),)),
     Rule("develop", "no training step", "develop", (Switch(MAKER, "develop", _developed_as_is),)),
@@ -187,9 +188,9 @@ def _swept() -> Iterator[Rule]:
             switch = Switch("instant.instants", "config_for", change, of_original=True)
             yield Rule(f"{word} develop.{path}", f"times {factor}", STAGES[2], (switch,))
         for path, value in _numbers(StaticBaselineConfig()):
-            change = partial(_preset, path, _scaled(value, factor))
-            switch = Switch("instant.static_baseline", "StaticBaselineConfig", change, of_original=True)
-            yield Rule(f"{word} baseline.{path}", f"times {factor}", STAGES[0], (switch,))
+            yield Rule(
+                f"{word} baseline.{path}", f"times {factor}", STAGES[0], _baseline(**{path: _scaled(value, factor)})
+            )
         for module, name, stage in CONSTANTS:
             switch = Switch(module, name, partial(_scaled, factor=factor), of_original=True)
             yield Rule(f"{word} {module.rsplit('.', 1)[-1]}.{name}", f"times {factor}", stage, (switch,))
@@ -197,10 +198,6 @@ def _swept() -> Iterator[Rule]:
 
 def _changed(path: str, value: Any, config_for: Callable[..., Any]) -> Callable[..., Any]:
     return lambda run: dataclasses.replace(config_for(run), **{path: value})
-
-
-def _preset(path: str, value: Any, config: Any) -> Any:
-    return partial(config, **{path: value})
 
 
 SWEEP = {"half": 0.5, "twice": 2.0}

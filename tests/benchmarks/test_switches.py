@@ -1,0 +1,26 @@
+"""Rules that `benchmarks.ablate` switches off or changes reach what they are of."""
+
+import pytest
+
+from benchmarks.ablate.switches import RULES, switched_off
+from torch_backend.freeze.instant import repairs
+from torch_backend.freeze.instant.develop import DevelopConfig
+
+
+@pytest.mark.parametrize("word, factor", [("half", 0.5), ("twice", 2.0)])
+def test_numbers_of_the_static_baseline_reach_its_repair(word, factor):
+    usual, *_ = repairs.repairs(DevelopConfig())
+    changed = 0
+    for name, value in vars(usual.config).items():
+        with switched_off(frozenset({f"{word} baseline.{name}"})):
+            baseline, *_ = repairs.repairs(DevelopConfig())
+        assert getattr(baseline.config, name) == pytest.approx(factor * value, abs=1.0), name
+        changed += baseline.config != usual.config
+    assert changed == len(vars(usual.config))
+    assert repairs.repairs(DevelopConfig())[0].config == usual.config, "and is as before afterwards"
+
+
+def test_every_rule_can_be_switched_off():
+    for name in RULES:
+        with switched_off(frozenset({name})):
+            pass
