@@ -54,8 +54,6 @@ class StaticBaselineConfig:
     plate's time shows better than the twin then counts. Held-still people sway by less; their mean is as good."""
     nearer: float = 1.0 / AFAR
     """A plate sees a Gaussian from near if its distance is at most so much of that at t*."""
-    rounds: int = 2
-    """Comparisons: what stays open is held against the twin again without what was closed."""
 
 
 def apply_static_baseline(
@@ -77,20 +75,15 @@ def apply_static_baseline(
     movers = (plates.moving_share(frozen, t_star) > 0.5).float()
     shown_at_t_star = showing(run.train_frames, t_star)
     others = [frame for frame in spread(run.train_frames, config.plates) if frame not in shown_at_t_star]
-    for _ in range(config.rounds):
-        left = rows[frozen.motion[rows] > 0.5]
-        if not len(left):
-            break
-        twin = with_still_means(run, frozen, left)
-        pair = _Pair(run, plates, frozen, twin, left, movers, t_star, config)
-        near = _nearest(frozen.state["means"][left], config.neighbours)
-        gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
-        least = torch.where((movers[left] > 0.5) | pair.went, harm, config.doubted * harm)
-        stays = (harm <= 0.0) | (gain > least)
-        if bool(stays.all()):
-            break
-        frozen = with_still_means(run, frozen, left[~stays])
-    return frozen
+    left = rows[frozen.motion[rows] > 0.5]
+    if not len(left):
+        return frozen
+    pair = _Pair(run, plates, frozen, with_still_means(run, frozen, left), left, movers, t_star, config)
+    near = _nearest(frozen.state["means"][left], config.neighbours)
+    gain, harm = -pair.worse(shown_at_t_star, near, still=False), pair.worse(others, near)
+    least = torch.where((movers[left] > 0.5) | pair.went, harm, config.doubted * harm)
+    stays = (harm <= 0.0) | (gain > least)
+    return frozen if bool(stays.all()) else with_still_means(run, frozen, left[~stays])
 
 
 @torch.no_grad()
