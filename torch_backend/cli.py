@@ -31,6 +31,9 @@ class Console:
         self._last = ("", 0.0)
         self._open_line = False
         self.error: dict[str, Any] | None = None
+        self._way: contract.WholeWay | None = None
+        self._job = ("", 0.0)
+        """Kind of the job at work, and when it began, seconds since the epoch."""
 
     def __call__(self, event: Event) -> None:
         if event.type == "error":
@@ -48,6 +51,19 @@ class Console:
         elif event.type == "done" and event.data["state"] == "cancelled":
             self._line("Cancelled. Start the same command again to go on: finished work is kept.")
 
+    def begins(self, kind: str, way: contract.WholeWay | None) -> None:
+        """A job of a kind begins, `way` the jobs that it is one of."""
+        self._job, self._way = (kind, time.time()), way
+
+    def _of_all(self, event: Event) -> str:
+        """How far all jobs are, in words; empty if nobody knows."""
+        if self._way is None:
+            return ""
+        kind, since = self._job
+        lasts = event.data["stage"] in contract.LASTING_STAGES
+        share, left = self._way.at(kind, event.time - since, event.data.get("eta_seconds") if lasts else None)
+        return f"; in all {share:.0%}, {contract.duration(left)} left"
+
     def _progress(self, event: Event) -> None:
         data = event.data
         share = data["done"] / data["total"] if data["total"] else 0.0
@@ -57,7 +73,7 @@ class Console:
             return
         self._last = (data["stage"], event.time)
         eta = f", {data['eta_seconds']:.0f} s left" if data.get("eta_seconds") and not finished else ""
-        text = f"  {data['stage']:<22} {100 * share:3.0f}%  {data['message']}{eta}"
+        text = f"  {data['stage']:<22} {100 * share:3.0f}%  {data['message']}{eta}{self._of_all(event)}"
         if self._tty:
             self.stream.write("\r" + text[:118].ljust(118) + ("\n" if finished else ""))
             self.stream.flush()
@@ -135,12 +151,15 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
         _give_up(error, output)
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
+    way: contract.WholeWay | None = None
     for kind, params in requests.items():
         since = time.perf_counter()
+        console.begins(kind, way)
         results[kind] = run_station(shot, kind, params, console)
         stages[kind] = round(time.perf_counter() - since, 2)
         if kind == "import":
             print_reading(results[kind], console)
+            way = _rest_of_the_way(shot, requests, stages[kind])
         info = shot.info()
         if args.t_star is not None and not info.first <= args.t_star <= info.last:  # said before hours of training
             raise contract.UserError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
@@ -148,6 +167,16 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     write_json(output / contract.SUMMARY_FILE, summary)
     print_summary(summary, console)
     return ExitCode.OK
+
+
+def _rest_of_the_way(shot: Shot, requests: dict[str, Any], spent: float) -> contract.WholeWay | None:
+    """The jobs after the import, which took `spent` seconds; None if how long they take cannot be told."""
+    try:
+        size, pace = contract.ShotSize.of(shot), contract.paces(Path(sys.prefix))
+    except (OSError, ValueError):
+        return None
+    seconds = {kind: contract.expected_seconds(kind, requests[kind], size) for kind in requests if kind != "import"}
+    return contract.WholeWay({kind: (s or 0.0) * pace.get(kind, 1.0) for kind, s in seconds.items()}, spent)
 
 
 def _refuse_anothers(root: Path, asked: contract.ImportParams) -> None:

@@ -49,6 +49,8 @@ class JobReporter:
         self._taken_by: Writer | None = None
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
+        self.from_nothing = False
+        """The job's first stage began at its beginning: nothing of it had been done before."""
         self._foretold = ("", 0.0)
         now = time.time()
         pid, host = os.getpid(), contract.computer_name()
@@ -67,6 +69,7 @@ class JobReporter:
         with self._lock:
             if stage != self._stage_started[0]:
                 self._stage_started = (stage, now, fraction)
+                self.from_nothing |= stage == contract.BEGINS_WITH.get(self.status.kind) and fraction < 0.05
             eta = self._eta(now, fraction)
             self.status.stage, self.status.fraction = stage, fraction
             self.status.message, self.status.eta_seconds = message, eta
@@ -229,8 +232,11 @@ def _run(
             reporter.holds(held.enter_context(mine))
             shot.publish_frames()
         reporter.check_cancelled()
+        since = time.monotonic()
         with _kept_in_place(shot, request.kind):
             result = RUNNERS[request.kind](shot, params, reporter)
+        if reporter.from_nothing:
+            _learn_pace(shot, request.kind, params, time.monotonic() - since)
     except Cancelled:
         state, code = "cancelled", int(ExitCode.CANCELLED)
         message, hint = "Cancelled.", "Start it again to go on: finished work is kept."
@@ -258,6 +264,14 @@ def _run(
     if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
         print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log goes with the shot's folder, the status does not
     return code, result
+
+
+def _learn_pace(shot: Shot, kind: str, params: Any, seconds: float) -> None:
+    """Notes how fast this machine was, for the estimates of later jobs."""
+    with contextlib.suppress(OSError, ValueError):
+        expected = contract.expected_seconds(kind, params, contract.ShotSize.of(shot))
+        if expected is not None:
+            contract.learn_pace(Path(sys.prefix), kind, seconds, expected)
 
 
 @contextlib.contextmanager

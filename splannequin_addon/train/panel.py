@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...torch_backend import contract
 from ..access import layout_of, scene_in, settings_of
 from ..process import steps
 from ..scene import paths
@@ -50,7 +51,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             columns = cells(column.row(align=True), _PRESET_WIDTHS)
             label = tr(names[row.preset])  # ours: Blender's own word for Final is too long for the column in German
             columns[0].prop_enum(props, "preset", row.preset, text=label, translate=False)
-            spent = "-" if row.seconds is None else step_panel.minutes(row.seconds) + ("" if row.measured else " ?")
+            spent = "-" if row.seconds is None else contract.duration(row.seconds) + ("" if row.measured else " ?")
             for place, text in zip(columns[1:], (str(row.width or "-"), f"{row.steps / 1000:g}k", spent), strict=True):
                 place.label(text=text, translate=False)
         if told is None:
@@ -104,7 +105,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             wrap(
                 body,
                 context,
-                f"{first:.1f} to {last:.1f} dB on frames kept out, in {step_panel.minutes(seconds)}",
+                f"{first:.1f} to {last:.1f} dB on frames kept out, in {contract.duration(seconds)}",
                 "NONE",
             )
 

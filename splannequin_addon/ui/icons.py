@@ -11,6 +11,7 @@ OF: dict[str, Icon] = {
     "splannequin.align_floor": "GRID",
     "splannequin.align_origin": "OBJECT_ORIGIN",
     "splannequin.align_scale": "ARROW_LEFTRIGHT",
+    "splannequin.all_steps": "PLAY",
     "splannequin.bake": "RENDER_ANIMATION",
     "splannequin.cancel": "CANCEL",
     "splannequin.cancel_setup": "CANCEL",

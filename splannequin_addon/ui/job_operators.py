@@ -9,7 +9,7 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Outcome, scene_in
-from ..process import job_timer, jobs, steps
+from ..process import all_steps, job_timer, jobs, steps
 from ..properties import StringProperty
 from ..shot import selection
 from ..translations import tr
@@ -31,6 +31,7 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         """Asks the job to stop."""
         folder = selection.shot_folder(scene_in(context))
         watch = job_timer.watch_of(folder) if folder else None
+        ended = folder is not None and all_steps.stop(folder)
         if watch and self.step in ("", watch.running()) and job_timer.stop_work(watch):
             job_timer.redraw()
             return {"FINISHED"}
@@ -40,6 +41,8 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
             return {"FINISHED"}
         job = watch.jobs.get(self.step or watch.running() or "") if watch else None
         if job is None or job.ended:
+            if ended:  # between two steps
+                return {"FINISHED"}
             self.report({"WARNING"}, "Nothing is running")
             return {"CANCELLED"}
         try:
@@ -47,6 +50,41 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         except (contract.JobError, OSError) as error:
             self.report({"ERROR"}, tr(f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()))
             return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class SPLANNEQUIN_OT_all_steps(bpy.types.Operator):
+    """Solve the camera, train, and freeze t*, each with its own settings, as soon as the step before is done. What is
+    there already stays"""
+
+    bl_idname = "splannequin.all_steps"
+    bl_label = "Solve, Train and Freeze"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Off before the import, while a step runs, and when all are done."""
+        folder = selection.shot_folder(scene_in(context))
+        if folder is not None and job_timer.watch_of(folder).running():
+            cls.poll_message_set(tr("A step of this shot is running"))
+            return False
+        if not all_steps.missing(scene_in(context)):
+            cls.poll_message_set(tr("There is nothing to do: import a clip, or freeze again with the button below"))
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> Outcome:
+        """Begins the first of them; headless, does all of them."""
+        scene = scene_in(context)
+        folder = selection.shot_folder(scene)
+        if folder is None:
+            return {"CANCELLED"}
+        all_steps.begin(scene, folder)
+        failures = job_timer.watch_of(folder).failures
+        for step in all_steps.BUTTONS:
+            if step in failures:
+                self.report({"ERROR"}, tr(" ".join(failures[step]).strip()))
+                return {"CANCELLED"}
         return {"FINISHED"}
 
 
@@ -74,4 +112,4 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (SPLANNEQUIN_OT_cancel, SPLANNEQUIN_OT_open_log)
+CLASSES = (SPLANNEQUIN_OT_cancel, SPLANNEQUIN_OT_all_steps, SPLANNEQUIN_OT_open_log)

@@ -10,6 +10,7 @@ from typing import Any
 
 import bpy
 
+from ...torch_backend import contract
 from ..access import PanelBase, layout_of, scene_in
 from ..process import job_timer, jobs, steps
 from ..shot import selection
@@ -135,7 +136,7 @@ class StepPanel(PanelBase):
         row.operator("splannequin.cancel", text=stop, icon=icons.of("splannequin.cancel")).step = self.step
         detail = [status.message] if status and status.message else []
         if status and status.eta_seconds is not None:
-            detail.append(f"about {minutes(status.eta_seconds)} left")
+            detail.append(f"about {contract.duration(status.eta_seconds)} left")
         wrap(layout, context, ", ".join(tr(part) for part in detail) if detail else "The backend is starting.", "INFO")
         if started_elsewhere(job):
             wrap(layout, context, f"Started from {job.blend}.", "FILE_BLEND")
@@ -190,13 +191,6 @@ def started_elsewhere(job: jobs.Job) -> bool:
 def unsaid(warnings: list[tuple[str, str]], said: list[str]) -> list[str]:
     """A job's warnings as lines, without those that the step's state tells anyway, as it does a verdict."""
     return [f"{message} {hint}".strip() for message, hint in warnings if message not in said]
-
-
-def minutes(seconds: float) -> str:
-    """A duration for people: "45 s", "3 min", "1.5 h"."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def sub_panel(layout: bpy.types.UILayout, name: str, label: str, folded: bool = True) -> Any | None:

@@ -11,7 +11,7 @@ import pytest
 
 from torch_backend import cli
 from torch_backend.contract import ExitCode, JobError, ShotFolder, write_json
-from torch_backend.farm.work import FIRST_FRAMES, PER_WORKING
+from torch_backend.contract.pace import FIRST_FRAMES, PER_WORKING
 from torch_backend.freeze.exr import read_frozen_exr
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -5,6 +5,7 @@
     verbs           the words of the command lines; command_line makes both of them of it
     jobs            a job's folder: request, status, events
     processes       children, and which process lives
+    pace            how long jobs take on this machine
     lock            one writer per shot
     path_rules      where files of another computer lie on this one
     shot_folder     where everything of a shot lies
@@ -173,6 +174,16 @@ from .options import (
     SurfaceParams,
     TrainParams,
     check_params,
+)
+from .pace import (
+    BEGINS_WITH,
+    LASTING_STAGES,
+    ShotSize,
+    WholeWay,
+    duration,
+    expected_seconds,
+    learn_pace,
+    paces,
 )
 from .path_rules import RULES_VARIABLE, mapped
 from .picture_files import is_whole_picture, read_exr_header

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ..contract import PRESET_STEPS, PRESET_WIDTHS
+from ..contract import PRESET_STEPS, ShotSize
 from ..freeze.instant.develop import DevelopConfig
 from .shots import FarmShot
 
@@ -14,14 +14,6 @@ STEPS = ("import", "solve", "train", "open", "freeze", "finish", "bake", "delive
 """Of a shot, in their order: each begins when all of the one before has succeeded."""
 MOST_VALUES = 1024
 """Values of a task parameter, at most, as Open Job Description has it."""
-
-
-PER_STEP, PER_SOLVED = 0.16, 0.13
-"""Megapixels that a training step and a solved frame cost whatever their size; measured, see docs/farm.md."""
-PER_WORKING, FIRST_FRAMES = 3.6, 3.5
-"""Megapixels of frozen frames that one of working frames costs as much as, for what moves and what a plate shows is
-looked for at their size; and how many frames' worth of that the first of a part is, which meets most plates first.
-From "What a frame costs" in docs/benchmarks.md."""
 
 
 @dataclass(frozen=True)
@@ -64,19 +56,18 @@ def steps_of(shot: FarmShot, part: int, bake: bool) -> list[Step]:
     """
     part = max(1, part, -(-shot.frames // MOST_VALUES))
     starts = list(range(shot.first, shot.last + 1, part))
-    wide, high = take_size(shot)
+    size, (wide, high) = _size(shot), take_size(shot)
     each = wide * high / 1e6
     lengths = {start: min(part, shot.last + 1 - start) for start in starts}
-    working = shot.working[0] * shot.working[1] / 1e6
-    frozen = {start: n * each + (n + FIRST_FRAMES) * PER_WORKING * working for start, n in lengths.items()}
+    frozen = {start: size.freeze_work(n, wide) for start, n in lengths.items()}
     baked = {start: n * each for start, n in lengths.items()}
     whole = {0: shot.frames * each}
     every = list(shot.takes)
     plain: list[tuple[str, float]] = []
     if shot.clip:
-        plain.append(("import", shot.frames * shot.source[0] * shot.source[1] / 1e6))
+        plain.append(("import", size.import_work()))
     if not shot.solved:
-        plain.append(("solve", shot.frames * (working + PER_SOLVED)))
+        plain.append(("solve", size.solve_work()))
     if not shot.trained:
         plain.append(("train", _training(shot)))
     steps = [Step(shot, kind, [], [], part, {0: amount}) for kind, amount in plain]
@@ -92,19 +83,22 @@ def steps_of(shot: FarmShot, part: int, bake: bool) -> list[Step]:
 def take_size(shot: FarmShot) -> tuple[int, int]:
     """Width and height in pixels of a shot's frozen frames, without overscan."""
     width = int(shot.requests["freeze"]["width"]) or shot.source[0]
-    return width, max(16, round(shot.source[1] * width / shot.source[0]))
+    return width, _size(shot).take_height(width)
+
+
+def _size(shot: FarmShot) -> ShotSize:
+    return ShotSize(shot.frames, shot.working, shot.source)
 
 
 def _training(shot: FarmShot) -> float:
     asked: dict[str, Any] = shot.requests["train"]
-    steps = asked["iterations"] or PRESET_STEPS[asked["preset"]]
-    return steps * (_trained_width(shot) ** 2 * _shape(shot) / 1e6 + PER_STEP)
+    return _size(shot).train_work(asked["iterations"] or PRESET_STEPS[asked["preset"]], _trained_width(shot))
 
 
 def _trained_width(shot: FarmShot) -> int:
     """Pixels of the training's pictures."""
     asked: dict[str, Any] = shot.requests["train"]
-    return min(asked["width"] or PRESET_WIDTHS[asked["preset"]] or shot.working[0], shot.working[0])
+    return _size(shot).trained_width(asked["width"], asked["preset"])
 
 
 def _developing(shot: FarmShot) -> float:
@@ -114,11 +108,7 @@ def _developing(shot: FarmShot) -> float:
     usual, trained = DevelopConfig(), _trained_width(shot)
     width = min(max(usual.width, trained), shot.working[0])
     steps = round(usual.steps * max(1.0, trained / usual.width))
-    return steps * width**2 * _shape(shot) / 1e6
-
-
-def _shape(shot: FarmShot) -> float:
-    return shot.working[1] / shot.working[0]
+    return steps * width**2 * shot.working[1] / shot.working[0] / 1e6
 
 
 def disk_bytes(shot: FarmShot, bake: bool) -> float:

@@ -7,11 +7,11 @@ there will be is the schedule of growth. A run that ends its growth or itself ea
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..contract import duration
 from ..gaussians import Densifier
 from .config import PRESETS
 
@@ -109,13 +109,6 @@ def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: floa
     return found[::-1]
 
 
-def words_for(seconds: float) -> str:
-    """A duration as it is said: "40 s", "25 min", "3.5 h"."""
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{math.floor(seconds / 360 + 0.5) / 10:g} h"
-
-
 def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternative]) -> tuple[str, str] | None:
     """(sentence, hint) for a run that will take longer than `LONG_SECONDS`; None for another.
 
@@ -127,14 +120,14 @@ def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternat
     """
     if seconds <= LONG_SECONDS:
         return None
-    long = words_for(seconds)
+    long = duration(seconds)
     sentence = f"The training takes about {long} on the processor."
     if resumed:
         sentence = f"The training takes about {long} more on the processor."
     less = "A smaller width or fewer Gaussians take less."
     if smaller:
         other = next((row for row in smaller if row.seconds <= LONG_SECONDS), smaller[-1])
-        takes = words_for(other.seconds)
+        takes = duration(other.seconds)
         less = f"The preset {other.preset} would take about {takes}."
         if other.width >= width:  # then more steps are all that it saves: on one clip of 640 pixels they gained nothing
             less = f"The preset {other.preset} would take about {takes} on pictures of the same size."

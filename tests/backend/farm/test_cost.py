@@ -6,18 +6,12 @@ import math
 import pytest
 
 from torch_backend.contract import JobError, write_json
+from torch_backend.contract.pace import FIRST_FRAMES, PER_SOLVED, PER_STEP, PER_WORKING
 from torch_backend.farm import rates
 from torch_backend.farm.cost import estimate, needs, sentences
 from torch_backend.farm.rates import Rate, measure, read_rates, to_json
 from torch_backend.farm.shots import gather
-from torch_backend.farm.work import (
-    FIRST_FRAMES,
-    MOST_VALUES,
-    PER_SOLVED,
-    PER_STEP,
-    PER_WORKING,
-    steps_of,
-)
+from torch_backend.farm.work import MOST_VALUES, steps_of
 from torch_backend.freeze.instant.develop import DevelopConfig
 
 ONE = {kind: Rate(1.0, 0.0, 2.0, 1000) for kind in rates.MEASURED}

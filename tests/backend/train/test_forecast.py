@@ -2,7 +2,7 @@
 
 import pytest
 
-from torch_backend.contract import FORECAST, Cancelled, TrainParams
+from torch_backend.contract import FORECAST, Cancelled, TrainParams, duration
 from torch_backend.train import PRESETS, train_shot
 from torch_backend.train.forecast import (
     GAUSSIAN_PIXELS,
@@ -13,7 +13,6 @@ from torch_backend.train.forecast import (
     smaller_presets,
     step_work,
     warning_of,
-    words_for,
 )
 
 
@@ -43,14 +42,6 @@ def test_the_first_step_does_not_count_and_what_is_between_neither():
     assert [watch.step(10.0) for _ in range(STEPS)][-1] == 0.0
 
 
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.2, "1 s"), (89, "89 s"), (100, "2 min"), (5300, "88 min"), (5500, "1.5 h"), (36000, "10 h")],
-)
-def test_a_duration_in_words(seconds, words):
-    assert words_for(seconds) == words
-
-
 def test_smaller_presets_take_less_and_what_fits_an_hour_is_named():
     each = 1e-6
     rows = smaller_presets("final", (1280, 720), 20_000, each)
@@ -63,7 +54,7 @@ def test_smaller_presets_take_less_and_what_fits_an_hour_is_named():
     assert smaller_presets("preview", (1280, 720), 20_000, each) == []
     sentence, hint = warning_of(9000.0, 1280, False, rows)
     assert sentence == "The training takes about 2.5 h on the processor."
-    assert hint.endswith(f"The preset preview would take about {words_for(preview)}.") and standard > 3600
+    assert hint.endswith(f"The preset preview would take about {duration(preview)}.") and standard > 3600
     assert warning_of(9000.0, 1280, True, [Alternative("standard", 3000.0, 960), Alternative("preview", 9.0, 320)]) == (
         "The training takes about 2.5 h more on the processor.",
         "It can be paused at any time and goes on where it stopped. The preset standard would take about 50 min.",
@@ -76,7 +67,7 @@ def test_a_clip_on_which_a_smaller_preset_trains_on_the_same_pictures_is_told_so
     rows = smaller_presets("final", (640, 480), 20_000, 4e-7)
     assert [row.width for row in rows] == [640, 320]
     hint = warning_of(9000.0, 640, False, rows)[1]
-    assert hint.endswith(f"standard would take about {words_for(rows[0].seconds)} on pictures of the same size.")
+    assert hint.endswith(f"standard would take about {duration(rows[0].seconds)} on pictures of the same size.")
 
 
 def test_a_long_run_says_how_long_it_takes_before_it_has_begun_in_earnest_and_when_it_goes_on(world, quiet):
@@ -88,7 +79,7 @@ def test_a_long_run_says_how_long_it_takes_before_it_has_begun_in_earnest_and_wh
         (left,) = (event[2]["seconds_left"] for event in report.events if event[:2] == ("metric", FORECAST))
         ((sentence, hint),) = (event[1:] for event in report.events if event[0] == "warning")
         more = " more" if resumed else ""
-        assert sentence == f"The training takes about {words_for(left)}{more} on the processor." and left > 3600
+        assert sentence == f"The training takes about {duration(left)}{more} on the processor." and left > 3600
         assert "The preset preview would take about" in hint
 
 
