@@ -28,6 +28,7 @@ from torch_backend.freeze.frozen import (
 )
 from torch_backend.freeze.instant.instants import developed
 from torch_backend.freeze.take.plan import choose_t_star
+from torch_backend.freeze.views.reproject import resized
 from torch_backend.motion.mattes import load_motion
 from torch_backend.scene import load_scene, split_frames
 from torch_backend.shot import Shot
@@ -168,9 +169,14 @@ class DetailClip:
         return own, torch.where(known, sampled(of_t_star, places, nearest=True), 0.0)
 
     def still(self, frame: int, t_star: int, view: View) -> Tensor:
-        """Pixels of the frame in which the frozen frame must show what the plate shows, bool [H, W]."""
+        """Pixels of the frame in which the frozen frame must show what the plate shows, bool [H, W].
+
+        What is masked as no part of the scene, such as a burnt-in logo, is not among them: the freeze removes it.
+        """
         own, frozen = self.mattes(frame, t_star, view)
-        return still_pixels(own, frozen > 0.75)
+        ignored = self.compositor.seen.view(frame).ignored
+        masked = None if ignored is None else resized(ignored[..., 0], self.width, self.height) > 0.0
+        return still_pixels(own, frozen > 0.75) if masked is None else still_pixels(own, frozen > 0.75) & ~masked
 
 
 def over(color: Tensor, alpha: Tensor) -> Tensor:

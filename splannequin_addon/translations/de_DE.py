@@ -1132,6 +1132,8 @@ BACKEND: dict[str, str] = {
     "bottom": "unten",
     "lower right": "unten rechts",
     "most of the picture": "fast das ganze Bild",
+    "Nothing moves in it, but the motion mattes call {} % of the frames moving.": "Darin bewegt sich nichts, doch nach den Bewegungsmatten bewegen sich {} % der Bilder.",
+    "Train with more steps; where the mattes are wrong, paint over them.": "Mit mehr Schritten trainieren; wo die Matten falsch sind, sie übermalen.",
     "Nothing moves in it.": "Darin bewegt sich nichts.",
     "Something does not hold still: it travels up to {} of {} pixels in {}.": "Etwas hält nicht still: es legt bis zu {} von {} Pixeln zurück in {!t}.",
     "What moves sways by up to {} of {} pixels.": "Was sich bewegt, schwankt um bis zu {} von {} Pixeln.",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from ..motion.mattes import STILL
+from ..motion.mattes import MOVING, STILL
 from ..scene import evenly_spaced
 from ..torch_types import from_numpy, norm
 from .losses import psnr
@@ -58,6 +58,8 @@ class FrameEvidence:
     """[K] travel of the picture's pixels that travel at all, as a share of the width, every 16th."""
     still_unexplained: float | None = None
     """Share of the pixels that the motion matte calls still that differ; None without a matte."""
+    matte_moving: float | None = None
+    """Share of the pixels that the motion matte calls moving; None without a matte."""
 
 
 def gather_evidence(
@@ -142,7 +144,7 @@ def _inspect_frame(
     lost = None if still is None or not still.any() else float(off[still].float().mean())
     return FrameEvidence(
         trainer.scene.frames[index], held_out, psnr(shown, plate, ignored), shares(off.float()), _cells(travels, 0.97),
-        moving.numpy(), lost,
+        moving.numpy(), lost, None if matte is None else float((matte == MOVING).mean()),
     )  # fmt: skip
 
 

@@ -42,6 +42,9 @@ class RunLimits:
     still: float = 0.008
     """Sway, as a share of the width, below which nothing moves: 0.004 in a world in which nothing does, 0.016 to 0.021
     in the clips."""
+    unlearnt: float = 0.01
+    """Share of the frames that the motion mattes may call moving in a run in which nothing moves: an empty room's have
+    less, the clips' 0.056 to 0.087."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,12 @@ class RunFigures:
     """Those are frames that were held out."""
     still_unexplained: float | None = None
     """Share of what the motion mattes call still that is not explained; None without mattes."""
+    matte_moving: float | None = None
+    """Share of the frames that the motion mattes call moving; None without mattes."""
+
+    def learnt_no_motion(self, limits: RunLimits) -> bool:
+        """True if nothing moves in the run although, by the motion mattes, something moves in the clip."""
+        return self.sway < limits.still and (self.matte_moving or 0.0) > limits.unlearnt
 
 
 def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int) -> RunFigures:
@@ -80,6 +89,7 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int) -> RunFig
     moving = np.concatenate([one.moving for one in seen])
     whole = len(seen) * pixels / 16  # `moving` has every 16th pixel
     still = [one.still_unexplained for one in seen if one.still_unexplained is not None]
+    mattes = [one.matte_moving for one in seen if one.matte_moving is not None]
     return RunFigures(
         width,
         [one.frame for one in seen],
@@ -92,6 +102,7 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int) -> RunFig
         float(np.percentile(values, 10)),
         bool(kept),
         float(np.mean(still)) if still else None,
+        float(np.mean(mattes)) if mattes else None,
     )
 
 
@@ -106,7 +117,7 @@ def judge(figures: RunFigures, limits: RunLimits | None = None) -> Verdict:
         far = figures.travel > limits.far
         walks, bad = spans_of(figures.frames, figures.travel, far, most=1), bad | far.any(axis=(1, 2))
     poor = dim or float(lost.any(axis=(1, 2)).mean()) > limits.poor_lost
-    word = "poor" if poor else "fair" if places or walks else "good"
+    word = "poor" if poor else "fair" if places or walks or figures.learnt_no_motion(limits) else "good"
     sentences = _sentences(figures, limits, dim, places, walks)
     span = _longest_good(figures.frames, np.asarray(bad)) if places or walks else None
     advice = _advice(figures, dim, span, places, walks, limits)
@@ -130,7 +141,10 @@ def _sentences(
     elif not places:
         sentences.append(EXPLAINED)
     sentences += [f"It does not hold in {where_words(place)}." for place in places]
-    if figures.sway < limits.still:
+    if figures.learnt_no_motion(limits):
+        share = 100.0 * (figures.matte_moving or 0.0)
+        sentences.append(f"Nothing moves in it, but the motion mattes call {share:.0f} % of the frames moving.")
+    elif figures.sway < limits.still:
         sentences.append("Nothing moves in it.")
     elif walks:
         farthest, place = round(figures.farthest * width), where_words(walks[0])
@@ -145,6 +159,8 @@ def _advice(
     walks: list[dict[str, Any]], limits: RunLimits,
 ) -> list[str]:  # fmt: skip
     """What to do about it. `span`: first and last frame of the longest span in which nothing is lost or walks."""
+    if figures.learnt_no_motion(limits) and not places and not dim:
+        return ["Train with more steps; where the mattes are wrong, paint over them."]
     if figures.sway < limits.still and not places and not dim:
         return ["Any frame will do as t*."]
     if dim or (places and span is None):

@@ -44,6 +44,15 @@ def test_a_still_world_is_told_as_one():
     assert verdict.advice == ["Any frame will do as t*."]
 
 
+def test_a_run_that_learnt_no_motion_is_not_taken_for_a_still_world():
+    still = {"sway": 0.0, "farthest": 0.0}
+    verdict = judge(figures(**still, matte_moving=0.087))
+    assert verdict.word == "fair" and "9 % of the frames moving" in verdict.sentences[-1]
+    assert "more steps" in verdict.advice[0] and "Any frame" not in verdict.advice[0]
+    assert judge(figures(**still, matte_moving=0.009)).word == "good"
+    assert judge(figures(matte_moving=0.087)).word == "good", "what moves was learnt"
+
+
 def test_a_walker_is_told_with_frames_place_and_what_to_do():
     travel = lost_at(10, 40, 1, 1, 0.22)
     verdict = judge(figures(unexplained=lost_at(10, 31, 3, 0), travel=travel, far=0.02, farthest=0.22))
