@@ -101,15 +101,15 @@ def made_before(take: str) -> tuple[str, str]:
     )
 
 
-def outdated(take: PlannedTake, place: Place, frames: Set[int]) -> tuple[str, str] | None:
-    """A warning that frames of the take go and are not rendered again: they show something else than this take, and
-    are not among its `frames`. None if there are none."""
-    gone = set(frames_of(take.folder)) - place.right_here - frames
+def outdated(take: PlannedTake, kept: Set[int]) -> tuple[str, str] | None:
+    """A warning that frames of the take, other than those `kept`, are removed and not rendered again, because they
+    show something else. None if there are none."""
+    gone = set(frames_of(take.folder)) - kept
     if not gone:
         return None
     return (
-        f"{len(gone)} frames of the take {take.folder.root.name} show another instant or have other settings: they are "
-        "removed, and not rendered again.",
+        f"Frames of the take {take.folder.root.name} that show another instant or have other settings are removed and "
+        f"not rendered again: {len(gone)}.",
         "Freeze the whole range to have them again, or name another take to keep them.",
     )
 

@@ -51,7 +51,7 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     place = place_of(take, params)
     if place.of_before:
         report.warning(*made_before(params.take))
-    if (warning := outdated(take, place, {f.frame for f in frames})) is not None:
+    if (warning := outdated(take, place.right_here | {f.frame for f in frames})) is not None:
         report.warning(*warning)
     done = place.right_here | place.right_beside
     make_ready(take, frames, done, report)  # what can fail, or be cancelled, before anything of before goes

@@ -25,7 +25,7 @@ from ...contract import (
 from ...shot import Shot, write_json
 from ..frozen import OutputFrame
 from .cameras import in_range
-from .folder import files_of, frames_of, made_before, make_folders, right_frames, stored_key, stored_keys
+from .folder import files_of, frames_of, made_before, make_folders, outdated, right_frames, stored_key, stored_keys
 from .frames import render_frames
 from .job import finish
 from .plan import PlannedTake, planned
@@ -89,6 +89,8 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
             "Run the part that it belongs to again.",
             ExitCode.FREEZE,
         )
+    if (warning := outdated(take, right)) is not None:
+        report.warning(*warning)
     for number in frames_of(take.folder):
         if number not in right:
             for old in files_of(take.folder, number):

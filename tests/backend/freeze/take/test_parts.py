@@ -107,7 +107,10 @@ def test_frames_of_before_stay_until_the_take_is_finished(own, quiet):
     assert (own.take("again") / "000104.exr").is_file()
     params.last = 103
     freeze_part(own, params, quiet())
-    finish_take(own, params, quiet())
+    report = quiet()
+    finish_take(own, params, report)
+    (warning,) = [event[1] for event in report.events if event[0] == "warning" and "take again" in event[1]]
+    assert warning.endswith("not rendered again: 1.")
     assert sorted(p.name for p in own.take("again").glob("*.exr")) == ["000103.exr"]
     assert not (own.take("again") / "preview" / "000104.png").exists()
 
