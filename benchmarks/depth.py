@@ -175,8 +175,8 @@ def _text(of: dict[str, float | None]) -> str:
         return "–" if value is None else f"{unit * value:.{digits}f}"
 
     cells = said("median", 100.0, 2), said("beyond", 100.0, 1), said("boundary_f", 1.0, 3), said("precision", 1.0, 3)
-    told = said("within_1_sigma", 100.0, 1), said("within_2_sigma", 100.0, 1)
-    return " | ".join((*cells, said("recall", 1.0, 3), *told))
+    shares = said("within_1_sigma", 100.0, 1), said("within_2_sigma", 100.0, 1)
+    return " | ".join((*cells, said("recall", 1.0, 3), *shares))
 
 
 def table(found: dict[str, dict[str, dict[str, float | None]]]) -> list[str]:

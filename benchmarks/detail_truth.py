@@ -76,10 +76,10 @@ def judge(
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             target, regions = truth.truth(t_star, pose, *size), truth.regions(t_star, pose, *size)
             behind, pictures = truth.behind(t_star, pose, *size), _pictures(clip, pose, t_star)
-            told = {name: score(image, target, regions) for name, image in pictures.items()}
+            scores = {name: score(image, target, regions) for name, image in pictures.items()}
             row: dict[str, Any] = {"t_star": t_star, "pose": pose}
-            row |= {v: {region: of["psnr_db"] for region, of in found.items()} for v, found in told.items()}
-            row[PERCEIVED] = {v: {region: of[PERCEIVED] for region, of in found.items()} for v, found in told.items()}
+            row |= {v: {region: of["psnr_db"] for region, of in found.items()} for v, found in scores.items()}
+            row[PERCEIVED] = {v: {region: of[PERCEIVED] for region, of in found.items()} for v, found in scores.items()}
             row[RECALLED] = {name: recall_of(behind, image, target, regions) for name, image in pictures.items()}
             rows.append(row)
         print(f"{truth.name}, t* {t_star}: {gains_text(means(rows)[WHOLE])} dB whole so far", flush=True)
@@ -185,7 +185,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--delivered", action="store_true", help="judge at the size of the plates")
     parser.add_argument("--train-only", action="store_true")
     args = parser.parse_args(argv)
-    found, seen, there, results = {}, {}, {}, args.results.absolute()
+    found, seen, recalled, results = {}, {}, {}, args.results.absolute()
     for truth, runs in trained_scenes(args, [args.seed]):
         run = runs[args.seed]
         print(f"{truth.name}: {truth.shot.run(run)}", flush=True)
@@ -193,12 +193,12 @@ def main(argv: Sequence[str] | None = None) -> None:
             continue
         width = 0 if args.delivered else load_run(truth.shot, run, torch.device("cpu")).width
         rows = judge(truth, run, args.t_star or truth.t_stars, args.every, args.develop == "on", width)
-        found[truth.name], seen[truth.name], there[truth.name] = means(rows), perceived(rows), recalls(rows)
+        found[truth.name], seen[truth.name], recalled[truth.name] = means(rows), perceived(rows), recalls(rows)
         name = truth.name.replace(" ", "-")
         facts = {"version": 1, "scene": truth.name, "run": str(truth.shot.run(run))}
         write_json(results / f"truth-{name}.json", {**facts, "mean": found[truth.name], "frames": rows})
     if found:
-        print("\n".join(["", *table(found), *perceived_table(seen), *recall_table(there)]))
+        print("\n".join(["", *table(found), *perceived_table(seen), *recall_table(recalled)]))
 
 
 if __name__ == "__main__":

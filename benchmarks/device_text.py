@@ -223,8 +223,8 @@ def run(program: Path, most: int = 1 << 30) -> tuple[list[dict[str, Any]], str]:
     command = [str(program), str(program.parent / "launches.bin"), str(most)]
     done = subprocess.run(command, capture_output=True, text=True, env=environ)
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    said = [line for line in done.stderr.splitlines() if "fully support makecontext" not in line]
-    return rows, "\n".join(said)
+    messages = [line for line in done.stderr.splitlines() if "fully support makecontext" not in line]
+    return rows, "\n".join(messages)
 
 
 def judge(rows: list[dict[str, Any]], bound: float = 1e-5) -> list[str]:

@@ -225,9 +225,11 @@ def baked(host: Host, words: Sequence[str]) -> None:
         "--blender",
         host.blender,
     ]
-    said = subprocess.run([sys.executable, *entered], capture_output=True, text=True, check=True, env=environ()).stdout
-    told = dict(line.removeprefix("openjd_env: ").split("=", 1) for line in said.splitlines() if "=" in line)
-    command: list[str] = json.loads(told["SPLANNEQUIN_BLENDER_COMMAND"])
+    output = subprocess.run(
+        [sys.executable, *entered], capture_output=True, text=True, check=True, env=environ()
+    ).stdout
+    variables = dict(line.removeprefix("openjd_env: ").split("=", 1) for line in output.splitlines() if "=" in line)
+    command: list[str] = json.loads(variables["SPLANNEQUIN_BLENDER_COMMAND"])
     command += [str(ROOT / "splannequin_addon" / "run_in_bpy.py"), *(["--"] if host.blender else []), "bake", *words]
     env = environ() | {"SPLANNEQUIN_BACKEND_PYTHON": sys.executable}
     subprocess.run(command, check=True, env=env, stdout=subprocess.DEVNULL)
@@ -236,7 +238,7 @@ def baked(host: Host, words: Sequence[str]) -> None:
 def compared(ours: Path, theirs: Path) -> bool:
     """Prints how many files of two folders are the same, by folder and kind; True if all are."""
     same: dict[str, list[bool]] = {}
-    unlike: list[str] = []
+    different: list[str] = []
     for path in sorted(p for top in ("shots", "baked") for p in (theirs / top).rglob("*")):
         name = path.relative_to(theirs)
         if not path.is_file() or (name.parts[0] == "shots" and "takes" not in name.parts):
@@ -249,12 +251,12 @@ def compared(ours: Path, theirs: Path) -> bool:
         other = ours / name
         same.setdefault(kind, []).append(other.is_file() and other.read_bytes() == path.read_bytes())
         if not same[kind][-1]:
-            unlike.append(str(name))
+            different.append(str(name))
     for kind, equal in sorted(same.items()):
         print(f"{kind:<16}{sum(equal):>5} of {len(equal)} files are the same, bit for bit")
-    for name in unlike[:10]:
+    for name in different[:10]:
         print(f"  not: {name}")
-    return not unlike
+    return not different
 
 
 def main() -> int:
@@ -277,11 +279,11 @@ def main() -> int:
     out: Path = args.output.absolute()
     out.mkdir(parents=True)
     print(f"{os.cpu_count()} cores, load {os.getloadavg()}", flush=True)
-    asked = ["--iterations", str(args.iterations), "--session-tasks", str(args.session_tasks)]
+    options = ["--iterations", str(args.iterations), "--session-tasks", str(args.session_tasks)]
     rates: list[str] = []
     if args.measure:
         clip = clip_of(out / "clips", "other", 18, OTHER_FRAMES, args.shrink)
-        exported(out / "other", [clip], [*asked, "--t-star", str(OTHER_FRAMES // 2), "--frames", "8"])
+        exported(out / "other", [clip], [*options, "--t-star", str(OTHER_FRAMES // 2), "--frames", "8"])
         run(out / "other", host, args.session_tasks, args.at_once, args.seed)
         backend("farm", "measure", str(out / "other" / "shots" / f"other{SHOT_SUFFIX}"), "--output", str(out))
         rates = ["--rates", str(out / "rates.json")]
@@ -289,12 +291,12 @@ def main() -> int:
     apart = max(1, (CLIP_FRAMES - args.length) // max(1, args.shots - 1))
     clips = [clip_of(out / "clips", name, 1 + n * apart, args.length, args.shrink) for n, name in enumerate(names)]
     instants = f"{args.length // 3},{2 * args.length // 3}"
-    asked += ["--t-star", instants, "--frames", str(args.part)]
-    said = exported(out / "job", clips, asked)
+    options += ["--t-star", instants, "--frames", str(args.part)]
+    said = exported(out / "job", clips, options)
     if rates:
         guess = f"{said['core_hours'] * 3600:.0f} core-seconds, {said['on_hosts'][str(args.at_once)]:.0f} by the clock"
         print(f"by the program's own rates: {guess}")
-        said = exported(out / "job", clips, [*asked, *rates])
+        said = exported(out / "job", clips, [*options, *rates])
     job, clock = run(out / "job", host, args.session_tasks, args.at_once, args.seed)
     print(f"load {os.getloadavg()}", flush=True)
     told(said, job, clock, args.at_once)

@@ -118,16 +118,16 @@ def fit(cases: Sequence[Case]) -> StateWeights:
     flat = [case.evidence.reshape(-1, len(NAMES)) for case in cases]
     every = torch.cat(flat)
     mean, deviation = every.mean(0), every.std(0).clamp_min(1e-3)
-    told = [((x - mean) / deviation, case.saving().flatten(), case.differs().flatten()) for x, case in
+    samples = [((x - mean) / deviation, case.saving().flatten(), case.differs().flatten()) for x, case in
             zip(flat, cases, strict=True)]  # fmt: skip
     weights, bias = torch.zeros(len(NAMES), requires_grad=True), torch.tensor(-2.0, requires_grad=True)
     optimizer = torch.optim.Adam([weights, bias], lr=RATE)
     for _ in range(STEPS):
         loss = DECAY * weights.square().sum()
-        for x, saving, differs in told:
+        for x, saving, differs in samples:
             odds = x @ weights + bias
             entropy = F.binary_cross_entropy_with_logits(odds, differs)
-            loss = loss + (LABEL_WEIGHT * entropy - (torch.sigmoid(odds) * saving).mean()) / len(told)
+            loss = loss + (LABEL_WEIGHT * entropy - (torch.sigmoid(odds) * saving).mean()) / len(samples)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

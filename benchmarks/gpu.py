@@ -96,11 +96,11 @@ class Stage:
             return
         since = time.monotonic()
         try:
-            told = call()
+            result = call()
         except Exception as error:  # the stage goes on: the card is not at hand for long
             traceback.print_exc()
-            told = {"failed": f"{type(error).__name__}: {error}".splitlines()[0]}
-        self.found[name] = {"seconds": round(time.monotonic() - since, 2), **told}
+            result = {"failed": f"{type(error).__name__}: {error}".splitlines()[0]}
+        self.found[name] = {"seconds": round(time.monotonic() - since, 2), **result}
         print(f"{name}: {json.dumps(self.found[name])[:400]}", flush=True)
 
     def child(self, command: list[str], most: float, **environ: str) -> dict[str, Any]:
@@ -113,10 +113,10 @@ class Stage:
             ran = subprocess.run(command, cwd=ROOT, env=whole, capture_output=True, text=True, timeout=limit)
         except subprocess.TimeoutExpired:
             return {"exit_code": None, "seconds": round(limit, 1), "said": "it was ended: no time was left"}
-        said = (ran.stdout + ran.stderr).strip().splitlines()
+        output = (ran.stdout + ran.stderr).strip().splitlines()
         if ran.returncode:
-            print("\n".join(said), file=sys.stderr)
-        return {"exit_code": ran.returncode, "seconds": round(time.monotonic() - since, 2), "said": said[-25:]}
+            print("\n".join(output), file=sys.stderr)
+        return {"exit_code": ran.returncode, "seconds": round(time.monotonic() - since, 2), "said": output[-25:]}
 
     def scratch_shot(self) -> Shot:
         """A copy of the shot, to write runs into. JobError without one."""
@@ -251,8 +251,8 @@ def _host(stage: Stage, run: Callable[[], Any], count: int) -> dict[str, Any]:
     def most(column: int) -> dict[str, Any]:
         return dict(sorted(rows.items(), key=lambda row: row[1][column], reverse=True)[:45])
 
-    told = {"ms": round(1e3 * whole / count, 3), "issued_ms": round(1e3 * issued / count, 3)}
-    return {**told, "own": most(1), "with_calls": most(2)}
+    times = {"ms": round(1e3 * whole / count, 3), "issued_ms": round(1e3 * issued / count, 3)}
+    return {**times, "own": most(1), "with_calls": most(2)}
 
 
 def _frames_host(stage: Stage, body: raster_bench.Body) -> dict[str, Any]:
@@ -272,11 +272,11 @@ def _late_step(stage: Stage) -> dict[str, Any]:
     trainer = Trainer(scene, images, scene.solved, config, Warnings(), {}, stage.device)
     while trainer.iteration < 0.6 * config.iterations:
         _step(trainer)
-    told: dict[str, Any] = {"gaussians": len(trainer.model.gaussians), "open": len(trainer.model.open_rows())}
+    row: dict[str, Any] = {"gaussians": len(trainer.model.gaussians), "open": len(trainer.model.open_rows())}
     for name, recorder in _ways(trainer).items():
         trainer.recorder = recorder
-        told[name] = {**_busy(stage, trainer), **_host(stage, lambda: _step(trainer), 20 if stage.dry else 200)}
-    return {**told, **_replays(trainer)}
+        row[name] = {**_busy(stage, trainer), **_host(stage, lambda: _step(trainer), 20 if stage.dry else 200)}
+    return {**row, **_replays(trainer)}
 
 
 def _ways(trainer: Trainer) -> dict[str, Recorder | None]:
@@ -297,14 +297,14 @@ def _whole_runs(stage: Stage) -> dict[str, Any]:
     few, width = (600, 64) if stage.dry else (PRESETS["preview"]().densify.budget, PRESETS["preview"]().width)
     train, test = split_frames(scene.solved, 8, 0)
     images = load_images(scene, train + test, *training_size(scene, width)).to(stage.device)
-    told: dict[str, Any] = {}
+    rows: dict[str, Any] = {}
     for seed in (0,) if stage.dry else (0, 1):
         for records in (False, True):
             steps = 20 if stage.dry else 0
-            asked = TrainParams(
+            params = TrainParams(
                 preset="preview", iterations=steps, max_gaussians=few, width=width, seed=seed, holdout=8
             )
-            config = config_from_params(asked)
+            config = config_from_params(params)
             trainer = Trainer(scene, images[: len(train)], train, config, Warnings(), {}, stage.device)
             trainer.recorder = trainer.recorder if records else None
             stage.wait()
@@ -312,11 +312,11 @@ def _whole_runs(stage: Stage) -> dict[str, Any]:
             trainer.run(stage.results / "gpu-scratch.safetensors", lambda _: None)
             stage.wait()
             seconds = time.perf_counter() - since
-            told[f"{'recorded' if records else 'launched'}-{seed}"] = {
+            rows[f"{'recorded' if records else 'launched'}-{seed}"] = {
                 "seconds": round(seconds, 2), "steps": trainer.iteration, "gaussians": len(trainer.model.gaussians),
                 "heldout_db": trainer.heldout_psnr(test, images[len(train) :]), **_replays(trainer),
             }  # fmt: skip
-    return told
+    return rows
 
 
 def _short_list(stage: Stage, name: str) -> dict[str, Any]:
@@ -393,11 +393,11 @@ def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any
     # The processor's numbers on either device: a card's own are others.
     few = 400 if stage.dry else known.densify.budget
     width = 64 if stage.dry else known.width or load_scene(shot).width
-    asked = TrainParams(
+    params = TrainParams(
         run=name, preset=preset, iterations=steps, seed=seed, device=device, holdout=8, max_gaussians=few, width=width,
         resume=False,
     )  # fmt: skip
-    summary = train_shot(shot, asked, report)
+    summary = train_shot(shot, params, report)
     lines = (shot.run(name) / METRICS_FILE).read_text(encoding="utf-8").splitlines()
     rows = [{"iteration": 0, "seconds": 0.0}, *map(json.loads, lines)]
     pace = [
@@ -452,7 +452,7 @@ def _full_hd(stage: Stage) -> dict[str, Any]:
     many, size, count = (2000, (64, 36), 2) if stage.dry else (1_000_000, (1920, 1080), 30)
     trainer = _trainer(stage, 300, 2000 if stage.dry else 100_000, 64 if stage.dry else 0, "hexplane", size)
     trainer.schedule_events()
-    told: dict[str, Any] = {"gaussians": many, "width": size[0], "height": size[1], "frames": len(trainer.times)}
+    figures: dict[str, Any] = {"gaussians": many, "width": size[0], "height": size[1], "frames": len(trainer.times)}
     for name, share in (("static", 0.0), ("tenth", 0.1), ("all", 1.0)):
         if name == "tenth":
             trainer.iteration = 101  # a third: the field is made
@@ -472,10 +472,10 @@ def _full_hd(stage: Stage) -> dict[str, Any]:
                 trainer.step()
             stage.wait()
             ms = round(1e3 * (time.perf_counter() - since) / count, 2)
-            row = told[f"{name}, {way}"] = {"ms": ms, **_busy(stage, trainer)}
+            row = figures[f"{name}, {way}"] = {"ms": ms, **_busy(stage, trainer)}
             if stage.device.type == "cuda":
                 row["peak_gb"] = round(torch.cuda.max_memory_allocated() / 1e9, 2)
-    return {**told, **_replays(trainer)}
+    return {**figures, **_replays(trainer)}
 
 
 def _busy(stage: Stage, trainer: Trainer) -> dict[str, Any]:
@@ -545,7 +545,7 @@ def _memory(stage: Stage, gb: int) -> dict[str, Any]:
     trainer.schedule_events()
     trainer.model.pieces = 500 if stage.dry else plan.pieces
     _enlarged(trainer, 2000 if stage.dry else plan.gaussians)
-    told: dict[str, Any] = {"planned": {"gaussians": plan.gaussians, "pieces": plan.pieces}, "sentence": plan.sentence}
+    row: dict[str, Any] = {"planned": {"gaussians": plan.gaussians, "pieces": plan.pieces}, "sentence": plan.sentence}
     if stage.device.type == "cuda":
         whole = torch.cuda.get_device_properties(stage.device).total_memory
         torch.cuda.set_per_process_memory_fraction(min(1.0, (gb * 1e9 - 9e8) / whole))
@@ -555,17 +555,17 @@ def _memory(stage: Stage, gb: int) -> dict[str, Any]:
             trainer.step()
             trainer.iteration += 1
         stage.wait()
-        told["fits"] = True
+        row["fits"] = True
     except torch.OutOfMemoryError as error:
-        told |= {"fits": False, "said": str(error).splitlines()[0]}
+        row |= {"fits": False, "said": str(error).splitlines()[0]}
     finally:
         if stage.device.type == "cuda":
-            told["peak_gb"] = round(torch.cuda.max_memory_allocated() / 1e9, 3)
-            told["reserved_gb"] = round(torch.cuda.max_memory_reserved() / 1e9, 3)
+            row["peak_gb"] = round(torch.cuda.max_memory_allocated() / 1e9, 3)
+            row["reserved_gb"] = round(torch.cuda.max_memory_reserved() / 1e9, 3)
             torch.cuda.set_per_process_memory_fraction(1.0)
             del trainer
             torch.cuda.empty_cache()
-    return told
+    return row
 
 
 def _resumed(stage: Stage) -> dict[str, Any]:
@@ -577,7 +577,7 @@ def _resumed(stage: Stage) -> dict[str, Any]:
         _step(trainer)
     path = stage.results / "gpu-scratch.safetensors"
     trainer.save(path)
-    told: dict[str, Any] = {"at": trainer.iteration}
+    row: dict[str, Any] = {"at": trainer.iteration}
     for device in dict.fromkeys((stage.device.type, "cpu")):
         other = Trainer(
             trainer.scene, trainer.images.to(device), trainer.train_ids, trainer.config, Warnings(), {}, device
@@ -587,9 +587,9 @@ def _resumed(stage: Stage) -> dict[str, Any]:
         for _ in range(3):
             _step(other)
         loss = float(other.step())
-        told[device] = {"gaussians": [before, len(other.model.gaussians)], "loss": loss}
+        row[device] = {"gaussians": [before, len(other.model.gaussians)], "loss": loss}
     path.unlink()
-    return told
+    return row
 
 
 def _run_of(stage: Stage) -> str:
@@ -607,9 +607,9 @@ def _frozen(stage: Stage) -> dict[str, Any]:
     first = load_scene(shot).frames[0]
     last = first + (0 if stage.dry else 9)
     since = time.perf_counter()
-    asked = FreezeParams(run=name, take="gpu", first=first, last=last, device=stage.device.type)
-    asked.develop = "off" if stage.dry else asked.develop
-    facts = freeze_shot(shot, asked, Warnings())
+    params = FreezeParams(run=name, take="gpu", first=first, last=last, device=stage.device.type)
+    params.develop = "off" if stage.dry else params.develop
+    facts = freeze_shot(shot, params, Warnings())
     return {"frames": facts["frames"], "seconds_per_frame": round((time.perf_counter() - since) / facts["frames"], 3)}
 
 
@@ -665,7 +665,7 @@ def main(words: list[str] | None = None) -> int:
     }  # fmt: skip
     place = args.results / f"gpu-{args.stage}.json"
     write_json(place, report)
-    failed = [name for name, told in stage.found.items() if isinstance(told, dict) and "failed" in told]
+    failed = [name for name, result in stage.found.items() if isinstance(result, dict) and "failed" in result]
     print(f"{place}: {len(stage.found)} parts, {len(failed)} failed {failed or ''}".rstrip())
     return 1 if failed else 0
 

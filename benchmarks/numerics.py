@@ -75,8 +75,8 @@ def _cases(bodies: list[str], names: list[str]) -> list[str]:
         gradient = "finite" if case.gradient is None else _cell(case.gradient)
         plain = f" (reference32: {_cell(case.plain)})" if case.plain else ""
         bounds = f"{case.psnr:.0f}, {gradient}{plain}; flips {100 * case.flips:.0f} %"
-        told = f"{name}: {case.note}" if case.note else name
-        lines.append(f"| {told} | {' | '.join(map(_errors, errors))} | {bounds} |")
+        title = f"{name}: {case.note}" if case.note else name
+        lines.append(f"| {title} | {' | '.join(map(_errors, errors))} | {bounds} |")
     close = len(names) - len(lines) + 2
     others = (
         f"In the other {close} cases every body reaches {_CLOSE[0]:.0f} dB, with gradients within {_cell(_CLOSE[1])}."

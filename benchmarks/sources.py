@@ -182,8 +182,8 @@ def make_scenes(
 
 def last_words(errors: str) -> str:
     """The last line that a failed child wrote, but for what image libraries say of themselves as Python ends."""
-    told = [line for line in errors.strip().splitlines() if "nanobind" not in line and not line.startswith(" - ")]
-    return told[-1] if told else "no output"
+    lines = [line for line in errors.strip().splitlines() if "nanobind" not in line and not line.startswith(" - ")]
+    return lines[-1] if lines else "no output"
 
 
 def child_environ(**extra: str) -> dict[str, str]:

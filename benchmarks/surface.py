@@ -69,11 +69,11 @@ def off_truth(places: NDArray[np.float64], truth: RayScene, views: Sequence[View
 def figures(off: NDArray[np.float64]) -> dict[str, float]:
     """Points, and of those that plates see: their share, median and ninth tenth of their distance, share `BEYOND`."""
     seen = off[np.isfinite(off)]
-    told = {"points": float(len(off)), "seen": len(seen) / max(len(off), 1)}
+    row = {"points": float(len(off)), "seen": len(seen) / max(len(off), 1)}
     if len(seen):
-        told |= {"median": float(np.median(seen)), "ninth tenth": float(np.quantile(seen, 0.9))}
-        told["beyond"] = float((seen > BEYOND).mean())
-    return told
+        row |= {"median": float(np.median(seen)), "ninth tenth": float(np.quantile(seen, 0.9))}
+        row["beyond"] = float((seen > BEYOND).mean())
+    return row
 
 
 def judge(truth: SyntheticTruth, run: str, t_star: int, every: int) -> dict[str, dict[str, float]]:
@@ -103,8 +103,8 @@ def judge(truth: SyntheticTruth, run: str, t_star: int, every: int) -> dict[str,
     for kind, of in (("at pixels", shown), ("frames", points)):
         known = np.isfinite(of[:, 0])
         parts |= {f"room, {kind}": of[~moves & known], f"people, {kind}": of[moves & known]}
-    told = {name: figures(off_truth(of, standing, views)) for name, of in parts.items()}
-    return told | {"shadow": shadows(surface, standing, views)}
+    rows = {name: figures(off_truth(of, standing, views)) for name, of in parts.items()}
+    return rows | {"shadow": shadows(surface, standing, views)}
 
 
 def points_of(folder: TakeFolder) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
@@ -130,8 +130,8 @@ def shadows(surface: RayScene, truth: RayScene, views: Sequence[View]) -> dict[s
         for view in (views[0], views[middle], views[-1])
     ]
     known = [one for one in found if one is not None]
-    told = {"pictures": float(len(known))}
-    return told | ({"mean": float(np.mean(known)), "worst": min(known)} if known else {})
+    row = {"pictures": float(len(known))}
+    return row | ({"mean": float(np.mean(known)), "worst": min(known)} if known else {})
 
 
 @in_words
@@ -147,10 +147,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.cameras != "exact":
         raise ValueError("the surface is judged in metres: only exact cameras have them")
     for truth, runs in trained_scenes(args, args.seeds):
-        told: dict[str, Any] = {}
+        results: dict[str, Any] = {}
         for seed, run in runs.items():
             for t_star in args.t_star or truth.t_stars:
-                found = told[f"seed {seed}, t* {t_star}"] = judge(truth, run, t_star, args.every)
+                found = results[f"seed {seed}, t* {t_star}"] = judge(truth, run, t_star, args.every)
                 shaded = found["shadow"]
                 cells = [f"{shaded[k]:.3f}" if k in shaded else "–" for k in ("mean", "worst")]
                 where = f"{truth.name}, seed {seed}, t* {t_star}"
@@ -162,7 +162,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                     where = f"{truth.name} | {seed} | {t_star} | {part} | {of['points']:.0f} | {of['seen']:.2f}"
                     rows.append(f"| {where} | {' | '.join(cells)} |")
                     print(rows[-1], flush=True)
-        write_json(args.results.absolute() / f"surface-{truth.name.replace(' ', '-')}.json", {"version": 1, **told})
+        write_json(args.results.absolute() / f"surface-{truth.name.replace(' ', '-')}.json", {"version": 1, **results})
     print("\n".join(["", *rows, *ends]))
 
 

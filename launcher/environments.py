@@ -253,8 +253,8 @@ def _torch(environment: Environment, options: list[str], index: str) -> tuple[st
         return torch_lock(index, version), ("--index-url", index)
     build = this_machines_index().rpartition("/")[2]
     if f"torch-{build}" in TORCH_LOCKS:
-        asked = ("--dry-run", "--no-deps", "--retries", "1", f"{_torch_pin()}+{build}")
-        command = python_child(environment.python, "pip", "install", *options, *asked)
+        pip_options = ("--dry-run", "--no-deps", "--retries", "1", f"{_torch_pin()}+{build}")
+        command = python_child(environment.python, "pip", "install", *options, *pip_options)
         done = subprocess.run(command["args"], cwd=command["cwd"], env=child_environ(), capture_output=True)
         if done.returncode == 0:
             return f"torch-{build}.lock", ()
@@ -352,7 +352,7 @@ def _step(
         lines.put(None)
 
     threading.Thread(target=read, daemon=True).start()
-    said: list[str] = []
+    output_lines: list[str] = []
     spoke = started
     try:
         with open(environment.log, "a", encoding="utf-8") as log:
@@ -368,7 +368,7 @@ def _step(
                 if line is None:
                     break
                 log.write(line)
-                said.append(line.strip())
+                output_lines.append(line.strip())
                 text = condense(line.strip()) if condense else None
                 if text:
                     spoke = time.monotonic()
@@ -380,7 +380,7 @@ def _step(
     finally:
         close_input(child)
     if code:
-        printed = "\n".join([*said[:5], *said[-40:]])  # pip names its indexes first
+        printed = "\n".join([*output_lines[:5], *output_lines[-40:]])  # pip names its indexes first
         refuse(environment.name, environment.log, step, printed, wheels)
     if condense is None:
         say(f"  {time.monotonic() - started:5.0f} s  {step}: done")

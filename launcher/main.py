@@ -152,8 +152,8 @@ def _is_anothers(folder: Path, given: str) -> bool:
     """True if a folder holds what was made of another clip or shot than this one, as far as it tells."""
     wanted, shots = _absolute(given), list(folder.glob("*" + SHOT_SUFFIX))
     if "://" not in given and is_shot(given):
-        told = str(read_summary(folder).get("shot") or "")
-        return bool(shots) or (bool(told) and os.path.normcase(told) != os.path.normcase(wanted))
+        shot_path = str(read_summary(folder).get("shot") or "")
+        return bool(shots) or (bool(shot_path) and os.path.normcase(shot_path) != os.path.normcase(wanted))
     made_of_a_shot = not shots and bool(read_summary(folder).get("shot"))
     return made_of_a_shot or any(is_imported_from(shot, wanted) is False for shot in shots)
 

@@ -52,5 +52,5 @@ def _is_whole(folder: Path, record: str | None) -> bool:
 def needs_cuda(environment: Path) -> bool:
     """True if the torch that is installed asks for NVIDIA's libraries, as PyPI's build for Linux does."""
     site = site_packages(environment)
-    told = "".join(p.read_text(encoding="utf-8") for p in site.glob("torch-*.dist-info/METADATA")) if site else ""
-    return re.search(r"^Requires-Dist: (nvidia|cuda|triton)\b", told, re.M) is not None
+    metadata = "".join(p.read_text(encoding="utf-8") for p in site.glob("torch-*.dist-info/METADATA")) if site else ""
+    return re.search(r"^Requires-Dist: (nvidia|cuda|triton)\b", metadata, re.M) is not None

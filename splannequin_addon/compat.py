@@ -411,9 +411,9 @@ def colour_space(encoding: str | tuple[float, ...]) -> str:
             bpy.data.images.remove(image)
         if not name:
             names = {"linear": "scene-linear Rec.709", "srgb": "sRGB"}
-            told = names[encoding] if isinstance(encoding, str) else "these pictures"
+            what = names[encoding] if isinstance(encoding, str) else "these pictures"
             raise UserError(
-                f"The colour configuration that Blender was started with (OCIO) has no colour space for {told}. "
+                f"The colour configuration that Blender was started with (OCIO) has no colour space for {what}. "
                 "Start Blender without it, or add one to it."
             )
         _spaces[encoding] = name
@@ -435,8 +435,8 @@ def _first_pixel(image: bpy.types.Image) -> tuple[float, float, float]:
 
 def _enumerated(name: str) -> Mapping[str, int]:
     """Values of a property of a key, by identifier."""
-    told: Any = bpy.types.Keyframe.bl_rna.properties[name]
-    return {item.identifier: item.value for item in told.enum_items}
+    prop: Any = bpy.types.Keyframe.bl_rna.properties[name]
+    return {item.identifier: item.value for item in prop.enum_items}
 
 
 def fcurves(datablock: _Animated) -> Iterator[bpy.types.FCurve]:

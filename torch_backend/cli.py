@@ -131,10 +131,10 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
     if kind == "surface" and not console.as_json:
         print(f"Surface: {result['surface']}", file=console.stream, flush=True)
     if kind == "light" and not console.as_json:
-        said = (
+        message = (
             f"Light: {result['light']}, an estimate: {result['filled']:.0%} of the sphere was not seen, and is filled."
         )
-        print(said, file=console.stream, flush=True)
+        print(message, file=console.stream, flush=True)
     return ExitCode.OK
 
 
@@ -395,11 +395,11 @@ def farm(args: argparse.Namespace, console: Console) -> int:
         print(output / export.RATES_FILE, file=console.stream)
         return ExitCode.OK
     args.t_star = None  # instants are takes of their own; see `FarmWords`
-    told, files = export.export(words, contract.requested_params(args), contract.trains_anew(args))
+    summary, files = export.export(words, contract.requested_params(args), contract.trains_anew(args))
     if console.as_json:
-        print(json.dumps({"written": [str(p) for p in files], **dataclasses.asdict(told)}), file=console.stream)
+        print(json.dumps({"written": [str(p) for p in files], **dataclasses.asdict(summary)}), file=console.stream)
         return ExitCode.OK
-    for line in [*cost.sentences(told, words.rates or "of docs/farm.md"), *map(str, files)]:
+    for line in [*cost.sentences(summary, words.rates or "of docs/farm.md"), *map(str, files)]:
         print(line, file=console.stream)
     return ExitCode.OK
 

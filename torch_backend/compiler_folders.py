@@ -231,8 +231,8 @@ def _copied(native: Path, home: Path) -> Path:
         home.mkdir(parents=True, exist_ok=True)
         with locked(home / "copying.lock"):
             if not (home / "native").is_dir():
-                beside = home / "native.part"
-                shutil.rmtree(beside, ignore_errors=True)
-                shutil.copytree(native, beside)
-                replace_file(beside, home / "native")
+                partial = home / "native.part"
+                shutil.rmtree(partial, ignore_errors=True)
+                shutil.copytree(native, partial)
+                replace_file(partial, home / "native")
     return home

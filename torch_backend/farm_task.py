@@ -51,8 +51,8 @@ class EngineReporter(Reporter):
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
         """Tells the engine, every few seconds and at the end of a stage."""
         share = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
-        now, (before, since, said) = time.monotonic(), self._last
-        if stage == before and ((now - since < _STATUS_SECONDS and share < 1.0) or share == said):
+        now, (before, since, last_share) = time.monotonic(), self._last
+        if stage == before and ((now - since < _STATUS_SECONDS and share < 1.0) or share == last_share):
             return
         self._last = (stage, now, share)
         self._say("openjd_progress", f"{100 * share:.1f}")
@@ -153,8 +153,8 @@ def asked_of(args: argparse.Namespace, request: dict[str, Any], kind: str) -> An
     ValueError names what cannot be.
     """
     values = dict(request[kind])
-    for said in args.paths or ():
-        field, _, path = said.partition("=")
+    for setting in args.paths or ():
+        field, _, path = setting.partition("=")
         of, _, name = field.partition(".")
         if of == kind:
             values[name] = path
@@ -183,9 +183,9 @@ def _take(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
     if args.frames:
         params.first, params.last = args.first, min(args.first + args.frames - 1, int(request["last"]))
     work = {"open": open_take, "freeze": freeze_part, "finish": finish_take}[args.step]
-    told = work(shot, params, reporter)
+    answer = work(shot, params, reporter)
     if args.step != "finish":
-        print(json.dumps(told), flush=True)
+        print(json.dumps(answer), flush=True)
     return ExitCode.OK
 
 
@@ -201,8 +201,8 @@ def _freezing(args: argparse.Namespace, request: dict[str, Any]) -> FreezeParams
 
 def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineReporter) -> int:
     """bake or deliver: Blender, as this host has it."""
-    told = os.environ.get(BLENDER_VARIABLE, "")
-    if not told:
+    blender = os.environ.get(BLENDER_VARIABLE, "")
+    if not blender:
         raise JobError(
             "This host was given no Blender.", "Enter the job's environment with --bake.", ExitCode.ENVIRONMENT
         )
@@ -214,7 +214,7 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
     output = Path(args.output).absolute() / folder / params.take
     part = "frames" if args.step == "bake" else "file"
     script = Path(__file__).resolve().parent.parent / "splannequin_addon" / "run_in_bpy.py"
-    command: list[str] = json.loads(told)
+    command: list[str] = json.loads(blender)
     words = ["bake", "--json", "--tied", "--shot", args.shot, "--take", params.take, "--output", str(output)]
     words += [f"--first={first}", f"--last={last}", "--step", "1", "--part", part]
     apart = ["--"] if len(command) > 2 else []  # a Blender takes what is before it for its own
@@ -224,14 +224,14 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
         stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace", env=environ,
         cwd=os.path.dirname(os.path.abspath(command[0])),
     )  # fmt: skip
-    said = ""
+    message = ""
     try:
         for line in child.stdout or ():
             event = _event(line)
             if event is not None:
                 reporter(event)
             elif line.startswith("Error: "):
-                said = line.removeprefix("Error: ").strip()
+                message = line.removeprefix("Error: ").strip()
             elif line.strip():
                 print(contract.printable(line.rstrip(), 1000), flush=True)
             if event is not None:
@@ -241,7 +241,7 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
             child.stdin.close()  # it ends with us
     code = child.wait()
     if code:
-        reporter.fail(said or f"Blender ended with exit code {code}: see the log.")
+        reporter.fail(message or f"Blender ended with exit code {code}: see the log.")
     return code if code in {one.value for one in ExitCode} else int(ExitCode.BAKE)
 
 

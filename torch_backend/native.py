@@ -55,8 +55,8 @@ def cores() -> int:
 def default_threads() -> int:
     """Number of worker threads used unless told otherwise: all cores that this process may use, at most 16, or as many
     as OMP_NUM_THREADS names, which torch obeys as well."""
-    told = os.environ.get("OMP_NUM_THREADS", "")
-    return max(1, min(cores(), 16, int(told) if told.isdecimal() else 16))
+    setting = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, min(cores(), 16, int(setting) if setting.isdecimal() else 16))
 
 
 _WORTH_A_THREAD = 460_000
@@ -315,8 +315,8 @@ def _stream(device: str, handle: int) -> Any:
 
 def warp_stream(device: torch.device) -> Any:
     """Warp's name for torch's current stream of a CUDA device; kept for good, as torch keeps its streams."""
-    given: Any = device.index  # None for plain "cuda"
-    index: int = torch.cuda.current_device() if given is None else given
+    device_index: Any = device.index  # None for plain "cuda"
+    index: int = torch.cuda.current_device() if device_index is None else device_index
     if _raw_stream is not None:
         return _stream(f"cuda:{index}", _raw_stream(index))
     return _stream(f"cuda:{index}", torch.cuda.current_stream(device).cuda_stream)

@@ -116,10 +116,10 @@ class Shot(ShotFolder):
         if not news.is_file():
             return
         with contextlib.suppress(ValueError, KeyError, TypeError):  # damaged by no hand of ours: frames.json holds
-            told = read_json(news)
-            info = from_dict(ShotInfo, {**dataclasses.asdict(self.info()), **{name: told[name] for name in IMPORTED}})
-            if told.get("replaced"):
-                keep_replaced(self, str(told["replaced"]), [int(frame) for frame in told["same"]])
+            record = read_json(news)
+            info = from_dict(ShotInfo, {**dataclasses.asdict(self.info()), **{name: record[name] for name in IMPORTED}})
+            if record.get("replaced"):
+                keep_replaced(self, str(record["replaced"]), [int(frame) for frame in record["same"]])
             shutil.rmtree(self.own(self.solve), ignore_errors=True)
             self.save(info)
         remove_file(news)

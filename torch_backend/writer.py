@@ -107,17 +107,17 @@ def _heartbeat(root: Path, holder: Writer) -> object:
 def _bury(root: Path, dead: Writer) -> None:
     """Takes away the lock of a writer that gave no sign of life. One that was made meanwhile is put back."""
     path = contract.ShotFolder(root).lock
-    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
+    partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
     try:
-        os.rename(path, beside)
+        os.rename(path, partial)
     except OSError:
         return  # another one was faster
     try:
         with contextlib.suppress(OSError, ValueError):
-            if contract.from_dict(Writer, contract.read_json(beside, _LENGTH)) != dead:
-                os.link(beside, path)
+            if contract.from_dict(Writer, contract.read_json(partial, _LENGTH)) != dead:
+                os.link(partial, path)
     finally:
-        beside.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
 
 
 def _take(root: Path, mine: Writer) -> None:
@@ -160,25 +160,25 @@ def _make(path: Path, mine: Writer) -> bool:
 
     A link is made or refused by the server of a network disk itself; where a disk knows none, an exclusive open is.
     """
-    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
+    partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
     try:
-        _write(beside, mine)
+        _write(partial, mine)
         if sys.platform == "win32":
             try:
-                os.rename(beside, path)  # which refuses to replace, there
+                os.rename(partial, path)  # which refuses to replace, there
             except PermissionError:  # a scanner is at it, or the one of before is just going: it is looked at again
                 return False
         else:
             try:
-                os.link(beside, path)
+                os.link(partial, path)
             except FileExistsError:
-                return os.stat(beside).st_nlink == 2  # NFS asked twice, and was told of its own success
+                return os.stat(partial).st_nlink == 2  # NFS asked twice, and was told of its own success
             except OSError:  # no links on this disk
                 _write(path, mine)
     except FileExistsError:
         return False
     finally:
-        contract.remove_file(beside)
+        contract.remove_file(partial)
     return True
 
 

@@ -241,7 +241,7 @@ def _figure(size: tuple[float, float]) -> tuple[Any, Any]:
 
 
 def _save(figure: Any, path: Path) -> Path:
-    with atomic_path(path) as beside:
-        figure.savefig(beside, dpi=150)
+    with atomic_path(path) as partial:
+        figure.savefig(partial, dpi=150)
     _pyplot().close(figure)
     return path

@@ -129,11 +129,11 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
     _write_mesh(folder / "geometry" / "static.npz", static)
     for mover in movers:
         _write_mesh(folder / "geometry" / f"{mover.name}.npz", mover.mesh)
-        with atomic_path(folder / "geometry" / f"{mover.name}.npy") as beside:
-            np.save(beside, mover.vertices, allow_pickle=False)
+        with atomic_path(folder / "geometry" / f"{mover.name}.npy") as partial:
+            np.save(partial, mover.vertices, allow_pickle=False)
     if thing:
-        with atomic_path(folder / "geometry" / "thing.npz") as beside:
-            np.savez(beside, faces=thing.faces, gone=thing.gone)
+        with atomic_path(folder / "geometry" / "thing.npz") as partial:
+            np.savez(partial, faces=thing.faces, gone=thing.gone)
     plan = _plan(key, seed, kind, size, camera, people, movers, thing, place)
     if scene:
         _write_held(folder, plan, size, camera, scene, movers)
@@ -145,8 +145,8 @@ def _write_held(
 ) -> None:
     """geometry/held.npz, and in the plan: what is held, its other state behind it, and motion blur."""
     things = [thing for part in scene.parts for thing in part.things]
-    with atomic_path(folder / "geometry" / "held.npz") as beside:
-        np.savez(beside, allow_pickle=False, **{thing.name: thing.faces for thing in things})
+    with atomic_path(folder / "geometry" / "held.npz") as partial:
+        np.savez(partial, allow_pickle=False, **{thing.name: thing.faces for thing in things})
     plan["held"] = [
         {"thing": thing.name, "mover": thing.mover} | part.to_json() for part in scene.parts for thing in part.things
     ]
@@ -229,8 +229,8 @@ def _write_textures(folder: Path, seed: int, size: Size, place: Place) -> None:
 
 
 def _write_mesh(path: Path, mesh: Mesh) -> None:
-    with atomic_path(path) as beside:
-        np.savez(beside, vertices=mesh.vertices, triangles=mesh.triangles, uv=mesh.uv, material=mesh.material)
+    with atomic_path(path) as partial:
+        np.savez(partial, vertices=mesh.vertices, triangles=mesh.triangles, uv=mesh.uv, material=mesh.material)
 
 
 # --------------------------------------------------------------------------------------------------- who and what

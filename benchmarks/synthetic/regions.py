@@ -168,8 +168,8 @@ def write_regions(folder: Path, seed: int, kind: str, size: Size, progress: Call
             elif kind == "held":
                 window = round(STILL_SECONDS * size.fps)
                 maps[THING + HELD] = held_elsewhere(geometry, standing, index, pose, views[pose], window)
-            with atomic_path(path) as beside:
-                np.savez_compressed(beside, **maps)
+            with atomic_path(path) as partial:
+                np.savez_compressed(partial, **maps)
             done += 1
             progress(done, total)
 

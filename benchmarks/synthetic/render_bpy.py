@@ -352,9 +352,9 @@ class Stage:
             render.border_min_y, render.border_max_y = 1.0 - high / height, 1.0 - low / height
             light[low:high] = self._exposed(job, band)[low:high]
         render.use_border = False
-        beside = out.with_name(f".{out.stem}.{os.getpid()}.tmp.png")
-        beside.write_bytes(png(srgb(light * 2.0 ** (stops + job["stops"]))))
-        os.replace(beside, out)
+        partial = out.with_name(f".{out.stem}.{os.getpid()}.tmp.png")
+        partial.write_bytes(png(srgb(light * 2.0 ** (stops + job["stops"]))))
+        os.replace(partial, out)
 
     def _render_box(self, job: dict[str, Any], light: np.ndarray) -> None:
         """The pixels of a box without the scene's thing; the rest stays black."""
@@ -445,9 +445,9 @@ def _metered(folder: Path, plan: dict[str, Any], stage: Stage) -> float:
         return json.loads(path.read_text(encoding="utf-8"))["stops"]
     stops = stage.meter()
     record = {"stops": stops, "bpy": bpy.app.version_string, "threads": stage.scene.render.threads}
-    beside = path.with_name(f".meter.{os.getpid()}.tmp")
-    beside.write_text(json.dumps(record) + "\n", encoding="utf-8")
-    os.replace(beside, path)
+    partial = path.with_name(f".meter.{os.getpid()}.tmp")
+    partial.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    os.replace(partial, path)
     return stops
 
 

@@ -87,8 +87,8 @@ def exact_shot(scene: SyntheticScene, folder: str | Path, report: Reporter) -> S
     points, origin = _triangulated(scene, shot, names), "triangulation"
     if points is None or len(points["xyz"]) < LEAST_POINTS:
         points, origin = surface_points(scene), "surfaces"
-    with atomic_path(shot.solve / "points.npz") as beside:
-        np.savez(beside, xyz=points["xyz"], rgb=points["rgb"], error=points["error"], track=points["track"])
+    with atomic_path(shot.solve / "points.npz") as partial:
+        np.savez(partial, xyz=points["xyz"], rgb=points["rgb"], error=points["error"], track=points["track"])
     write_json(shot.solve / "cameras.json", exact_cameras(scene).to_json())
     error = float(points["error"].mean())
     result = SolveResult(

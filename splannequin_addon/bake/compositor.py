@@ -146,8 +146,8 @@ def _warp_image(take: Take) -> bpy.types.Image | None:
 
 def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bpy.types.Image:
     """A sequence of the take, once it is known to have some layers. ValueError if not."""
-    there = _layers_of(image, take)
-    missing = [n for n in names if n not in there]
+    layers = _layers_of(image, take)
+    missing = [n for n in names if n not in layers]
     if missing:
         raise contract.UserError(f"the frames in {take.folder} have no layer {missing[0]!r}: freeze the take again")
     return image

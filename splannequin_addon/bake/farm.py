@@ -87,9 +87,9 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
             shots=(str(shot),), output=str(folder), t_star=self.instants, frames=self.frames, bake=self.bake
         )
         try:
-            asked = farm_job.begin(words, requests_of(scene, shot))
+            question = farm_job.begin(words, requests_of(scene, shot))
             if bpy.app.background:
-                for line in farm_job.written(asked):
+                for line in farm_job.written(question):
                     self.report({"INFO"}, line)
                 return {"FINISHED"}
         except (contract.JobError, OSError, ValueError) as error:
@@ -97,7 +97,7 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
             self.report({"ERROR"}, tr(sentence))
             return {"CANCELLED"}
         job_timer.watch_of(shot).failures.pop("bake", None)
-        job_timer.when_answered(asked, lambda: _tell(shot, asked))
+        job_timer.when_answered(question, lambda: _tell(shot, question))
         return {"FINISHED"}
 
 

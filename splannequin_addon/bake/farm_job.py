@@ -28,14 +28,14 @@ def begin(words: contract.FarmWords, requests: dict[str, Any]) -> children.Quest
     backend.python()  # before anything is written
     device: list[str] = []
     if words.action == "export":
-        told: dict[str, dict[str, Any]] = {
+        values: dict[str, dict[str, Any]] = {
             kind: params if is_json_object(params) else dataclasses.asdict(params) for kind, params in requests.items()
         }
         request = Path(words.output) / REQUEST
-        contract.write_json(request, told)
+        contract.write_json(request, values)
         words = dataclasses.replace(words, request=str(request))
-        if told.get("freeze", {}).get("device"):
-            device = ["--device", told["freeze"]["device"]]
+        if values.get("freeze", {}).get("device"):
+            device = ["--device", values["freeze"]["device"]]
     return backend.ask("farm", *contract.said_of(words), *device)
 
 

@@ -23,15 +23,15 @@ _WARPS = "splannequin_warps"
 def switch_warp(node: bpy.types.CompositorNodeGroup, wanted: bool, possible: bool) -> list[str]:
     """Gives our node the factor of the warp, or takes it away; says what was changed. The inside is not touched."""
     group, name = present(node.node_tree), AS_WARP
-    there = [i for i in compat.sockets_of(group) if i.in_out == "INPUT" and i.name == name]
+    sockets = [i for i in compat.sockets_of(group) if i.in_out == "INPUT" and i.name == name]
     group[_WARPS] = wanted
-    if wanted and possible and not there:
+    if wanted and possible and not sockets:
         text = "1: the plate that you lead in, frozen by the take's warp; 0: the take's own frames"
         _factor(compat.new_socket(group, name, "INPUT", "NodeSocketFloat", text), 1.0)
         set_value(node.inputs[name], 1.0)
         return ["What is led into the group is frozen by the take's warp, with its own values."]
-    if there and not (wanted and possible):
-        present(group.interface).remove(there[0])
+    if sockets and not (wanted and possible):
+        present(group.interface).remove(sockets[0])
         why = "The take has no warp: its own frames are shown." if wanted else "The take's own frames are shown again."
         return [why]
     return []
@@ -46,13 +46,13 @@ def wants_warp(scene: bpy.types.Scene) -> bool:
 
 def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
     """What our node is asked for that the take does not have, in words."""
-    inside, asked = present(node.node_tree).nodes, list[str]()
+    inside, remarks = present(node.node_tree).nodes, list[str]()
     if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
-        asked.append("The take has no grain to add: freeze it again.")
+        remarks.append("The take has no grain to add: freeze it again.")
     frozen = inside[FROZEN].outputs
     if (value_of(node.inputs["Splat"]) or value_of(node.inputs[INVENTED])) and "Plate" not in frozen:
-        asked.append("The take does not tell plate from splats: it was frozen without detail.")
-    return asked
+        remarks.append("The take does not tell plate from splats: it was frozen without detail.")
+    return remarks
 
 
 def shows_plate(scene: bpy.types.Scene) -> bool:
@@ -147,11 +147,11 @@ def _factor(socket: Any, value: float) -> None:
 
 def give_sockets(group: bpy.types.NodeTree) -> set[str]:
     """Gives a group the sockets that it lacks, those of an older version stay; returns the names of new inputs."""
-    there = {(i.in_out, i.name) for i in compat.sockets_of(group)}
+    existing = {(i.in_out, i.name) for i in compat.sockets_of(group)}
     given: set[str] = set()
 
     def new(name: str, side: str, kind: str, text: str) -> Any:
-        if (side, name) in there:
+        if (side, name) in existing:
             return None
         if side == "INPUT":
             given.add(name)
@@ -184,18 +184,18 @@ def give_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[s
 
     An output that leads somewhere stays without its pass. Returns a sentence for each of these.
     """
-    group, said = present(node.node_tree), list[str]()
-    there = {i.name: i for i in compat.sockets_of(group) if i.in_out == "OUTPUT"}
+    group, remarks = present(node.node_tree), list[str]()
+    outputs = {i.name: i for i in compat.sockets_of(group) if i.in_out == "OUTPUT"}
     for layer in _PASSES:
         name = layer.output
         if layer.name in layers:
-            if name not in there:
+            if name not in outputs:
                 compat.new_socket(group, name, "OUTPUT", layer.socket, layer.tip)
-        elif name in there and node.outputs[name].is_linked:
-            said.append(f"The take has no {name}, which your compositor uses: freeze it again with Passes.")
-        elif name in there:
-            present(group.interface).remove(there[name])
-    return said
+        elif name in outputs and node.outputs[name].is_linked:
+            remarks.append(f"The take has no {name}, which your compositor uses: freeze it again with Passes.")
+        elif name in outputs:
+            present(group.interface).remove(outputs[name])
+    return remarks
 
 
 def set_defaults(node: bpy.types.CompositorNodeGroup, names: set[str]) -> None:

@@ -169,18 +169,18 @@ def _cg_depth(group: bpy.types.NodeTree, enter: bpy.types.Node) -> bpy.types.Nod
     around = compat.new_nearest_node(group)
     group.links.new(enter.outputs["CG Depth"], around.inputs[0])
     # Where there is a depth, the other is made so large that the lesser of the two is the pixel's own.
-    there = compat.new_math_node(group, "LESS_THAN")
-    there.inputs[1].default_value = _NOTHING
-    group.links.new(enter.outputs["CG Depth"], there.inputs[0])
+    has_depth = compat.new_math_node(group, "LESS_THAN")
+    has_depth.inputs[1].default_value = _NOTHING
+    group.links.new(enter.outputs["CG Depth"], has_depth.inputs[0])
     far = compat.new_math_node(group, "MULTIPLY_ADD")
     far.inputs[1].default_value = contract.NO_DEPTH
-    group.links.new(there.outputs[0], far.inputs[0])
+    group.links.new(has_depth.outputs[0], far.inputs[0])
     group.links.new(around.outputs[0], far.inputs[2])
     depth = compat.new_math_node(group, "MINIMUM")
     depth.label = "Depth of CG, edges too"
     group.links.new(enter.outputs["CG Depth"], depth.inputs[0])
     group.links.new(far.outputs[0], depth.inputs[1])
-    for column, node in enumerate((around, there, far, depth)):
+    for column, node in enumerate((around, has_depth, far, depth)):
         node.location = (GAP * (column - 3), -1100.0)
     return _shadows_nearer(group, enter, depth.outputs[0])
 
@@ -257,10 +257,10 @@ def _share(
         lacking = compat.new_math_node(group, "SUBTRACT")
         lacking.inputs[0].default_value = 1.0
         group.links.new(layers[layer], lacking.inputs[1])
-        taken = _product(group, enter.outputs[name], lacking.outputs[0])
+        removed = _product(group, enter.outputs[name], lacking.outputs[0])
         kept = compat.new_math_node(group, "SUBTRACT")
         kept.inputs[0].default_value = 1.0
-        group.links.new(taken, kept.inputs[1])
+        group.links.new(removed, kept.inputs[1])
         total = _product(group, total, kept.outputs[0])
         lacking.location, kept.location = (-2 * GAP, 500.0 + 170.0 * row), (-GAP, 500.0 + 170.0 * row)
     left.location = (-GAP, 330.0)

@@ -70,24 +70,24 @@ class Plate:
 def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
     """The footage that a take was frozen from, or None and, if the take knows of it, why it cannot be shown."""
     try:
-        told: dict[str, Any] = dict(contract.read_json(contract.TakeFolder(take.folder).facts).get("footage") or {})
-        if not told:
+        footage: dict[str, Any] = dict(contract.read_json(contract.TakeFolder(take.folder).facts).get("footage") or {})
+        if not footage:
             return None, ""
-        name = Path(str(told["file"])).name
-        if told["unlike"]:
-            return None, f"{name}: {told['unlike']}"
-        if told.get("orientation", 1) != 1 and not compat.TURNS_VIDEOS:
+        name = Path(str(footage["file"])).name
+        if footage["unlike"]:
+            return None, f"{name}: {footage['unlike']}"
+        if footage.get("orientation", 1) != 1 and not compat.TURNS_VIDEOS:
             return None, f"{name}: it is turned by its header"
-        places = [Path(str(told["file"])), *([shot / str(told["beside"])] if told["beside"] else [])]
+        places = [Path(str(footage["file"])), *([shot / str(footage["beside"])] if footage["beside"] else [])]
         file = next((place for place in places if place.is_file()), None)
         if file is None:
             return None, f"{name} is not there any more"
-        st = take.folder / str(told["map"]) if told["map"] else None
+        st = take.folder / str(footage["map"]) if footage["map"] else None
         if st is not None and not st.is_file():
             return None, "the take's ST map is gone"
-        width, height = (int(side) for side in told["size"])
-        probe = tuple(float(value) for value in told["probe"])
-        return Footage(file, (width, height), probe, str(told["space"]), st, int(told.get("shift") or 0)), ""
+        width, height = (int(side) for side in footage["size"])
+        probe = tuple(float(value) for value in footage["probe"])
+        return Footage(file, (width, height), probe, str(footage["space"]), st, int(footage.get("shift") or 0)), ""
     except (OSError, ValueError, TypeError, KeyError, contract.JobError):
         return None, ""  # of an earlier version, or damaged
 
@@ -99,17 +99,17 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
     if footage is not None:
         image, why = _image(footage, (take.first, take.last))
     if footage is None or image is None:
-        said = [f"The compositor shows working frames as the plate, not the footage: {why}."] if why else []
+        remarks = [f"The compositor shows working frames as the plate, not the footage: {why}."] if why else []
         image = sequences.load_sequence(stand_in, working_name(stand_in), "srgb")
         size = sequences.shown_size(image, take.first, take.last)
-        return Plate(image, None, said, size, has_shoulder=working_light.has_shoulder(contract.ShotFolder(shot)))
+        return Plate(image, None, remarks, size, has_shoulder=working_light.has_shoulder(contract.ShotFolder(shot)))
     st = None
     if footage.map is not None:
         st = sequences.load_numbers(footage.map, _map_name(take))
     width, height = footage.size
     without = ", without its lens by the take's ST map" if st is not None else ""
-    said = [f"The plate is {footage.file.name} itself, {width} x {height}{without}."]
-    return Plate(image, st, said, footage.size, footage.shift)
+    remarks = [f"The plate is {footage.file.name} itself, {width} x {height}{without}."]
+    return Plate(image, st, remarks, footage.size, footage.shift)
 
 
 def read_ahead(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:

@@ -124,7 +124,7 @@ def apply(scene: bpy.types.Scene, rows: Iterable[Setting]) -> list[str]:
                 "Remove its keyframes or its driver.",
                 contract.ExitCode.BAKE,
             )
-    said: list[str] = []
+    remarks: list[str] = []
     noted: list[tuple[str, str, Any, Any]] = []
     # All of them first: one setting may change another, as a display does whose views have other names.
     were = [(row, getattr(_owner(scene, row.owner), row.name)) for row in rows]
@@ -142,12 +142,12 @@ def apply(scene: bpy.types.Scene, rows: Iterable[Setting]) -> list[str]:
                 )
             noted.append((row.owner, row.name, before, getattr(owner, row.name)))
             scene[_NOTED] = json.dumps(noted)
-            if row.why and row.why not in said:
-                said.append(row.why)
+            if row.why and row.why not in remarks:
+                remarks.append(row.why)
     except BaseException:
         restore(scene)
         raise
-    return said
+    return remarks
 
 
 def set_noted(scene: bpy.types.Scene, owner: str, name: str, value: Any) -> None:

@@ -177,9 +177,9 @@ class Run:
 
     def refused(self, error: RuntimeError) -> None:
         """Notes what Blender says of a scene that it does not render, or of a picture that it could not write."""
-        said = " ".join(str(error).split()).removeprefix("Error: ")
-        said = said.replace(str(self._beside), str(self._folder_name()))
-        self.error = self.error or self._or_full(f"Blender could not render the scene: {said}", None)
+        message = " ".join(str(error).split()).removeprefix("Error: ")
+        message = message.replace(str(self._beside), str(self._folder_name()))
+        self.error = self.error or self._or_full(f"Blender could not render the scene: {message}", None)
 
     def is_of(self, scene: bpy.types.Scene) -> bool:
         """True if it renders this scene."""

@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 
 def shown(scene: bpy.types.Scene, shot: Path) -> str:
     """Name of the take of this shot that the scene's compositor shows; empty if there is none, or another shot's."""
-    there = freeze_group.shown(scene)
-    return there[0].name if there is not None and there[0].parent == contract.ShotFolder(shot).takes else ""
+    found = freeze_group.shown(scene)
+    return found[0].name if found is not None and found[0].parent == contract.ShotFolder(shot).takes else ""
 
 
 def stale_scale(scene: bpy.types.Scene, shot: Path) -> bool:
     """True if the shot was scaled since its take was put into the compositor: its depth does not fit the scene's."""
-    there = freeze_group.shown(scene)
-    if there is None or not shown(scene, shot):
+    found = freeze_group.shown(scene)
+    if found is None or not shown(scene, shot):
         return False
     scale = scene_objects.depth_scale(scene, shot)
-    return abs(there[1] - scale) > 1e-4 * scale
+    return abs(found[1] - scale) > 1e-4 * scale
 
 
 def follow_scale(scene: bpy.types.Scene, shot: Path) -> list[str]:

@@ -37,10 +37,10 @@ class Bake(Step):
         params = takes.params_of(scene)
         if folder is None:
             return params
-        asked = takes.take_params(folder, props.take_name, params.t_star)
-        if asked is not None and props.choose_t_star:
-            asked.t_star_per_frame = params.t_star_per_frame
-        params = asked or params
+        stored = takes.take_params(folder, props.take_name, params.t_star)
+        if stored is not None and props.choose_t_star:
+            stored.t_star_per_frame = params.t_star_per_frame
+        params = stored or params
         params.device = backend.device()
         params.first, params.last, params.step = scene.frame_start, scene.frame_end, scene.frame_step
         return params
@@ -56,9 +56,9 @@ class Bake(Step):
         tree = compat.compositor_tree(scene)
         if tree is None or freeze_group.group_node(tree) is None:
             return View(False, True, [], "Put the freeze before your compositor's output and render.")
-        there, take = freeze_group.shown(scene), shown_take.shown(scene, state.folder)
-        if there is not None and take != settings_of(scene).take_name:
-            shown = f"take {take}" if take else f"another shot, {scene_objects.name_of(there[0].parent.parent)}"
+        found, take = freeze_group.shown(scene), shown_take.shown(scene, state.folder)
+        if found is not None and take != settings_of(scene).take_name:
+            shown = f"take {take}" if take else f"another shot, {scene_objects.name_of(found[0].parent.parent)}"
             lines = [f"Your compositor shows {shown}: the one that was baked last."]
             return View(False, True, lines, "Baking puts this take in its place.")
         lines = ["The freeze is in your compositor."]
@@ -79,11 +79,11 @@ class Bake(Step):
         about all that work on the shot, if that is not there any more."""
         name, take = steps.scene_of(job), str(job.params["take"])
         named = next((s for s in bpy.data.scenes if s.name == name and not library_of(s)), None)
-        asked = session.scene_of(job.scene_uid) or named  # by its name in another file, and of a job found again
-        if asked is None:
+        target = session.scene_of(job.scene_uid) or named  # by its name in another file, and of a job found again
+        if target is None:
             insertion.bring_in(scene, job.shot, take, alone=False)
-        elif asked in selection.scenes_of(job.shot):
-            insertion.bring_in(asked, job.shot, take)
+        elif target in selection.scenes_of(job.shot):
+            insertion.bring_in(target, job.shot, take)
         else:
             job_timer.watch_of(job.shot).notes[self.name] = [self.late(job)]
         return True
@@ -114,8 +114,8 @@ class Bake(Step):
 
 def _baked(scene: bpy.types.Scene) -> Path | None:
     """The shot whose take the compositor shows."""
-    there = freeze_group.shown(scene)
-    return there[0].parent.parent if there is not None else None
+    found = freeze_group.shown(scene)
+    return found[0].parent.parent if found is not None else None
 
 
 def shown(take: Path) -> bool:

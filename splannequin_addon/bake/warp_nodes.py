@@ -32,11 +32,11 @@ def frozen(
         warp: outputs of the Image node that shows the warp, `LAYERS`.
         size: width and height of the plate that the warp is for.
     """
-    there = {node.name for node in tree.nodes}
+    names = {node.name for node in tree.nodes}
     shown = looked_up(tree, plate, warp["ST"], size)
     whole = _mixed(tree, 1.0, _mixed(tree, 1.0, shown, warp["Matte"], "MULTIPLY"), warp["Combined"], "ADD")
     whole = compat.with_alpha(tree, whole, warp["Alpha"])
-    for column, node in enumerate(n for n in tree.nodes if n.name not in there):
+    for column, node in enumerate(n for n in tree.nodes if n.name not in names):
         node.location = (_WIDE * (column % 8 - 3), -1700.0 - _WIDE * (column // 8))
     return whole
 

@@ -33,12 +33,12 @@ def has_shoulder(shot_folder: contract.ShotFolder) -> bool:
 
 def lit(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """Socket of a picture's light, scene-linear; the picture was read as sRGB and has a shoulder. It is opaque."""
-    there = {node.name for node in tree.nodes}
+    names = {node.name for node in tree.nodes}
     # The curve is of Rec.709's light; where Blender works in another, there and back.
     channels = _through(tree, list(compat.separated(tree, picture)), Color.from_scene_linear_to_rec709_linear)
     channels = _through(tree, [_bent_back(tree, c) for c in channels], Color.from_rec709_linear_to_scene_linear)
     whole = compat.combined(tree, channels)
-    for column, node in enumerate(n for n in tree.nodes if n.name not in there):
+    for column, node in enumerate(n for n in tree.nodes if n.name not in names):
         node.location = (_WIDE * (column % 8), -300.0 - _WIDE * (column // 8))
     return whole
 

@@ -101,8 +101,8 @@ def export(args: argparse.Namespace, console: Console) -> int:
     output = Path(args.output).absolute()
     words: contract.ExportWords = contract.words_of(args)
     words.shot, words.output = str(Path(words.shot).absolute()), str(output)
-    asked = exchange.begin_export(words)
-    console.say(exchange.exported(asked, output))
+    question = exchange.begin_export(words)
+    console.say(exchange.exported(question, output))
     return ExitCode.OK
 
 
@@ -252,9 +252,9 @@ def _bake_a_part(
 def write_stmaps(args: argparse.Namespace, console: Console) -> int:
     """`stmaps SHOT`: ST maps of the lens, both ways."""
     shot = _shot(args)
-    asked = stmaps.begin(shot, args.width)
-    asked.wait()
-    facts = stmaps.answer(asked)
+    question = stmaps.begin(shot, args.width)
+    question.wait()
+    facts = stmaps.answer(question)
     if console.as_json:
         print(json.dumps(facts))
     for line in stmaps.sentences(facts):
@@ -266,12 +266,12 @@ def status(args: argparse.Namespace, console: Console) -> int:
     """`status SHOT`: the newest job of each kind, one line each."""
     shot = _shot(args)
     for kind, job in jobs.latest(shot).items():
-        told = job.status or contract.Status(kind, "queued", 0, 0.0, 0.0, 0.0)
+        status = job.status or contract.Status(kind, "queued", 0, 0.0, 0.0, 0.0)
         if console.as_json:
-            print(json.dumps({"job": job.folder.name, **dataclasses.asdict(told)}))
+            print(json.dumps({"job": job.folder.name, **dataclasses.asdict(status)}))
         else:
-            share = f"{told.stage} {100 * told.fraction:.0f}%" if told.stage else ""
-            print(contract.printable(f"{job.folder.name}  {told.state:<9} {share}  {told.message}").rstrip())
+            share = f"{status.stage} {100 * status.fraction:.0f}%" if status.stage else ""
+            print(contract.printable(f"{job.folder.name}  {status.state:<9} {share}  {status.message}").rstrip())
     return ExitCode.OK
 
 
@@ -407,10 +407,10 @@ def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
         scene.render.filepath = rendering.output_path(frames)
         bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
     except RuntimeError as error:
-        said = f"{blend.name} could not be saved: {str(error).strip()}"
+        message = f"{blend.name} could not be saved: {str(error).strip()}"
         if rendering.is_full(blend.parent, os.path.getsize(bpy.data.filepath) if bpy.data.filepath else 1 << 20):
-            raise contract.disk_error(blend.parent, said) from error
-        raise contract.JobError(f"{said}.", f"Can {blend.parent} be written to?", ExitCode.BAKE) from error
+            raise contract.disk_error(blend.parent, message) from error
+        raise contract.JobError(f"{message}.", f"Can {blend.parent} be written to?", ExitCode.BAKE) from error
     finally:
         files.save_version = backups
 

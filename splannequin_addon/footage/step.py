@@ -91,8 +91,8 @@ def _imported_from(scene: bpy.types.Scene) -> str:
     """The clip that the scene's shot was made of: one that was opened by its folder says it; empty without a shot."""
     folder = selection.shot_folder(scene)
     try:
-        told = {} if folder is None else contract.read_json(contract.ShotFolder(folder).info_path)
-        return str(told.get("source", ""))
+        info = {} if folder is None else contract.read_json(contract.ShotFolder(folder).info_path)
+        return str(info.get("source", ""))
     except (OSError, ValueError, contract.JobError):  # the import itself says what is wrong with it
         return ""
 

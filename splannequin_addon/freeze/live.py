@@ -88,7 +88,7 @@ class Session:
     def busy(self, view: int) -> bool:
         """True while the last request for a view is not answered."""
         with self._change:
-            return any(asked.view == view for asked in self._sent.values())
+            return any(request.view == view for request in self._sent.values())
 
     def close(self) -> None:
         """Ends the child; returns at once. Its memory is free as soon as it has seen that its input ended."""
@@ -133,8 +133,8 @@ class Session:
         code = process.wait()
         if not self._closed and self.failure is None:
             words = last_line(log)
-            told = f" Last line of its log: {words}" if words else ""
-            self._fail(f"The live session ended without a word (exit code {code}).{told}", "Start it again.")
+            log_line = f" Last line of its log: {words}" if words else ""
+            self._fail(f"The live session ended without a word (exit code {code}).{log_line}", "Start it again.")
 
     def _take_in(self, header: dict[str, Any], body: bytes) -> None:
         if header["kind"] == "ready":
@@ -144,20 +144,20 @@ class Session:
         elif header["kind"] == "error":
             self._answered(header["seq"])  # this view cannot be drawn; the next one may
         elif header["kind"] == "frame":
-            asked = self._answered(header["seq"])
+            request = self._answered(header["seq"])
             w, h = header["width"], header["height"]
             values = np.frombuffer(body, np.float32)
             rgba, depth = values[: 4 * w * h].reshape(h, w, 4), values[4 * w * h :].reshape(h, w)
-            self.frames[asked.view] = Frame(asked, header["t_star"], rgba, depth)
+            self.frames[request.view] = Frame(request, header["t_star"], rgba, depth)
             self.drawn += 1
 
     def _answered(self, seq: int) -> contract.LiveView:
         """The request that was answered; it and those of its view that it took the place of wait no more."""
         with self._change:
-            asked = self._sent.pop(seq)
-            for older in [s for s, v in self._sent.items() if v.view == asked.view and s < seq]:
+            request = self._sent.pop(seq)
+            for older in [s for s, v in self._sent.items() if v.view == request.view and s < seq]:
                 del self._sent[older]
-        return asked
+        return request
 
     def _fail(self, message: str, hint: str) -> None:
         with self._change:

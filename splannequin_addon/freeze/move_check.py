@@ -68,7 +68,7 @@ def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_tim
         contract.JobError: the camera cannot be read, there is no run or no backend, or the session ended.
     """
     props = settings_of(scene)
-    run, asked = props.run_name, takes.params_of(scene)
+    run, params = props.run_name, takes.params_of(scene)
     total = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
     every = max(1, math.ceil(total / MOST_FRAMES))
     turns = own_camera.sample_path(scene, name, shot, WIDTH, every)
@@ -92,10 +92,10 @@ def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_tim
         while not drawn.facts:
             _still_open(drawn)
             yield job_timer.Progress("The backend is loading the run", 0, len(path.frames))
-        t_star = float(drawn.facts["suggestions"][0]["frame"] if asked.t_star is None else asked.t_star)
+        t_star = float(drawn.facts["suggestions"][0]["frame"] if params.t_star is None else params.t_star)
         shares: dict[int, float] = {}
         for frame in path.frames:
-            at, develop = asked.t_star_per_frame.get(str(frame.frame), t_star), asked.develop == "on"
+            at, develop = params.t_star_per_frame.get(str(frame.frame), t_star), params.develop == "on"
             view = contract.LiveView(
                 _VIEW, 0, frame.viewmat, frame.K, path.width, path.height, at, show="support", develop=develop
             )

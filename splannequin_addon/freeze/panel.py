@@ -83,8 +83,8 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
         body = step_panel.sub_panel(layout_of(self), "takes", "Takes")
         if body is not None:
             listing.draw(body, "take", watch.state, settings_of(scene_in(context)).take_name)
-            for told in watch.state.damaged["take"].values():
-                wrap(body, context, told, "ERROR")
+            for damage in watch.state.damaged["take"].values():
+                wrap(body, context, damage, "ERROR")
             body.operator("splannequin.add_splats", icon=icons.of("splannequin.add_splats"))
             body.operator("splannequin.add_surface", icon=icons.of("splannequin.add_surface"))
             row = body.row(align=True)
@@ -120,9 +120,9 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
         text = "Stop Scrubbing" if session is not None else "Scrub in View"
         row.operator("splannequin.live", text=text, icon=icon, depress=session is not None)
         if session is None:
-            told = viewport.failure()
-            if told is not None:
-                wrap(layout, context, f"{told[0]} {told[1]}".strip(), "ERROR")
+            failure = viewport.failure()
+            if failure is not None:
+                wrap(layout, context, f"{failure[0]} {failure[1]}".strip(), "ERROR")
             return
         row.operator("splannequin.suggested_instant", text="", icon="TRIA_LEFT").step = -1
         row.operator("splannequin.suggested_instant", text="", icon="TRIA_RIGHT").step = 1

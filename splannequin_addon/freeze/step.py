@@ -124,8 +124,8 @@ class Freeze(Step):
 def _own_verdict(state: ShotState, take: dict[str, Any]) -> list[str]:
     """Lines of a take's verdict that do not stand under Train already: a take repeats what its run's found amiss."""
     run = contract.verdict_of(state.runs.get(take["run"], {}))
-    told = [*run.sentences, *run.advice] if run is not None else []
-    return [line for line in contract.verdict_lines(take) if line not in told]
+    sentences = [*run.sentences, *run.advice] if run is not None else []
+    return [line for line in contract.verdict_lines(take) if line not in sentences]
 
 
 STEP = Freeze()

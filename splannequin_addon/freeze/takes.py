@@ -142,20 +142,20 @@ def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
         scene: the scene whose settings are compared.
         take: an entry of `ShotState.takes`.
     """
-    asked, camera = params_of(scene), own_camera.name_of(scene)
-    if take["run"] != asked.run:
-        return f"It was frozen from the run {take['run']}, now {asked.run} is chosen."
+    params, camera = params_of(scene), own_camera.name_of(scene)
+    if take["run"] != params.run:
+        return f"It was frozen from the run {take['run']}, now {params.run} is chosen."
     if bool(take["camera_path"]) != bool(camera):
         return "It is seen from another camera than the one chosen now."
     ramp = {int(n): float(at) for n, at in take["t_star_per_frame"].items()}
-    wanted = {int(n): at for n, at in asked.t_star_per_frame.items()}
+    wanted = {int(n): at for n, at in params.t_star_per_frame.items()}
     if bool(ramp) != bool(wanted) or any(abs(ramp[n] - wanted[n]) > 1e-4 for n in ramp.keys() & wanted.keys()):
         return "Its t* is not the one that is keyed now." if wanted else "Its t* was keyed, now it is not."
-    if not wanted and asked.t_star not in (None, take["t_star_frame"], take["t_star_asked"]):
-        return f"Its t* is frame {take['t_star_frame']}, now frame {asked.t_star} is chosen."
-    if abs(take["overscan"] - asked.overscan) > 1e-6:
+    if not wanted and params.t_star not in (None, take["t_star_frame"], take["t_star_asked"]):
+        return f"Its t* is frame {take['t_star_frame']}, now frame {params.t_star} is chosen."
+    if abs(take["overscan"] - params.overscan) > 1e-6:
         return "Its overscan is not the one chosen now."
-    if abs(take["shutter"] - asked.shutter) > 1e-3:
+    if abs(take["shutter"] - params.shutter) > 1e-3:
         return "Its motion blur is not the one chosen now."
     lacking = 0 if camera else take["frames_in_all"] - take["frame_count"]
     return f"{lacking} of its {take['frames_in_all']} frames are not rendered yet." if lacking > 0 else ""
@@ -184,18 +184,18 @@ def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool
 def may_be_stale(shot: Path, take: str) -> bool:
     """True if a take's run was trained on after the take was frozen: the backend can tell which frames that changed."""
     facts = inventory.read(shot).takes.get(take, {})
-    there = contract.ShotFolder(shot)
-    trained = contract.RunFolder(there.runs / str(facts.get("run", ""))).checkpoint
-    told = contract.TakeFolder(there.takes / take).facts
-    if not trained.is_file() or not told.is_file():
+    folder = contract.ShotFolder(shot)
+    trained = contract.RunFolder(folder.runs / str(facts.get("run", ""))).checkpoint
+    record = contract.TakeFolder(folder.takes / take).facts
+    if not trained.is_file() or not record.is_file():
         return False
     try:
-        frozen = contract.read_json(told, contract.SHORT_JSON).get("checkpoint")
+        frozen = contract.read_json(record, contract.SHORT_JSON).get("checkpoint")
         if frozen:
             return contract.file_digest(trained) != frozen
     except (OSError, ValueError):
         return True
-    return trained.stat().st_mtime > told.stat().st_mtime  # frozen by an earlier version, which did not say of what
+    return trained.stat().st_mtime > record.stat().st_mtime  # frozen by an earlier version, which did not say of what
 
 
 def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:

@@ -180,9 +180,9 @@ def _tick() -> float | None:
     if state != _last or resting:
         _last = state
         redraw(("WINDOW",))
-    told = tuple(reason(s) for s in scenes)
-    if told != _last_told and not _moving(now):
-        _last_told = told
+    reasons = tuple(reason(s) for s in scenes)
+    if reasons != _last_told and not _moving(now):
+        _last_told = reasons
         redraw(("UI",))
     return TICK_SECONDS
 
@@ -221,8 +221,8 @@ def view_of(
 
 def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
     """True if both show the same, at whatever size, made of plates or not."""
-    told = [(v.t_star, v.show, v.exposed_like, v.develop) for v in (one, other)]
-    if told[0] != told[1]:
+    instants = [(v.t_star, v.show, v.exposed_like, v.develop) for v in (one, other)]
+    if instants[0] != instants[1]:
         return False
     ks = [np.array(v.K) / (v.width, v.height, v.width, v.height) for v in (one, other)]
     return bool(np.allclose(ks[0], ks[1], atol=2e-3) and np.allclose(one.viewmat, other.viewmat, atol=1e-6))
@@ -258,15 +258,15 @@ def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:
     """Asks for the quick view if it shows something new; once that rests for the sharp one, then for its detail."""
     if _session is None:
         return
-    asked, now = _session.wanted(key), time.monotonic()
-    if asked is None or not _same(asked, quick):
+    wanted, now = _session.wanted(key), time.monotonic()
+    if wanted is None or not _same(wanted, quick):
         _moved[key] = now
         _rested.discard(key)
         _session.ask(quick)
     elif now - _moved[key] > _REST_SECONDS and not _session.busy(key):
-        if asked.width < sharp.width:
-            _session.ask(dataclasses.replace(sharp, detail=asked.detail))
-        elif asked.detail != sharp.detail:
+        if wanted.width < sharp.width:
+            _session.ask(dataclasses.replace(sharp, detail=wanted.detail))
+        elif wanted.detail != sharp.detail:
             _session.ask(sharp)
 
 

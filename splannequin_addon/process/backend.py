@@ -133,9 +133,9 @@ def diagnosis(question: children.Question) -> str:
 
 def doctor(gpu: bool = False) -> str:
     """`diagnosis`, waited for; of a graphics card that is tested anew if `gpu`."""
-    asked = ask("doctor", "--gpu") if gpu else begin_doctor()
-    asked.wait(120.0)
-    return diagnosis(asked)
+    question = ask("doctor", "--gpu") if gpu else begin_doctor()
+    question.wait(120.0)
+    return diagnosis(question)
 
 
 def start(job: jobs.Job) -> None:

@@ -129,10 +129,10 @@ def poll(setup: SetUp) -> bool:
 
 def _why(setup: SetUp, code: int) -> str:
     try:
-        told = str(contract.read_json(setup.summary).get("error", ""))
+        error = str(contract.read_json(setup.summary).get("error", ""))
     except (OSError, ValueError):
-        told = ""
-    return told or f"The set-up ended with exit code {code}: {' '.join(setup.said[-1:])}"
+        error = ""
+    return error or f"The set-up ended with exit code {code}: {' '.join(setup.said[-1:])}"
 
 
 def cancel(setup: SetUp) -> None:
@@ -217,13 +217,13 @@ def _empty(folder: Path) -> None:
 
 def findings(facts: str) -> list[str]:
     """What a backend's doctor (JSON) means for an artist, a sentence each."""
-    told = json.loads(facts)
-    lines = [f"Python {told['python']}, torch {told['packages'].get('torch')}."]
-    if told.get("trains_on") == "cuda":
-        lines.append(f"Trains on {told.get('cuda_device')}.")
+    record = json.loads(facts)
+    lines = [f"Python {record['python']}, torch {record['packages'].get('torch')}."]
+    if record.get("trains_on") == "cuda":
+        lines.append(f"Trains on {record.get('cuda_device')}.")
     else:
-        lines.append(f"Trains on the processor, {told.get('cores')} cores.")
-        refusal = re.sub(r"\s+", " ", str(told.get("cuda_refusal") or ""))
+        lines.append(f"Trains on the processor, {record.get('cores')} cores.")
+        refusal = re.sub(r"\s+", " ", str(record.get("cuda_refusal") or ""))
         if nvidia_card() and refusal:
             lines.append(f"The NVIDIA card is not used: {refusal}")
     return lines

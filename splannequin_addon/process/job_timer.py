@@ -258,7 +258,7 @@ def tick() -> float:
 
 def _pulse() -> float | None:
     """Calls what pulses; the least seconds that any of it asks for, None if nothing does."""
-    asked: list[float] = []
+    delays: list[float] = []
     for turn in list(_pulses):
         try:
             seconds = turn()
@@ -268,8 +268,8 @@ def _pulse() -> float | None:
         if seconds is None:
             drop(turn)
         else:
-            asked.append(seconds)
-    return min(asked, default=None)
+            delays.append(seconds)
+    return min(delays, default=None)
 
 
 def _follow_jobs() -> float:
@@ -280,10 +280,10 @@ def _follow_jobs() -> float:
         try:
             changed |= _turn(watch, until)
         except Exception as error:  # whatever it is: an exception would end the timer, and with it every shot's panel
-            step, told = watch.running() or next(iter(steps.STEPS)), f"{type(error).__name__}: {error}"
-            if watch.failures.get(step, ("",))[0] != told:  # once, not at every turn
+            step, message = watch.running() or next(iter(steps.STEPS)), f"{type(error).__name__}: {error}"
+            if watch.failures.get(step, ("",))[0] != message:  # once, not at every turn
                 traceback.print_exc()
-            watch.failures[step] = (told, "The console has the details.")
+            watch.failures[step] = (message, "The console has the details.")
             changed = True
     for turn in list(_meanwhile):
         try:
@@ -436,9 +436,9 @@ def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]],
 
 def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
     """`_apply` for a job that had ended before its shot was chosen."""
-    said = steps.STEPS[step].late(job)
-    if said:
-        watch.notes[step] = [said]
+    sentence = steps.STEPS[step].late(job)
+    if sentence:
+        watch.notes[step] = [sentence]
     else:
         _apply(watch, step, job)
 

@@ -198,8 +198,8 @@ def refuse_second_writer(shot: Path) -> None:
     if writer is not None and writer.works() and not contract.gives_back(shot, writer):
         raise contract.busy(shot, writer)
     for job in latest(shot).values():
-        here = job.status is None or job.status.host in ("", contract.computer_name())  # others have the lock
-        if here and not job.ended and is_alive(job, job.status):
+        is_local = job.status is None or job.status.host in ("", contract.computer_name())  # others have the lock
+        if is_local and not job.ended and is_alive(job, job.status):
             raise contract.JobError(
                 f"A step of {shot.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
             )
@@ -287,9 +287,10 @@ def open_job(folder: Path) -> Job | None:
 def latest(shot: Path) -> dict[str, Job]:
     """The newest job of each kind in a shot, polled once: those that run are found again here."""
     found: dict[str, Job] = {}
-    there = contract.ShotFolder(shot).jobs
-    is_own = shot.is_dir() and not contract.is_link(there)  # behind a link lie another shot's: nothing is written there
-    folders = sorted(there.glob("*/"), key=lambda p: p.name, reverse=True) if is_own else []
+    jobs_folder = contract.ShotFolder(shot).jobs
+    # A link would lead to the jobs of another shot, where nothing is written.
+    is_own = shot.is_dir() and not contract.is_link(jobs_folder)
+    folders = sorted(jobs_folder.glob("*/"), key=lambda p: p.name, reverse=True) if is_own else []
     for folder in folders:
         if contract.is_link(folder):
             continue
@@ -423,9 +424,9 @@ def _take_in(job: Job, event: contract.Event) -> None:
 
 
 def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
-    told = _last_words(job, status)
-    if told is not None:
-        return _keep(job, told)
+    message = _last_words(job, status)
+    if message is not None:
+        return _keep(job, message)
     now = time.time()
     status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
     if not job.folder.is_dir():

@@ -148,9 +148,9 @@ def add(step: Step) -> None:
 
 def step_of(job: jobs.Job) -> str:
     """Name of the step that a job found in a shot folder belongs to: Freeze and Bake ask for the same kind."""
-    told = _noted(job, contract.STEP_FILE)
+    noted = _noted(job, contract.STEP_FILE)
     names = [s.name for s in STEPS.values() if job.kind in (s.kind, *s.also)]
-    return told if told in names else names[0]
+    return noted if noted in names else names[0]
 
 
 def scene_of(job: jobs.Job) -> str:

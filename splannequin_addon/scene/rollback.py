@@ -31,7 +31,7 @@ def scene_of(scene: bpy.types.Scene) -> Generator[None, None, None]:
 
     What it took away is not brought back: that has to come last, when nothing can fail any more.
     """
-    there = {kind: {block.session_uid for block in getattr(bpy.data, kind)} for kind in _KINDS}
+    existing = {kind: {block.session_uid for block in getattr(bpy.data, kind)} for kind in _KINDS}
     names = [(owner, name) for owner, names in _SETTINGS.items() for name in names]
     values = {(o, name): getattr(_owner(scene, o), name) for o, name in names if hasattr(_owner(scene, o), name)}
     camera = scene.camera.session_uid if scene.camera is not None else None
@@ -42,7 +42,7 @@ def scene_of(scene: bpy.types.Scene) -> Generator[None, None, None]:
         yield
     except BaseException:
         for kind in _KINDS:
-            bpy.data.batch_remove([b for b in getattr(bpy.data, kind) if b.session_uid not in there[kind]])
+            bpy.data.batch_remove([b for b in getattr(bpy.data, kind) if b.session_uid not in existing[kind]])
         for (owner, name), value in values.items():
             if getattr(_owner(scene, owner), name) != value:
                 setattr(_owner(scene, owner), name, value)

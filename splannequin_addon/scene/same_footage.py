@@ -50,17 +50,17 @@ def _same_sequence(one: Path, other: Path) -> bool:
     """True if two paths name pictures of one sequence, or of two copies of it."""
     if _folder_of(one, other):
         return True
-    here, there = _pictures(one), _pictures(other)
-    if here is None or there is None:
+    first, second = _pictures(one), _pictures(other)
+    if first is None or second is None:
         return False
-    if _place(here[0]) == _place(there[0]) and here[1] == there[1]:
+    if _place(first[0]) == _place(second[0]) and first[1] == second[1]:
         return True
-    common = sorted(here[2].keys() & there[2].keys())
+    common = sorted(first[2].keys() & second[2].keys())
     if not common:
         return False
     # Several, far apart: the first frames of two clips may both be black.
     looked_at = {common[0], common[len(common) // 2], common[-1]}
-    return all(_same_file(here[2][n], there[2][n], by_content=True) for n in looked_at)
+    return all(_same_file(first[2][n], second[2][n], by_content=True) for n in looked_at)
 
 
 def _folder_of(picture: Path, folder: Path) -> bool:

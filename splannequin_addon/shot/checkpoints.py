@@ -30,23 +30,23 @@ def _facts(path: Path) -> dict[str, Any]:
 
 def paused(run: Path) -> dict[str, Any] | None:
     """Of a run that has a checkpoint and is not finished: at which `iteration` of `end`, `preset` and `config`."""
-    told = facts(RunFolder(run).checkpoint)
+    header = facts(RunFolder(run).checkpoint)
     try:
-        config = told["config"]
-        asked: contract.TrainParams = contract.from_dict(contract.TrainParams, params_of(config))
-        done: _Count = contract.from_dict(_Count, {"steps": told["iteration"]})
+        config = header["config"]
+        params: contract.TrainParams = contract.from_dict(contract.TrainParams, params_of(config))
+        done: _Count = contract.from_dict(_Count, {"steps": header["iteration"]})
     except (KeyError, TypeError, AttributeError, ValueError):
         return None
     return {
-        "iteration": done.steps, "end": asked.iterations, "preset": asked.preset, "config": config,
+        "iteration": done.steps, "end": params.iterations, "preset": params.preset, "config": config,
         "depth_source": depth_source(run),
     }  # fmt: skip
 
 
 def depth_source(run: Path) -> str:
     """Absolute path of the depth maps that a run was trained with; empty without."""
-    told: object = facts(RunFolder(run).checkpoint).get("depth")
-    source = cast("dict[str, Any]", told).get("source") if isinstance(told, dict) else None
+    depth: object = facts(RunFolder(run).checkpoint).get("depth")
+    source = cast("dict[str, Any]", depth).get("source") if isinstance(depth, dict) else None
     return source if isinstance(source, str) and os.path.isabs(source) and source.isprintable() else ""
 
 
@@ -58,8 +58,8 @@ class _Count:
 def anew(run: Path) -> dict[str, Any] | None:
     """Of a run that is trained anew, paused or at work: as `paused`, of the training that was saved last."""
     saved = sorted(RunFolder(run).next.glob(f"*/{contract.CHECKPOINT_FILE}"), key=_saved)
-    told = paused(saved[-1].parent) if saved else None
-    return None if told is None else {**told, "folder": saved[-1].parent}
+    progress = paused(saved[-1].parent) if saved else None
+    return None if progress is None else {**progress, "folder": saved[-1].parent}
 
 
 def _saved(path: Path) -> float:
@@ -71,15 +71,15 @@ def _saved(path: Path) -> float:
 
 def extension(run: Path) -> dict[str, int] | None:
     """Of steps that were begun to be added to a finished run: how many of `steps` are `done`."""
-    there = RunFolder(run)
-    if not there.extension.is_file():
+    folder = RunFolder(run)
+    if not folder.extension.is_file():
         return None
-    told, base = facts(there.extension), facts(there.checkpoint)
+    extended, base = facts(folder.extension), facts(folder.checkpoint)
     try:
-        last = told["extensions"][-1]
-        if (told["key"], last["from_iteration"]) != (base["key"], base["iteration"]):
+        last = extended["extensions"][-1]
+        if (extended["key"], last["from_iteration"]) != (base["key"], base["iteration"]):
             return None
-        done: _Count = contract.from_dict(_Count, {"steps": told["iteration"] - last["from_iteration"]})
+        done: _Count = contract.from_dict(_Count, {"steps": extended["iteration"] - last["from_iteration"]})
         added: _Count = contract.from_dict(_Count, {"steps": last["steps"]})
     except (KeyError, TypeError, ValueError, IndexError):
         return None
@@ -99,10 +99,10 @@ def params_of(config: dict[str, Any]) -> dict[str, Any]:
 
 def other_cameras(shot: Path, run: Path) -> bool:
     """True if the shot was solved again, with another result, after the run was trained."""
-    cameras, there = contract.ShotFolder(shot).cameras, RunFolder(run)
+    cameras, folder = contract.ShotFolder(shot).cameras, RunFolder(run)
     try:
-        told = file_cache.of(there.config, contract.read_json)["solve"]
-        return file_cache.of(cameras, _key) != told
+        trained_on = file_cache.of(folder.config, contract.read_json)["solve"]
+        return file_cache.of(cameras, _key) != trained_on
     except (OSError, ValueError, KeyError):
         return False
 

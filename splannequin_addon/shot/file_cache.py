@@ -24,8 +24,8 @@ def of(path: Path, read: Callable[..., T], *words: Hashable) -> T:
         path: a file, or a folder if only the names in it count.
         read: a function of a module, called with the path and `words`, which can be hashed.
     """
-    told = os.stat(path)
-    stamp = (told.st_ino, told.st_size, told.st_mtime_ns, told.st_ctime_ns)
+    stat = os.stat(path)
+    stamp = (stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
     key = (os.fspath(path), read, *words)
     found = _known.get(key)
     if found is not None and found[0] == stamp:

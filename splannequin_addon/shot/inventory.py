@@ -36,27 +36,27 @@ def create(folder: Path, name: str = "") -> None:
 
 def read(folder: Path) -> ShotState:
     """The state of the shot in a folder; an empty state if there is none. ValueError on a broken or newer file."""
-    state, there = ShotState(folder), ShotFolder(folder)
-    if not there.info_path.is_file():
+    state, paths = ShotState(folder), ShotFolder(folder)
+    if not paths.info_path.is_file():
         return state
-    state.info = _typed(_Info, there.info_path)
-    if there.listing.is_file():
-        told = file_cache.of(there.listing, _listed)
-        state.frames, state.beside, state.read_as, state.timecode, state.shift = told
-    if there.cameras.is_file():
-        state.solve = _typed(_Solve, there.solve_record)
-        state.lacks_motion = _is_unfinished(there.motion)
-    state.runs = _named(_Run, there.runs, contract.SUMMARY_FILE, state.damaged["run"])
+    state.info = _typed(_Info, paths.info_path)
+    if paths.listing.is_file():
+        listing = file_cache.of(paths.listing, _listed)
+        state.frames, state.beside, state.read_as, state.timecode, state.shift = listing
+    if paths.cameras.is_file():
+        state.solve = _typed(_Solve, paths.solve_record)
+        state.lacks_motion = _is_unfinished(paths.motion)
+    state.runs = _named(_Run, paths.runs, contract.SUMMARY_FILE, state.damaged["run"])
     for name, run in state.runs.items():
-        run["extension"] = checkpoints.extension(there.runs / name)
-        run["depth_source"] = checkpoints.depth_source(there.runs / name)
-    for name in _names(there.runs, contract.CHECKPOINT_FILE):
+        run["extension"] = checkpoints.extension(paths.runs / name)
+        run["depth_source"] = checkpoints.depth_source(paths.runs / name)
+    for name in _names(paths.runs, contract.CHECKPOINT_FILE):
         known = name in state.runs or name in state.damaged["run"]
-        told = None if known else checkpoints.paused(there.runs / name)
-        if told is not None:
-            state.unfinished[name] = told
+        paused = None if known else checkpoints.paused(paths.runs / name)
+        if paused is not None:
+            state.unfinished[name] = paused
     for name, run in [*state.runs.items(), *state.unfinished.items()]:
-        place = contract.RunFolder(there.runs / name)
+        place = contract.RunFolder(paths.runs / name)
         run["anew"] = checkpoints.anew(place.root)
         if run["anew"] is not None:
             run["anew"]["other_cameras"] = checkpoints.other_cameras(folder, run["anew"]["folder"])
@@ -66,9 +66,9 @@ def read(folder: Path) -> ShotState:
         run["other_cameras"] = checkpoints.other_cameras(folder, place.root)
         run["history"] = file_cache.of(place.metrics, _history) if place.metrics.is_file() else []
         run["preview"] = max(place.previews.glob("*.png"), default=None)
-    state.takes = _named(_Take, there.takes, contract.TAKE_FILE, state.damaged["take"])
+    state.takes = _named(_Take, paths.takes, contract.TAKE_FILE, state.damaged["take"])
     for name, take in state.takes.items():
-        folder_of = contract.TakeFolder(there.takes / name)
+        folder_of = contract.TakeFolder(paths.takes / name)
         take["frame_count"] = file_cache.of(folder_of.root, _frame_count, _mtime(folder_of.facts))
         take["mattes"] = mattes(folder_of)
     return state
@@ -76,9 +76,9 @@ def read(folder: Path) -> ShotState:
 
 def stamp(folder: Path) -> tuple[float, ...]:
     """Changes when something in the shot did: cheap to ask for on every tick."""
-    there = ShotFolder(folder)
-    parts = (there.info_path, there.listing, there.solve_record, there.motion, there.runs, there.takes, there.jobs)
-    deep = [p for place in (there.runs, there.takes) if place.is_dir() for p in place.iterdir()]
+    paths = ShotFolder(folder)
+    parts = (paths.info_path, paths.listing, paths.solve_record, paths.motion, paths.runs, paths.takes, paths.jobs)
+    deep = [p for place in (paths.runs, paths.takes) if place.is_dir() for p in place.iterdir()]
     places = (contract.RunFolder(run).next for run in deep)
     anew = [p for place in places if place.is_dir() for p in place.iterdir()]
     # Windows dates no folder of a FAT or exFAT disk, as memory cards and portable disks are, when its files change.
@@ -180,15 +180,21 @@ def burnt_in(shot: Path) -> Path | None:
 
 def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
     """Those of some frames that a take lacks."""
-    there = set(numbered.frame_numbers(ShotFolder(shot).takes / take))
-    return [n for n in frames if n not in there]
+    existing = set(numbered.frame_numbers(ShotFolder(shot).takes / take))
+    return [n for n in frames if n not in existing]
 
 
 def _listed(path: Path) -> tuple[int, str, list[str], str, int]:
     """Of frames.json: how many frames there are, and `beside`, `read_as`, `timecode` and `shift` of `ShotState`."""
-    told = _read_typed(path, _Listing, contract.LONGEST_JSON)
-    read_as = [contract.printable(line, 300) for line in told["read_as"][:_MOST_SENTENCES] if isinstance(line, str)]
-    return len(told["frames"]), told["beside"], read_as, contract.parse_timecode(told["timecode"]), told["shift"]
+    listing = _read_typed(path, _Listing, contract.LONGEST_JSON)
+    read_as = [contract.printable(line, 300) for line in listing["read_as"][:_MOST_SENTENCES] if isinstance(line, str)]
+    return (
+        len(listing["frames"]),
+        listing["beside"],
+        read_as,
+        contract.parse_timecode(listing["timecode"]),
+        listing["shift"],
+    )
 
 
 def _digests(path: Path) -> dict[int, str]:
@@ -222,10 +228,10 @@ def _history(path: Path) -> list[tuple[float, float]]:
 
 def _measured(line: bytes) -> tuple[float, float] | None:
     try:
-        told = json.loads(line)
+        event = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return contract.measured(cast("dict[str, Any]", told)) if isinstance(told, dict) else None
+    return contract.measured(cast("dict[str, Any]", event)) if isinstance(event, dict) else None
 
 
 @dataclass

@@ -35,10 +35,10 @@ def source_of(state: ShotState) -> str:
     """The footage that a shot was imported from, where it is now: as it was named, or beside the shot, with which it
     was moved. Empty if it is in neither place."""
     named, beside = str(state.info.get("source", "")), state.beside
-    there = [Path(named), state.folder.parent / re.split(r"[\\/]", named)[-1]]
+    candidates = [Path(named), state.folder.parent / re.split(r"[\\/]", named)[-1]]
     if beside:
-        there.insert(1, state.folder / beside)
-    return next((os.path.normpath(p) for p in there if named and _there(p)), "")
+        candidates.insert(1, state.folder / beside)
+    return next((os.path.normpath(p) for p in candidates if named and _there(p)), "")
 
 
 def locate(scene: bpy.types.Scene, folder: Path) -> None:
@@ -149,14 +149,16 @@ def _after_load(*_: object) -> None:
     if not bpy.data.filepath:
         return
     _read_backslashes()
-    here = Path(bpy.data.filepath).parent
+    folder = Path(bpy.data.filepath).parent
     for owner, name in _holders():
         path = _get(owner, name)
         if not path or path.startswith("//") or _known(Path(paths.absolute(path)), name):
             continue
         words = re.split(r"[\\/]+", path)
         tails = [Path(*words[n:]) for n in range(1, len(words)) if words[n]]
-        found = next((base / tail for tail in tails for base in (here, here.parent) if _known(base / tail, name)), None)
+        found = next(
+            (base / tail for tail in tails for base in (folder, folder.parent) if _known(base / tail, name)), None
+        )
         if found is not None:
             _set(owner, name, paths.blend_path(found))
 

@@ -198,6 +198,6 @@ def missing(scene: bpy.types.Scene, state: ShotState | None) -> bool:
 def see(scene: bpy.types.Scene, state: ShotState | None) -> None:
     """Remembers that the scene's shot is there, so that it can be missed."""
     folder, held = folder_of(settings_of(scene)), settings_of(scene)
-    there = folder is not None and state is not None and state.frames and state.folder == folder
-    if folder is not None and there and paths.absolute(held.shot_seen) != str(folder):
+    is_shot = folder is not None and state is not None and state.frames and state.folder == folder
+    if folder is not None and is_shot and paths.absolute(held.shot_seen) != str(folder):
         held.shot_seen = paths.blend_path(folder)

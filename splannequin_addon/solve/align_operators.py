@@ -109,8 +109,8 @@ class _Aligns(OperatorBase):
         try:
             notes = scale.move(scene, shot, self.change(scene, shot, self._places(context, shot)))
         except (contract.JobError, OSError, ValueError) as error:
-            told = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
-            self.report({"ERROR"}, told)
+            message = f"{getattr(error, 'message', error)} {getattr(error, 'hint', '')}".strip()
+            self.report({"ERROR"}, message)
             return {"CANCELLED"}
         job_timer.watch_of(shot).notes["solve"] = notes
         for note in notes:
@@ -141,8 +141,8 @@ class _Aligns(OperatorBase):
         cloud = cameras.find(scene, shot, "MESH")
         xyz = points.coloured(mesh_of(cloud))[0] if cloud is not None else np.zeros((0, 3), np.float32)
         if bpy.app.background or not len(xyz):
-            told = "There are no points to click: select objects that stand where they should be"
-            self.report({"ERROR"}, told)
+            message = "There are no points to click: select objects that stand where they should be"
+            self.report({"ERROR"}, message)
             return {"CANCELLED"}
         stop()
         _picking = self._mine = Picking(shot, xyz, self.count)

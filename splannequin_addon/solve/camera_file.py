@@ -93,9 +93,9 @@ def written(asked: children.Question, file: Path, shot: Path) -> Path:
 
 def read_now(scene: bpy.types.Scene, file: Path, shot: Path) -> Path:
     """`begin` and `written`, waited for."""
-    asked = begin(scene, file, shot)
-    asked.wait(LONGEST_SECONDS)
-    return written(asked, file, shot)
+    question = begin(scene, file, shot)
+    question.wait(LONGEST_SECONDS)
+    return written(question, file, shot)
 
 
 # ------------------------------------------------------------------------------------------------- in the child

@@ -51,19 +51,19 @@ def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple
     into = folder.own(folder.drawn_masks(kind))
     into.mkdir(parents=True, exist_ok=True)
     _tidy(into.parent)
-    beside = _beside(into, os.getpid())
+    partial = _beside(into, os.getpid())
     shift = _shift(folder)
     try:
         for done, number in enumerate(numbers, 1):
-            _render_one(mask_uid, name, size, beside / contract.frame_file(number, contract.PICTURE), number + shift)
+            _render_one(mask_uid, name, size, partial / contract.frame_file(number, contract.PICTURE), number + shift)
             yield done, len(numbers)
         for old in into.glob("*.png"):
             if old.stem.isdecimal():
                 contract.remove_file(old)
-        for made in sorted(beside.iterdir()):
+        for made in sorted(partial.iterdir()):
             contract.replace_file(made, into / made.name)
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(partial, ignore_errors=True)
     return into
 
 
@@ -86,8 +86,8 @@ def _tidy(masks: Path) -> None:
     if contract.is_link(masks):
         return
     left = [(folder, _BESIDE.fullmatch(folder.name)) for folder in masks.glob(".*")]
-    for folder, told in left:
-        if told and told[1] == _here() and not contract.runs_still(int(told[2]), float(told[3])):
+    for folder, match in left:
+        if match and match[1] == _here() and not contract.runs_still(int(match[2]), float(match[3])):
             shutil.rmtree(folder, ignore_errors=True)  # a link is left alone
 
 
@@ -141,8 +141,8 @@ def _stage(mask: bpy.types.Mask, size: tuple[int, int]) -> Generator[bpy.types.S
 def _shift(folder: contract.ShotFolder) -> int:
     """What to add to a frame number of the shot to get the scene's frame at which its movie clip shows it."""
     state = inventory.read(folder.root)
-    told = (str(state.info.get("source", "")), places.source_of(state))  # where it was, and where it is
-    sources = [Path(path) for path in told if os.path.isabs(path)]
+    named = (str(state.info.get("source", "")), places.source_of(state))  # where it was, and where it is
+    sources = [Path(path) for path in named if os.path.isabs(path)]
     shown = next((clip for clip in bpy.data.movieclips if same_footage.shows(clip, sources)), None)
     if shown is None:
         return 0

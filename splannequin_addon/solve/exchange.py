@@ -41,13 +41,13 @@ def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> 
     JobError names what is missing. OSError if the shot cannot be written.
     """
     props = settings_of(scene)
-    asked = contract.SolveParams(camera_model=props.camera_model, retry=props.retry)
-    asked.focal_mm = _said(props.focal_mm)
-    if asked.focal_mm:
-        asked.sensor_mm, asked.refine_focal = _said(props.sensor_mm), props.refine_focal
+    params = contract.SolveParams(camera_model=props.camera_model, retry=props.retry)
+    params.focal_mm = _said(props.focal_mm)
+    if params.focal_mm:
+        params.sensor_mm, params.refine_focal = _said(props.sensor_mm), props.refine_focal
     if props.st_map and props.cameras_from == "SOLVE":  # others bring their own lens
-        asked.st_map = os.path.abspath(bpy.path.abspath(props.st_map))
-        asked.st_map_way, asked.st_map_layer = props.st_map_way, props.st_map_layer.strip()
+        params.st_map = os.path.abspath(bpy.path.abspath(props.st_map))
+        params.st_map_way, params.st_map_layer = props.st_map_way, props.st_map_layer.strip()
     if props.cameras_from == "FILE":
         if not props.cameras_path:
             raise contract.JobError(
@@ -55,22 +55,22 @@ def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> 
                 "Choose a COLMAP folder, a transforms.json or a camera path, or set Cameras From to Solve.",
                 contract.ExitCode.USAGE,
             )
-        asked.cameras = os.path.abspath(bpy.path.abspath(props.cameras_path))
-        if camera_file.is_one(asked.cameras):
-            file, folder = Path(asked.cameras), _imported(shot)
-            asked.cameras = str(contract.ShotFolder(folder).tracking)
+        params.cameras = os.path.abspath(bpy.path.abspath(props.cameras_path))
+        if camera_file.is_one(params.cameras):
+            file, folder = Path(params.cameras), _imported(shot)
+            params.cameras = str(contract.ShotFolder(folder).tracking)
             if not is_read:
                 camera_file.read_now(scene, file, folder)
     elif props.cameras_from == "SCENE":
         name, folder = _scene_camera(scene), _imported(shot)
-        asked.cameras = str(contract.ShotFolder(folder).tracking)
+        params.cameras = str(contract.ShotFolder(folder).tracking)
         if not is_read:
             for _ in scene_camera.write_in_turns(scene, name, folder):
                 pass
     elif props.cameras_from == "TRACKING":
         data = transforms(props.tracking_clip)
-        asked.cameras = str(camera_samples.write(_imported(shot), data))
-    return asked
+        params.cameras = str(camera_samples.write(_imported(shot), data))
+    return params
 
 
 def _imported(shot: Path | None) -> Path:
@@ -126,15 +126,15 @@ def read_in_turns(scene: bpy.types.Scene, shot: Path) -> Iterator[job_timer.Prog
         yield from _sampled(turns)
         return
     file, folder = Path(os.path.abspath(bpy.path.abspath(settings_of(scene).cameras_path))), _imported(shot)
-    asked, began = camera_file.begin(scene, file, folder), time.monotonic()
+    question, began = camera_file.begin(scene, file, folder), time.monotonic()
     del scene
     try:
-        while not asked.ended and time.monotonic() - began < camera_file.LONGEST_SECONDS:
+        while not question.ended and time.monotonic() - began < camera_file.LONGEST_SECONDS:
             yield job_timer.Progress(f"Reading the cameras of {file.name}", 0, 1)
     finally:
-        if not asked.ended:  # given up
-            asked.process.kill()
-    camera_file.written(asked, file, folder)
+        if not question.ended:  # given up
+            question.process.kill()
+    camera_file.written(question, file, folder)
 
 
 def _sampled(turns: Iterator[tuple[int, int]]) -> Iterator[job_timer.Progress]:
@@ -211,9 +211,9 @@ def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:
         )
     centre: Any = camera.principal_point_pixels
     focal, (x, y) = float(camera.focal_length_pixels), centre
-    told = {"w": int(width), "h": int(height), "fl_x": focal, "fl_y": focal * float(camera.pixel_aspect)}
-    told |= {"cx": float(x), "cy": float(height - y), "camera_model": "OPENCV"}
-    return {**told, **(values if model == "POLYNOMIAL" else {})}
+    lens = {"w": int(width), "h": int(height), "fl_x": focal, "fl_y": focal * float(camera.pixel_aspect)}
+    lens |= {"cx": float(x), "cy": float(height - y), "camera_model": "OPENCV"}
+    return {**lens, **(values if model == "POLYNOMIAL" else {})}
 
 
 # ------------------------------------------------------------------------------------------------- out

@@ -61,16 +61,16 @@ def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) ->
 
 def unmark(scene: bpy.types.Scene, shot: Path) -> bool:
     """Takes those markers away, but what the artist renamed or moved. True if there was one."""
-    entry, taken = scene_objects.of(scene, shot), False
+    entry, is_changed = scene_objects.of(scene, shot), False
     marks: list[tuple[str, int]] = json.loads(entry.marks or "[]") if entry is not None else []
     for name, frame in marks:
         marker = next((m for m in scene.timeline_markers if m.name == name and m.frame == frame), None)
         if marker is not None:
             scene.timeline_markers.remove(marker)
-            taken = True
+            is_changed = True
     if entry is not None:
         entry.marks = ""
-    return taken
+    return is_changed
 
 
 def told(result: dict[str, Any]) -> str:

@@ -26,9 +26,9 @@ def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolvePara
     JobError names what is not chosen, or cannot be written.
     """
     shot = selection.shot_folder(scene)
-    asked = exchange.params(scene, shot, rendered)
-    asked.ignore_mask, asked.people_mask = (_source(scene, shot, kind, rendered) for kind in contract.MASK_KINDS)
-    return asked
+    params = exchange.params(scene, shot, rendered)
+    params.ignore_mask, params.people_mask = (_source(scene, shot, kind, rendered) for kind in contract.MASK_KINDS)
+    return params
 
 
 def drawn(scene: bpy.types.Scene) -> dict[str, bpy.types.Mask]:

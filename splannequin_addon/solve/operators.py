@@ -70,9 +70,9 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
         words.take = settings_of(scene_in(context)).take_name
         try:
             placement.write(scene_in(context), shot)
-            asked = exchange.begin_export(words)
+            question = exchange.begin_export(words)
             if bpy.app.background:
-                self.report({"INFO"}, exchange.exported(asked, folder))
+                self.report({"INFO"}, exchange.exported(question, folder))
                 return {"FINISHED"}
         except contract.JobError as error:
             self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
@@ -82,7 +82,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
             self.report({"ERROR"}, f"{refusal.message} {refusal.hint}".strip())
             return {"CANCELLED"}
         job_timer.watch_of(shot).failures.pop("solve", None)
-        job_timer.when_answered(asked, lambda: tell(shot, lambda: [exchange.exported(asked, folder)]))
+        job_timer.when_answered(question, lambda: tell(shot, lambda: [exchange.exported(question, folder)]))
         return {"FINISHED"}
 
 
@@ -154,7 +154,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         if folder is None:
             return {"CANCELLED"}
         try:
-            asked = stmaps.begin(folder, self.width)
+            question = stmaps.begin(folder, self.width)
         except contract.JobError as error:
             self.report({"ERROR"}, f"{error.message} {error.hint}".strip())
             return {"CANCELLED"}
@@ -162,10 +162,10 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         watch.failures.pop("solve", None)
         if not bpy.app.background:
             watch.notes["solve"] = ["Writing the ST maps."]
-            follow_stmaps(folder, asked)
+            follow_stmaps(folder, question)
             return {"FINISHED"}
-        asked.wait()
-        tell(folder, lambda: stmaps.sentences(stmaps.answer(asked)))
+        question.wait()
+        tell(folder, lambda: stmaps.sentences(stmaps.answer(question)))
         if "solve" in watch.failures:
             self.report({"ERROR"}, watch.failures["solve"][0])
             return {"CANCELLED"}

@@ -64,8 +64,8 @@ class Solve(Step):
             return View(False, False, [], self.needs)
         if not state.solve:
             return View(False, True, [], "Find where the camera was on every frame.")
-        told = state.solve.get("result", state.solve)
-        lines = [line for line in (told.get("quality"), guesses.told(told)) if line]
+        result = state.solve.get("result", state.solve)
+        lines = [line for line in (result.get("quality"), guesses.told(result)) if line]
         if state.lacks_motion:
             lines.append("What moves is not found yet: the training finds it first.")
         if cameras.find(scene, state.folder, "CAMERA") is None:
@@ -112,10 +112,10 @@ def solve_in_turns(scene_uid: int, shot: Path) -> Iterator[job_timer.Progress | 
             while True:
                 while bpy.app.is_job_running("RENDER"):  # the artist's own comes first: Blender renders one at a time
                     yield now
-                told = next(turns, None)
-                if told is None:
+                progress = next(turns, None)
+                if progress is None:
                     break
-                now = job_timer.Progress(f"Rendering the mask {name}, frame {told[0]} of {told[1]}", *told)
+                now = job_timer.Progress(f"Rendering the mask {name}, frame {progress[0]} of {progress[1]}", *progress)
                 yield now
     scene = session.scene_of(scene_uid)
     if scene is None:

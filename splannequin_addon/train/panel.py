@@ -41,7 +41,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
 
     def _presets(self, context: bpy.types.Context, layout: bpy.types.UILayout, state: ShotState | None) -> None:
         """A button for each preset: how large, how many steps, how long on this machine."""
-        props, (rows, told) = settings_of(scene_in(context)), estimates.costs(state)
+        props, (rows, basis) = settings_of(scene_in(context)), estimates.costs(state)
         column = layout.column(align=True)
         head = cells(column.row(align=True), _PRESET_WIDTHS)
         for place, text in zip(head, ("Preset", "Pixels", "Steps", "Time"), strict=True):
@@ -54,14 +54,16 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             spent = "-" if row.seconds is None else contract.duration(row.seconds) + ("" if row.measured else " ?")
             for place, text in zip(columns[1:], (str(row.width or "-"), f"{row.steps / 1000:g}k", spent), strict=True):
                 place.label(text=text, translate=False)
-        if told is None:
+        if basis is None:
             words = (
                 "Preview took 1.5 to 3.5 minutes on two cores without a graphics card. "
                 "Times here come with the first run."
             )
         else:
-            where = "graphics card" if told.get("device") == "cuda" else "processor"
-            words = f"By what run {told.get('run', '')} took on the {where}. With a ?: an estimate by pixels and steps."
+            where = "graphics card" if basis.get("device") == "cuda" else "processor"
+            words = (
+                f"By what run {basis.get('run', '')} took on the {where}. With a ?: an estimate by pixels and steps."
+            )
         wrap(layout, context, words)
 
     def _plan(self, context: bpy.types.Context) -> training.Plan:
@@ -116,8 +118,8 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         body = step_panel.sub_panel(layout_of(self), "runs", "Runs")
         if body is not None:
             listing.draw(body, "run", state, settings_of(scene_in(context)).run_name)
-            for told in state.damaged["run"].values():
-                wrap(body, context, told, "ERROR")
+            for damage in state.damaged["run"].values():
+                wrap(body, context, damage, "ERROR")
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The run's name, and depth maps."""

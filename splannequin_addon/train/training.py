@@ -31,23 +31,23 @@ def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Pla
     """
     finished = state.runs.get(run) if state is not None else None
     paused = state.unfinished.get(run) if state is not None else None
-    told = finished or paused
-    if told is None:
+    stored = finished or paused
+    if stored is None:
         return Plan("train", "Train", "")
-    if _goes_on(told, preset, depth):
+    if _goes_on(stored, preset, depth):
         words = "Paused while the run was trained anew. The run is as it was until the new one is done."
         return Plan("resume", "Resume", words)
-    if told.get("other_cameras"):
+    if stored.get("other_cameras"):
         return Plan(
             "anew", "Train Anew", "The camera was solved again: training begins anew and replaces this run when done. "
             "Give the run another name to keep it."
         )  # fmt: skip
-    if told.get("preset", preset) != preset:
+    if stored.get("preset", preset) != preset:
         return Plan(
             "anew", "Train Anew", "This run has another preset: training begins anew and replaces it when done. "
             "Give the run another name to keep it."
         )  # fmt: skip
-    if not _same_depth(told, depth):
+    if not _same_depth(stored, depth):
         return Plan(
             "anew", "Train Anew", "This run has another depth sequence, or none: training begins anew and replaces "
             "this run when done. Give the run another name to keep it."
@@ -79,8 +79,8 @@ def params(
     kind = plan(state, run, preset, depth).kind
     if state is not None and kind == "resume":
         # Its own settings, not the panel's: a run that was begun on the command line goes on too.
-        told = state.runs.get(run) or state.unfinished[run]
-        begun = told["anew"] if _goes_on(told, preset, depth) else told
+        stored = state.runs.get(run) or state.unfinished[run]
+        begun = stored["anew"] if _goes_on(stored, preset, depth) else stored
         settings = checkpoints.params_of(begun["config"])
         return contract.TrainParams(run=run, device=device, depth=begun.get("depth_source", ""), **settings)
     extend = 0

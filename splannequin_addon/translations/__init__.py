@@ -69,10 +69,10 @@ def _filled(target: str, values: tuple[str, ...], locale: str) -> str:
     following = iter(values)
 
     def value(field: re.Match[str]) -> str:
-        said = values[int(field[1])] if field[1] else next(following)
+        value = values[int(field[1])] if field[1] else next(following)
         if field[2] == "!l":
-            return ", ".join(translate(part, locale) for part in said.split(", "))
-        return translate(said, locale) if field[2] else said
+            return ", ".join(translate(part, locale) for part in value.split(", "))
+        return translate(value, locale) if field[2] else value
 
     return _FIELD.sub(value, target)
 
@@ -90,11 +90,11 @@ def _patterns(locale: str) -> list[tuple[re.Pattern[str], str]]:
 
 def register() -> None:
     """Makes the translations known to Blender."""
-    told = {
+    sentences = {
         locale: {(context, key): target for key, target in messages.items() for context in _CONTEXTS}
         for locale, messages in LANGUAGES.items()
     }
-    bpy.app.translations.register(_PACKAGE, told)
+    bpy.app.translations.register(_PACKAGE, sentences)
 
 
 def unregister() -> None:

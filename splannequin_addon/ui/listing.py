@@ -35,8 +35,8 @@ def run_rows(state: ShotState) -> list[tuple[str, ...]]:
             rows.append((name, "damaged"))
             continue
         if run is None:
-            told = state.unfinished[name]
-            share = 100.0 * told["iteration"] / max(1, told["end"])
+            paused = state.unfinished[name]
+            share = 100.0 * paused["iteration"] / max(1, paused["end"])
             rows.append((name, f"paused at {share:.0f} %"))
             continue
         psnr = run.get("heldout_psnr_db")

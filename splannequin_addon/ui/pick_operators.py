@@ -59,8 +59,8 @@ class Remove(Pick):
             return {"CANCELLED"}
         # Only what is listed, whose names come from the folder itself: any other may lead to somewhere else.
         folder = watch.shot / f"{self.kind}s" / name
-        there = name in state.listed(self.kind)
-        refusal = _in_use(watch.shot, folder) if there else f"This shot has no {self.kind} {name!r}"
+        exists = name in state.listed(self.kind)
+        refusal = _in_use(watch.shot, folder) if exists else f"This shot has no {self.kind} {name!r}"
         if not refusal:
             try:
                 jobs.refuse_second_writer(watch.shot)  # also one that was started from a command line

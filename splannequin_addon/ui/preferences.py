@@ -57,7 +57,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
         """What is used, its set-up, the device."""
         layout = layout_of(self)
         try:
-            there = bool(backend.python())
+            has_backend = bool(backend.python())
             self._say(layout, f"In use: {backend.python()}", "CHECKMARK")
         except contract.JobError as error:
             if not busy():  # it is about to be there
@@ -65,10 +65,10 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
                 column.alert = True
                 self._say(column, error.message, "ERROR")
                 self._say(column, error.hint, "BLANK1")
-            there = False
+            has_backend = False
         for line in _findings:
             self._say(layout, line, "DOT")
-        self._draw_setup(there)
+        self._draw_setup(has_backend)
         layout.prop(self, "device")
         layout.prop(self, "backend_python")
 
@@ -232,19 +232,19 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
         """Runs the backend's doctor beside Blender; headless, waits for it."""
         _findings[:] = ["Checking the backend."]
         try:
-            asked = backend.begin_doctor()
+            question = backend.begin_doctor()
         except contract.JobError as error:
             _findings.clear()
             self.report({"ERROR"}, tr(f"{error.message} {error.hint}"))
             return {"CANCELLED"}
         if bpy.app.background:
-            asked.wait(120.0)
-            _take_in(asked)
+            question.wait(120.0)
+            _take_in(question)
             for line in _findings:
                 self.report({"INFO"}, tr(line))
             return {"FINISHED"}
-        _checks.append(asked)
-        job_timer.when_answered(asked, lambda: _take_in(asked))
+        _checks.append(question)
+        job_timer.when_answered(question, lambda: _take_in(question))
         return {"FINISHED"}
 
 
@@ -270,7 +270,7 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
                 self.report({"ERROR"}, tr(f"The environment stays: a step of {name} runs. Wait for it or cancel it."))
                 return {"CANCELLED"}
         try:
-            there = environment.remove(backend.folder(), wait=bpy.app.background)
+            was_removed = environment.remove(backend.folder(), wait=bpy.app.background)
         except environment.AtWork as other:
             self.report({"ERROR"}, tr(_at_work(other.pid)))
             return {"CANCELLED"}
@@ -278,7 +278,7 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
             self.report({"ERROR"}, tr(f"The environment stays: {error}"))
             return {"CANCELLED"}
         _findings.clear()
-        self.report({"INFO"}, "The backend's environment was removed" if there else "There was nothing to remove")
+        self.report({"INFO"}, "The backend's environment was removed" if was_removed else "There was nothing to remove")
         return {"FINISHED"}
 
 

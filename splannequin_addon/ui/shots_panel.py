@@ -118,8 +118,8 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
         """Has the folder chosen, beginning where it was."""
         folder = selection.shot_folder(scene_in(context))
         if folder is not None:
-            there = next((p for p in folder.parents if p.is_dir()), None)
-            self.directory = f"{there}/" if there is not None else ""
+            existing = next((p for p in folder.parents if p.is_dir()), None)
+            self.directory = f"{existing}/" if existing is not None else ""
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 

@@ -155,8 +155,8 @@ def write_model(folder: Path, model: ColmapModel, text: bool = False) -> list[Pa
         else (_cameras_as_bytes(model), _images_as_bytes(model), _points_as_bytes(model))
     )
     for path, content in zip(written, contents, strict=True):
-        with atomic_path(path) as beside:
-            beside.write_bytes(content)
+        with atomic_path(path) as partial:
+            partial.write_bytes(content)
     return written
 
 

@@ -236,8 +236,8 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
     """nerfstudio's format: camera-to-world, OpenGL axes; what a frame does not say of its lens stands at the top."""
     lenses: dict[Lens, int] = {}
     cameras: list[ForeignCamera] = []
-    said: Any = data.get(OWN_FACTS)
-    facts = cast("dict[str, Any]", said) if isinstance(said, dict) else {}
+    own_facts: Any = data.get(OWN_FACTS)
+    facts = cast("dict[str, Any]", own_facts) if isinstance(own_facts, dict) else {}
     for n, frame in enumerate(data["frames"]):
         name = frame.get("file_path")
         matrix = np.array(frame.get("transform_matrix", []), np.float64)

@@ -110,8 +110,8 @@ def requested_params(args: argparse.Namespace, unset: Mapping[str, Any] | None =
     kinds = VERBS[name].jobs
     if freezes_a_shot(args):
         _refuse_what_a_clip_wants(args)
-        said = {name: getattr(args, name) for name in _RANGE if name in getattr(args, "said", {})}
-        return {"freeze": FreezeParams(**{**_values(args, name, FreezeParams, unset or {}), **said})}
+        ranges = {name: getattr(args, name) for name in _RANGE if name in getattr(args, "said", {})}
+        return {"freeze": FreezeParams(**{**_values(args, name, FreezeParams, unset or {}), **ranges})}
     return {kind: cls(**_values(args, name, cls, unset or {})) for kind, cls in kinds.items()}
 
 
@@ -193,21 +193,21 @@ def trains_anew(args: argparse.Namespace) -> bool:
 
 def notes(args: argparse.Namespace) -> list[str]:
     """Sentences on what a command line says in vain, or in an old word."""
-    verb, said = VERBS[args.command], getattr(args, "said", {})
+    verb, explicit = VERBS[args.command], getattr(args, "said", {})
     found: list[str] = []
     if verb.now:
         found.append(f"`{args.command} SHOT` is called `{verb.now} SHOT` now: the old word goes with the next version.")
     for cls in (verb.words, *verb.jobs.values()):
         dests = {one.name: spec.dest for one, spec in options_for(args.command, cls)}
         for one, spec in options_for(args.command, cls):
-            if spec.heeded_with is None or dests[one.name] not in said:
+            if spec.heeded_with is None or dests[one.name] not in explicit:
                 continue
             field, values = spec.heeded_with
             if getattr(args, dests[field]) not in values:
                 other = _listed([f"--{field.replace('_', '-')} {value}" for value in values])
                 found.append(f"{spec.flag} is passed over: it is heeded only with {other}.")
-    if "extend" in said:
-        lost = [flag for dest, flag in said.items() if dest not in ("extend", "run", "device")]
+    if "extend" in explicit:
+        lost = [flag for dest, flag in explicit.items() if dest not in ("extend", "run", "device")]
         if lost:
             found.append(f"{_listed(lost)}: passed over beside --extend, as a finished run keeps its settings.")
     return found

@@ -26,5 +26,5 @@ def _name_of(node: ast.stmt) -> str:
     call = getattr(node, "value", None)
     if not any(isinstance(t, ast.Name) and t.id == "HOST" for t in targets) or not isinstance(call, ast.Call):
         return ""
-    given = [*call.args[:1], *(k.value for k in call.keywords if k.arg == "name")]
-    return next((str(one.value) for one in given if isinstance(one, ast.Constant)), "")
+    names = [*call.args[:1], *(k.value for k in call.keywords if k.arg == "name")]
+    return next((str(one.value) for one in names if isinstance(one, ast.Constant)), "")

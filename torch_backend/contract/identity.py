@@ -37,8 +37,8 @@ def files_digest(files: Mapping[int, Path]) -> str:
     else:
         with ThreadPoolExecutor(_READERS) as readers:
             digests = list(readers.map(_or_nothing, (files[n] for n in numbers)))
-    told = "".join(f"{number} {digest}\n" for number, digest in zip(numbers, digests, strict=True))
-    return hashlib.sha256(told.encode()).hexdigest()[:32]
+    digest_lines = "".join(f"{number} {digest}\n" for number, digest in zip(numbers, digests, strict=True))
+    return hashlib.sha256(digest_lines.encode()).hexdigest()[:32]
 
 
 def _or_nothing(path: Path) -> str:

@@ -766,8 +766,8 @@ LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.va
 def check_params(params: object) -> None:
     """ValueError, in a sentence, names the first number of a job's parameters that is out of its `LIMITS`."""
     for name, limit in LIMITS.get(type(params), {}).items():
-        given = getattr(params, name)
-        values: Iterable[Any] = given.values() if is_json_object(given) else (given,)
+        chosen = getattr(params, name)
+        values: Iterable[Any] = chosen.values() if is_json_object(chosen) else (chosen,)
         for value in values:
             if value is None or value in limit.also or limit.low <= value <= limit.high:  # NaN is none of them
                 continue

@@ -61,8 +61,8 @@ def _told() -> list[dict[str, Any]]:
     data = read_json(Path(file), LONGEST_JSON)
     rules: Any = data.get("path_mapping_rules") or []
     wanted = {"source_path_format", "source_path", "destination_path"}
-    told = cast("list[Any]", rules) if isinstance(rules, list) else [None]
-    found = [rule for rule in told if is_json_object(rule) and wanted <= set(rule)]
-    if len(found) != len(told):
+    rows = cast("list[Any]", rules) if isinstance(rules, list) else [None]
+    found = [rule for rule in rows if is_json_object(rule) and wanted <= set(rule)]
+    if len(found) != len(rows):
         raise UserError(f"{file} holds no path mapping rules as Open Job Description writes them")
     return found

@@ -90,9 +90,9 @@ def placement_of(facts: Mapping[str, Any]) -> Placement:
     Takes of earlier versions say none: their splats are in the solve's own axes and units. ValueError if the entry
     is damaged.
     """
-    told = facts.get("placement")
-    if told is None:
+    placement = facts.get("placement")
+    if placement is None:
         return Placement([float(row == column) for row in range(4) for column in range(4)])
-    if not is_json_object(told):
+    if not is_json_object(placement):
         raise UserError("The take's placement is damaged: freeze it again.")
-    return Placement.from_json(told)
+    return Placement.from_json(placement)

@@ -53,11 +53,11 @@ def own_input() -> int:
     Whoever as much as looks at a pipe that somebody reads from waits on Windows until something comes: a child that
     inherits it as it starts, and a library as it is loaded.
     """
-    taken = os.dup(0)
+    standard_input = os.dup(0)
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.close(nothing)
-    return taken
+    return standard_input
 
 
 def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
@@ -123,10 +123,10 @@ def _name_of_mac() -> str:
         return ""
     try:  # as in `process_of_ps`
         command = ["/usr/sbin/scutil", "--get", "LocalHostName"]
-        asked = subprocess.run(command, capture_output=True, close_fds=False, timeout=5.0, check=True)
+        done = subprocess.run(command, capture_output=True, close_fds=False, timeout=5.0, check=True)
     except (OSError, subprocess.SubprocessError):
         return ""
-    return os.fsdecode(asked.stdout).strip()
+    return os.fsdecode(done.stdout).strip()
 
 
 @dataclass(frozen=True)

@@ -65,15 +65,15 @@ def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
         path.parent.mkdir(exist_ok=True)
     # Not the process's number: two hosts of a farm have the same ones. Nobody can have put a link there, either. Short:
     # Windows counts 260 letters of a whole path.
-    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
+    partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
     try:
-        yield beside
-        with open(beside, "rb+") as handle:
+        yield partial
+        with open(partial, "rb+") as handle:
             os.fsync(handle.fileno())
-        replace_file(beside, path)
+        replace_file(partial, path)
     except BaseException:
         with contextlib.suppress(OSError):  # what went wrong is to be told, not that Windows has it open still
-            beside.unlink(missing_ok=True)
+            partial.unlink(missing_ok=True)
         raise
 
 
@@ -207,8 +207,8 @@ def try_lock(handle: int) -> bool:
 
 def write_atomic(path: str | Path, data: bytes, parents: bool = True) -> None:
     """Writes a whole file, or leaves what was there. `parents`: see `atomic_path`."""
-    with atomic_path(path, parents) as beside:
-        beside.write_bytes(data)
+    with atomic_path(path, parents) as partial:
+        partial.write_bytes(data)
 
 
 def write_json(path: str | Path, data: Mapping[str, Any], parents: bool = True) -> None:

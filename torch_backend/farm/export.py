@@ -39,7 +39,7 @@ def export(words: FarmWords, requests: dict[str, Any], trains: bool = False) -> 
     output = Path(words.output)
     known = rates.read_rates(words.rates) if words.rates else rates.MEASURED
     every = [step for shot in found for step in work.steps_of(shot, words.frames, words.bake)]
-    told = cost.estimate(every, known, card, words.bake, words.session_tasks)
+    costs = cost.estimate(every, known, card, words.bake, words.session_tasks)
     groups = [found[n : n + words.shots_per_job] for n in range(0, len(found), words.shots_per_job)]
     files: list[Path] = []
     for number, group in enumerate(groups, 1):
@@ -50,7 +50,7 @@ def export(words: FarmWords, requests: dict[str, Any], trains: bool = False) -> 
         values = template.job_values(SOFTWARE, group, output / "baked", words.bake)
         folder = output if len(groups) == 1 else output / f"job-{number:03d}"
         files += template.write_job(folder, job, values)
-    return told, files
+    return costs, files
 
 
 def _name(group: list[shots.FarmShot]) -> str:

@@ -93,10 +93,10 @@ def to_json(rates: dict[str, Rate]) -> dict[str, Any]:
 def read_rates(path: str | Path) -> dict[str, Rate]:
     """`MEASURED` with those of a file in their place. JobError if it is no such file."""
     try:
-        told = read_json(path)
-        if told.get("version") != VERSION:
+        record = read_json(path)
+        if record.get("version") != VERSION:
             raise ValueError("it is not of this version")
-        own = {str(step): from_dict(Rate, rate) for step, rate in dict(told["rates"]).items()}
+        own = {str(step): from_dict(Rate, rate) for step, rate in dict(record["rates"]).items()}
         if set(own) - set(MEASURED):
             raise ValueError(f"it names the step {sorted(set(own) - set(MEASURED))[0]}")
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -159,9 +159,9 @@ def _distinct(found: Sequence[FarmShot]) -> list[FarmShot]:
     What is shared gets a digest of the shot's path, or its clip's, at all who share it: what a shot is called does not
     depend on the order in which they are given.
     """
-    given = {str(shot.root) for shot in found if not shot.clip}
+    shot_roots = {str(shot.root) for shot in found if not shot.clip}
     # A clip whose own shot is given, too, is that shot.
-    found = [s for s in found if not (s.clip and str(s.root) in given and is_imported_from(s.root, s.clip))]
+    found = [s for s in found if not (s.clip and str(s.root) in shot_roots and is_imported_from(s.root, s.clip))]
     shots = list({shot.identity: shot for shot in found}.values())
     seen = Counter(same_name(str(shot.root)) for shot in shots)
     shots = [dataclasses.replace(s, root=_hashed(s)) if seen[same_name(str(s.root))] > 1 else s for s in shots]
@@ -203,18 +203,18 @@ def _of_shot(path: str, requests: dict[str, Any]) -> FarmShot:
             f"{folder.root} holds no imported clip ({error}).", "Import the clip first, or name the clip itself.",
             ExitCode.USAGE,
         ) from error  # fmt: skip
-    asked = {kind: dataclasses.asdict(params) for kind, params in requests.items() if kind != "import"}
-    _keep_camera_path(folder, asked["freeze"])
+    fields = {kind: dataclasses.asdict(params) for kind, params in requests.items() if kind != "import"}
+    _keep_camera_path(folder, fields["freeze"])
     freeze = requests["freeze"]
     span = numbers
-    if asked["freeze"]["camera_path"]:
-        span = [int(row["frame"]) for row in read_json(folder.root / asked["freeze"]["camera_path"])["frames"]]
+    if fields["freeze"]["camera_path"]:
+        span = [int(row["frame"]) for row in read_json(folder.root / fields["freeze"]["camera_path"])["frames"]]
     first = span[0] if freeze.first is None else max(span[0], freeze.first)
     last = span[-1] if freeze.last is None else min(span[-1], freeze.last)
     run = RunFolder(folder.run(requests["freeze"].run))
     name = str(info.get("name") or folder.root.name.removesuffix(SHOT_SUFFIX))
     return FarmShot(
-        "", name, str(folder.root), "", folder.root, "", first, last, working, (int(width), int(height)), {}, asked,
+        "", name, str(folder.root), "", folder.root, "", first, last, working, (int(width), int(height)), {}, fields,
         folder.cameras.is_file(), run.summary.is_file() and run.checkpoint.is_file(),
     )  # fmt: skip
 
@@ -222,24 +222,24 @@ def _of_shot(path: str, requests: dict[str, Any]) -> FarmShot:
 def _of_clip(path: str, requests: dict[str, Any], shots_folder: str) -> FarmShot:
     """A clip's shot. JobError if it is no footage, or does not say how long it is."""
     clip = path if "://" in path else str(Path(path).absolute())
-    taken: ImportParams = dataclasses.replace(requests["import"], source=clip)
-    opened = open_source(clip, taken.fps, taken.layer)
-    shift = shift_of(opened.info, taken)
+    import_params: ImportParams = dataclasses.replace(requests["import"], source=clip)
+    opened = open_source(clip, import_params.fps, import_params.layer)
+    shift = shift_of(opened.info, import_params)
     info = renumbered(opened, shift).info
     if info.last is None:
         raise JobError(f"{clip} does not say how many frames it has.", "Import it, and name the shot.", ExitCode.USAGE)
-    first = info.first if taken.first is None else max(info.first, taken.first + shift)
-    last = info.last if taken.last is None else min(info.last, taken.last + shift)
+    first = info.first if import_params.first is None else max(info.first, import_params.first + shift)
+    last = info.last if import_params.last is None else min(info.last, import_params.last + shift)
     identity = os.path.abspath(info.file or clip)
     called = readable_stem(os.path.basename(identity), Path(identity).suffix.lower() in PICTURES)
-    working = working_size(info.width, info.height, taken.working_height)
-    asked = {kind: dataclasses.asdict(params) for kind, params in requests.items()}
-    asked["import"]["source"] = clip
-    if asked["freeze"]["camera_path"]:
+    working = working_size(info.width, info.height, import_params.working_height)
+    fields = {kind: dataclasses.asdict(params) for kind, params in requests.items()}
+    fields["import"]["source"] = clip
+    if fields["freeze"]["camera_path"]:
         raise JobError("A camera path is for a shot that is solved.", "Name the shot folder.", ExitCode.USAGE)
     return FarmShot(
         "", called, identity, "", _root_of(clip, called, identity, shots_folder), clip, first, last,
-        working, (info.width, info.height), {}, asked, False, False,
+        working, (info.width, info.height), {}, fields, False, False,
     )  # fmt: skip
 
 
@@ -307,8 +307,8 @@ def read_requests(path: str, requests: dict[str, Any]) -> dict[str, Any]:
     """
     if path:
         try:
-            told = read_json(path)
-            for kind, values in told.items():
+            record = read_json(path)
+            for kind, values in record.items():
                 if kind not in STEP_PARAMS or not is_json_object(values):
                     raise ValueError(f"{kind!r} is none of {', '.join(STEP_PARAMS)}")
                 requests[kind] = from_dict(STEP_PARAMS[kind], {**dataclasses.asdict(requests[kind]), **values})
@@ -344,12 +344,12 @@ def read_instants(path: str) -> dict[str, list[int]]:
         text = line.partition("#")[0].strip()
         if not text:
             continue
-        said = re.fullmatch(r"(.*?)[\s,:;]+(-?\d+(?:[\s,]+-?\d+)*)", text)
-        if said is None:
+        match = re.fullmatch(r"(.*?)[\s,:;]+(-?\d+(?:[\s,]+-?\d+)*)", text)
+        if match is None:
             raise JobError(
                 f"Line {number} of {path} is not the name of a shot and its instants.",
                 "Write one line per shot, such as: kitchen 34, 60",
                 ExitCode.USAGE,
             )
-        found.setdefault(said.group(1).removesuffix(SHOT_SUFFIX), []).extend(parse_instants(said.group(2)))
+        found.setdefault(match.group(1).removesuffix(SHOT_SUFFIX), []).extend(parse_instants(match.group(2)))
     return found

@@ -168,16 +168,16 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
     words = [_LAUNCHER, "farm-task", kind, "--shot", "{{Task.Param.Shot}}", "--request", "{{Task.File.Request}}"]
     words += ["--path-rules", "{{Session.PathMappingRulesFile}}"]
     space: list[dict[str, Any]] = [{"name": "Shot", "type": "PATH", "range": [_refused(str(shot.root))]}]
-    said: list[str] = []
+    path_words: list[str] = []
     if kind == "import":
         space.append({"name": "Clip", "type": "PATH", "range": [_refused(shot.clip)]})
-        said.append("import.source={{Task.Param.Clip}}")
+        path_words.append("import.source={{Task.Param.Clip}}")
     for field in _path_fields(kind) if kind in STEP_PARAMS else ():
         name = _parameter_name(kind, field)
         if name in paths and shot.requests[kind][field] == paths[name]:
-            said.append(f"{kind}.{field}={{{{Param.{name}}}}}")
-    if said:
-        words += ["--paths", *said]
+            path_words.append(f"{kind}.{field}={{{{Param.{name}}}}}")
+    if path_words:
+        words += ["--paths", *path_words]
     if any(step.t_stars):
         space.append({"name": "TStar", "type": "INT", "range": [int(t) for t in step.t_stars]})
         words.append("--t-star={{Task.Param.TStar}}")  # a negative one is no option
@@ -191,7 +191,7 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
         "args": words,
         "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": NOTIFY_SECONDS},
     }
-    asked = _request(step)
+    request = _request(step)
     template: dict[str, Any] = {"name": step.name, "description": f"{_SAYS[kind]}."}
     if before:
         template["dependencies"] = [{"dependsOn": before}]
@@ -201,7 +201,7 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
         amounts.append({"name": "amount.worker.gpu", "min": 1})
     template["hostRequirements"] = {"amounts": amounts}
     template["parameterSpace"] = {"taskParameterDefinitions": space}
-    files = [{"name": "Request", "type": "TEXT", "filename": "request.json", "data": asked}]
+    files = [{"name": "Request", "type": "TEXT", "filename": "request.json", "data": request}]
     template["script"] = {"actions": {"onRun": action}, "embeddedFiles": files}
     return template
 
@@ -209,10 +209,10 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
 def _request(step: Step) -> str:
     """What a task is asked for, as the text of a file: parameters without paths, and the takes' names."""
     shot, kind = step.shot, step.kind
-    asked = kind if kind in STEP_PARAMS else "freeze"
-    values = dict(shot.requests[asked])
-    for field in _path_fields(asked):
-        if values[field] not in _NO_FILES and (asked, field) != ("freeze", "camera_path"):
+    params_kind = kind if kind in STEP_PARAMS else "freeze"
+    values = dict(shot.requests[params_kind])
+    for field in _path_fields(params_kind):
+        if values[field] not in _NO_FILES and (params_kind, field) != ("freeze", "camera_path"):
             values[field] = ""
     amounts = {str(start): round(amount, 4) for start, amount in step.amounts.items()}
     request: dict[str, Any] = {
@@ -220,9 +220,9 @@ def _request(step: Step) -> str:
         "name": shot.name,
         "output": shot.output,
         "amounts": amounts,
-        asked: values,
+        params_kind: values,
     }
-    if asked == "freeze":
+    if params_kind == "freeze":
         request |= {"takes": shot.takes, "first": shot.first, "last": shot.last}
     # Two braces begin or end a reference. JSON itself never has two: with an indent each stands on a line of its own.
     # DEL is the one control character that JSON leaves as it is.
@@ -235,10 +235,10 @@ def _request(step: Step) -> str:
 def _refused(text: str) -> str:
     """`text`, a path or name that stands in the template as it is. JobError if the engine would refuse it, or read a
     reference in it."""
-    said = "".join(c if c.isprintable() else "?" for c in text)
+    printable = "".join(c if c.isprintable() else "?" for c in text)
     if "{{" in text or "}}" in text:
         raise JobError(
-            f"{said} cannot stand in a job template: two braces mean a reference there.",
+            f"{printable} cannot stand in a job template: two braces mean a reference there.",
             "Rename it without {{ and }}.",
             ExitCode.USAGE,
         )
@@ -247,16 +247,16 @@ def _refused(text: str) -> str:
 
 def _refused_value(text: str) -> str:
     """`text`, a path as it stands in a value beside the template. JobError if the engine would refuse it."""
-    said = "".join(c if c.isprintable() else "?" for c in text)
+    printable = "".join(c if c.isprintable() else "?" for c in text)
     if len(text) > MOST_LETTERS:
         raise JobError(
-            f"{said[:100]}... has {len(text)} letters: a render farm's job takes {MOST_LETTERS}.",
+            f"{printable[:100]}... has {len(text)} letters: a render farm's job takes {MOST_LETTERS}.",
             "Move it to a folder with a shorter path.",
             ExitCode.USAGE,
         )
     if re.search(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]", text):
         raise JobError(
-            f"{said} cannot stand in a job template: its name holds control characters, or is not UTF-8.",
+            f"{printable} cannot stand in a job template: its name holds control characters, or is not UTF-8.",
             "Rename it.",
             ExitCode.USAGE,
         )

@@ -91,14 +91,14 @@ def _size(shot: FarmShot) -> ShotSize:
 
 
 def _training(shot: FarmShot) -> float:
-    asked: dict[str, Any] = shot.requests["train"]
-    return _size(shot).train_work(asked["iterations"] or PRESET_STEPS[asked["preset"]], _trained_width(shot))
+    params: dict[str, Any] = shot.requests["train"]
+    return _size(shot).train_work(params["iterations"] or PRESET_STEPS[params["preset"]], _trained_width(shot))
 
 
 def _trained_width(shot: FarmShot) -> int:
     """Pixels of the training's pictures."""
-    asked: dict[str, Any] = shot.requests["train"]
-    return _size(shot).trained_width(asked["width"], asked["preset"])
+    params: dict[str, Any] = shot.requests["train"]
+    return _size(shot).trained_width(params["width"], params["preset"])
 
 
 def _developing(shot: FarmShot) -> float:

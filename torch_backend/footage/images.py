@@ -92,10 +92,10 @@ def write_png(path: str | Path, pixels: NDArray[Any], key: str = "") -> None:
     buffer.specmod().attribute("oiio:ColorSpace", "sRGB")
     if key:
         buffer.specmod().attribute("splannequin:key", key)
-    with atomic_path(path) as beside:
+    with atomic_path(path) as partial:
         # OpenImageIO's writer says nothing when the disk is full.
-        if not (buffer.write(str(beside)) and _has_end(beside)):
-            full = shutil.disk_usage(beside.parent).free < max(_FULL_BYTES, pixels.nbytes)
+        if not (buffer.write(str(partial)) and _has_end(partial)):
+            full = shutil.disk_usage(partial.parent).free < max(_FULL_BYTES, pixels.nbytes)
             raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot write picture: {error_of(buffer)}", str(path))
 
 

@@ -331,11 +331,11 @@ def _log_remark(info: SourceInfo, config: FootageConfig, extracted: Extracted) -
     tones = looks_like_log(extracted.measures)
     if tones is None or info.colour == "linear" or config.colour_space or config.lut:
         return []
-    taken = info.reading.get("colour", "video")
+    colour = info.reading.get("colour", "video")
     return [
         (
             f"The picture is as flat as log: its darkest tones are at {100 * tones[0]:.0f} %, its brightest at "
-            f"{100 * tones[1]:.0f} %. It was taken as {taken}.",
+            f"{100 * tones[1]:.0f} %. It was taken as {colour}.",
             "If it is log, name its colour space (--colour-space, such as 'ARRI LogC3 (EI800)'), or a look (--lut).",
         )
     ]
@@ -460,8 +460,8 @@ def _displayed(info: SourceInfo, measures: list[FrameMeasures]) -> dict[str, Any
 def _news(record: dict[str, Any], source: str) -> dict[str, Any]:
     """What shot.json is to be told: it stands beside the frames from the moment on at which they take their place."""
     frames = record["frames"]
-    taken = {name: record[name] for name in ("step", "fps", "width", "height", "colour")}
-    return {"source": str(source), "first": frames[0]["frame"], "last": frames[-1]["frame"], **taken}
+    imported = {name: record[name] for name in ("step", "fps", "width", "height", "colour")}
+    return {"source": str(source), "first": frames[0]["frame"], "last": frames[-1]["frame"], **imported}
 
 
 def _beside(shot: Shot, source: str) -> str:

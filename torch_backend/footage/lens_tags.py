@@ -24,8 +24,8 @@ def focal_of_picture(spec: oiio.ImageSpec) -> float | None:
 def focal_of_video(container: Any, stream: Any) -> float | None:
     """Millimetres on 35 mm film by the QuickTime keys of a video; None if it does not say."""
     tables = [stream.metadata, container.metadata]
-    said = (_believable(table[key]) for table in tables for key in table if key.lower() == _QUICKTIME)
-    return next((focal for focal in said if focal is not None), None)
+    values = (_believable(table[key]) for table in tables for key in table if key.lower() == _QUICKTIME)
+    return next((focal for focal in values if focal is not None), None)
 
 
 def focal_px(focal_mm: float, width: int, height: int) -> float:

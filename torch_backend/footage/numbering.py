@@ -50,11 +50,13 @@ class Renumbered:
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
         """See `Source.frames`."""
-        said = len(self.warnings)
+        earlier = len(self.warnings)
         own = (None if number is None else number - self._shift for number in (first, last))
         for frame in self._source.frames(*own):
             yield replace(frame, number=frame.number + self._shift)
-        self.warnings[said:] = [(message, f"{hint} {OWN_NUMBERS}".strip()) for message, hint in self.warnings[said:]]
+        self.warnings[earlier:] = [
+            (message, f"{hint} {OWN_NUMBERS}".strip()) for message, hint in self.warnings[earlier:]
+        ]
 
     def plates(self, known: Known) -> PlateReader:
         """See `Source.plates`."""

@@ -121,8 +121,10 @@ def pixel_aspect(stream: Any) -> Fraction | None:
 def timecode(container: Any, stream: Any) -> str:
     """Of the first frame; empty if the file carries none."""
     tables = [stream.metadata, container.metadata, *(one.metadata for one in container.streams)]
-    said = (parse_timecode(str(value)) for table in tables for key, value in table.items() if key.lower() == "timecode")
-    return next((code for code in said if code), "")
+    timecodes = (
+        parse_timecode(str(value)) for table in tables for key, value in table.items() if key.lower() == "timecode"
+    )
+    return next((code for code in timecodes if code), "")
 
 
 def promise(container: Any, stream: Any, rate: Fraction) -> tuple[int, float]:

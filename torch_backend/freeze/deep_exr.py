@@ -57,13 +57,13 @@ def _deep_data(rgba: NDArray[np.float32], depth: NDArray[np.float32]) -> oiio.De
     values = np.concatenate([rgba.clip(-HALF_MAX, HALF_MAX), depth[..., None]], axis=-1).reshape(
         len(rgba), -1, len(DEEP_CHANNELS)
     )
-    there = values[..., 3] > 0.0
+    is_covered = values[..., 3] > 0.0
     data = cast(Any, oiio.DeepData())
-    data.init(there.shape[1], len(DEEP_CHANNELS), tuple(oiio.TypeDesc(kind) for kind in _FORMATS), DEEP_CHANNELS)
+    data.init(is_covered.shape[1], len(DEEP_CHANNELS), tuple(oiio.TypeDesc(kind) for kind in _FORMATS), DEEP_CHANNELS)
     run = deque[None](maxlen=0).extend
-    run(map(data.set_samples, range(there.shape[1]), there.sum(0).tolist()))
-    pixels, layers = np.nonzero(there.T)
-    at = (np.cumsum(there, axis=0) - 1)[layers, pixels].tolist()
+    run(map(data.set_samples, range(is_covered.shape[1]), is_covered.sum(0).tolist()))
+    pixels, layers = np.nonzero(is_covered.T)
+    at = (np.cumsum(is_covered, axis=0) - 1)[layers, pixels].tolist()
     places = pixels.tolist()
     for channel in range(len(DEEP_CHANNELS)):
         run(map(data.set_deep_value, places, repeat(channel), at, values[layers, pixels, channel].tolist()))

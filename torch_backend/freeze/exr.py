@@ -231,11 +231,11 @@ def write_beside(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bo
 
     OSError with the system's reason, as `write_frozen_exr`.
     """
-    with atomic_path(path) as beside:
-        output = oiio.ImageOutput.create(str(beside))
+    with atomic_path(path) as partial:
+        output = oiio.ImageOutput.create(str(partial))
         if output is None:
             raise OSError(errno.EIO, f"OpenImageIO cannot write EXR: {oiio.geterror()}", str(path))
-        good = bool(cast(Any, output).open(str(beside), spec))
+        good = bool(cast(Any, output).open(str(partial), spec))
         try:
             for top in range(0, spec.height, ROWS) if good else ():
                 good = good and rows(output, top)

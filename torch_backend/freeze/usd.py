@@ -62,7 +62,7 @@ def write_usd(
         )
     except ImportError as error:
         raise NoUsdError(str(error)) from error
-    with atomic_path(path) as beside:
+    with atomic_path(path) as partial:
         try:
             layer: Any = Sdf.Layer.CreateAnonymous(path.suffix)  # a layer of that path may be open in this process
             stage: Any = Usd.Stage.Open(layer)
@@ -71,7 +71,7 @@ def write_usd(
             _add_camera(UsdGeom.Camera.Define(stage, CAMERA), Gf, cameras, where, metres_per_unit)
             if gaussians is not None:
                 _add_splats(UsdVol.ParticleField3DGaussianSplat.Define(stage, SPLATS), Vt, gaussians)
-            written = layer.Export(str(beside), args={"format": path.suffix.removeprefix(".")})
+            written = layer.Export(str(partial), args={"format": path.suffix.removeprefix(".")})
         except Tf.ErrorException as error:
             raise write_error(str(error), path, _size_of(gaussians)) from error
         if not written:

@@ -86,7 +86,7 @@ def write_ply(
         dtype="<f4",
     )
     path = Path(path)
-    with atomic_path(path) as beside, open(beside, "wb") as handle:
+    with atomic_path(path) as partial, open(partial, "wb") as handle:
         handle.write(header.encode("ascii"))
         handle.write(rows.data)  # `tofile` would not say that the disk is full
     return path

@@ -128,13 +128,13 @@ def left_px(answer: dict[str, Any]) -> float:
 
 def _remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
     lens = answer["lens"]
-    found, taken = (_shown_deg(lens, *it) for it in (("found_deg", lens["found_px"]), ("view_deg", answer["focal_px"])))
-    given = lens.get("given_px")
-    if lens["held"] and given:
+    found, used = (_shown_deg(lens, *it) for it in (("found_deg", lens["found_px"]), ("view_deg", answer["focal_px"])))
+    given_px = lens.get("given_px")
+    if lens["held"] and given_px:
         return [
             (
                 f"The solve would have another focal length than was given ({lens['found_px']:.0f} px instead of "
-                f"{given:.0f}): it was held as given.",
+                f"{given_px:.0f}): it was held as given.",
                 "Is it for the sensor's width, and was the clip not cropped or stabilised?",
             )
         ]
@@ -144,20 +144,20 @@ def _remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
             return [
                 (
                     f"The clip does not tell its lens (the solve {off}): the one that the file names was taken, "
-                    f"{taken:.0f} degrees wide.",
+                    f"{used:.0f} degrees wide.",
                     "Was the clip cropped or stabilised? Then it is narrower.",
                 )
             ]
         return [
             (
-                f"The clip does not tell its lens (the solve {off}): a usual one of {taken:.0f} degrees was taken.",
+                f"The clip does not tell its lens (the solve {off}): a usual one of {used:.0f} degrees was taken.",
                 "Depth may look stretched; a range in which the camera travels more tells the lens.",
             )
         ]
     if lens["doubt"] == "off":
         return [
             (
-                f"The focal length came out as {lens['found_px']:.0f} px, and {given:.0f} were given.",
+                f"The focal length came out as {lens['found_px']:.0f} px, and {given_px:.0f} were given.",
                 "Is it for the sensor's width, and was the clip not cropped or stabilised?",
             )
         ]
@@ -171,7 +171,7 @@ def _remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
     if lens["doubt"]:
         return [
             (
-                f"The lens that the solve found is unusual: {taken:.0f} degrees wide.",
+                f"The lens that the solve found is unusual: {used:.0f} degrees wide.",
                 "If yours is not, choose a range in which the camera travels more.",
             )
         ]

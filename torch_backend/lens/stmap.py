@@ -197,11 +197,11 @@ def write_map(path: Path, pixels: NDArray[np.float32], key: str = "") -> Path:
     if key:
         spec.attribute("splannequin:key", key)
     try:
-        with atomic_path(path) as beside:
-            output = oiio.ImageOutput.create(str(beside))
+        with atomic_path(path) as partial:
+            output = oiio.ImageOutput.create(str(partial))
             if output is None:
                 raise OSError(errno.EIO, f"OpenImageIO cannot write EXR: {oiio.geterror()}", str(path))
-            if not (open_output(output, beside, spec) and output.write_image(pixels) and output.close()):
+            if not (open_output(output, partial, spec) and output.write_image(pixels) and output.close()):
                 need_disk(path.parent, pixels.nbytes, "the map")
                 raise OSError(errno.EIO, f"map not written: {output.geterror()}", str(path))
     except OSError as error:

@@ -240,9 +240,9 @@ def _own_score(
     """
     seen = neighbours(matches, key, len(clip.keys), config)
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
-    told = evidence(test, key, seen, clip.depths[key], config)
-    inverse, count = told.inverse, told.on + told.off
-    score = np.clip(told.off / (count + config.doubt) / config.share, 0.0, 1.0)
+    counts = evidence(test, key, seen, clip.depths[key], config)
+    inverse, count = counts.inverse, counts.on + counts.off
+    score = np.clip(counts.off / (count + config.doubt) / config.share, 0.0, 1.0)
     if before is None:
         left, known = Leftover(clip.picture, test, config).score(key, len(clip.keys), inverse, clip.depths[key])
     else:
@@ -250,7 +250,7 @@ def _own_score(
         left, known = (sample(values, last.at) * last.found for values in before)
     sure = np.minimum(count / config.sure, 1.0) * (count >= 1.0)
     own = np.maximum(score, left), np.maximum(sure, known * (left > score)), inverse
-    return own, (left, known), told
+    return own, (left, known), counts
 
 
 def _followed(
@@ -301,10 +301,10 @@ class Labels:
         known = np.maximum(spread(weight), 0.0)
         score = spread(frame.score * weight) / np.maximum(known, 1e-3)
         maps = score, known, self._misfit(frame)
-        score, known, unlike = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in maps)
+        score, known, difference = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in maps)
         least = round((config.blob * self._clip.width / 640) ** 2)
         moving = seeded(score > config.grow, score > config.seed, least)
-        moving |= seeded(unlike > rest.weak, unlike > rest.strong, least)
+        moving |= seeded(difference > rest.weak, difference > rest.strong, least)
         still = seeded(~moving, ~moving, least)  # holes are filled
         unknown = known < _UNKNOWN
         unknown = seeded(unknown, unknown, least)

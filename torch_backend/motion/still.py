@@ -232,15 +232,15 @@ def _counted(
     for pair in pairs:
         found, after = pair.seen.found, pair.seen.key - key
         at, x, y, length = pair.miss(inverse)
-        unlike = pair.other.unlike(look.grid, at, pair.gain)
+        difference = pair.other.unlike(look.grid, at, pair.gain)
         away = found & (length > pair.limit)
         fits = found & (length <= _AGREES * pair.limit)
         slope = pair.ray.slope(*pair.ray.project(inverse))
         agree += fits
         parallax = np.maximum(parallax, fits * np.hypot(*slope) * inverse)
-        alike = unlike - texture.nearly < _like(unlike, found & ~away & texture.telling, config)
+        alike = difference - texture.nearly < _like(difference, found & ~away & texture.telling, config)
         within = inside(at, look.grid.shape)
-        better = pair.right & (unlike > config.better * pair.matched + config.contrast**2)
+        better = pair.right & (difference > config.better * pair.matched + config.contrast**2)
         off += away & better & (texture.change(x, y, length) > config.contrast**2)
         weight = min(1.0, abs(after) / config.baselines[-1]) ** config.haste
         # Flow over a plain wall carries what is before it along: a match there that looks like nothing says nothing.

@@ -67,8 +67,8 @@ def _sh_degree(sh: Tensor | None, rest: Tensor | None, degree: int | None) -> in
         bands += rest.shape[1]
     held = _BANDS.get(bands)
     if held is None:
-        given = list(sh.shape) if rest is None else f"{list(sh.shape)} and {list(rest.shape)}"
-        raise ValueError(f"sh must have shape [N, K, 3] with K = 1, 4, 9 or 16, not {given}")
+        shapes = list(sh.shape) if rest is None else f"{list(sh.shape)} and {list(rest.shape)}"
+        raise ValueError(f"sh must have shape [N, K, 3] with K = 1, 4, 9 or 16, not {shapes}")
     if degree is None:
         return held
     if not 0 <= degree <= held:

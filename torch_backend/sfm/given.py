@@ -75,10 +75,10 @@ def take_over(
     Raises:
         JobError: the worker broke off, or not one point agrees with the cameras.
     """
-    given, matched = taken.solve, taken.matched
+    imported, matched = taken.solve, taken.matched
     size = (frames["width"], frames["height"])
     used = sorted({camera.lens for camera in matched.cameras.values()})
-    lenses = [given.lenses[n].scaled(*size) for n in used]
+    lenses = [imported.lenses[n].scaled(*size) for n in used]
     names = {f["frame"]: Path(f["file"]).name for f in frames["frames"]}
     poses = {
         names[n]: {"pose": camera.pose.tolist(), "source": "registered", "lens": used.index(camera.lens)}
@@ -101,8 +101,8 @@ def take_over(
     fx, fy, _, _, *bend = lenses[0].params
     return {
         **answer,
-        "given": given.kind,
-        "world": given.world,
+        "given": imported.kind,
+        "world": imported.world,
         "registered": len(registered),
         "camera_model": lenses[0].model,
         "focal_px": 0.5 * (fx + fy),

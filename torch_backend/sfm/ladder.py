@@ -103,15 +103,15 @@ def climb(
         Cancelled: between tries and in them.
     """
     best = last = _attempt(FIRST, request, frames, None, scratch, log, report)
-    asked, tries = dict(request), [_told(best.rung, best.words)]
+    current, tries = dict(request), [_told(best.rung, best.words)]
     while retry and best.fault is not None:
-        rung = next_rung(best, asked, {told["rung"] for told in tries})
+        rung = next_rung(best, current, {row["rung"] for row in tries})
         if rung is None:
             break
         report.check_cancelled()
         report.warning(f"{best.words} Trying again with {rung.words}.")
-        now = {**asked, **rung.changes}
-        asked = now if rung.stays else asked
+        now = {**current, **rung.changes}
+        current = now if rung.stays else current
         fresh = "features" in rung.changes
         need_disk(scratch, len(frames["frames"]) << 21, "Another try of the camera solve")
         try:
@@ -126,7 +126,7 @@ def climb(
             if file.name != DATABASE_FILE:
                 shutil.rmtree(file) if file.is_dir() else file.unlink()
     if best.fault is not None and best.fault.refused:
-        raise _refusal(best.fault.error, [told["rung"] for told in tries])
+        raise _refusal(best.fault.error, [row["rung"] for row in tries])
     return Climbed(best, tries)
 
 

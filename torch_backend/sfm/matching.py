@@ -102,15 +102,15 @@ def set_lens(request: Request, database: pycolmap.Database) -> bool:
     """Gives the one camera of a database the request's model; True if its focal length is told now and was not before,
     or the other way about."""
     old = database.read_all_cameras()[0]
-    told = start_params(request)
+    focal = start_params(request)
     camera = pycolmap.Camera.create_from_model_name(
         old.camera_id, request.camera_model, GUESSED_FOCAL * max(old.width, old.height), old.width, old.height
     )
-    if told:
-        camera.params = [float(value) for value in told.split(",")]
-    camera.has_prior_focal_length = bool(told)
+    if focal:
+        camera.params = [float(value) for value in focal.split(",")]
+    camera.has_prior_focal_length = bool(focal)
     database.update_camera(camera)
-    return bool(told) != old.has_prior_focal_length
+    return bool(focal) != old.has_prior_focal_length
 
 
 def wide_pairs(names: Sequence[str]) -> dict[str, list[str]]:
@@ -143,11 +143,11 @@ class Common:
 
 def common(request: Request) -> Common:
     """Measures the matches of the solved frames."""
-    told = [pair for pair in _shared(request) if len(pair.matches) >= LEAST_MATCHES]
+    matched = [pair for pair in _shared(request) if len(pair.matches) >= LEAST_MATCHES]
     with closing_database(request) as database:
         found = [database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()]
-    matches = int(np.median([len(pair.matches) for pair in told])) if told else 0
-    return Common(max((pair.shift for pair in told), default=0.0), len(told), matches, int(np.median(found)))
+    matches = int(np.median([len(pair.matches) for pair in matched])) if matched else 0
+    return Common(max((pair.shift for pair in matched), default=0.0), len(matched), matches, int(np.median(found)))
 
 
 def turning(request: Request) -> bool:
@@ -158,9 +158,11 @@ def turning(request: Request) -> bool:
     explained = [pair for pair in pairs if pair.kind in flat]
     if not pairs or len(explained) <= TURNING_SHARE * len(pairs):
         return False
-    told = [(p.homography, p.shift) for p in explained if p.homography is not None and len(p.matches) >= LEAST_MATCHES]
-    homographies = np.array([homography for homography, _ in told], np.float64).reshape(-1, 3, 3)
-    shifts = np.array([shift for _, shift in told])
+    measured = [
+        (p.homography, p.shift) for p in explained if p.homography is not None and len(p.matches) >= LEAST_MATCHES
+    ]
+    homographies = np.array([homography for homography, _ in measured], np.float64).reshape(-1, 3, 3)
+    shifts = np.array([shift for _, shift in measured])
     return only_turns(homographies, shifts, (request.size[0], request.size[1]), request.focal)
 
 

@@ -97,9 +97,9 @@ class OneBar:
             self._share = share
         self._share = max(self._share, share)
         left = self._left()
-        ahead = self._work_in_stage() + left
-        if ahead > 0.0:
-            self._bar = max(self._bar, 1.0 - (1.0 - self._entered[0]) * left / ahead)
+        remaining = self._work_in_stage() + left
+        if remaining > 0.0:
+            self._bar = max(self._bar, 1.0 - (1.0 - self._entered[0]) * left / remaining)
         self._tell(left, begins)
         self._report.progress(WHOLE, self._bar, 1.0, WORDS[name].format(message or "begins"))
 

@@ -98,8 +98,8 @@ def write_results(asked: Asked, answer: dict[str, Any], scratch: Path, staged: S
     if "given" in answer:
         refuse_misfit(answer, len(points["xyz"]))
     _undistort_all(asked, lenses, maps, staged, report)
-    with atomic_path(staged.solve / POINTS_FILE) as beside:
-        save_arrays(beside, points)
+    with atomic_path(staged.solve / POINTS_FILE) as partial:
+        save_arrays(partial, points)
     replace_file(scratch / "model", staged.solve / COLMAP_FOLDER)
     write_json(staged.solve / CAMERAS_FILE, path.to_json())
     misled = flat_words(points["xyz"]) or zoom_words(

@@ -117,7 +117,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Reporter) -> SolveResult:
     """Solves, and puts the files in the place of those before."""
     shot, frames = asked.shot, asked.frames
-    taken = prepare(frames, cameras, report) if cameras else None
+    imported = prepare(frames, cameras, report) if cameras else None
     lens = _lens_of_map(config, frames, report)
     _refuse_damaged(shot, frames)
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame, and copies of
@@ -128,11 +128,11 @@ def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Report
     shutil.rmtree(scratch, ignore_errors=True)
     make_folder(scratch)
     try:
-        if taken is None:
+        if imported is None:
             answer, left = _mapped(asked, config, lens, scratch, report)
         else:
             options = _matching(frames, config, asked.masks, scratch)
-            answer, left = take_over(shot, frames, taken, options, scratch, report), scratch
+            answer, left = take_over(shot, frames, imported, options, scratch, report), scratch
         had_maps = any((shot.solve / name).is_file() for name in STMAP_FILES)
         with replacing_solve(shot) as staged:
             result = write_results(asked, answer, left, staged, report)
@@ -285,8 +285,8 @@ def _matching(
 
 def _focal_of_file(frames: dict[str, Any]) -> float:
     """Focal length in pixels of the working frames that the footage's file tells; 0 if it does not."""
-    told = frames.get("reading", {}).get("focal_35mm")
-    return focal_px(told, frames["width"], frames["height"]) if told else 0.0
+    focal = frames.get("reading", {}).get("focal_35mm")
+    return focal_px(focal, frames["width"], frames["height"]) if focal else 0.0
 
 
 def _request(

@@ -22,8 +22,8 @@ def main(path: str) -> int:
         if ours or isinstance(error, MemoryError):
             raise
         traceback.print_exc()
-        said = str(error) if isinstance(error, ImportError) else f"{type(error).__name__}: {error}"
-        sys.stdout.write(json.dumps({"lacks": said}) + "\n")
+        message = str(error) if isinstance(error, ImportError) else f"{type(error).__name__}: {error}"
+        sys.stdout.write(json.dumps({"lacks": message}) + "\n")
         sys.stdout.flush()
         return ExitCode.ENVIRONMENT
     return worker.main(path)

@@ -359,7 +359,7 @@ class _Plan:
         for (p, _), known, row in zip(found, self.known, self.whole.tolist(), strict=True):
             of = state.get(p, {})
             now = p, of.get("exp_avg"), of.get("exp_avg_sq"), of.get("step")
-            if any(there() is not value for there, value in zip(known, now, strict=True)):
+            if any(reference() is not value for reference, value in zip(known, now, strict=True)):
                 return False
             if [value.data_ptr() for value in now] != [row[0], row[2], row[3], row[7]]:
                 return False

@@ -19,9 +19,9 @@ from .extend import EXTENSION_FILE
 
 def folder_for(run: Path, key: str, resume: bool) -> Path:
     """The folder in which settings of a key are trained: the run's own if it holds nothing else, or has begun them."""
-    there = begun(run, key) if resume else None
-    if there is not None:
-        return there
+    folder = begun(run, key) if resume else None
+    if folder is not None:
+        return folder
     return run / NEXT_FOLDER / key if (run / CHECKPOINT_FILE).is_file() else run
 
 

@@ -32,9 +32,9 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]
     """
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"version": CHECKPOINT_VERSION, **meta}, allow_nan=False)
-    with atomic_path(path) as beside:
+    with atomic_path(path) as partial:
         try:
-            write_stored(contiguous, beside, {"splannequin": text})
+            write_stored(contiguous, partial, {"splannequin": text})
         except SafetensorError as error:  # it hands the system's reason on in words: "... (os error 28)"
             code = int(number[1]) if (number := re.search(r"os error (\d+)", str(error))) else errno.EIO
             windows = (code,) if os.name == "nt" else ()
@@ -50,9 +50,9 @@ def misfit(path: Path, error: Exception, code: ExitCode) -> Exception:
     if isinstance(error, torch.OutOfMemoryError | torch.AcceleratorError):
         return error
     what = str(error).strip().splitlines()
-    told = f"{type(error).__name__}: {what[0]}" if what else type(error).__name__
+    reason = f"{type(error).__name__}: {what[0]}" if what else type(error).__name__
     return JobError(
-        f"The checkpoint {path} does not fit this version ({told}).", "Train the run again with --restart.", code
+        f"The checkpoint {path} does not fit this version ({reason}).", "Train the run again with --restart.", code
     )
 
 

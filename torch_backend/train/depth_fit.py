@@ -58,9 +58,9 @@ class FrameFit:
     def inverse_of(self, values: NDArray[np.float32], kind: str) -> NDArray[np.float32]:
         """Inverse depth of values, in 1 / scene units; 0 where a value is NaN, or means nothing before the camera."""
         fitted = np.nan_to_num(self.of(values), nan=0.0)
-        ahead = fitted > 1e-12
-        safe = np.where(ahead, fitted, 1.0)
-        return np.where(ahead, safe if kind == KINDS[1] else 1.0 / safe, 0.0).astype(np.float32)
+        is_positive = fitted > 1e-12
+        safe = np.where(is_positive, fitted, 1.0)
+        return np.where(is_positive, safe if kind == KINDS[1] else 1.0 / safe, 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True)

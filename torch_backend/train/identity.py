@@ -61,8 +61,8 @@ def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig, depth: l
     else:
         motion = None
     # With cameras that were given, another grade of the footage is the same solve.
-    anew, there = content_key(key, pictures_key(shot)), begun(run, key)
-    if begun(run, anew) is not None or (there and of_other_pictures(shot, read_meta(there / CHECKPOINT_FILE))):
+    anew, folder = content_key(key, pictures_key(shot)), begun(run, key)
+    if begun(run, anew) is not None or (folder and of_other_pictures(shot, read_meta(folder / CHECKPOINT_FILE))):
         key = anew
     return key, motion
 

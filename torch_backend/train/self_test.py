@@ -191,9 +191,9 @@ def tested_apart(key: str) -> SelfTest:
     except OSError as error:
         return SelfTest(key=key, problem=f"it could not be tested ({error})", lasting=False)
     try:
-        told = cast(dict[str, Any], json.loads(ran.stdout[ran.stdout.index("{") :])["gpu"]["test"])
-        checks = [from_dict(Check, row) for row in told["checks"]]
-        return from_dict(SelfTest, {**told, "key": key, "checks": checks})
+        answer = cast(dict[str, Any], json.loads(ran.stdout[ran.stdout.index("{") :])["gpu"]["test"])
+        checks = [from_dict(Check, row) for row in answer["checks"]]
+        return from_dict(SelfTest, {**answer, "key": key, "checks": checks})
     except (ValueError, KeyError, TypeError):
         if ran.returncode == ExitCode.ENVIRONMENT:
             return SelfTest(key=key, problem="it could not be tested", lasting=False)
@@ -352,13 +352,13 @@ def _planes(device: torch.device) -> list[Check]:
         points = at.to(where, copy=True).requires_grad_()
         features = body.features(points, leaves)
         backward((features * pull.to(where)).sum())
-        told = {"the field": features, "the gradient of its points": _gradient(points)}
-        told["the gradient of its planes"] = _gradients(leaves)
+        results = {"the field": features, "the gradient of its points": _gradient(points)}
+        results["the gradient of its planes"] = _gradients(leaves)
         for leaf in leaves:
             leaf.grad = None
         value = body.penalty(leaves, [(1.0, 0.5, 0.1)] * 6)
         backward(value)
-        found.append({**told, "the field's smoothness": value, "the gradient of its smoothness": _gradients(leaves)})
+        found.append({**results, "the field's smoothness": value, "the gradient of its smoothness": _gradients(leaves)})
     truth, seen = found
     return [Check(what, _relative(seen[what], value), _EXACT) for what, value in truth.items()]
 

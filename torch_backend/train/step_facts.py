@@ -106,8 +106,8 @@ class StepFacts:
 
     def into(self, room: StepFacts) -> None:
         """Writes it into the `room` of one of the same kind."""
-        for there, value in zip(room._tensors(), self._tensors(), strict=True):
-            there.copy_(value, non_blocking=True)
+        for target, value in zip(room._tensors(), self._tensors(), strict=True):
+            target.copy_(value, non_blocking=True)
 
     def _tensors(self) -> list[Tensor]:
         """All that there are, in one order."""

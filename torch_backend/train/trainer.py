@@ -246,9 +246,9 @@ class Trainer:
             self._foretold = True
             size = self.scene.width, self.scene.height
             smaller = smaller_presets(self.config.preset, size, self.initial, each)
-            told = warning_of(left, self.width, resumed, [row for row in smaller if row.seconds < left])
-            if told is not None:
-                self.report.warning(*told)
+            warning = warning_of(left, self.width, resumed, [row for row in smaller if row.seconds < left])
+            if warning is not None:
+                self.report.warning(*warning)
 
     def _densify_config(self) -> DensifyConfig:
         """As configured, but for what fits; the configuration itself stays as it was asked for: it is the run's key."""
@@ -323,13 +323,13 @@ class Trainer:
         draws = None
         if field is not None and len(rows) and s.anchors_due(self.iteration, self.progress):
             draws = draw(len(rows), len(self.centres), s, self.generator)
-        asked = time if field is None else field.training_time(time, self.progress, self.generator)
+        field_time = time if field is None else field.training_time(time, self.progress, self.generator)
         # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
         background = torch.rand(3, generator=self.generator, device="cpu")
         left, right, share = model.exposure.place(time)
         due = self.targets is not None and self.iteration % self.targets.every == 0
         depth = self.targets.at(frame) if due and self.targets is not None else None
-        numbers = from_numpy(np.array([asked, 1.0 - share, share, still_weight(self.progress, s)], np.float32))
+        numbers = from_numpy(np.array([field_time, 1.0 - share, share, still_weight(self.progress, s)], np.float32))
         ignored = self.ignored.get(index)
         movers = self.softened.movers_at(frame, self.progress)
         facts = StepFacts(

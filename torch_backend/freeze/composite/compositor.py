@@ -139,10 +139,14 @@ class Compositor:
         target = target_view(self.seen, output, frozen, image, width, height)
         usable = [frame for frame in self.seen.frames if frame not in withheld]
         primary = primary_plate(self.seen, output, target, usable)
-        given = primary_matte(self.seen, self.config, output, target, primary, usable, (width, height))
-        bars = self._keep_bars(given.matte, primary) if given.is_identity and primary == output.frame else None
-        fillers = fillers_of(self.seen, self.config, target, given.matte, primary, usable)
-        made = self._mix_frame(target, primary, given, fillers)
+        primary_part = primary_matte(self.seen, self.config, output, target, primary, usable, (width, height))
+        bars = (
+            self._keep_bars(primary_part.matte, primary)
+            if primary_part.is_identity and primary == output.frame
+            else None
+        )
+        fillers = fillers_of(self.seen, self.config, target, primary_part.matte, primary, usable)
+        made = self._mix_frame(target, primary, primary_part, fillers)
         if bars is not None:  # they are shown as they are, at every instant
             made.support[bars], made.motion[bars] = 1.0, 0.0
         return made

@@ -96,8 +96,8 @@ class MeasuredDepths:
         image = render_frozen(frozen, scene.viewmats[i], K, width, height)
         splats = (1.0 / image.depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE)).numpy()
         inverse, sigma = found.numpy()
-        there = inverse > 0
-        moving = there & (image.motion.numpy() > 0.5)
+        has_depth = inverse > 0
+        moving = has_depth & (image.motion.numpy() > 0.5)
         if not moving.any():
             return None
         own = float(np.median(sigma[moving] / inverse[moving]))
@@ -105,7 +105,7 @@ class MeasuredDepths:
         splat_noise = float(np.sqrt(max(apart**2 - own**2, self.config.noise**2)))
         pose = scene.viewmats[i].double().numpy(), K.double().numpy()
         # Where the map knows nothing it agrees with the splats, and is not sure of it.
-        measured = np.where(there, inverse, splats), np.where(there, sigma, 10.0 * splats)
+        measured = np.where(has_depth, inverse, splats), np.where(has_depth, sigma, 10.0 * splats)
         none = np.zeros_like(splats)
         return InstantDepth(
             KeyView(*pose, none, none, splats, self.config.noise * splats),

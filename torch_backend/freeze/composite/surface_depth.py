@@ -201,13 +201,13 @@ class Place:
         """Of the points of `view` at `inverse` [h, w] along `rays` [h, w, 3]."""
         turn, shift = between(view.viewmat, other.viewmat)
         points = rays @ turn.T + inverse[..., None] * shift
-        ahead = points[..., 2] > 1e-3
-        depth = np.where(ahead, points[..., 2], 1.0)
+        in_front = points[..., 2] > 1e-3
+        depth = np.where(in_front, points[..., 2], 1.0)
         fx, fy, cx, cy = (float(other.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
         x, y = points[..., 0] / depth, points[..., 1] / depth
         dx, dy = (f * (shift[i] - at * shift[2]) / depth for i, f, at in ((0, fx, x), (1, fy, y)))
-        outside = np.where(ahead, 0.0, -1e6).astype(np.float32)
-        places = fx * x + (cx - 0.5) + outside, fy * y + (cy - 0.5), dx, dy, ahead * inverse / depth
+        outside = np.where(in_front, 0.0, -1e6).astype(np.float32)
+        places = fx * x + (cx - 0.5) + outside, fy * y + (cy - 0.5), dx, dy, in_front * inverse / depth
         return cls(*(a.astype(np.float32) for a in places))
 
     def look(self, picture: Array) -> Array:
@@ -336,12 +336,12 @@ def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[A
     `inverse` [h, w] is where to begin. A point's place in the key view hangs on its depth; two rounds settle it.
     """
     turn, shift = between(view.viewmat, key.viewmat)
-    ahead = (rays @ turn.T)[..., 2]
+    along_axis = (rays @ turn.T)[..., 2]
 
     def once(inverse: Array) -> tuple[Array, Array]:
         place = Place.of(view, key, rays, inverse)
         depth = place.look(key.inverse)
-        better = depth * ahead / np.maximum(1.0 - depth * shift[2], 1e-3)
+        better = depth * along_axis / np.maximum(1.0 - depth * shift[2], 1e-3)
         better = np.maximum(np.where(depth > 0, better, inverse), LEAST_INVERSE).astype(np.float32)
         return better, np.where(depth > 0, place.look(key.sigma) * better / np.maximum(depth, LEAST_INVERSE), 0.0)
 
@@ -398,12 +398,12 @@ def _from_windows(
         lines = [m[at + dy] for m in windows]
         for dx in (-config.radii[0], 0, config.radii[0]):
             columns = slice(border + dx, border + dx + w)
-            level, along, below, fit, variance, *there = (
+            level, along, below, fit, variance, *window_colors = (
                 cv2.resize(m[:, columns], (width, rows), interpolation=cv2.INTER_NEAREST) for m in lines
             )
             guess = level + along * x + below * y - rough
             off = np.zeros_like(rough)
-            for one, other in zip(there, colors, strict=True):
+            for one, other in zip(window_colors, colors, strict=True):
                 off += np.square((one - other) * np.float32(1.0 / config.color))
             # Splats have the last word among windows of one colour, and none where the picture's colour denies them.
             weight = fit * np.exp(-0.5 * off) * (np.exp(-0.5 * np.square(guess * near)) + config.outlier)
@@ -449,13 +449,13 @@ class FrameDepths:
             picture: [H, W, 3] the finished frame, display-referred.
             measured: what the artist's depth maps say of the instant, if anything.
         """
-        there = depth < NO_DEPTH
-        inverse = torch.where(there, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE), 0.0)
+        has_depth = depth < NO_DEPTH
+        inverse = torch.where(has_depth, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE), 0.0)
         splats = Splats(viewmat.double().numpy(), K.double().numpy(), inverse.numpy(), motion.numpy())
         shown = picture.clamp(0.0, 1.0).numpy()
         found, sigma = (from_numpy(a) for a in frame_depth(self.surfaces, splats, shown, measured))
-        refined = torch.where(there, 1.0 / found.clamp_min(LEAST_INVERSE), NO_DEPTH)
-        return refined, torch.where(there, sigma * refined.square(), 0.0)
+        refined = torch.where(has_depth, 1.0 / found.clamp_min(LEAST_INVERSE), NO_DEPTH)
+        return refined, torch.where(has_depth, sigma * refined.square(), 0.0)
 
     def _key(self, shot: Shot, frame: int, still: FrozenGaussians) -> KeyView:
         import cv2

@@ -87,26 +87,26 @@ class Instants:
         return load_developed(self.shot, self.run, int(t_star), self._field(t_star), self.config, self.query)
 
     def _develop(self, t_star: float, report: Reporter, n: int = 0, count: int = 1) -> FrozenGaussians:
-        told: set[int] = set()
+        warned: set[int] = set()
 
         def check(done: int, steps: int) -> None:
             report.check_cancelled()
-            if done not in told:  # before the first step it is asked often
-                told.add(done)
+            if done not in warned:  # before the first step it is asked often
+                warned.add(done)
                 text = f"t* {int(t_star)}, step {done} of {steps}"
                 report.progress("developing", n * steps + done, count * steps, text)
 
         frozen = self._field(t_star)
         made = _make(self.shot, self.run, self.scene, int(t_star), frozen, self.config, check)
         # Another job may have developed it meanwhile, and others may be at work with that one: the first stays.
-        there = self._kept(t_star)
-        made = made if there is None else there
+        stored = self._kept(t_star)
+        made = made if stored is None else stored
         self._at = t_star, made
         report.progress("developing", n + 1, count, f"t* {int(t_star)}")
         if self.run.stale:
             self._held[t_star] = made
             return made
-        if there is not None:
+        if stored is not None:
             return made
         try:
             _save(self.shot, self.run, int(t_star), frozen, made, self.keys[t_star])

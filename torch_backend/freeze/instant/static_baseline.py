@@ -151,21 +151,23 @@ class _Pair:
             dim=-1,
         )
         first, second = (gathered(scene.state, *camera, stacked)[self.rows] for scene in self.scenes)
-        told = (first + second).reshape(len(self.rows), len(masks), 3)
+        sums = (first + second).reshape(len(self.rows), len(masks), 3)
         if then is None:
-            return told[:, 0, :2]
+            return sums[:, 0, :2]
         near = norm(self.scenes[0].state["means"][self.rows] - self.plates.centre(frame), -1) <= self.from_near
-        told = torch.where(near[:, None], told[:, 0], told[:, 1])
+        sums = torch.where(near[:, None], sums[:, 0], sums[:, 1])
         went = self._travel(then, frame) > self.sways
-        self.went |= went & (told[:, 1] > SEEN)
-        told[:, 0] -= told[:, 2] * (near | went)
-        return told[:, :2]
+        self.went |= went & (sums[:, 1] > SEEN)
+        sums[:, 0] -= sums[:, 2] * (near | went)
+        return sums[:, :2]
 
     def _travel(self, then: FrozenGaussians, frame: int) -> Tensor:
         """[M] pixels by which the rows move from t* to a frame's own time, as that frame sees it."""
         viewmat, K, _, _ = self.plates.camera(frame)
-        here, there = (project(scene.state["means"][self.rows], viewmat, K)[0] for scene in (self.scenes[0], then))
-        return norm(here - there, -1)
+        pixels_now, pixels_then = (
+            project(scene.state["means"][self.rows], viewmat, K)[0] for scene in (self.scenes[0], then)
+        )
+        return norm(pixels_now - pixels_then, -1)
 
     @torch.no_grad()
     def _shown(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:

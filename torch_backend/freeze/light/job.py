@@ -111,13 +111,13 @@ def _rendered(
 ) -> LightFacts:
     """Renders, fills and writes a panorama. JobError if nothing is seen from the point, or the disk is full."""
     report.progress("making the light", 0, len(sphere.FACES) + 1, "reading splats")
-    told, scene = read_json(folder.facts), load_scene(shot)
-    left = Similarity.of(placement_of(told))  # where the splats in the file stand
+    record, scene = read_json(folder.facts), load_scene(shot)
+    left = Similarity.of(placement_of(record))  # where the splats in the file stand
     change = Similarity.of(placement).after(left.inverse())
     cameras = left.points(camera_to_world(path_viewmats(load_cameras(shot)))[:, :3, 3])
     kept = cameras[evenly_spaced(len(cameras), config.cameras)]
     splats = seen_from(read_ply(folder.ply), change.inverse().points(point), kept, config)
-    splats.colors = _exposed(shot, told, scene, splats.colors, report)
+    splats.colors = _exposed(shot, record, scene, splats.colors, report)
     seen = render_panorama(splats, change.rotation, scene.display, config, report)
     try:
         light, share = sphere.filled(seen)

@@ -70,9 +70,9 @@ def panorama(width: int, render: Callable[[NDArray[np.float64]], NDArray[np.floa
     weights = np.zeros((fine // 2, fine, 1), np.float32)
     for rotation in face_rotations():
         x, y, z = np.moveaxis(along @ rotation.T.astype(np.float32), -1, 0)
-        ahead = np.maximum(z, np.float32(1e-6))
+        positive_z = np.maximum(z, np.float32(1e-6))
         weight = (_fade(x, z) * _fade(y, z))[..., None]
-        columns, rows = (focal * part / ahead + np.float32(side / 2.0 - 0.5) for part in (x, y))
+        columns, rows = (focal * part / positive_z + np.float32(side / 2.0 - 0.5) for part in (x, y))
         face = cv2.remap(render(rotation), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         total += weight * face
         weights += weight

@@ -76,7 +76,7 @@ def carry(
         frame = read(number)
         frozen = frozen_at(frame.t_star)
         if number == order[0]:
-            votes = {name: rule_out(told, frozen.state["means"]) for name, told in votes.items()}
+            votes = {name: rule_out(vote, frozen.state["means"]) for name, vote in votes.items()}
         mattes: dict[str, Matte] = {}
         for name in polygons:
             lasso = drawn.get((number, name))

@@ -93,8 +93,13 @@ def write_cryptomatte(
     spec = linear_spec(shape[1], shape[0], names, (oiio.FLOAT,) * len(names))
     layer = CRYPTOMATTE
     where = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
-    told = {"name": layer, "hash": "MurmurHash3_32", "conversion": "uint32_to_float32", "manifest": manifest([*mattes])}
-    for name, value in told.items():
+    attributes = {
+        "name": layer,
+        "hash": "MurmurHash3_32",
+        "conversion": "uint32_to_float32",
+        "manifest": manifest([*mattes]),
+    }
+    for name, value in attributes.items():
         spec.attribute(f"{where}/{name}", value)
     if key:
         spec.attribute("splannequin:key", key)

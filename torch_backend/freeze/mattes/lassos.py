@@ -95,5 +95,5 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 def _scale(row: Mapping[str, Any], name: str, size: int) -> float:
     """Pixels of the take's frames per pixel of the picture that a lasso was drawn on."""
-    given = row.get(name)
-    return size / given if _is_number(given) and given > 0 else 1.0
+    value = row.get(name)
+    return size / value if _is_number(value) and value > 0 else 1.0

@@ -66,13 +66,13 @@ def refine(
     `known` [H, W] in 0..1 is the share of each pixel that some vote was about: the picture decides about the rest.
     """
     config = config or SegmentConfig()
-    told = known > 0.5
-    inside = (rendered > 0.5) & told
+    is_known = known > 0.5
+    inside = (rendered > 0.5) & is_known
     if not inside.any():
         return np.zeros_like(rendered)
     band = max(2, round(config.band * picture.shape[1]))
-    prior = np.where(told, config.prior / band * signed_distance(inside), -config.prior)
-    return _cut(picture, depth, prior, told & ~_grown(inside, band), config)
+    prior = np.where(is_known, config.prior / band * signed_distance(inside), -config.prior)
+    return _cut(picture, depth, prior, is_known & ~_grown(inside, band), config)
 
 
 def signed_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -160,7 +160,7 @@ def write_surface(path: Path, header: SurfaceHeader, vertices: NDArray[np.float3
     faces["corners"], faces["people"] = 3, surface.people
     for n, corner in enumerate("abc"):
         faces[corner] = surface.triangles[:, n]
-    with atomic_path(path) as beside, open(beside, "wb") as handle:
+    with atomic_path(path) as partial, open(partial, "wb") as handle:
         handle.write(header.to_bytes())
         handle.write(points.data)  # `tofile` would not say that the disk is full
         handle.write(faces.data)

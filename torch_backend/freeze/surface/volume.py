@@ -72,9 +72,9 @@ class View:
         moved = points @ self.viewmat[:3, :3].T.astype(points.dtype) + self.viewmat[:3, 3].astype(points.dtype)
         depth = moved[..., 2]
         is_ahead = depth > 0.0
-        ahead = np.where(is_ahead, depth, 1.0)
-        x = np.where(is_ahead, self.K[0, 0] * moved[..., 0] / ahead + (self.K[0, 2] - 0.5), -2.0)
-        y = np.where(is_ahead, self.K[1, 1] * moved[..., 1] / ahead + (self.K[1, 2] - 0.5), -2.0)
+        safe_depth = np.where(is_ahead, depth, 1.0)
+        x = np.where(is_ahead, self.K[0, 0] * moved[..., 0] / safe_depth + (self.K[0, 2] - 0.5), -2.0)
+        y = np.where(is_ahead, self.K[1, 1] * moved[..., 1] / safe_depth + (self.K[1, 2] - 0.5), -2.0)
         return x.astype(np.float32), y.astype(np.float32), depth.astype(np.float32)
 
     def look(self, picture: NDArray[Any], x: NDArray[Any], y: NDArray[Any], nearest: bool = False) -> NDArray[Any]:

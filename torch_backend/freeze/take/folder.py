@@ -49,21 +49,21 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
     folder, spec = take.folder, take.spec
     make_folders(folder, spec)
     keys = stored_keys(folder, spec) if params.only_missing else {}
-    here, beside, of_before = right_frames(take, keys), folder.next, "" in keys.values()
-    there = set[int]()
-    if params.only_missing and beside.root.is_dir():
-        there = right_frames(take, stored_keys(beside, spec))
-    for n in set(_numbers(beside)) - there:
-        for file in files_of(beside, n):
+    right, next_folder, of_before = right_frames(take, keys), folder.next, "" in keys.values()
+    right_in_next = set[int]()
+    if params.only_missing and next_folder.root.is_dir():
+        right_in_next = right_frames(take, stored_keys(next_folder, spec))
+    for n in set(_numbers(next_folder)) - right_in_next:
+        for file in files_of(next_folder, n):
             remove_file(file)
-    stands = folder.facts.is_file() and bool(set(frames_of(folder)) - here)
+    stands = folder.facts.is_file() and bool(set(frames_of(folder)) - right)
     if not stands:
-        place = Place(folder, beside, here, there)
-        if beside.root.is_dir():  # killed while it took over
+        place = Place(folder, next_folder, right, right_in_next)
+        if next_folder.root.is_dir():  # killed while it took over
             take_over(take, place)
-        return Place(folder, None, here | there, set(), of_before)
-    _prepare(beside, spec)
-    return Place(beside, beside, here, there, of_before)
+        return Place(folder, None, right | right_in_next, set(), of_before)
+    _prepare(next_folder, spec)
+    return Place(next_folder, next_folder, right, right_in_next, of_before)
 
 
 def right_frames(take: PlannedTake, keys: dict[int, str | None]) -> set[int]:

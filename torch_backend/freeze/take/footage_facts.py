@@ -32,7 +32,7 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     info, lens = plates.original(), plates.lens()
     if info is None:
         return {}
-    unlike = info.unlike or _unsteady(shot, info.fps) or ("its lens changes between frames" if lens is None else "")
+    reason = info.unlike or _unsteady(shot, info.fps) or ("its lens changes between frames" if lens is None else "")
     shift = recorded_shift(load_frames(shot))
     facts = {
         "file": os.path.abspath(info.file),
@@ -44,10 +44,10 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
         "probe": list(info.probe),
         "space": info.reading.get("colour", ""),
         "map": "",
-        "unlike": unlike,
+        "unlike": reason,
         "orientation": info.reading.get("orientation", 1),
     }
-    if lens is not None and not lens.is_none and not unlike:
+    if lens is not None and not lens.is_none and not reason:
         key = content_key(1, plates.key, info.width, info.height)
         write_plate_map(take / TAKE_UNDISTORT, lens, info.width, info.height, key)
         facts["map"] = TAKE_UNDISTORT.as_posix()
@@ -57,8 +57,8 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
 def footage_light(shot: Shot) -> str:
     """Which of `LIGHTS` the footage holds, and frozen frames leave in; Rec.709's for all that is none of them."""
     reading: dict[str, Any] = load_frames(shot).get("reading") or {}
-    told = str(reading.get("light", ""))
-    return told if told in LIGHTS else LIGHTS[0]
+    light = str(reading.get("light", ""))
+    return light if light in LIGHTS else LIGHTS[0]
 
 
 def _unsteady(shot: Shot, fps: float) -> str:

@@ -172,10 +172,10 @@ def missable(what: str, report: Reporter) -> Generator[None]:
     try:
         yield
     except OSError as error:
-        told = None if is_disk_full(error) else path_error(error)
-        if told is None:
+        known = None if is_disk_full(error) else path_error(error)
+        if known is None:
             raise
-        report.warning(f"The {what} is not written: {told.message}", "The frames are. Close it, then freeze again.")
+        report.warning(f"The {what} is not written: {known.message}", "The frames are. Close it, then freeze again.")
 
 
 def _made_of(folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]) -> dict[str, Any]:

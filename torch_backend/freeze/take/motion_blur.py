@@ -116,9 +116,9 @@ class MotionBlur:
         for share in (-0.5, 0.5):
             camera = self.at(output, share)
             lens = camera.K.double() + (K - output.K).double()  # as much overscan as this frame has
-            seen, ahead = project(points, camera.viewmat.double(), lens)
+            seen, seen_depth = project(points, camera.viewmat.double(), lens)
             way = torch.hypot(*(seen - at).unbind(-1))
-            total += torch.where(solid & (ahead > 1e-6), way, 0.0)
+            total += torch.where(solid & (seen_depth > 1e-6), way, 0.0)
         return total
 
     def _beside(self, output: OutputFrame) -> list[OutputFrame]:

@@ -122,9 +122,9 @@ class Passes:
             viewmat = other.viewmat.double().numpy()
             local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
             is_ahead = is_solid & (local[..., 2] > _NEAREST)
-            ahead = np.where(is_ahead, local[..., 2], 1.0)
-            across = its_lens[0, 0] * local[..., 0] / ahead + its_lens[0, 2] - x
-            down = its_lens[1, 1] * local[..., 1] / ahead + its_lens[1, 2] - y
+            safe_z = np.where(is_ahead, local[..., 2], 1.0)
+            across = its_lens[0, 0] * local[..., 0] / safe_z + its_lens[0, 2] - x
+            down = its_lens[1, 1] * local[..., 1] / safe_z + its_lens[1, 2] - y
             found[..., at] = np.where(is_ahead, across, 0.0)
             found[..., at + 1] = np.where(is_ahead, -down, 0.0)
         return found

@@ -91,13 +91,13 @@ def export_splats(shot: Shot, kind: str, folder: Path, take: str, placement: str
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
-    there = TakeFolder(shot.take(take))
-    if not there.facts.is_file() or not there.ply.is_file():
+    take_folder = TakeFolder(shot.take(take))
+    if not take_folder.facts.is_file() or not take_folder.ply.is_file():
         raise JobError(f"Take {take} of {shot.root.name} has no splats.", "Freeze it first.", ExitCode.USAGE)
-    facts = read_json(there.facts)
+    facts = read_json(take_folder.facts)
     target = placement_for(shot, placement)
     change = Similarity.of(target).after(Similarity.of(placement_of(facts)).inverse())
-    splats = placed(read_ply(there.ply), change)
+    splats = placed(read_ply(take_folder.ply), change)
     if kind == "ply":
         return [write_ply(folder / PLY_FILE, *splats)]
     cameras = camera_path_of(shot, str(facts.get("camera_path", "")))

@@ -36,7 +36,10 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
         raise ValueError("frames should hold at least one frame, got none")
     shape = _checked(first, 0, None).shape
     # FFmpeg's errors are OSErrors with its errno, a full disk's among them.
-    with atomic_path(path) as beside, av.open(str(beside), "w", format="mp4", options={"movflags": "faststart"}) as mp4:
+    with (
+        atomic_path(path) as partial,
+        av.open(str(partial), "w", format="mp4", options={"movflags": "faststart"}) as mp4,
+    ):
         output: Any = mp4  # PyAV does not say what its packets are packets of
         stream = _add_stream(mp4, codec, rate, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
         output.mux(stream.encode(_picture(first, 0, rate)))

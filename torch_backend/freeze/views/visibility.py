@@ -70,8 +70,8 @@ def visible_pixels(
     ignored = None if ignored is None else ignored.contiguous()
     camera = torch.cat([viewmat[:3].flatten(), torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])]).float().contiguous()
     settings = torch.tensor([tolerance, soft], device="cpu")
-    given = [value for value in (points, surface, ignored, camera) if value is not None]
-    if any(value.dtype != torch.float32 or value.device.type != "cpu" for value in given):
+    tensors = [value for value in (points, surface, ignored, camera) if value is not None]
+    if any(value.dtype != torch.float32 or value.device.type != "cpu" for value in tensors):
         raise ValueError("points, cameras, surface and ignored must be float32 and on the CPU")
     pixels = torch.empty(*shape, 2, device="cpu")
     depth, visible, moving, explained = (torch.empty(shape, device="cpu") for _ in range(4))
