@@ -139,8 +139,8 @@ def run_child(
 
 
 def _lines_of(child: subprocess.Popen[bytes]) -> Iterator[bytes]:
-    """What a child prints, as it comes. A thread reads it, also after a Ctrl-C: on Windows nothing interrupts a read,
-    and a child that nobody reads stands still in its next word, instead of coming to its end."""
+    """Yields what a child prints, as it arrives. A thread reads it, also after a Ctrl-C: on Windows a read cannot be
+    interrupted, and a child whose output is not read blocks at its next print instead of ending."""
     lines: queue.Queue[bytes | None] = queue.Queue()
 
     def read() -> None:

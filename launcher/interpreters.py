@@ -77,6 +77,6 @@ def hand_over_to_newer_python() -> int:
         )
         return 9
     command = [newer, str(ROOT / "splannequin.py"), *sys.argv[1:]]
-    if WINDOWS:  # a program that takes another's place there is a second one, which nobody waits for
+    if WINDOWS:  # on Windows execv starts a second process, for which the shell does not wait
         return subprocess.call(command)
     os.execv(newer, command)  # noqa: S606  (no shell is wanted)

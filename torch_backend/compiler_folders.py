@@ -128,7 +128,7 @@ def _writable(environ: Mapping[str, str]) -> Path | None:
     """A folder of this user's with an ASCII name that can be written; None if there is none."""
     user = hashlib.sha256(environ.get("USERPROFILE", environ.get("USERNAME", "")).encode()).hexdigest()[:8]
     for base in _bases(environ):
-        # Not in a folder that users share: whoever owns that could put another one in this one's place.
+        # Not inside a folder that users share: its owner could replace this folder by another.
         folder = base / f"{_FOLDER}-{user}"
         try:
             base.mkdir(parents=True, exist_ok=True)
@@ -212,7 +212,7 @@ else:
         os.mkdir(folder, 0o700)
 
     def is_private(folder: Path) -> bool:
-        """True if a folder, and no link to one, is this user's, and no other may write there."""
+        """True for a folder (not a link) that this user owns and that no other user may write to."""
         found = os.lstat(folder)
         return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o022
 

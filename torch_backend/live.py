@@ -55,7 +55,7 @@ _COARSER = 1.25
 _DETAIL = CompositeConfig(sources=4, source_views=VisibilityConfig(width=320))
 """A take looks at more plates, more finely: there a plate serves a frame and its neighbours, here perhaps one view."""
 _TINT, _TINTED = (1.0, 0.15, 0.55), 0.75
-"""Display-referred colour of what is a guess, and how much of it covers what nobody saw at all."""
+"""Display-referred tint of guessed pixels, and its opacity where no frame supports the pixel at all."""
 
 
 class Superseded(Exception):
@@ -261,7 +261,7 @@ class _Waiting:
                     self._views[request.view] = request
                     self._change.notify()
         except (OSError, ValueError):
-            pass  # nobody who could be told: the session ends
+            pass  # the client is gone, so the session ends without an error
         with self._change:
             self._ended = True
             self._change.notify()

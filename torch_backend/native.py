@@ -180,10 +180,10 @@ class _Ask:
         self._left: list[None] = []
         self._told: SimpleQueue[None] = SimpleQueue()
         self.errors: list[BaseException] = []
-        """What workers ended with that did not end well."""
+        """Exceptions of workers that failed."""
 
     def help(self) -> None:
-        """A worker of the crew's: one that nobody has begun, if there still is one."""
+        """Runs one pending worker on a thread of the crew, if there is one left."""
         self._entered.append(None)
         try:
             self._take(self._pending.pop)
@@ -192,8 +192,8 @@ class _Ask:
             self._told.put(None)
 
     def carry_out(self, crew: "_Crew", helpers: int) -> None:
-        """The caller's: asks for helpers, does all that nobody has begun, waits for who has. Returns, also after a
-        Ctrl-C, when nobody is at the block.
+        """Runs on the calling thread: asks for helpers, carries out all pending workers, then waits for the helpers.
+        Returns only when no thread works on the block, also after a Ctrl-C.
 
         Helpers are asked in here, and the loop that waits is another function's: Python looks for a Ctrl-C as a
         function begins and as a loop turns, and that has to be within `try`.
@@ -212,7 +212,7 @@ class _Ask:
         while True:
             while self._take(self._pending.popleft):
                 pass
-            left = len(self._left)  # before who entered: who did so meanwhile is waited for
+            left = len(self._left)  # read before `_entered`, so that a helper that enters meanwhile is waited for
             if left == len(self._entered):
                 return
             with contextlib.suppress(Empty):
@@ -225,7 +225,7 @@ class _Ask:
             return False
         try:
             self._run(self._address, self._stage, worker)
-        except BaseException as raised:  # whoever asked raises it
+        except BaseException as raised:  # raised again by the caller
             self.errors.append(raised)
         return True
 
@@ -247,7 +247,7 @@ class _Crew:
                     except RuntimeError:
                         break
                     self._threads += 1
-        for _ in range(min(helpers, self._threads)):  # what nobody takes would lie there for good
+        for _ in range(min(helpers, self._threads)):  # without a thread to take it, a request would stay in the queue
             self._asked.put(ask)
 
     def _work(self) -> None:
@@ -334,7 +334,7 @@ def launch_on(
         dim: threads.
         inputs: numbers, or ctypes structures in the layout of a Warp structure.
         block: threads of a block (default: Warp's).
-        stream: what `warp_stream` says of the device, from whoever launches several.
+        stream: result of `warp_stream(device)`, for callers with several launches.
     """
     if not dim:
         return

@@ -3,8 +3,8 @@
 Until all of the new solve is written, nothing of the old one is touched. Then one rename, of `solve/next.partial` to
 `solve/next`, says that the new one holds, and its files are moved to where readers look for them. Between the first of
 these renames and the last (a millisecond for a clip of 75 frames) a reader may see new frames with old cameras; a
-process that is killed just there leaves `solve/next`, and whoever opens the shot next moves what remains. That is why
-this stands below `shot` and not in the solve's own folder.
+process that is killed in between leaves `solve/next`, and the next process that opens the shot moves the rest. That is
+why this stands below `shot` and not in the solve's own folder.
 """
 
 from __future__ import annotations

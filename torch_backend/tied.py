@@ -1,7 +1,7 @@
 """`python -m torch_backend.tied MODULE ARGUMENTS...`: `python -m MODULE` that ends when whoever started it does.
 
-The launcher starts the backend, venv and pip so: killed in a way that it cannot pass on, it leaves none of them at
-work. What Blender starts is not tied to it. Standard library only: any Python of the machine may run it.
+The launcher starts the backend, venv and pip this way, so that none of them outlives a launcher that is killed.
+Blender's jobs are not tied to Blender. Standard library only: any Python of the machine may run it.
 """
 
 from __future__ import annotations

@@ -55,12 +55,14 @@ def only_writer(root: Path, kind: str, job: str) -> Generator[Writer]:
 def patient_writer(
     root: Path, kind: str, job: str, waiting: Callable[[str], None], silence: float = SILENCE_SECONDS
 ) -> Generator[Writer]:
-    """`only_writer` that waits for whoever holds the shot, and takes it from one that died on another computer.
+    """`only_writer` that waits while another process holds the lock, and takes over the lock of a process that died on
+    another computer.
 
-    For render farms, which start what was killed again elsewhere: nobody is there to delete the lock.
+    For render farms, which restart killed tasks on other computers, where no user is there to delete the lock.
 
     Args:
-        waiting: called every now and then with a sentence that says for whom; what it raises ends the waiting.
+        waiting: called regularly with a sentence that names the process waited for; an exception from it ends the
+            waiting.
         silence: seconds, by this computer's clock alone, without a sign of life after which a writer counts as dead.
 
     Raises:

@@ -39,11 +39,11 @@ class Setting:
     owner: str
     """What has the setting, as a path from the scene; empty: the scene."""
     name: str
-    """Name of the setting. A Blender that lacks it passes the row over."""
+    """Name of the setting. The row is skipped in a Blender that lacks it."""
     values: tuple[Any, ...]
     """Values that the bake can use. The first that this Blender knows is set, unless the setting has one of them."""
     why: str
-    """What the artist is told if it was changed; empty: nothing, since no pixel depends on it."""
+    """Sentence for the artist when the setting was changed; empty if no pixel depends on it."""
     when: str = "always"
     """When the row is in force:
 
@@ -161,7 +161,7 @@ def set_noted(scene: bpy.types.Scene, owner: str, name: str, value: Any) -> None
 
 
 def restore(scene: bpy.types.Scene) -> None:
-    """Sets back what a bake changed, but what somebody has changed since."""
+    """Restores the settings that a bake changed, except those that were changed again since."""
     noted = json.loads(scene.get(_NOTED, "[]"))
     for owner, name, before, _ in [one for one in noted if getattr(_owner(scene, one[0]), one[1]) == one[3]]:
         with contextlib.suppress(TypeError):  # an enumeration that has another value since

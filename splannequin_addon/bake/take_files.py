@@ -75,7 +75,7 @@ def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _exr_header(path: Path) -> bytes:
-    """What a file begins with, attributes first; empty if it is no OpenEXR file."""
+    """First 16 KiB of an OpenEXR file, which hold its attributes; empty for any other file."""
     with contract.open_regular(path) as source:
         header = source.read(16384)
     return header if header[:4] == b"\x76\x2f\x31\x01" else b""

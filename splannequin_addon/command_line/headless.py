@@ -421,7 +421,7 @@ def asked(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _device(args: argparse.Namespace) -> str:
-    """Where the backend works: as this command says, else as the preferences do."""
+    """Device of the backend: from the command line, else from the preferences."""
     return args.device or backend.device()
 
 

@@ -131,7 +131,7 @@ class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator)
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks first where frames on which work was done may be replaced. A script consents with `replace`."""
+        """Asks for confirmation before frames are replaced on which work was done. Scripts pass `replace` instead."""
         question = replaces(scene_in(context))
         if not question:
             return self.execute(context)

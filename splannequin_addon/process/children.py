@@ -63,7 +63,7 @@ class Question:
     """What it printed on the standard output and error."""
 
     def __post_init__(self) -> None:
-        # What it prints is read while it runs: a pipe holds 4 KB on Windows, and who has more to say waits.
+        # Its output is read while it runs: a pipe holds 4 KB on Windows, and a child that prints more blocks.
         self._reader = threading.Thread(target=self._listen, name="splannequin answer", daemon=True)
         self._reader.start()
 

@@ -62,7 +62,7 @@ class SetUp:
     said: list[str] = field(default_factory=list[str])
     """Last lines of what it said."""
     failure: str = ""
-    """Why it ended, if not well."""
+    """Why the set-up failed; empty if it did not."""
     running: bool = True
     """Until it has ended."""
 
@@ -192,7 +192,7 @@ def remove(folder: Path, wait: bool = False) -> bool:
     renamed = folder / f"{_REMOVED}{uuid.uuid4().hex[:8]}"
     os.replace(environment, renamed)
     try:
-        _nobody_in(environment)  # who began between the look and the renaming has its old path and needs the rest of it
+        _nobody_in(environment)  # a process that started since the check knows only the old path
     except AtWork:
         os.replace(renamed, environment)
         raise

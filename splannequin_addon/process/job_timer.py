@@ -160,14 +160,14 @@ def work(shot: Path, step: str, turns: Iterator[Progress | None]) -> None:
 
 
 def stop_work(watch: Watch) -> bool:
-    """Ends what the timer does in turns for a shot, which puts back what it changed. False if it does nothing."""
+    """Stops a shot's task that the timer runs in slices; the task undoes its changes. False if there is none."""
     turns = watch.work.turns if watch.work is not None else None
     if turns is None:
         return False
     watch.work = None
     if isinstance(turns, Generator):
         turns.close()
-    sequences.forget_ahead()  # what was read for it may be other by the time it is needed
+    sequences.forget_ahead()  # pictures read ahead for it may have changed when they are needed
     return True
 
 

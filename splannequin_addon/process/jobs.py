@@ -254,7 +254,7 @@ def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> 
         except KeyboardInterrupt:
             cancel(job)
     if job.process is not None:
-        # After its last word it lets go of the shot's lock; on a busy machine whoever goes on at once would meet it.
+        # The job releases the shot's lock after its last status; on a busy machine the next step would find it locked.
         with contextlib.suppress(subprocess.TimeoutExpired):
             job.process.wait(_LAST_WORD_SECONDS)
     raise_if_failed(job)

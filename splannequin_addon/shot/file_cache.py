@@ -18,7 +18,7 @@ _known: OrderedDict[tuple[Any, ...], tuple[tuple[int, ...], Any]] = OrderedDict(
 def of(path: Path, read: Callable[..., T], *words: Hashable) -> T:
     """`read(path, *words)`, remembered while file or folder is what it was: same file, same length, same times.
 
-    The value is given out again and again: nobody may change it. What `read` raises is not remembered.
+    All callers share the value: do not modify it. What `read` raises is not remembered.
 
     Args:
         path: a file, or a folder if only the names in it count.

@@ -50,5 +50,5 @@ def follow(scene: bpy.types.Scene) -> bool:
 
 
 def forget() -> None:
-    """Drops what is known of scenes, as those of another file are others."""
+    """Forgets the markers of all scenes, since another file was loaded."""
     _known.clear()

@@ -22,7 +22,7 @@ def placement_in(scene: bpy.types.Scene, shot: Path) -> contract.Placement | Non
         return None
     place, turn, stretch = root.matrix_world.decompose()
     scale = sum(abs(value) for value in stretch) / 3.0
-    # In float64: single precision leaves a large scale too far from even.
+    # In float64: in single precision a large scale would fail the test for a uniform scale.
     matrix = np.eye(4)
     matrix[:3, :3] = scale * _orthonormal(np.array(turn.to_matrix(), dtype=np.float64))
     matrix[:3, 3] = place[:]

@@ -21,7 +21,8 @@ def is_of(folder: Path, clip: str | Path) -> bool | None:
 
 
 def _told(file: Path, name: str, longest: int) -> str:
-    """What a file of the shot says under a name; empty if it cannot be read: whoever works on it says why."""
+    """Value that a file of the shot has under a name; empty if it cannot be read. The step that needs the file says
+    why."""
     try:
         return file_cache.of(file, _read, name, longest)
     except (OSError, ValueError):

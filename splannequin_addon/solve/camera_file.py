@@ -264,7 +264,7 @@ def _usd() -> Callable[[str], Any] | None:
 
 
 def _fbx() -> Callable[[str], Any] | None:
-    """The importer in C++, which Blender has from 4.5 on, or that in Python; both count from the file's time 0."""
+    """Blender's FBX importer: the C++ one (4.5 and later) or the Python one. Both start at the file's time 0."""
     wm: Any = bpy.ops.wm
     if "fbx_import" in dir(wm):
         return lambda path: wm.fbx_import(filepath=path, anim_offset=0.0)

@@ -49,7 +49,7 @@ def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
 
 
 def scaled(scene: bpy.types.Scene, shot: Path) -> bool:
-    """True if somebody gave a shot its scale: by Set Scale, or by hand on its root. A guess is none."""
+    """True if the artist has set the shot's scale: by Set Scale, or on its root. A guessed scale does not count."""
     entry = scene_objects.of(scene, shot)
     unscaled = guessed_scale(scene, shot) or 1.0
     return (entry is not None and entry.scaled) or abs(scene_objects.depth_scale(scene, shot) / unscaled - 1.0) > 1e-4

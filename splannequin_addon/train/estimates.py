@@ -48,7 +48,7 @@ def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
 
 
 def _size(run: dict[str, Any]) -> tuple[int, int]:
-    """The larger and longer, the more a run's time tells of others'."""
+    """Sort key of runs: the time of a larger and longer run predicts that of other runs best."""
     return run["width_px"], run["iterations"]
 
 

@@ -17,7 +17,7 @@ _collection: Any = None
 
 
 def icon_of(path: Path) -> int:
-    """Icon of a picture file, 0 if there is none. Read once: who has one rewritten calls `forget`."""
+    """Icon of a picture file, 0 if there is none. It is read once: call `forget` after the file is rewritten."""
     if _collection is None:
         return 0
     name = str(path)

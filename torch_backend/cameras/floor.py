@@ -17,7 +17,7 @@ LEAST_POINTS = 50
 BIG = 0.08
 """Least share of the points on the floor."""
 BELOW = 0.05
-"""Most of the points under it: outliers. A table has the floor under it."""
+"""Largest share of points below the floor, which are outliers. A table top has more: the floor's own points."""
 NEAR = 0.01
 """A point this near is on a plane, in median distances from the cameras."""
 _TRIES, _LOOKED_AT, _FINAL, _ALL = 5000, 400, 12, 3000

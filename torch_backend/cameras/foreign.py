@@ -1,4 +1,4 @@
-"""Cameras from elsewhere: a COLMAP model, a nerfstudio transforms.json, or a CameraPath, matched to a shot's frames.
+"""Imported cameras: a COLMAP model, a nerfstudio transforms.json, or a CameraPath, matched to a shot's frames.
 
 Whatever the file holds comes out as world-to-camera poses with OpenCV axes, and as lenses of four kinds with COLMAP's
 parameters: PINHOLE, OPENCV, FULL_OPENCV, OPENCV_FISHEYE. No pycolmap and no pictures: files in, plain values out.
@@ -36,7 +36,7 @@ from .poses import camera_centre
 
 LEAST_CAMERAS = 8
 LEAST_SHARE = 0.25
-"""Of the clip's frames: with fewer cameras than this, most of the path would be made up between them."""
+"""Least share of the clip's frames with a camera: with fewer, most of the path would be interpolated."""
 ASPECT_SLACK = 0.01
 """Of the ratio of width to height: what rounding to whole pixels may change."""
 RIGID_SLACK = 1e-2

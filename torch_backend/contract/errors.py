@@ -55,7 +55,7 @@ class MissingError(UserError, FileNotFoundError):
 
 
 def unexpected(what: str, error: BaseException, log: str | Path) -> JobError:
-    """The one sentence for an error that is nobody's but ours. `what` broke; its details are in `log`."""
+    """The error for a bug of ours: `what` failed, and `log` has the details."""
     text = " ".join(str(error).split())[:300]
     message = f"{what} broke: {type(error).__name__}{': ' if text else ''}{text}"
     return JobError(message, f"This is a bug; its details are in {log}.", ExitCode.INTERNAL)

@@ -168,7 +168,7 @@ def gone(shot: Path, kind: str) -> JobError:
 def runs_job(pid: int, started: float, folder: Path) -> bool:
     """True if a process is the job of a folder beyond doubt: its start, and a command line that runs that job.
 
-    A file's word for a process is not enough to end it: whoever wrote the file could have anything ended.
+    A process is never ended because a file names it: the author of the file could have any process ended.
     """
     found = process(pid) if pid > 1 else None
     if found is None or not started or found.started != started:

@@ -59,7 +59,7 @@ def gives_back(shot: Path, writer: Writer) -> bool:
 
 
 def busy(shot: Path, writer: Writer) -> JobError:
-    """What the second one who would write into a shot is told: who does, since when, where, and what to do."""
+    """The error for a job that finds the shot locked: which job holds it, since when, where, and what to do."""
     try:
         now, then = time.localtime(), time.localtime(writer.since)
         since = time.strftime("%H:%M" if now[:3] == then[:3] else "%Y-%m-%d %H:%M", then)

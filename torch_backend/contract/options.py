@@ -349,9 +349,10 @@ class SolveParams:
         tip="Mask of what may move, white: the camera is solved from the rest, and everything outside stands still. "
         "One picture for all frames, a picture of a sequence, or a video",
     )
-    """Mask of what alone may move, in white; the camera is not matched on it. Empty: everything may."""
+    """Mask (white) of the only regions that may move; the solve finds no features in them. Empty: everything may
+    move."""
     overlap: int = option(15, limit=Limit("number of following frames that are matched", 1, 31))
-    """Each solved frame is matched with those 1, 2, 4, ... frames after it: so many distances."""
+    """Number of distances at which each solved frame is matched: 1, 2, 4, ... frames after it."""
     cameras: str = option(
         "",
         flag="--cameras",

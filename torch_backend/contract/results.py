@@ -38,7 +38,7 @@ class Verdict:
     word: str
     """One of `VERDICT_WORDS`."""
     sentences: list[str]
-    """What is so."""
+    """Findings, a sentence each."""
     where: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     """Where it will not hold, worst first: `first` and `last` frame number, and `region` of the picture in words."""
     advice: list[str] = field(default_factory=list[str])

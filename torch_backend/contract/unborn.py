@@ -34,7 +34,7 @@ def refuse_foreign(folder: Path) -> None:
     """
     try:
         names = sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
-    except OSError:  # not there yet, or to be told by who makes it
+    except OSError:  # the folder does not exist yet, or making it will fail with its own error
         return
     foreign = [name for name in names if name not in SHOT_NAMES]
     if INFO_FILE not in names and foreign:

@@ -37,8 +37,9 @@ class GateConfig:
     """Who is open later on in a long run paints movers with this share of its paint in so many frames, or closes: less
     than is asked for to be opened, because mattes miss much of an arm."""
     LONG: ClassVar[int] = 3000
-    """Steps up to which that is not asked: strays are few then (6 and 25 % of the open on two clips, 60 % after 9000),
-    and developing takes who is closed for still, which costs arms of which mattes find a third."""
+    """Runs of at most this many steps do not close strays. Strays are few then (6 and 25 % of the open Gaussians on two
+    clips, 60 % after 9000 steps), and developing treats closed Gaussians as still, which costs arms of which mattes
+    find a third."""
 
     start: float = 1.0 / 3.0
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""
@@ -69,7 +70,7 @@ class GateConfig:
 
 @torch.no_grad()
 def painted(model: Gaussians) -> Tensor:
-    """bool [N]: who has contributed to any training frame."""
+    """bool [N]: Gaussians that have contributed to any training frame."""
     return model.support.any(1)
 
 
@@ -88,8 +89,8 @@ def change_of(
         rows: [M] who.
         moments: their deltas [M] at times spread over the clip.
         pixels: [M] pixels per scene unit where each is seen from nearest.
-        seen: bool [T, M] at which of the moments somebody saw each: where nobody did, a field says anything. Who was
-            seen at none of them is asked at all. None: all were.
+        seen: bool [T, M], moments at which a frame shows each Gaussian: elsewhere the field is arbitrary. A Gaussian
+            that no moment shows is evaluated at all of them. None: all are shown.
 
     Returns:
         (change [M], mean deltas [M]): the largest departure from the mean over the moments at which each was seen.

@@ -62,7 +62,7 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
         rates: step's kind -> rate.
         card: a graphics card is asked for.
         bake: takes are baked.
-        session_tasks: tasks of a step that a host does in one session of the engine; 0: all that it does of it.
+        session_tasks: tasks of a step that a host runs in one session of the engine; 0: all of the host's tasks.
     """
     shots: dict[str, FarmShot] = {step.shot.name: step.shot for step in steps}
     chains = [[_times(step, rates) for step in steps if step.shot.name == name] for name in shots]

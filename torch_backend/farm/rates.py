@@ -57,8 +57,8 @@ WATCH_CORES = 0.015
 def measure(records: Iterable[dict[str, Any]]) -> dict[str, Rate]:
     """Rates by what tasks took (`records.read`), for those steps that there are records of.
 
-    Where tasks had different amounts to do, what is fixed and what grows are told apart by least squares, neither below
-    zero; else both are those of `MEASURED`, slower or faster by as much as the tasks were.
+    Where tasks had different amounts of work, a fixed cost and a cost per unit are fitted by non-negative least
+    squares. Otherwise both are those of `MEASURED`, scaled by how much slower or faster the tasks were.
     """
     by_step: dict[str, list[tuple[float, float, float, float]]] = {}
     for record in records:

@@ -1,9 +1,9 @@
 """Bars beside the picture: letterbox and pillars, of one colour or a blurred copy of the picture. They are no scene.
 
-A bar ends at a straight border that stands at the same row or column in every frame, while the camera moves. Outside
-of it there is one colour, or far less detail than inside and a step at the border. What is merely dark ends where the
-scene says: somewhere else in every frame, or along no line. A bar that is none costs a part of the scene, so that
-whatever is doubtful is none.
+A bar ends at a straight border that stands at the same row or column in every frame, while the camera moves. Outside of
+it there is one colour, or far less detail than inside and a step at the border. What is merely dark ends where the
+scene says: somewhere else in every frame, or along no line. A false bar would cut off a part of the scene, so a
+doubtful edge is not a bar.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def recorded_bars(record: dict[str, Any], height: int, width: int) -> Bars:
 
 
 def find_bars(pictures: Sequence[NDArray[np.uint8]]) -> Bars:
-    """The bars of grey pictures [H, W], spread over a clip; none where nobody can be sure."""
+    """The bars of grey pictures [H, W], spread over a clip; none where the evidence is weak."""
     if len(pictures) < _LEAST_FRAMES:
         return Bars()
     stack = np.stack(pictures).astype(np.float32)

@@ -42,9 +42,10 @@ def looked_at(count: int) -> list[int]:
 
 
 def find_mark(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.bool_] | None:
-    """bool [H, W]: what is burnt into grey pictures [H, W] spread over a clip; None if nothing is, or nobody can tell.
+    """bool [H, W]: what is burnt into grey pictures [H, W] spread over a clip.
 
-    Nobody can where the camera hardly moves, of few pictures, and of small ones.
+    None if nothing is, or if it cannot be decided.
+    It cannot where the camera hardly moves, or where pictures are few or small.
     """
     if len(pictures) < _LEAST_FRAMES or pictures[0].shape[1] < _LEAST_WIDTH:
         return None

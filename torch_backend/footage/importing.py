@@ -62,7 +62,7 @@ _DISK_CHECK_FRAMES = 16
 
 
 FootageConfig = ImportParams
-"""What is taken of the footage, and how large. Which footage that is, is asked for apart: `source` is not looked at."""
+"""Range, size and colour of an import. Its `source` is ignored: the footage is an argument of its own."""
 
 
 def import_footage(shot: Shot, source: str, config: FootageConfig, report: Reporter) -> dict[str, Any]:
@@ -465,7 +465,7 @@ def _news(record: dict[str, Any], source: str) -> dict[str, Any]:
 
 
 def _beside(shot: Shot, source: str) -> str:
-    """Where the footage lies seen from the shot folder, with slashes: it holds where both were moved together."""
+    """Path of the footage relative to the shot folder, with slashes, so that both can be moved together."""
     try:
         return Path(os.path.relpath(source, shot.root)).as_posix()
     except ValueError:  # another drive on Windows

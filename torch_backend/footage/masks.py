@@ -114,7 +114,7 @@ class _Reading:
         self.name = f"The mask {source}" if source != MASK_ALPHA else "The footage's alpha"
 
     def mask(self) -> Mask:
-        """All of it."""
+        """Reads all pictures of the source into one mask."""
         made = Mask(self.kind, self.size)
         pictures = self._alpha() if self.source == MASK_ALPHA else self._pictures()
         total = 0.0

@@ -77,7 +77,7 @@ def opens_as_video(path: Path) -> bool:
 
 
 def open_video(path: Path, colours: Colours | None = None, told: Told | None = None, layer: str = "") -> VideoSource:
-    """A video. JobError says of a picture, animated or not, that it is one."""
+    """Opens a video. Raises JobError for a picture, animated or not."""
     try:
         video = VideoSource(path, colours, told, layer)
     except JobError as error:

@@ -1,4 +1,4 @@
-"""How footage was read, in words for the one who shot it."""
+"""Sentences for the artist about how footage was read."""
 
 from __future__ import annotations
 

@@ -22,11 +22,11 @@ from .av_types import seconds_of
 from .sources import Known, footage_error
 
 _THREADS = 2
-"""Of the decoder; each of them holds frames of its own."""
+"""Threads of the decoder; each holds its own frames."""
 _KEPT = 4
-"""Decoded frames held after those that were asked for: neighbours are asked for next, also backwards."""
+"""Number of decoded frames kept: the next request is usually for a neighbour, forwards or backwards."""
 _AHEAD = 32
-"""Frames that are rather decoded than jumped over: key frames mostly lie farther apart."""
+"""Distance in frames up to which decoding on is faster than seeking: key frames are usually farther apart."""
 _EARLIER = (0.0, 1.0, 5.0, 20.0)
 """Seconds before a frame at which a key frame is looked for, in this order."""
 _LEAST_GAP = 1e-5

@@ -100,7 +100,7 @@ def unreadable_pictures(pattern: str) -> JobError:
 def _names_in(folder: Path) -> list[str]:
     try:
         with os.scandir(folder) as entries:
-            # A dot: what macOS and programs keep beside a file under its name.
+            # Names with a leading dot are metadata that macOS and other programs store next to a file.
             return [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
     except OSError:
         return []

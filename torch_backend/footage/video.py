@@ -57,7 +57,7 @@ _ANIMATED_PICTURES = {"apng", "gif"}
 
 # Code points of ITU-T H.273, as stored in the stream.
 UNSAID = (0, 2, 3)
-"""Of primaries and transfer functions: reserved, or not known to the one who wrote the file."""
+"""Codes of primaries and transfer functions that mean reserved or unspecified."""
 TRANSFERS = {
     1: "g24", 4: "g22", 5: "g24", 6: "g24", 7: "g24", 8: "lin", 11: "g24", 12: "g24", 13: "srgb", 14: "g24",
     15: "g24", 16: "pq", 18: "hlg",

@@ -97,7 +97,7 @@ def streams_of(container: Any, path: Path) -> list[Any]:
 def alpha_decoder_of(stream: Any) -> str:
     """The decoder that gives the alpha of a clip whose own leaves it out; empty if its own does, or there is none.
 
-    VP8 and VP9 keep alpha as a second picture beside the first, which only Google's own decoder puts to it.
+    VP8 and VP9 store alpha as a second picture, which only Google's libvpx decoder joins with the first.
     """
     marked = {key.lower(): str(value) for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
     decoder = {"vp8": "libvpx", "vp9": "libvpx-vp9"}.get(stream.codec_context.name, "")

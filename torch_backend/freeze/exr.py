@@ -326,7 +326,7 @@ def read_key(path: str | Path) -> str | None:
     except (OSError, ValueError):
         return None
     if image is None:
-        oiio.geterror()  # else it is told to whoever asks next
+        oiio.geterror()  # clears the error, which the next caller would get
         return None
     try:
         return str(image.spec().getattribute("splannequin:key") or "")

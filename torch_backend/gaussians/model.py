@@ -112,7 +112,7 @@ class Gaussians:
         model = Gaussians({name: tensors[f"gaussians.{name}"] for name in (*PARAM_NAMES, *own)}, bins)
         model.open = tensors["gaussians.open"].clone()
         model.support = unpack_bits(tensors["gaussians.support"], bins)
-        if "gaussians.hidden" in tensors:  # earlier checkpoints did not look
+        if "gaussians.hidden" in tensors:  # earlier versions did not store it
             model.hidden = unpack_bits(tensors["gaussians.hidden"], bins)
         return model
 

@@ -16,11 +16,11 @@ FISHEYE = "OPENCV_FISHEYE"
 FISHEYE_START = 0.45
 """Focal length of a fisheye before any picture was seen, as a share of the picture's width: 127 degrees wide."""
 MOST_BEND = 1.0
-"""First radial coefficient from which on a lens is none."""
+"""Largest plausible first radial coefficient."""
 RUN_OFF = 1.3
 """Times by which a solve may change a focal length that it was given, before the given one is believed instead."""
 WIDE_DEG = 100.0
-"""Angle of view from which on a lens that is no fisheye's may be one."""
+"""Angle of view from which on a lens solved without a fisheye model may be a fisheye."""
 LEFT_SHARE = 0.003
 """How far pictures without its lens may still be bent at the corners, as a share of the diagonal: 2.4 px at 640x480."""
 _SAMPLES = 2048
@@ -49,7 +49,7 @@ def doubt_of(model: str, width: int, height: int, params: Sequence[float], given
         found = "narrow" if not angle >= NARROWEST_DEG else "wide" if angle > MOST_DEG else ""
     else:
         found = doubtful(width, height, _focals(model, params), *[*bends, 0.0][:2])
-    if found in ("narrow", "wide") and given:  # who gave it knows
+    if found in ("narrow", "wide") and given:  # the artist knows the lens
         found = ""
     return found or ("bent" if impossible(model, width, height, params) else "")
 

@@ -31,7 +31,7 @@ _DONE_PX, _WRONG_PX = 1e-9, 1e-6
 _BEYOND = 0.5
 """How far out of the polynomial's box the search for a way back may go, in boxes."""
 _NONE_PX = 1e-3
-"""A lens that moves no pixel of a picture by more is none."""
+"""Largest shift in pixels of a map that counts as no distortion."""
 _GRID = 33
 """Points along a side at which a picture is tested for a fold."""
 _SLACK_PX = 0.02
@@ -261,8 +261,7 @@ def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) ->
     Args:
         lens: of any window.
         shape: width over height of the map's undistorted picture.
-        known: least x, least y, most x, most y of that picture beyond which nobody said where to look; None: all is
-            known.
+        known: least x, least y, most x, most y of the region of that picture that the map defines; None: all of it.
 
     Raises:
         JobError: (SOLVE) no part of the picture is whole.

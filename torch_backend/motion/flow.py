@@ -53,19 +53,20 @@ class FlowConfig:
     blurred: float = 0.25
     """Share of another picture's sharpness (mean square step) below which a picture is blurred beside it."""
     gone_far: float = 0.5
-    """Of a match that tells of motion, what is nowhere four key frames before and after counts so much."""
+    """Weight, relative to a moving match, of a point that is found neither four key frames before nor after."""
     better: float = 1.5
-    """By this factor the picture differs more (squared) where a still point would be seen than where it is matched."""
+    """Factor by which the squared difference at the still point's pixel must exceed that at the match to count as
+    motion."""
     haste: float = 0.3
     """Power of a pair's distance in time with which it counts for stillness: what sways is still for a moment."""
     doubt: float = 1.0
-    """So many matches that tell of motion are taken for errors."""
+    """Number of moving matches that are attributed to errors."""
     outline: float = 1.0
     """So much more of that at outlines, where flow is a mixture of two surfaces."""
     share: float = 0.4
-    """A point moves for certain if so much of what it is matched with says so."""
+    """Share of a point's matches that must show motion for a score of 1."""
     sure: float = 4.0
-    """With so many matches a point is known as well as it can be."""
+    """Number of matches from which on the confidence in a point is 1."""
     spans: tuple[int, ...] = (4, 8, 16)
     """Key frames this far before and after are laid over one by its depths, to see what is left of motion."""
     least: float = 0.67

@@ -125,11 +125,11 @@ class Leftover:
 
 
 def _drift(left: list[Map], telling: Mask, inverse: Map, unit: float) -> list[Map]:
-    """By how much x and y of the whole picture are off, [h, w] each: a poor pose, a rolling shutter, a lens.
+    """Smooth error of x and y over the whole picture, [h, w] each, as a poor pose, a rolling shutter or a lens causes
+    it.
 
-    A second-order polynomial, and what is nearer more so, as a camera that stands elsewhere sees it, through what is
-    `telling` of what is `left`, those far from it hardly counting. What moves by itself does so here and there and not
-    evenly over the picture.
+    A second-order polynomial, plus a term in inverse depth for an error of the camera's position, fitted robustly to
+    the residual flow `left` at the pixels `telling`. Movers are local, so a smooth fit leaves them in the residual.
     """
     height, width = telling.shape
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j].astype(np.float32)

@@ -64,7 +64,8 @@ class Look:
         """Mean square difference of neighbouring points."""
 
     def unlike(self, values: Map, at: tuple[Map, Map], gain: tuple[float, float]) -> Map:
-        """Mean square difference around each point between `values` and this picture, times and plus `gain`, there."""
+        """Mean squared difference around each point between `values` and this picture at `at`, after `gain` (factor,
+        offset)."""
         half = np.float32(0.5)
         shown = cv2.remap(self._smooth, at[0] - half, at[1] - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         beyond = values - np.float32(gain[1]) - shown * np.float32(gain[0])
@@ -246,7 +247,8 @@ def _counted(
         # Flow over a plain wall carries what is before it along: a match there that looks like nothing says nothing.
         smeared = found & ~away & ~alike & ~pair.right
         on += weight * ((found & ~away & ~smeared) + 0.5 * ((away & ~better) | (within & alike & ~found)))
-        # A picture lost in blur looks like nothing far from it, wherever it moves.
+        # A blurred picture matches no picture far from it in time, even where the scene stands still, so it is no
+        # evidence.
         if abs(after) <= _NEAR or look.sharpness >= config.blurred * pair.other.sharpness:
             gone[after] = within & ~alike & (~found | smeared)
     for step in config.baselines[:3]:

@@ -171,7 +171,7 @@ class _Images(NamedTuple):
     radii: Tensor
     means2d: Tensor
     weights: Tensor
-    """[2, C, N]: sum and maximum of alpha T; N is 0 where nobody wants them."""
+    """[2, C, N]: sum and maximum of alpha T; N is 0 if they were not requested."""
     top_ids: Tensor
     top_weights: Tensor
 

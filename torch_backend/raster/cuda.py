@@ -144,7 +144,7 @@ class _Demand:
             self.capacity = min(-(-wanted // _HITS_STEP) * _HITS_STEP, most)
 
     def report(self) -> None:
-        """Send the maximum to the host, behind the work queued so far; whoever asks before it arrives sees the last."""
+        """Sends the maximum to the host after the work queued so far; until it arrives, the previous value is read."""
         if not _capturing(self.most.device):
             self.echo.copy_(self.most, non_blocking=True)
 

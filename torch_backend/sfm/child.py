@@ -54,7 +54,7 @@ def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = Fals
     if answer is not None and "lacks" in answer:
         raise incomplete(answer["lacks"])
     if answer is None or code != 0:
-        report.check_cancelled()  # Ctrl-Break, as the launcher cancels on Windows, ends us both
+        report.check_cancelled()  # the launcher cancels by Ctrl-Break on Windows, which also reaches COLMAP
         need_disk(log.parent, _FULL_BYTES, "The camera solve")
         raise JobError(
             f"The camera solve broke off (COLMAP ended with code {code}): {_tail(log, start)}",

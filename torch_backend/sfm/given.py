@@ -1,4 +1,5 @@
-"""A solve whose cameras are given: what the worker's answer would be, from a file instead of the mapper."""
+"""Solves with imported cameras: builds the answer that the worker would give, from a file instead of COLMAP's
+mapper."""
 
 from __future__ import annotations
 
@@ -22,15 +23,15 @@ from .child import run_worker
 from .points import LEAST_POINTS, filter_points, refuse_narrow
 
 LEAST_AGREEMENT = 0.25
-"""Share of the keypoints matched between frames that find a point, below which given cameras are of something else.
+"""Least share of matched keypoints that triangulate to a point. Below it, imported cameras belong to another clip.
 Cameras of a rendered room: 0.93 (0.76 a frame off, 0.35 four frames off, 0.05 at random); of a real clip: 0.67."""
 POOR_AGREEMENT = 0.5
-"""Share below which they are doubted aloud."""
+"""Share below which the imported cameras are used, with a warning."""
 
 
 @dataclass
 class Taken:
-    """Given cameras, matched to a clip."""
+    """Imported cameras, matched to the frames of a clip."""
 
     solve: foreign.ForeignSolve
     """What was read."""
@@ -55,7 +56,7 @@ def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> Taken:
 def take_over(
     shot: Shot, frames: dict[str, Any], taken: Taken, options: dict[str, Any], scratch: Path, report: Reporter
 ) -> dict[str, Any]:
-    """Has the worker do what given cameras leave to do: undistort their lenses, and triangulate points if need be.
+    """Has the worker finish a solve with imported cameras: undistort the frames, and triangulate points where needed.
 
     The file's own points are taken if enough of them come with errors and tracks to train from; else points are
     triangulated with the cameras held, which also tells how well they fit.
@@ -118,7 +119,7 @@ def _own_points(taken: Taken, size: tuple[int, int]) -> dict[str, NDArray[Any]] 
 
 
 def _request(shot: Shot, solved: list[str], known: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """What the worker is asked: `solved` are names of pictures, `known` is what the cameras' file says of them."""
+    """The request to the worker. `solved` are names of pictures, `known` their cameras as the file has them."""
     return {
         "images": str(shot.raw),
         "solved": solved,
@@ -147,7 +148,7 @@ def _keep_own(
 
 
 def refuse_misfit(answer: dict[str, Any], usable: int) -> None:
-    """JobError for given cameras that nothing could be trained on, `usable` points being left to train from."""
+    """Raises JobError for imported cameras that leave too few (`usable`) points to train from."""
     agreement = answer.get("agreement", 1.0)
     if usable < LEAST_POINTS or agreement < LEAST_AGREEMENT:
         share = f", and {100 * agreement:.0f} % of what was matched" if "agreement" in answer else ""
@@ -160,7 +161,7 @@ def refuse_misfit(answer: dict[str, Any], usable: int) -> None:
 
 
 def doubts(answer: dict[str, Any]) -> list[tuple[str, str]]:
-    """(sentence, hint) for cameras that are taken, but fit the frames badly."""
+    """(sentence, hint) for imported cameras that are used although they fit the frames badly."""
     if answer.get("agreement", 1.0) >= POOR_AGREEMENT:
         return []
     share = f"{100 * answer['agreement']:.0f} %"
@@ -181,7 +182,7 @@ def _enough(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> bool:
 def _write_model(
     folder: Path, lenses: list[foreign.Lens], poses: dict[str, dict[str, Any]], points: dict[str, NDArray[Any]]
 ) -> None:
-    """The given model, of the working frames, as a solve would leave its own."""
+    """Writes the imported cameras as the COLMAP model that a solve of the working frames would leave."""
     cameras = {n: ColmapCamera(n, x.model, x.width, x.height, x.params) for n, x in enumerate(lenses, start=1)}
     images = [
         ColmapImage(n, name, camera["lens"] + 1, np.array(camera["pose"]))

@@ -108,7 +108,7 @@ class OneBar:
         return self._weights[self._stage] * (self._share - self._entered[1]) if self._stage else 0.0
 
     def _left(self) -> float:
-        """Weight of what is still to be done, if nothing is tried again."""
+        """Weight of the remaining work, if the solve is not retried."""
         after = self._order[self._order.index(self._stage) + 1 :]
         return self._weights[self._stage] * (1.0 - self._share) + sum(self._weights[name] for name in after)
 

@@ -191,7 +191,7 @@ def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: 
     new = ["ignore_mask", "people_mask"]  # solves of before had none of these
     new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # the file counts by what is in it
     new += [] if config.focal_mm else ["focal_mm", "sensor_mm", "refine_focal"]
-    new += ["retry"] if config.retry else []  # who switches it on again wants what it may find
+    new += ["retry"] if config.retry else []  # a solve without retries does not count as one with them
     for name in new:
         settings.pop(name)
     return content_key(SOLVE_VERSION, settings, frames.get("key"), *source, *(mask.key for mask in masks.values()))

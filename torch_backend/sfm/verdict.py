@@ -33,7 +33,8 @@ _BARE_HINT = "Choose a sharper range, or film with more light and texture in vie
 
 def doubt_of(moving: float) -> tuple[str, str] | None:
     """(what is wrong, what to do) with cameras that leave a share `moving` of the pixels moving by themselves; None if
-    nothing is. Cameras without depth fit their matches, and only what everything seems to do then tells of it."""
+    nothing is. Cameras without parallax fit their matches, so that the only sign of a wrong solve is that everything
+    seems to move."""
     if moving < MUCH_MOVES:
         return None
     return (

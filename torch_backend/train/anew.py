@@ -2,7 +2,7 @@
 
 runs/<name>/next/<key>/ holds what a run's folder holds, one folder for each set of settings that was begun, so neither
 a finished run nor hours of a paused one go before there is another. Inside of the run's own folder it is part of the
-run: who lists runs does not see it, who removes the run removes it.
+run: it is not listed as a run, and is removed with the run.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def begun(run: Path, key: str) -> Path | None:
 def replace_run(run: Path, done: Path) -> None:
     """Moves what was trained in `done`, a folder of `folder_for`, to the run's own; nothing else that was begun stays.
 
-    Every file is replaced at once, the checkpoint first: whoever freezes has the one or the other. `finish_replacing`
-    goes on where a killed process stopped.
+    Every file is replaced atomically, the checkpoint first, so that a freeze reads either the old run or the new one.
+    `finish_replacing` goes on where a killed process stopped.
     """
     if not (done / DEPTH_FILE).is_file() and (done / CHECKPOINT_FILE).is_file():  # else a killed process has moved it
         remove_file(run / DEPTH_FILE)

@@ -24,8 +24,8 @@ def choose_device(requested: str, report: Reporter | None = None, doing: str = "
     The first use of a card on a machine tests it, in seconds, or tens of them where nothing is compiled yet.
 
     Args:
-        report: told once, as a warning, why `auto` leaves this machine's card unused; None: nobody.
-        doing: what is done there, with which that sentence begins: "Training", "Freezing".
+        report: receives one warning that says why `auto` leaves this machine's card unused; None: no warning.
+        doing: first word of that sentence: "Training", "Freezing".
     """
     device, unused = decide_device(requested)
     if report is not None and unused is not None:
@@ -68,7 +68,7 @@ def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]
 
 
 def unused_words(unused: tuple[str, str], doing: str) -> tuple[str, str]:
-    """(sentence, hint) for whoever waits for `doing`, of what `decide_device` says."""
+    """(sentence, hint) that says why `doing` does not use the card, from the answer of `decide_device`."""
     return f"{doing} uses the processor, not the graphics card: {unused[0]}", unused[1]
 
 

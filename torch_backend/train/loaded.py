@@ -38,7 +38,8 @@ class LoadedRun:
     train_frames: list[int]
     """Frame numbers it was trained on."""
     stamp: str
-    """`contract.file_digest` of the checkpoint that the model is from: what is made of it is known by it."""
+    """`contract.file_digest` of the checkpoint. Takes and developed instants store it, to tell which checkpoint they
+    are from."""
     former_stamp: list[Any] = dataclasses.field(default_factory=list[Any])
     """The checkpoint's name, size and modification time (ns), by which earlier versions knew it."""
     depth_key: str = ""

@@ -1,10 +1,10 @@
 """How much of a card's memory a run will take, by arithmetic, and how it is made to fit before it starts.
 
 The figures are bytes of the tensors that live at once in a training step (`tests/backend/card/test_card.py` holds them
-against what a pretended card counts). What torch, its libraries and the compiled kernels take besides is `_FIXED`, what
-the allocator cannot use `_WASTE`: neither was measured on a card. A run that does not fit is made smaller in the order
-of what that costs: the frames wait in host memory; the field works in pieces and computes them again on the way back;
-fewer Gaussians.
+against what a pretended card counts). `_FIXED` stands for torch, its libraries and the compiled kernels, `_WASTE` for
+memory that the allocator cannot use; neither was measured on a card. A run that does not fit is made smaller in the
+order of what that costs: the frames wait in host memory; the field works in pieces and computes them again on the way
+back; fewer Gaussians.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LEAST = 2_000
 _FIXED = 450_000_000
 """Of a card: libraries, kernels, small tensors."""
 _WASTE = 1.15
-"""What is asked of the allocator, over what is in use."""
+"""Memory that the allocator reserves, as a multiple of the memory in use."""
 _MOVED = 14
 """Numbers of a Gaussian that a field moves."""
 _TILES = 12

@@ -71,7 +71,8 @@ def moving_frames(run: RunView, share: float) -> Tensor:
 
 
 def on_trial(run: RunView) -> Tensor:
-    """bool [N]: who the gate opens on trial: all that is painted, or of it what moves in several frames and often."""
+    """bool [N]: Gaussians that the gate opens on trial: all that contribute or, with motion mattes, those that lie on
+    moving pixels in several frames and in a large share of the frames that show them."""
     gate: GateConfig = run.config.gate
     candidates = painted(run.model.gaussians)
     if run.movers is None:
@@ -98,9 +99,9 @@ def harden(run: RunView) -> bool:
 
 @torch.no_grad()
 def close_strays(run: RunView) -> None:
-    """In a long run closes who hardly paints movers any more; its mean change stays.
+    """In a long run, closes Gaussians that hardly contribute to movers any more; they keep their mean change.
 
-    What is split while it is open leaves open children, of which many paint what stands still beside a mover.
+    Splits of open Gaussians are open, and many of them paint still surfaces next to a mover.
     """
     model, (share, frames) = run.model, GateConfig.STRAY
     rows = model.open_rows()

@@ -30,12 +30,11 @@ from .soundness import INSPECT_EVERY, Soundness
 from .step_facts import StepFacts, StepKind
 
 refused = ""
-"""What the card's self-test has against recorded steps (`device`); then each is launched. Of the process, as the card
-is."""
+"""Why the card's self-test forbids recorded steps (`device`); each kernel is then launched singly. Process-wide."""
 _SPARE = 1.5
-"""Of what a step took at its peak, how much has to be free for a recording."""
+"""Free memory that a recording needs, as a multiple of a step's peak."""
 _TRIES = 4
-"""Recordings that find less room than that, before none is tried any more."""
+"""Attempts without enough free memory after which recording is given up."""
 
 
 class RecordedRun(Protocol):

@@ -10,10 +10,11 @@ seen again in any loss. So
 - a number of the field becomes what it was when the field was last seen in order; where that is not known, the median
   of its tensor: 0 among weights, the neutral 1 in planes of time, a usual radius among radii;
 - a number of the exposure or the poses becomes 0, which is no correction;
-- a field that throws what it moves out of its place goes back to what it was as a whole, at half the learning rates:
-  whoever is out of the picture gets no gradient to come back by;
-- who is thrown so by a field in order is dropped at every round of growth: a field hides so, for all frames but a few,
-  what suits those few alone, and in a long run that becomes the tenth for which it would be put back, again and again;
+- a field that throws what it moves out of its place goes back to what it was as a whole, at half the learning rates: a
+  Gaussian outside the picture gets no gradient that would bring it back;
+- Gaussians that a sound field throws out of place are dropped at every round of growth. The field hides them so from
+  all frames but the few that they fit; in a long run they would become the tenth for which the field is reset, again
+  and again;
 - Adam's moments start at 0 wherever a number was mended, and wherever they are not finite themselves.
 
 What would leave less than half of the Gaussians is no repair: the run ends in words.
@@ -122,7 +123,7 @@ class FieldMemory:
             self._worst.copy_(torch.maximum(self._worst, self.thrown(shift).float().mean()))
 
     def thrown(self, shift: Tensor) -> Tensor:
-        """bool [M]: who of what it moves, by `shift` [M, 3] in scene units, is out of its place."""
+        """bool [M]: Gaussians that the field moves out of place, by `shift` [M, 3] in scene units."""
         return shift.abs().amax(1) > self._reach
 
     def of(self, name: str, p: Tensor) -> Tensor | None:

@@ -20,13 +20,13 @@ class RunView(Protocol):
     model: DynamicModel
     """What is trained."""
     report: Reporter
-    """Who says that the run is cancelled."""
+    """Receives progress, and says when the run is cancelled."""
     device: torch.device
     """Where it trains."""
     images: Tensor
     """[I, H, W, 3] float16 display-referred, the trained frames; on the device or in host memory."""
     movers: Tensor | None
-    """bool [I, H, W] what the motion mattes call moving in them; None: there are no mattes."""
+    """bool [I, H, W], pixels that the motion mattes mark as moving; None without mattes."""
     train_ids: list[int]
     """[I] indices of them into the scene's frames."""
     times: list[float]

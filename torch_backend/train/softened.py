@@ -25,9 +25,9 @@ class SoftenedMovers:
     def __init__(self, movers: Tensor | None, width: int, span: tuple[float, float], block: float) -> None:
         """
         Args:
-            movers: bool [I, H, W], what moves in each trained frame; None: nobody knows, and nothing is softened.
+            movers: bool [I, H, W], moving pixels of each trained frame; None: unknown, and nothing is softened.
             width: W.
-            span: from when to when it is softened, in shares of the run.
+            span: start and end of the softening, as shares of the run.
             block: pixels of pictures 640 wide along the side of a softened one.
         """
         self.block, self.margin = round(block * width / _LENGTHS_OF), max(1, round(_MARGIN * width / _LENGTHS_OF))

@@ -27,7 +27,7 @@ class StepKind:
     detached: bool
     """Do the images leave the field alone?"""
     hidden: bool
-    """Is it marked who could not be seen?"""
+    """Does the step mark Gaussians that are hidden in the frame?"""
     anchored: bool
     """Are pairs anchored?"""
     penalised: bool

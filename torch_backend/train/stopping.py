@@ -189,13 +189,13 @@ class RunFacts:
     growth_gain_db: float | None = None
     """dB per 10 % more Gaussians when growth was judged last, what optimisation gained meanwhile included."""
     opened: FieldOpened | None = None
-    """When the field was made."""
+    """The creation of the deformation field; None before it."""
     hardened: int | None = None
     """Iteration at which the gate closed what did not move."""
     correlation_frames: float | None = None
-    """Frames until half of what the static model lacks has changed."""
+    """Lag in frames at which the residual of the static model correlates with itself by half."""
     time_nodes: int | None = None
-    """Nodes of the field's time axis that follow from it."""
+    """Number of nodes on the field's time axis, chosen from that lag."""
     poses_gain_db: float | None = None
     """What refined cameras gained on the probes."""
     exposure_gain_db: float | None = None
@@ -207,7 +207,7 @@ class RunFacts:
 
     @property
     def on_trial(self) -> bool:
-        """Is there a field of which it is not yet known who moves?"""
+        """True while the field exists and the gate has not decided yet which Gaussians move."""
         return self.opened is not None and self.hardened is None
 
     def to_json(self) -> dict[str, Any]:

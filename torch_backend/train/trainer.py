@@ -267,8 +267,8 @@ class Trainer:
     def _make_room(self, checkpoint: Path | None) -> None:
         """After the card's memory ended: saves, and makes the run smaller. JobError if there is nothing left to take.
 
-        First go the recordings of steps, which nobody misses; then the field works in pieces; then a fifth of the
-        Gaussians goes, those that cover least. In either of the last two cases no more are made than there are.
+        Frees the recordings of steps first; then the field works in pieces; then the fifth of the Gaussians that cover
+        least is dropped. In the last two cases the number of Gaussians does not grow any more.
         """
         model = self.model.gaussians
         before = len(model)
@@ -523,7 +523,7 @@ class Trainer:
     # ------------------------------------------------------------------ the gate
 
     def _open_gate(self) -> None:
-        """Opens, on trial, what is painted, or of it what the motion mattes call moving."""
+        """Opens Gaussians on trial (`movers.on_trial`), and creates the deformation field if there are any."""
         model = self.model.gaussians
         model.open |= on_trial(self)
         if bool(model.open.any()):

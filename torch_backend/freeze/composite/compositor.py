@@ -65,7 +65,8 @@ class CompositeFrame:
     depth: Tensor
     """[H, W] as in `FrozenImage`."""
     support: Tensor
-    """[H, W] in 0..1: 1: what is seen stands still, or was seen near t*; 0: how it looked at t* nobody saw."""
+    """[H, W] in 0..1: 1: the surface stands still, or a frame near t* shows it; 0: no frame shows how it looked at
+    t*."""
     motion: Tensor
     """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell. On the clip's own
     poses 1 also where the frame's own plate shows what moves and is let go of: where it is 0 that plate may stand."""

@@ -79,7 +79,8 @@ def fillers_of(
 
 
 def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
-    """[h, w] in 0..1 for each plate: it shows what is seen and what is around that; of use where something moves."""
+    """[h, w] in 0..1 for each plate: where it shows the surface of the pixel and its surroundings. Used near movers
+    only."""
     near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 4 * _ROUGH + 1)  # as far as what follows reaches
     points, out = target.points[near], list[Tensor]()
     for frame, way in zip(chosen, moved, strict=True):

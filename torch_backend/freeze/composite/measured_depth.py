@@ -2,8 +2,8 @@
 
 What moves is seen at t* by one plate alone, so that no parallax tells how far away it is; a depth map does. Where the
 splats of a frozen frame are those that plate t* shows, their inverse depth and the map's are averaged, each weighted by
-its variance. The map's variance is that of its fit. The splats' is what is left of their deviation from the map when
-the map's own is taken out of it.
+its variance. The map's variance is that of its fit. The splats' variance is that of their difference from the map, less
+the map's variance.
 """
 
 from __future__ import annotations

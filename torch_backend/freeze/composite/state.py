@@ -90,7 +90,7 @@ def evidence(
         noise += _unexplained(source_views, target.t, instant, config.smoothing * unit)
         carried = look_up(source_views.view(target.t).picture.float(), instant.pixels)
         ours, theirs = (blurred(each * instant.visible[..., None], unit) for each in (plate, carried))
-        reach = max(1, round(MARGIN * unit))  # by which depth may misplace plate t*
+        reach = max(1, round(MARGIN * unit))  # pixels by which an error of depth may misplace plate t*
         contradiction = torch.maximum(beyond(ours, theirs, reach), beyond(theirs, ours, reach))
     gain = change - misfit
     return {

@@ -11,10 +11,10 @@ the depth behind them is taken. What stands still is measured instead, once for 
    of a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows around it whose
    deviations their variances explain: a window that reaches over an edge is no plane (Kuwahara et al. 1976).
 
-A frame takes depth from the key views nearest to it: of their values and the splats', that on which most agree. What
-moves, and what they do not show, is the splats'. Planes are fitted once more in small windows, and each pixel takes
-those of its neighbours that are about as deep as the splats there and have its colour in the frame's picture: a joint
-bilateral filter of planes.
+A frame takes depth from the key views nearest to it: the value on which most of them and the splats agree. Moving
+pixels, and pixels that no key view shows, keep the splats' depth. Planes are fitted once more in small windows, and
+each pixel takes those of its neighbours that are about as deep as the splats there and have its colour in the frame's
+picture: a joint bilateral filter of planes.
 """
 
 from __future__ import annotations

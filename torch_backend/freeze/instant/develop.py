@@ -41,7 +41,7 @@ _TRAINING = TrainConfig()
 _BESIDE = 2
 """Number of trained frames on either side of t* that are asked whether what moves may be taken over."""
 _PARTS = (0.0, 0.5, 1.0)
-"""Parts of the way to what it became, of which what moves goes the best."""
+"""Blend factors between movers before and after fine-tuning; the best of them is kept."""
 Check = Callable[[int, int], None]
 """Called with (steps done, steps in all); raises to cancel."""
 
@@ -61,13 +61,14 @@ class DevelopConfig:
     half a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it. Where they gain less, what
     moves is trained alone, on plate t*."""
     worth: float = 3.0
-    """What moves is then taken over where plate t* gains more than so many times what the trained frames beside it
+    """Movers trained alone are kept where plate t* gains more than this many times what the neighbouring trained frames
     lose, in mean squared error."""
     instant_share: float = 0.25
     """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training: 30
     steps, as plate t* alone shows what moves."""
     afar: float = AFAR
-    """Plate t* teaches nothing of what it sees from more than so many times as far as some trained frame does."""
+    """Plate t* does not train Gaussians that it sees from more than this many times as far as some trained frame
+    does."""
     seed: int = 0
     """Of the order of frames."""
 
@@ -124,10 +125,10 @@ class _FineTuning:
         opened[known:] = 1.0
         self.held = ((self.afar > 0.5) & (moves.amax(0) > 0.5)).nonzero()[:, 0]
         self.alone = (self.mover * opened > 0.5).nonzero()[:, 0]
-        """Rows of what moves and stands, at t*, in what the plate says moves."""
+        """Rows of movers that lie on moving pixels of plate t*."""
 
     def run(self, check: Check | None) -> FrozenGaussians:
-        """All steps, and the judgement."""
+        """Runs all steps, then keeps what made the judged frames better."""
         steps, before = self.config.steps, self._judged()
 
         def checked(done: int) -> None:
@@ -201,8 +202,8 @@ class _FineTuning:
 
     @torch.no_grad()
     def _error(self, frames: list[int], movers: bool = False) -> float:
-        """Mean squared error of frames, display-referred: of what they say of the frozen scene, or of what moves in
-        them. 0 where there is nothing."""
+        """Mean squared error of frames, display-referred, over the pixels that show the frozen scene or (`movers`) over
+        their moving pixels. 0 without such pixels."""
         sums = torch.zeros(2, dtype=torch.float64, device=self.device)
         for frame in frames:
             shown, pixels = self._shown(frame)

@@ -1,14 +1,14 @@
 """No worse than a static model: what the field harms in a frozen scene is closed before the instant is developed.
 
-A field is trained to explain every frame at its own time. Time standing still asks it for something nobody checked:
-how the world of t* looks from the other poses, the wall behind a person, say, that the field let fade while she stood
-there. The static twin of a frozen scene has the same Gaussians, the open ones at the mean of the times at which they
-were seen. Scene and twin are held against plates: that of t*, and the still pixels of others, all over the clip. A
-Gaussian is closed where the others are worse for it by more than plate t* gains; where the mattes see nothing move at
-t* and it only sways, by more than a third of that. It is asked of neighbours together: errors are noisy, and things
-move in pieces. Where it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call
-still, a mean is always nearer. They miss whole arms, too. So of what went farther than a sway, what the run shows at a
-plate's own time better than the twin counts against the twin: that plate says nothing of t*.
+A field is trained to explain every frame at its own time. A frozen shot evaluates it where no loss supervised it: at
+t*, from all other poses. An example is the wall behind a person, which the field may let fade while she stands there.
+The static twin of a frozen scene has the same Gaussians, the open ones at the mean of the times at which they were
+seen. Scene and twin are held against plates: that of t*, and the still pixels of others, all over the clip. A Gaussian
+is closed where the others are worse for it by more than plate t* gains; where the mattes see nothing move at t* and it
+only sways, by more than a third of that. It is asked of neighbours together: errors are noisy, and things move in
+pieces. Where it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call still, a
+mean is always nearer. They miss whole arms, too. So of what went farther than a sway, what the run shows at a plate's
+own time better than the twin counts against the twin: that plate says nothing of t*.
 
 Of what t* sees from afar its plate cannot say how it looks: a face of six pixels fits it with its eyes anywhere. Plates
 that see such a thing from near are asked with all of its pixels, whether they move or not; and there, where they do

@@ -50,8 +50,8 @@ class LightConfig:
     """How the panorama is made."""
 
     width: int = 1024
-    """Width in pixels; half as high, which must be 32 or a power of two above. Mirrors show pixels of a third of a
-    degree, matt things nothing of it."""
+    """Width in pixels; half as high, which must be 32 or a power of two above. A pixel is a third of a degree: visible
+    in mirrors, not on matt surfaces."""
     near: float = 0.02
     """Splats nearer to the point than this share of the median distance are left out, up to twice that they fade in:
     in front of the point one of them would cover a large part of the sphere."""
@@ -234,8 +234,8 @@ def exposed_as(run: LoadedRun, scene: Scene, frame: float, colors: Tensor) -> Te
 def render_panorama(
     splats: SeenSplats, turn: NDArray[np.float64], display: Display, config: LightConfig, report: Reporter
 ) -> NDArray[np.float32]:
-    """[width / 2, width, 4] of splats: scene-linear, premultiplied by their coverage, in the axes that the rotation
-    `turn` [3, 3] leads to from theirs."""
+    """[width / 2, width, 4], splats as a panorama: scene-linear, premultiplied by coverage, in axes that `turn` [3, 3]
+    rotates the splats' axes to."""
     focal, side = sphere.face_camera(config.width)
     K = torch.tensor([[focal, 0.0, side / 2.0], [0.0, focal, side / 2.0], [0.0, 0.0, 1.0]])
     apart = norm(splats.means, -1)

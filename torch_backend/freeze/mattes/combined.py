@@ -173,7 +173,7 @@ def grown(matte: Array, width: int) -> Array:
 
 def with_motion(matte: Array, others: Array, motion: Array) -> Array:
     """A matte [H, W] with all that moves (`motion` [H, W]) and touches it: a hand that the matte missed, or where the
-    thing is while it lives. What is nearer to `others` [H, W], the mattes of all further things, belongs to those.
+    thing is while it lives. Moving pixels nearer to `others` [H, W], the mattes of all other things, are left to them.
 
     `motion` is the layer of a frozen frame: what moves at t* or in the frame's own plate.
     """
@@ -289,7 +289,7 @@ def _keys(source: Source | None, number: int) -> list[Any]:
 
 
 def _living_frame(base: FrozenFrame, plates: Plates, number: int, inner: tuple[slice, slice]) -> FrozenFrame:
-    """A frame of the plate, with the depth of the frozen scene: how far away a living thing is, nobody knows."""
+    """A frame of the plate, with the depth of the frozen scene: the depth of a thing that goes on living is unknown."""
     rgba = np.zeros_like(base.rgba)
     rgba[inner] = np.concatenate(
         [plates.linear(number).numpy(), np.ones((*base.depth[inner].shape, 1), np.float32)], axis=2

@@ -35,7 +35,7 @@ def murmur3(data: bytes, seed: int = 0) -> int:
         block = block * 0xCC9E2D51 & _MASK
         block = _turned(block, 15) * 0x1B873593 & _MASK
         hashed ^= block
-        if n < whole // 4:  # the rest of fewer than four bytes is mixed in, and nothing more
+        if n < whole // 4:  # MurmurHash3 mixes a tail of fewer than four bytes in without this step
             hashed = (_turned(hashed, 13) * 5 + 0xE6546B64) & _MASK
     hashed ^= len(data)
     hashed = (hashed ^ hashed >> 16) * 0x85EBCA6B & _MASK
@@ -68,7 +68,7 @@ def manifest(names: Sequence[str]) -> str:
 def ranked(mattes: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
     """[H, W, 2 * PAIRS]: identifier and share of the mattes of each pixel, the largest share first; 0 where none is.
 
-    Shares of a pixel that together are more than it are scaled to it. ValueError without mattes, or of unlike sizes.
+    Shares of a pixel that sum to more than 1 are scaled to sum to 1. ValueError without mattes, or of unlike sizes.
     """
     identifiers = np.array([as_float(identifier(name)) for name in mattes], np.float32)
     shares = np.stack([np.clip(matte, 0.0, 1.0) for matte in mattes.values()], axis=-1).astype(np.float32)

@@ -43,7 +43,8 @@ def vote(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, weights: Tensor, d
 
 
 def in_front(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, depth: Tensor) -> Tensor:
-    """[N] bool: False for Gaussians behind the surface that a picture shows there; `depth` [H, W] as in `vote`.
+    """[N] bool: False for Gaussians behind the surface that the frame shows at their pixel; `depth` [H, W] as in
+    `vote`.
 
     Splats of a person are not opaque. A wall that shines through them would become a part of them.
     """

@@ -124,7 +124,7 @@ def deep_samples(
 def _surfaces(surface: Tensor, step: float) -> tuple[Tensor, Tensor]:
     """([H, W] depth that parts a pixel's surfaces, infinite where it has one; [2, H, W] depth of both) of a frame's.
 
-    Where depth steps between a pixel and its eight neighbours, the nearest and the farthest of the nine meet in it.
+    Where depth steps within a 3 x 3 neighbourhood, the pixel holds its nearest and its farthest surface.
     """
     solid = surface < NO_DEPTH
     nearest = -_highest(torch.where(solid, -surface, -NO_DEPTH))

@@ -115,7 +115,7 @@ def outdated(take: PlannedTake, kept: Set[int]) -> tuple[str, str] | None:
 
 
 def clear(take: PlannedTake, done: Set[int]) -> None:
-    """Removes all frames of before but those that are `done`: nobody shall take old ones for a part of this take."""
+    """Removes all earlier frames except those in `done`, so that none of them passes for a frame of this take."""
     folder = take.folder
     stale = set(_numbers(folder)) - done
     for old in [folder.facts, *(file for n in stale for file in files_of(folder, n))] if stale else ():

@@ -341,7 +341,7 @@ def _write_warp(folder: TakeFolder, output: OutputFrame, made: CompositeFrame, s
 def small_share(plate: Tensor, support: Tensor) -> Tensor:
     """[H, W] share of plate, averaged to a picture about 160 pixels wide, for figures.
 
-    A plate that shows what nobody saw near t* is none for the instant, by so much as `support` [H, W] says.
+    A plate counts by at most `support` [H, W]: where no frame near t* shows the surface, it does not show the instant.
     """
     plate = torch.minimum(plate, support)
     height, width = plate.shape

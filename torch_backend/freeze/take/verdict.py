@@ -1,7 +1,7 @@
 """A take in words: how much of it is plate, how much a guess, where it will not hold, and what to do about it.
 
-A take is no better than its run: who walks through the clip is in no plate where he stood at t*, and in the model he is
-somebody else at every instant. So what the run's verdict found amiss is said of the take too.
+A take is no better than its run. A person who walks through the clip is in no other plate where they stood at t*, and
+the model has another shape for them at every instant. So the faults in the run's verdict are repeated for the take.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def unsure(verdict: Verdict, frames: list[int]) -> set[int]:
 
 
 def _percent(share: float) -> int:
-    """Whole percent; what is there is not called 0, what is not whole not 100."""
+    """Whole percent. A share above 0 is at least 1 %, one below 1 at most 99 %."""
     return min(max(round(100.0 * share), 1 if share > 0.0 else 0), 99 if share < 0.9995 else 100)
 
 

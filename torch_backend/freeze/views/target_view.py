@@ -49,7 +49,7 @@ class TargetView:
     moved: Tensor
     """[h, w] in 0..1: what moves in the clip, at t* or in the frame's own plate; else `motion`."""
     unseen: Tensor
-    """[h, w] in 0..1: what moves, and is in no plate near t*: how it looked then nobody knows."""
+    """[h, w] in 0..1: pixels of moving surfaces that no plate near t* shows, so their state at t* is unknown."""
 
     def settings(self, width: int, height: int) -> RasterSettings:
         """How its camera renders the picture, overscan included, at another size."""

@@ -58,7 +58,7 @@ class WorkingPlates:
         return self._pictures[frame].to(self.device).float() / 255.0
 
     def matte(self, frame: int) -> Tensor:
-        """[H, W] in 0..1; still where nobody has looked."""
+        """[H, W] in 0..1, the motion matte; 0 (still) for frames without one."""
         if frame not in self._mattes:
             found = self.moving(frame)
             found = torch.zeros(self.height, self.width, device="cpu") if found is None else found
@@ -74,7 +74,7 @@ class WorkingPlates:
         return (dilate(resized(mask, self.width, self.height), max(1, self.margin)) > 0.0).to(self.device)
 
     def moving_share(self, frozen: FrozenGaussians, frame: int) -> Tensor:
-        """[N] in 0..1: of what a frame's camera sees of each Gaussian, the share that lies in what moves there."""
+        """[N] in 0..1: share of each Gaussian's contribution to a frame that falls on moving pixels."""
         matte = self.matte(frame)
         weights = torch.stack([matte, torch.ones_like(matte)], dim=-1)
         inside, whole = gathered(frozen.state, *self.camera(frame), weights).unbind(1)
