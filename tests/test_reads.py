@@ -19,7 +19,7 @@ OWN = {
     "torch_backend/sfm/child.py": "the log of a child that this process started, opened by it",
     "torch_backend/sfm/request.py": "what the parent wrote into the scratch folder that it made",
     "torch_backend/sfm/results.py": "what the child wrote into the scratch folder that was made for it",
-    "torch_backend/lens/straight.py": "the same scratch folder",
+    "torch_backend/lens/undistort_first.py": "the same scratch folder",
     "torch_backend/footage/images.py:_has_end": "a picture that this process has just written",
     "torch_backend/contract/writing.py": "files that this process writes",
     "splannequin_addon/process/environment.py": "the log of a set-up that this Blender started",

@@ -137,7 +137,7 @@ LAYOUT = {
 OTHER_FOLDERS = {
     ("splannequin_addon/process/environment.py", "summary.json"),  # of the launcher, in an environment
     ("splannequin_addon/process/environment.py", ".splannequin"),
-    ("torch_backend/cameras/foreign.py", "colmap/sparse/0"),  # of another program
+    ("torch_backend/cameras/imported.py", "colmap/sparse/0"),  # of another program
 }
 """(file, name) of what is called like something of the shot, and is not."""
 

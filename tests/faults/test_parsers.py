@@ -24,7 +24,7 @@ from launcher.environments import Environment
 from launcher.summary import failed_job, read_summary
 from tests.backend.conftest import Quiet
 from torch_backend import contract
-from torch_backend.cameras import foreign
+from torch_backend.cameras import imported
 from torch_backend.cameras.export import export_cameras
 from torch_backend.cameras.placement import placement_for
 from torch_backend.cameras.stored import load_cameras, load_points
@@ -181,10 +181,10 @@ PARSERS: dict[str, Parser] = {
     "status.json": Parser(in_shot("jobs/*/status.json"), lambda _, path: status_of(path)),
     "events.jsonl": Parser(in_shot("jobs/*/events.jsonl"), lambda _, path: list(contract.read_lines(path))),
     "camera path": Parser(named("path.json"), lambda _, path: CameraPath.load(path)),
-    "camera path to import": Parser(named("path.json"), lambda _, path: foreign.read(path)),
-    "transforms.json": Parser(named("nerfstudio/transforms.json"), lambda _, path: foreign.read(path)),
+    "camera path to import": Parser(named("path.json"), lambda _, path: imported.read(path)),
+    "transforms.json": Parser(named("nerfstudio/transforms.json"), lambda _, path: imported.read(path)),
     **{
-        f"COLMAP {name}": Parser(named(f"{folder}/{name}"), lambda _, path: foreign.read(path.parent))
+        f"COLMAP {name}": Parser(named(f"{folder}/{name}"), lambda _, path: imported.read(path.parent))
         for folder, end in (("binary", "bin"), ("text", "txt"))
         for name in (f"cameras.{end}", f"images.{end}", f"points3D.{end}")
     },

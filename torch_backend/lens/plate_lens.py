@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..array_types import meshgrid
-from ..cameras import foreign
+from ..cameras import imported
 from ..cameras.stored import damaged, load_cameras, load_record
 from ..shot import Shot
 from .lens import load_lens
@@ -25,7 +25,7 @@ _ROWS = 64
 class PlateLens:
     """A lens, and the pinhole camera of the frames that were undistorted with it."""
 
-    lens: foreign.Lens
+    lens: imported.Lens
     """Of the original working frames."""
     pinhole: tuple[float, float, float, float]
     """fx, fy, cx, cy of the undistorted ones, pixels."""
@@ -85,11 +85,11 @@ def load_plate_lenses(shot: Shot) -> dict[int, PlateLens | MapLens]:
         one = load_lens(shot)
         if isinstance(one, MapLens):
             return dict.fromkeys((frame.frame for frame in path.frames), one)
-        lens = foreign.Lens("OPENCV", one.width, one.height, (*one.focal, *one.centre, one.k1, one.k2, one.p1, one.p2))
+        lens = imported.Lens("OPENCV", one.width, one.height, (*one.focal, *one.centre, one.k1, one.k2, one.p1, one.p2))
         return dict.fromkeys((frame.frame for frame in path.frames), PlateLens(lens, one.intrinsics))
     try:
         known = [
-            foreign.lens_from_colmap(str(x["model"]), path.width, path.height, [float(p) for p in x["params"]])
+            imported.lens_from_colmap(str(x["model"]), path.width, path.height, [float(p) for p in x["params"]])
             for x in recorded
         ]
         index = [int(n) for n in record["lens_of_frame"]]

@@ -24,8 +24,8 @@ from ..footage.images import read_frame
 from ..sfm.masks import IGNORE, load_mask, painted_over
 from ..shot import Shot
 from .flow import FlowConfig, Map, Matches, neighbours, sample
-from .leftover import Leftover
 from .misfit import MisfitConfig, Sight, misfit, seeded
+from .residual_flow import ResidualFlow
 from .still import Evidence, Look, StillTest, evidence
 from .surface import KeyEvidence
 
@@ -244,7 +244,7 @@ def _own_score(
     inverse, count = counts.inverse, counts.on + counts.off
     score = np.clip(counts.off / (count + config.doubt) / config.share, 0.0, 1.0)
     if before is None:
-        left, known = Leftover(clip.picture, test, config).score(key, len(clip.keys), inverse, clip.depths[key])
+        left, known = ResidualFlow(clip.picture, test, config).score(key, len(clip.keys), inverse, clip.depths[key])
     else:
         last = next(each for each in seen if each.key == key - 1)
         left, known = (sample(values, last.at) * last.found for values in before)

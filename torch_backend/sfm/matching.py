@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..lens.lens_verdict import FISHEYE, FISHEYE_START
 from . import colmap_types as colmap
 from .pairs import match_pairs
+from .pure_rotation import is_pure_rotation
 from .request import Request, closing_database, say
-from .turning import only_turns
 
 STILL_SHARE = 0.008
 """Largest median flow between any two frames, as a share of the image width, below which the camera stands still."""
@@ -150,7 +150,7 @@ def common(request: Request) -> Common:
     return Common(max((pair.shift for pair in matched), default=0.0), len(matched), matches, int(np.median(found)))
 
 
-def turning(request: Request) -> bool:
+def only_rotates(request: Request) -> bool:
     """True if the camera only turns on the spot: homographies explain what the frames share, and are rotations."""
     kinds = pycolmap.TwoViewGeometryConfiguration
     flat = {kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC}
@@ -163,7 +163,7 @@ def turning(request: Request) -> bool:
     ]
     homographies = np.array([homography for homography, _ in measured], np.float64).reshape(-1, 3, 3)
     shifts = np.array([shift for _, shift in measured])
-    return only_turns(homographies, shifts, (request.size[0], request.size[1]), request.focal)
+    return is_pure_rotation(homographies, shifts, (request.size[0], request.size[1]), request.focal)
 
 
 @dataclass(frozen=True)

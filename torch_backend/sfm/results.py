@@ -36,7 +36,7 @@ from ..lens.zoom import zoom_words
 from ..replacing import Staged
 from ..shot import Shot, atomic_path, replace_file, write_json
 from .flat import flat_words
-from .given import doubts, refuse_misfit
+from .imported_cameras import doubts, refuse_misfit
 from .masks import write_undistorted
 from .points import filter_points
 from .verdict import FAIR_ERROR_PX, quality_words
@@ -86,7 +86,7 @@ def write_results(asked: Asked, answer: dict[str, Any], scratch: Path, staged: S
     """Writes the solve's files, from what the worker left in `scratch`, to where they wait until they are whole.
 
     Args:
-        answer: the worker's, `cameras.foreign`'s where cameras were given.
+        answer: the worker's, `cameras.imported`'s where cameras were given.
     """
     frames = asked.frames
     solved = sum(f["solve"] for f in frames["frames"])

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..cameras import foreign
+from ..cameras import imported
 from ..cameras.stored import load_cameras, load_points, load_record
 from ..contract import (
     CAMERA_MODELS,
@@ -31,14 +31,14 @@ from ..footage.masks import Mask, read_masks
 from ..footage.sources import frame_words
 from ..lens import map_reading
 from ..lens.map_lens import MapLens
-from ..lens.straight import Straight
 from ..lens.undistort import Undistorter
+from ..lens.undistort_first import UndistortedFrames
 from ..replacing import replacing_solve, settle_solve
 from ..shot import Shot, content_key, make_folder, need_disk, write_json
-from .given import prepare, take_over
-from .ladder import climb
+from .imported_cameras import prepare, take_over
 from .masks import facts_of, given_masks, more_features, wants_wide, write_matching
 from .results import SOLVE_VERSION, Asked, SolveResult, write_results
+from .retries import solve_with_retries
 
 _LOG_END_BYTES = 16_384
 
@@ -75,7 +75,7 @@ class SolveConfig:
     st_map_layer: str = ""
     """Layer of the file; empty: red and green."""
     retry: bool = True
-    """Try again in other ways where the solve is refused or poor, as `ladder.climb` does."""
+    """Try again in other ways where the solve is refused or poor, as `retries.solve_with_retries` does."""
 
 
 def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str = "") -> SolveResult:
@@ -88,7 +88,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 
     With an ST map in `config` the frames are undistorted through it first, and the solve finds the focal length alone.
 
-    With `cameras`, a path that `foreign.read` understands, the cameras of that file are taken instead of solving: in
+    With `cameras`, a path that `imported.read` understands, the cameras of that file are taken instead of solving: in
     its world, frames without one interpolated.
 
     `report` hears a metric `CAMERAS_KNOWN` at the end.
@@ -100,7 +100,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
         shot.own(folder)
     settle_solve(shot)
     frames = load_frames(shot)
-    source = [foreign.fingerprint(cameras)] if cameras else []
+    source = [imported.fingerprint(cameras)] if cameras else []
     source += [map_reading.fingerprint(config.st_map)] if config.st_map else []
     masks = read_masks(shot, _mask_sources(shot, config), report)
     key = _key(config, frames, source, masks)
@@ -117,7 +117,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Reporter) -> SolveResult:
     """Solves, and puts the files in the place of those before."""
     shot, frames = asked.shot, asked.frames
-    imported = prepare(frames, cameras, report) if cameras else None
+    imported_cameras = prepare(frames, cameras, report) if cameras else None
     lens = _lens_of_map(config, frames, report)
     _refuse_damaged(shot, frames)
     # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame, and copies of
@@ -128,11 +128,11 @@ def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Report
     shutil.rmtree(scratch, ignore_errors=True)
     make_folder(scratch)
     try:
-        if imported is None:
+        if imported_cameras is None:
             answer, left = _mapped(asked, config, lens, scratch, report)
         else:
             options = _matching(frames, config, asked.masks, scratch)
-            answer, left = take_over(shot, frames, imported, options, scratch, report), scratch
+            answer, left = take_over(shot, frames, imported_cameras, options, scratch, report), scratch
         had_maps = any((shot.solve / name).is_file() for name in STMAP_FILES)
         with replacing_solve(shot) as staged:
             result = write_results(asked, answer, left, staged, report)
@@ -152,13 +152,13 @@ def _mapped(
 ) -> tuple[dict[str, Any], Path]:
     """COLMAP's answer, and the folder in which its files lie."""
     shot, frames = asked.shot, asked.frames
-    straight = None if lens is None else Straight(shot, frames, lens, scratch / "straight", report)
-    request = _request(shot, frames, config, asked.masks, scratch, straight)
-    climbed = climb(request, frames, config.retry, scratch, shot.colmap_log, report)
-    answer = {**climbed.best.answer["result"], "rung": climbed.best.rung, "tries": climbed.tries}
-    if straight is not None:
-        answer |= straight.told(climbed.best.folder)
-    return answer, climbed.best.folder
+    undistorted = None if lens is None else UndistortedFrames(shot, frames, lens, scratch / "straight", report)
+    request = _request(shot, frames, config, asked.masks, scratch, undistorted)
+    outcome = solve_with_retries(request, frames, config.retry, scratch, shot.colmap_log, report)
+    answer = {**outcome.best.answer["result"], "rung": outcome.best.strategy, "tries": outcome.tries}
+    if undistorted is not None:
+        answer |= undistorted.answer_changes(outcome.best.folder)
+    return answer, outcome.best.folder
 
 
 def _facts(shot: Shot, config: SolveConfig, masks: dict[str, Mask], key: str) -> dict[str, Any]:
@@ -295,24 +295,24 @@ def _request(
     config: SolveConfig,
     masks: dict[str, Mask],
     scratch: Path,
-    straight: Straight | None,
+    undistorted: UndistortedFrames | None,
 ) -> dict[str, Any]:
     """What the worker is asked for at first: of frames whose lens was taken out before, no bend."""
-    scale = 1.0 if straight is None else straight.focal_scale
+    scale = 1.0 if undistorted is None else undistorted.focal_scale
     names: dict[bool, list[str]] = {True: [], False: []}
     for frame in frames["frames"]:
         names[bool(frame["solve"])].append(Path(frame["file"]).name)
     return {
-        "images": str(shot.raw if straight is None else straight.folder),
+        "images": str(shot.raw if undistorted is None else undistorted.folder),
         "solved": names[True],
         "others": names[False],
-        "camera_model": config.camera_model if straight is None else "SIMPLE_RADIAL",
-        "hold_bend": straight is not None,
+        "camera_model": config.camera_model if undistorted is None else "SIMPLE_RADIAL",
+        "hold_bend": undistorted is not None,
         "size": [frames["width"], frames["height"]],
         "focal_px": config.focal_mm / config.sensor_mm * frames["width"] * scale,
         "hold_focal": not config.refine_focal,
         "start_focal_px": _focal_of_file(frames) * scale,
-        **_matching(frames, config, masks, scratch, None if straight is None else straight.undistort),
+        **_matching(frames, config, masks, scratch, None if undistorted is None else undistorted.undistort),
         "neighbours": config.neighbours if config.localise else 0,
         "threads": max(1, min(os.cpu_count() or 1, 16)),
     }

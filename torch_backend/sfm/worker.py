@@ -41,7 +41,7 @@ from .mapping import (
     triangulate,
     triangulation_angle,
 )
-from .matching import STILL_SHARE, common, extract, match, turning
+from .matching import STILL_SHARE, common, extract, match, only_rotates
 from .pairs import match_lines
 from .placing import localise
 from .request import SEED, Request, say
@@ -69,7 +69,7 @@ def main(path: str) -> int:
         return 0
     models = build(request)
     if not models:
-        say(failure="turning" if turning(request) else "no_pair", **vars(shared))
+        say(failure="turning" if only_rotates(request) else "no_pair", **vars(shared))
         return 0
     doubt = lens_doubt(request, models[0])
     first, held = first_camera(models[0]), False
@@ -81,7 +81,7 @@ def main(path: str) -> int:
     write_answers(request, models[0], poses)
     lens = {"doubt": doubt, "held": held, **_found(request, first, models[0])}
     result = _result(models, len(poses))
-    say(result={**result, "flow_px": shared.flow_px, "turning": turning(request), "lens": lens})
+    say(result={**result, "flow_px": shared.flow_px, "turning": only_rotates(request), "lens": lens})
     return 0
 
 

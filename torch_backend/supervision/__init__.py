@@ -1,4 +1,4 @@
-"""Who was seen when, and what holds a Gaussian at times at which nobody saw it."""
+"""Support over time, hidden and defective Gaussians, and the anchoring losses that hold unsupervised states."""
 
 from .anchors import (
     Anchored,

@@ -1,4 +1,4 @@
-"""The anchoring losses: what is held, to what, how strongly.
+"""The anchoring losses: which states are anchored, to which, and with what weight.
 
 `support` needs no rendering: an unsupported (Gaussian, time) is drawn to the deltas of its nearest supported bins.
 `paper` is the Splannequin paper's rule (section "Temporally-Anchored Regularization"): hidden states to the past,
@@ -32,7 +32,7 @@ class SupervisionConfig:
     switch: float = 2.0 / 3.0
     """Share at which `paper` goes from L2 to L1 (paper: 20,000 of 30,000)."""
     every: int = 10
-    """`paper` acts every so many iterations (paper: 10)."""
+    """`paper`: interval in iterations (paper: 10)."""
     tau: float = 5.0
     """`paper`: decay of the confidence with normalised time (paper: 5)."""
     weight_hidden: float = 10.0
@@ -42,14 +42,14 @@ class SupervisionConfig:
     defective_gradient: float = 1e-9
     """`paper`: a visible Gaussian with a screen gradient of at most this is defective (paper: 1e-9)."""
     detector: str = "grad_norm"
-    """`paper`, which Gaussians an image acts on. grad_norm: by the norm of the screen gradient, as the paper says;
-    grad_signed: by its signed sum over x and y, as the published code does; weight: by what they contribute."""
+    """`paper`: test for Gaussians that an image supervises. grad_norm: norm of the screen gradient, as in the paper;
+    grad_signed: its signed sum over x and y, as in the published code; weight: the contribution to the image."""
     pulls: str = "field"
-    """`paper`, what its terms pull. field: the field alone. all: the canonical parameters too, as the published code
-    does: it detaches the reference state and not what both states share, so canonical parameters follow a difference
-    that does not depend on them. Published configurations (`host_config`) set all."""
+    """`paper`: which parameters get its gradient. field: the deformation field alone. all: canonical parameters too, as
+    in the published code, which detaches the reference state but not the canonical parameters that both states share.
+    Published configurations (`host_config`) set all."""
     support_every: int = 4
-    """`support` acts every so many iterations."""
+    """`support`: interval in iterations."""
     support_weight: float = 0.2
     """`support`: weight of the whole term (docs/decisions.md)."""
     support_samples: int = 1024
@@ -57,20 +57,20 @@ class SupervisionConfig:
     support_seconds: float = 4.0
     """`support`: confidence in an anchor decays as exp(-|dt| / this)."""
     anchor: str = "hidden"
-    """`support`, who is anchored where, among those that did not contribute. hidden: whom nobody could have seen, out
-    of the frame or behind something; unsupported: all. Scenes with truth have to say which freezes better."""
+    """`support`: which (Gaussian, time) pairs without contribution are anchored. hidden: those outside the frame or
+    behind a surface; unsupported: all of them."""
     look_every: int = 4
-    """`support` with anchor `hidden` looks every so many iterations who could not be seen in the frame."""
+    """`support` with anchor `hidden`: interval in iterations at which hidden Gaussians of the frame are marked."""
 
     still_weight: float = 22.0
-    """`support`: weight of `stillness`, which every motion has to be worth, in photometric losses."""
+    """`support`: weight of `stillness`, relative to the photometric loss: the price of motion."""
     still_scale: float = 0.15
-    """`support`: from here on a change costs less and less; 0.15 is a shift of 0.03 scene units."""
+    """`support`: change at which the price turns from linear to logarithmic; 0.15 is a shift of 0.03 scene units."""
     still_ramp: float = 0.2
-    """`support`: share of the run, from `start` on, over which that weight grows from nothing: a field that has to pay
-    before it has found anything finds nothing."""
+    """`support`: share of the run, from `start` on, over which `still_weight` grows from 0. With the full price at once
+    the field would learn no motion."""
     still_knee: float = 2e-3
-    """`support`: shifts in scene units below this cost their square, others themselves."""
+    """`support`: shift in scene units below which the price is quadratic instead of linear."""
 
     def __post_init__(self) -> None:
         if self.anchor not in ("hidden", "unsupported"):
@@ -79,29 +79,30 @@ class SupervisionConfig:
             raise ValueError(f"pulls is {self.pulls!r}: it should be all or field")
 
     def hidden_due(self, iteration: int) -> bool:
-        """Is it marked at this step who could not be seen in the frame?"""
+        """True if hidden Gaussians of the frame are marked at this step."""
         return self.preset == "support" and self.anchor == "hidden" and iteration % self.look_every == 0
 
     def anchors_due(self, iteration: int, progress: float) -> bool:
-        """Does `support` anchor at this step? `progress` is the share of the run that is done."""
+        """True if `support` anchors at this step. `progress` is the share of the run that is done."""
         return self.preset == "support" and progress >= self.start and iteration % self.support_every == 0
 
     def paper_due(self, iteration: int, progress: float) -> bool:
-        """Does `paper` act at this step?"""
+        """True if `paper` acts at this step."""
         return self.preset == "paper" and progress >= self.start and iteration % self.every == 0
 
 
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
 """Weights of the attributes in `support`, so that typical deltas of each count alike; means in scene units."""
 _STILL_WEIGHTS = {"means": 5.0, "quats": 0.5, "log_scales": 0.5, "opacity_logits": 1.0, "sh0": 1.0, "shN": 0.5}
-"""Weights of the attributes in `stillness`: more on what lets a Gaussian be another thing at another time."""
+"""Weights of the attributes in `stillness`. Opacity and colour weigh more: they let a Gaussian become another
+object."""
 _KNEE = 0.02
 """Below this the support loss is quadratic, above it linear (Charbonnier)."""
 
 
 @dataclass
 class Anchored:
-    """(Gaussian, time) pairs that no frame supports and none denies, and so need an anchor."""
+    """(Gaussian, time) pairs to anchor: no frame supports them, and none contradicts them."""
 
     rows: Tensor
     """[S] int64 rows of the model."""
@@ -113,16 +114,17 @@ class Anchored:
 
 @dataclass
 class Draws:
-    """Random numbers that pairs to anchor are drawn by: they lie on the CPU, wherever the run is."""
+    """Random numbers that choose the pairs to anchor; on the CPU on any device."""
 
     picked: Tensor
-    """[P] int64 places among the open rows: the first lie anywhere in time, the last `support_samples` near support."""
+    """[P] int64 indices into the open rows: the last `support_samples` are paired with bins near support, others with
+    any bin."""
     anywhere: Tensor
     """[P - support_samples] int64 time bins of the first."""
     start: Tensor
-    """[support_samples] float32 in [0, 1): which of a row's supported bins the others begin at."""
+    """[support_samples] float32 in [0, 1): supported bin of the row at which a near pair starts."""
     step: Tensor
-    """[support_samples] int64 how many bins they go from there, in either direction."""
+    """[support_samples] int64 signed distance in bins from that one."""
 
     def tensors(self) -> tuple[Tensor, ...]:
         """All of them."""
@@ -130,7 +132,7 @@ class Draws:
 
 
 def draw(rows: int, bins: int, config: SupervisionConfig, generator: torch.Generator) -> Draws:
-    """Draws for so many open rows and time bins."""
+    """Random draws for a number of open rows and of time bins."""
     count = config.support_samples
     far = _FAR * count
     picked = torch.randint(rows, (far + count,), generator=generator, device="cpu")
@@ -142,10 +144,9 @@ def draw(rows: int, bins: int, config: SupervisionConfig, generator: torch.Gener
 
 
 def anchored_pairs(model: Gaussians, rows: Tensor, draws: Draws, config: SupervisionConfig) -> Anchored | None:
-    """The pairs among the open `rows` [M] that numbers drawn for so many stand for; None if none of them counts.
+    """The pairs that `draws` choose among the open `rows` [M]; None if none of them needs an anchor.
 
-    On a GPU pairs that do not count stay, with weight 0: to leave them out, the host would have to wait for their
-    number.
+    On a GPU pairs that need none stay, with weight 0: to drop them, the host would have to wait for their number.
     """
     support = model.support[rows]
     lacking = ~support & model.hidden[rows] if config.anchor == "hidden" else ~support
@@ -199,29 +200,29 @@ def support_loss(
 
 
 def _columns(deltas: Deltas) -> tuple[Tensor, list[tuple[str, int]]]:
-    """([M, C] all numbers of deltas [M] side by side, name and columns of each part): one operator instead of many."""
+    """([M, C] deltas concatenated along columns, name and width of each attribute). One operator on it replaces
+    many."""
     parts = {name: value.flatten(1) if value.dim() > 1 else value[:, None] for name, value in deltas.moved().items()}
     return torch.cat(list(parts.values()), dim=1), [(name, part.shape[1]) for name, part in parts.items()]
 
 
 def still_weight(progress: float, config: SupervisionConfig) -> float:
-    """What `stillness` weighs once a share `progress` of the run is done."""
+    """Weight of `stillness` at a share `progress` of the run."""
     return config.still_weight * min(max((progress - config.start) / max(config.still_ramp, 1e-6), 0.0), 1.0)
 
 
 def stillness(deltas: Deltas, count: int, error: Tensor, weight: Tensor, config: SupervisionConfig) -> Tensor:
-    """What the `deltas` [M] of one frame cost in a model of `count` Gaussians.
+    """Price of motion of one frame's `deltas` [M] in a model of `count` Gaussians.
 
-    At its own time a Gaussian is seen from one side only, so whatever a field does to it there to please that one
-    frame goes unpunished, and shows as soon as the instant is seen from elsewhere. What moves must therefore be worth
-    more to the image than this. Per Gaussian the price is the logarithm of an L1 norm: to begin to move costs most, to
-    go on little, since who moves much is no more suspect than who moves. The sum is over all Gaussians of the model, so
-    that the price of one does not depend on how many others may move.
+    One camera alone sees each time, so a delta that overfits that frame is not penalised by any other, and shows as
+    soon as the instant is seen from elsewhere. Motion must therefore improve the image by more than this price. Per
+    Gaussian the price is the logarithm of an L1 norm: starting to move costs most, moving farther costs little. The sum
+    is divided by the number of all Gaussians, so that the price of one does not depend on how many others may move.
 
     Args:
-        error: the frame's photometric loss, 0-dim, which is the currency: an image that is harder to fit gains more
-            from any motion, a false one too.
-        weight: 0-dim, what `still_weight` says of the run's progress.
+        error: the frame's photometric loss, 0-dim; it scales the price, because an image that is harder to fit gains
+            more from any motion, also from a false one.
+        weight: 0-dim, `still_weight` at the run's progress.
     """
     moved, widths = _columns(deltas)
     names = [name for name, _ in widths]
@@ -235,17 +236,17 @@ def stillness(deltas: Deltas, count: int, error: Tensor, weight: Tensor, config:
 
 
 _FAR = 4
-"""So many pairs anywhere are drawn for each one near support; near ones fill what is then left of the count."""
+"""Number of pairs with any bin for each pair near support; near pairs only fill the remaining count."""
 
 
 def _pairs(support: Tensor, lacking: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
-    """(row, bin, valid) of drawn pairs; of them as many as are drawn near support are valid at most: lacking [M, B], in
-    a row with support [M, B].
+    """(row, bin, valid) of the drawn pairs. A pair is valid where `lacking` [M, B] is set, in a row with any `support`
+    [M, B]; at most as many pairs are valid as are drawn near support.
 
-    The first lie anywhere, the last at a log-uniform distance from support.
+    The first pairs take any bin, the last a bin at a log-uniform distance from support.
 
-    Near pairs pull hardest, also at what faded because it moved away: an even mix of both kinds with weight 1 trained
-    the bundled clip to 22.96 dB on held-out frames, against 24.39 dB with that weight and mostly far pairs.
+    Near pairs pull hardest, also on Gaussians that faded because they moved away: with weight 1 an even mix of both
+    kinds trained the bundled clip to 22.96 dB on held-out frames, against 24.39 dB with mostly far pairs.
     """
     bins, count, picked = support.shape[1], len(draws.start), draws.picked
     # The k-th supported bin of a row is where the running count first exceeds k.
@@ -261,7 +262,7 @@ def _pairs(support: Tensor, lacking: Tensor, draws: Draws) -> tuple[Tensor, Tens
 
 @dataclass
 class PaperView:
-    """One of the two views that the paper's rule compares: the states and who was supervised in it."""
+    """One of the two views that the paper's rule compares, with the Gaussians' states and supervision."""
 
     time: float
     """Normalised time."""
@@ -270,18 +271,19 @@ class PaperView:
     inside: Tensor
     """bool [M]: the centre is inside the camera's frustum; False is the paper's `hidden`."""
     supervised: Tensor
-    """bool [M]: the view's image acts on it (`well_supervised`)."""
+    """bool [M]: the view's image supervises the Gaussian (`well_supervised`)."""
 
 
 def well_supervised(
     config: SupervisionConfig, weight: Tensor, norm: Tensor, pull: Tensor, K: Tensor, viewmat: Tensor, means: Tensor,
     size: tuple[int, int],
 ) -> Tensor:  # fmt: skip
-    """bool [M]: on which Gaussians an image acts, by the configured detector.
+    """bool [M]: Gaussians that an image supervises, by the configured detector; the others in its frustum are
+    *defective*.
 
-    grad_signed adds the components of the screen gradient in NDC, as the published code does, so that about half of
-    the Gaussians that an image does act on fail. The rasteriser tells the gradient's norm; its components are those of
-    the gradient of the 3D means across the line of sight, to the first order in the Gaussian's size over its depth.
+    grad_signed adds the components of the screen gradient in NDC, as the published code does, so that about half of the
+    supervised Gaussians fail. The rasteriser returns only the norm of that gradient; its components equal those of the
+    gradient of the 3D means across the line of sight, to first order in the Gaussian's size over its depth.
 
     Args:
         weight: [M] sum of alpha * T over the image.
@@ -304,8 +306,8 @@ def well_supervised(
 def paper_loss(one: PaperView, two: PaperView, progress: float, config: SupervisionConfig) -> Tensor | None:
     """The paper's two terms for a pair of views; None if no valid anchor was found.
 
-    The later view's hidden Gaussians are held to the earlier view, the earlier view's defective ones to the later;
-    the reference must be well supervised (inside the frustum, and the image acts on it) and is detached. Mean
+    Hidden Gaussians of the later view are anchored to the earlier view, defective ones of the earlier view to the
+    later. The reference is detached and must be well supervised: inside the frustum, and supervised by the image. Mean
     over the selected Gaussians, summed over the attributes.
     """
     early, late = (one, two) if one.time < two.time else (two, one)

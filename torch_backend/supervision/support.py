@@ -1,7 +1,7 @@
 """The support bitmap: per Gaussian, the time bins in which it contributed to a training frame.
 
-It fills for free from the rasteriser's sum of alpha * T, is inherited on split, and answers three questions: where to
-anchor, which instant to ask a Gaussian at, and which frozen pixels are guesses (docs/architecture.md, "support").
+It is filled at no cost from the rasteriser's sum of alpha * T, and inherited on split. It decides where to anchor, at
+which time to evaluate a Gaussian in a freeze, and which frozen pixels are guesses (docs/architecture.md, "The method").
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ..gaussians import Gaussians
 
 MAX_BINS = 256
 _BEHIND = 0.02
-"""Share of the depth by which a centre must lie behind what is seen, beyond its own size, to count as hidden."""
+"""Share of the depth by which a centre must lie behind the visible surface, beyond its own size, to count as hidden."""
 SEEN_WEIGHT = 0.1
 """Sum of alpha * T over a frame's pixels above which a Gaussian counts as seen in it."""
 
@@ -36,9 +36,10 @@ def bin_of(centres: Tensor, time: float) -> int:
 
 @torch.no_grad()
 def mark_seen(model: Gaussians, time_bin: Tensor, weight_sum: Tensor) -> None:
-    """Notes who contributed to a training frame; weight_sum [N] is the sum of alpha * T over its pixels.
+    """Marks the Gaussians that contribute to a training frame; weight_sum [N] is the sum of alpha * T over its pixels.
 
-    time_bin: int64 [1], on the model's device: a recorded step (`train.recorder`) is told another one each time.
+    time_bin: int64 [1], on the model's device, so that a recorded step (`train.recorder`) can be replayed with another
+        bin.
     """
     seen = weight_sum[:, None] > SEEN_WEIGHT
     model.support.index_copy_(1, time_bin, model.support.index_select(1, time_bin) | seen)
@@ -54,10 +55,10 @@ def mark_hidden(
     K: Tensor,
     depth: Tensor,
 ) -> None:
-    """Notes who of `rows` [M] could not have been seen in a frame: out of it, or behind what is there.
+    """Marks the Gaussians of `rows` [M] that a frame cannot show: outside the frame, or behind its surface.
 
-    A Gaussian in plain view that does not contribute is not unsupervised: the frame says that it is not there. It may
-    have faded, or its owner moved on; it is not to be drawn back to where it was seen (`anchors.anchored_pairs`).
+    A Gaussian in plain view that does not contribute is not unsupervised: the frame contradicts it. It may have faded,
+    or its object moved away, so it is not anchored to where it was seen (`anchors.anchored_pairs`).
 
     Args:
         time_bin: int64 [1], on the model's device.
@@ -78,7 +79,7 @@ def mark_hidden(
 
 
 def nearest_supported(support: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Nearest supported bins at or before, and at or after, a bin.
+    """The nearest supported bins on either side of a bin, itself included.
 
     Args:
         support: bool [M, B].
@@ -103,7 +104,7 @@ def nearest_bin(support: Tensor, centres: Tensor, time: float) -> tuple[Tensor, 
 
 
 def support_confidence(support: Tensor, is_open: Tensor, centres: Tensor, time: float, decay: float) -> Tensor:
-    """How well each Gaussian is known at a time, [N] in [0, 1].
+    """Confidence in each Gaussian's state at a time, [N] in [0, 1].
 
     1 for a Gaussian that does not move and was ever seen, or that was seen at that time; for a moving one it decays
     with the distance to its nearest supported bin as exp(-|dt| / decay), both in normalised time; 0 if never seen.

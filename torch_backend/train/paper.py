@@ -1,4 +1,5 @@
-"""The paper's terms of one training step: what two frames, seen at each other's time, say of each other's Gaussians."""
+"""The paper's anchoring terms in a training step: detects hidden and defective Gaussians in two frames, and adds the
+loss."""
 
 from __future__ import annotations
 
@@ -15,13 +16,13 @@ from .run_view import RunView
 
 
 class RenderedRun(RunView, Protocol):
-    """A run that can be asked for more pictures in the middle of a step; `Trainer` is one."""
+    """A run that can render more pictures within a step; `Trainer` is one."""
 
     generator: torch.Generator
     """Source of every random draw."""
 
     def render_trained(self, state: dict[str, Tensor], frame: int, **options: Any) -> RasterOutput:
-        """Parameters `state` as the camera of the trained frame at position `frame` sees them."""
+        """Renders the parameters `state` from the camera of the trained frame at position `frame`."""
         ...
 
     def image_of(self, frame: int) -> Tensor:
@@ -30,7 +31,7 @@ class RenderedRun(RunView, Protocol):
 
 
 def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> int | None:
-    """Adds the paper's terms for this frame and a random other one; their gradients join the step's.
+    """Adds the paper's terms for this frame and another one drawn at random; their gradients add to the step's.
 
     Args:
         frame: position of the step's frame among the trained ones.
@@ -38,7 +39,7 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
         state: all parameters at the frame's time; means hold their gradient.
         out: its picture, after the backward pass.
 
-    Returns the position of the other frame; None if the draw was of no use.
+    Returns the position of the other frame; None if it has the same time or is excluded.
     """
     other = int(torch.randint(len(run.train_ids), (1,), generator=run.generator, device="cpu"))
     if run.times[other] == run.times[frame] or other in run.excluded_frames:
@@ -67,7 +68,7 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
 
 
 def _supervised(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> Tensor:
-    """bool [M]: which of `rows` the frame supervises well; `out` and `state` after the frame's own backward pass."""
+    """bool [M]: which of `rows` the frame supervises well. Call it after the backward pass of `out` and `state`."""
     index, pull = run.train_ids[frame], state["means"].grad
     if pull is None or out.weight_sum is None:
         raise RuntimeError("the frame was rendered without gradients or contributions")
@@ -85,7 +86,8 @@ def _view(run: RenderedRun, state: dict[str, Tensor], frame: int, rows: Tensor, 
 
 
 def inside_frustum(means: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:
-    """bool [M]: is the centre of means [M, 3] in front of the camera and inside its image."""
+    """bool [M]: centres [M, 3] in front of the camera and inside its image; the others are the paper's *hidden*
+    ones."""
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = camera[:, 2].clamp_min(1e-6)
     x = camera[:, 0] / depth * K[0, 0] + K[0, 2]

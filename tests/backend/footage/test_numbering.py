@@ -7,7 +7,7 @@ import OpenImageIO as oiio
 import pytest
 
 from tests.backend.footage.test_plates import solved
-from torch_backend.cameras import foreign
+from torch_backend.cameras import imported
 from torch_backend.contract import MASK_ALPHA, JobError
 from torch_backend.footage import FootageConfig, import_footage, load_frames
 from torch_backend.footage.images import read_png, write_png
@@ -140,10 +140,10 @@ def test_masks_may_be_numbered_as_the_footage_or_as_the_shot(tmp_path, pictures,
 @pytest.mark.parametrize(("counted_from", "shift"), [(1, 1000), (1001, 0)])
 def test_cameras_may_be_numbered_as_the_footage_or_as_the_shot(tmp_path, counted_from, shift):
     """Again more of them than frames."""
-    lens = foreign.Lens("PINHOLE", 128, 96, (100.0, 100.0, 64.0, 48.0))
+    lens = imported.Lens("PINHOLE", 128, 96, (100.0, 100.0, 64.0, 48.0))
     names = [f"f_{n:04d}.png" for n in range(counted_from, counted_from + 30)]
-    cameras = [foreign.ForeignCamera(name, np.eye(4)[:3], 0) for name in names]
-    solve = foreign.ForeignSolve(tmp_path, "COLMAP model", [lens], cameras)
-    matched = foreign.match(solve, Counted(list(range(1003, 1023)), shift=1000), (128, 96))
+    cameras = [imported.ImportedCamera(name, np.eye(4)[:3], 0) for name in names]
+    solve = imported.ImportedSolve(tmp_path, "COLMAP model", [lens], cameras)
+    matched = imported.match(solve, Counted(list(range(1003, 1023)), shift=1000), (128, 96))
     assert not matched.missing
     assert matched.cameras[1003].name == f"f_{1003 - shift:04d}.png"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_backend.cameras import foreign
+from torch_backend.cameras import imported
 from torch_backend.footage.display import PLAIN, ROLLED
 from torch_backend.lens.plate_lens import PlateLens
 from torch_backend.lens.undistort import BandUndistorter, Undistorter, of_frames
@@ -130,7 +130,7 @@ def test_a_tangential_lens_keeps_its_pixel_aspect(maps):
 def test_plates_of_any_size_lose_the_lens_that_the_working_frames_lost(maps, name):
     model, params = LENSES[name]
     pinhole, where = maps(name)
-    lens = PlateLens(foreign.lens_from_colmap(model, 160, 120, params), tuple(pinhole))
+    lens = PlateLens(imported.lens_from_colmap(model, 160, 120, params), tuple(pinhole))
     assert lens.is_none == (name == "none")
     np.testing.assert_allclose(lens.where(160, 120), where, atol=1e-4)
     # A source of three times the size, but for a rounding: every third pixel centre is one of the working frame's.

@@ -1,4 +1,5 @@
-"""The plate that gives a frozen frame whole pixels: which one it is, and where nothing that moves is seen in it."""
+"""Chooses the primary source: the plate that gives a frozen frame most of its pixels, and the matte where it is
+used."""
 
 from __future__ import annotations
 
@@ -22,22 +23,22 @@ from .warp import snap
 
 @dataclass
 class PrimaryMatte:
-    """How much of each pixel the primary plate gives, and why."""
+    """Share of each pixel that the primary plate gives, and the evidence for it."""
 
     matte: Tensor
     """[H, W] in 0..1."""
     st: Tensor
-    """[H, W, 2] places in the primary plate, as `CompositeFrame.st`."""
+    """[H, W, 2] coordinates in the primary plate, as in `CompositeFrame.st`."""
     is_identity: bool
     """True if `st` is the identity: the frame is one of the clip's own."""
     terms: Evidence = field(default_factory=dict[str, Tensor])
-    """What decided, [h, w] each: the evidence, its log-odds. Empty where the plate shows t* itself."""
+    """The evidence and its log-odds, [h, w] each. Empty if the plate shows t* itself."""
 
 
 def primary_plate(source_views: SourceViews, output: OutputFrame, target: TargetView, usable: list[int]) -> int:
-    """The frame's own plate, else the nearest in pose of those usable: in travel over depth, and in direction.
+    """The frame's own plate, else the usable one nearest in pose: distance over depth, and viewing direction.
 
-    Of poses that are alike, as a tripod's are, the nearest in number.
+    Among equal poses (a tripod) the nearest in frame number.
     """
     if target.own and output.frame in usable:
         return output.frame

@@ -19,7 +19,7 @@ _NOISE = 0.004
 """How far from a rotation noise makes one, as the ratio of its largest to its smallest singular value, less one."""
 
 
-def only_turns(
+def is_pure_rotation(
     homographies: NDArray[np.float64], shifts: NDArray[np.float64], size: tuple[int, int], focal: float = 0.0
 ) -> bool:
     """True if one focal length makes rotations of the homographies between the pairs that are farthest apart.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torch_backend.sfm.turning import only_turns
+from torch_backend.sfm.pure_rotation import is_pure_rotation
 
 SIZE, FOCAL = (640, 480), 600.0
 LENS = np.array([[FOCAL, 0.0, 320.0], [0.0, FOCAL, 240.0], [0.0, 0.0, 1.0]])
@@ -29,24 +29,24 @@ FACING = np.array([0.0, 0.0, 1.0])
 
 @pytest.mark.parametrize("focal", [0.0, FOCAL, 1.15 * FOCAL])
 def test_rotations_are_turning_whether_the_focal_length_is_known_or_not(focal):
-    assert only_turns(*pairs(TURNS), SIZE, focal)
+    assert is_pure_rotation(*pairs(TURNS), SIZE, focal)
 
 
 def test_a_sway_of_a_hundredth_of_the_distance_is_turning_still():
     moved = [r + np.outer([0.01, 0.005, 0.0], FACING) for r in TURNS]
-    assert only_turns(*pairs(moved), SIZE)
+    assert is_pure_rotation(*pairs(moved), SIZE)
 
 
 @pytest.mark.parametrize("normal", [FACING, np.array([0.6, 0.0, 0.8])])
 def test_walking_past_a_wall_is_not(normal):
     """A wall is explained by homographies as well as a turn is. Seen straight on it shifts as a turn's middle does."""
     moved = [np.eye(3) + np.outer([0.02 * n, 0.0, 0.0], normal) for n in range(1, 12)]
-    assert not only_turns(*pairs(moved), SIZE)
+    assert not is_pure_rotation(*pairs(moved), SIZE)
     turned = [r + np.outer([0.02 * n, 0.0, 0.0], normal) for n, r in enumerate(TURNS, 1)]
-    assert not only_turns(*pairs(turned), SIZE)
+    assert not is_pure_rotation(*pairs(turned), SIZE)
 
 
 def test_the_scale_of_a_homography_does_not_matter_and_none_at_all_is_no_turn():
     homographies, shifts = pairs(TURNS)
-    assert only_turns(-3.0 * homographies, shifts, SIZE)
-    assert not only_turns(np.zeros((0, 3, 3)), np.zeros(0), SIZE)
+    assert is_pure_rotation(-3.0 * homographies, shifts, SIZE)
+    assert not is_pure_rotation(np.zeros((0, 3, 3)), np.zeros(0), SIZE)

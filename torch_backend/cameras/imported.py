@@ -70,7 +70,7 @@ class Lens:
 
 
 @dataclass
-class ForeignCamera:
+class ImportedCamera:
     """One camera of the file."""
 
     name: str
@@ -84,7 +84,7 @@ class ForeignCamera:
 
 
 @dataclass
-class ForeignSolve:
+class ImportedSolve:
     """What a file holds."""
 
     path: Path
@@ -93,7 +93,7 @@ class ForeignSolve:
     """COLMAP model, transforms.json or camera path."""
     lenses: list[Lens]
     """In the size of the pictures that they were found from."""
-    cameras: list[ForeignCamera]
+    cameras: list[ImportedCamera]
     """In the file's order."""
     points: dict[str, Any] | None = None
     """xyz float64 [P, 3], rgb uint8 [P, 3], error float64 [P] px (negative: unknown), seen: P arrays of indices into
@@ -108,7 +108,7 @@ class ForeignSolve:
 class Matched:
     """The cameras of a solve that stand for frames of a clip."""
 
-    cameras: dict[int, ForeignCamera]
+    cameras: dict[int, ImportedCamera]
     """By frame number."""
     missing: list[int]
     """Frame numbers without a camera."""
@@ -157,7 +157,7 @@ def fingerprint(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-def read(path: str | Path) -> ForeignSolve:
+def read(path: str | Path) -> ImportedSolve:
     """Whatever stands at a path. JobError (SOLVE) in a sentence if it cannot be read or used."""
     kind, files = find(path)
     try:
@@ -177,12 +177,12 @@ def read(path: str | Path) -> ForeignSolve:
 # ------------------------------------------------------------------------------------------------- the three kinds
 
 
-def _from_colmap(folder: Path) -> ForeignSolve:
+def _from_colmap(folder: Path) -> ImportedSolve:
     model = read_model(folder)
     numbers = {camera: n for n, camera in enumerate(model.cameras)}
     lenses = [lens_from_colmap(c.model, c.width, c.height, c.params) for c in model.cameras.values()]
-    cameras = [ForeignCamera(i.name, i.pose, numbers[i.camera]) for i in model.images]
-    return ForeignSolve(folder, "COLMAP model", lenses, cameras, _colmap_points(model))
+    cameras = [ImportedCamera(i.name, i.pose, numbers[i.camera]) for i in model.images]
+    return ImportedSolve(folder, "COLMAP model", lenses, cameras, _colmap_points(model))
 
 
 def _colmap_points(model: ColmapModel) -> dict[str, Any] | None:
@@ -221,21 +221,21 @@ def _lens(model: str, width: int, height: int, params: tuple[float, ...]) -> Len
     return Lens(model, width, height, params)
 
 
-def _from_path(file: Path, data: dict[str, Any]) -> ForeignSolve:
+def _from_path(file: Path, data: dict[str, Any]) -> ImportedSolve:
     path = CameraPath.from_json(data)
     lenses: dict[Lens, int] = {}
-    cameras: list[ForeignCamera] = []
+    cameras: list[ImportedCamera] = []
     for frame in path.frames:
         lens = lenses.setdefault(_lens("PINHOLE", path.width, path.height, tuple(frame.K)), len(lenses))
         pose = _rigid(np.reshape(frame.viewmat, (4, 4)), f"frame {frame.frame}")
-        cameras.append(ForeignCamera(f"frame {frame.frame}", pose, lens, frame.frame))
-    return ForeignSolve(file, "camera path", list(lenses), cameras)
+        cameras.append(ImportedCamera(f"frame {frame.frame}", pose, lens, frame.frame))
+    return ImportedSolve(file, "camera path", list(lenses), cameras)
 
 
-def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
+def _from_transforms(file: Path, data: dict[str, Any]) -> ImportedSolve:
     """nerfstudio's format: camera-to-world, OpenGL axes; what a frame does not say of its lens stands at the top."""
     lenses: dict[Lens, int] = {}
-    cameras: list[ForeignCamera] = []
+    cameras: list[ImportedCamera] = []
     own_facts: Any = data.get(OWN_FACTS)
     facts = cast("dict[str, Any]", own_facts) if isinstance(own_facts, dict) else {}
     for n, frame in enumerate(data["frames"]):
@@ -249,9 +249,9 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ForeignSolve:
         pose = np.concatenate([turned[:, :3].T, -(turned[:, :3].T @ turned[:, 3:])], axis=1)
         lens = lenses.setdefault(_transforms_lens(file, {**data, **frame}), len(lenses))
         number = int(Path(name).stem) if facts.get("is_numbered_as_shot") is True else None
-        cameras.append(ForeignCamera(name, pose, lens, number))
+        cameras.append(ImportedCamera(name, pose, lens, number))
     world = SCENE_WORLD if facts.get("world") == SCENE_WORLD else ""
-    return ForeignSolve(file, "transforms.json", list(lenses), cameras, None, world, _notes(facts))
+    return ImportedSolve(file, "transforms.json", list(lenses), cameras, None, world, _notes(facts))
 
 
 def _notes(facts: dict[str, Any]) -> list[tuple[str, str]]:
@@ -302,7 +302,9 @@ def _rigid(matrix: NDArray[Any], name: str) -> NDArray[np.float64]:
 # ------------------------------------------------------------------------------------------------- to the clip
 
 
-def match(solve: ForeignSolve, counted: Counted, size: tuple[int, int], solved: Sequence[int] | None = None) -> Matched:
+def match(
+    solve: ImportedSolve, counted: Counted, size: tuple[int, int], solved: Sequence[int] | None = None
+) -> Matched:
     """Finds the camera of each frame by the numbers of all pictures, see `pairing`.
 
     Args:
@@ -352,17 +354,17 @@ def match(solve: ForeignSolve, counted: Counted, size: tuple[int, int], solved: 
     return Matched(cameras, missing, [words] if words else [])
 
 
-def _tables(solve: ForeignSolve) -> dict[str, dict[int, ForeignCamera]]:
+def _tables(solve: ImportedSolve) -> dict[str, dict[int, ImportedCamera]]:
     """Cameras by number, of each sequence of pictures in the file by its pattern. JobError for one number twice."""
     if all(c.number is not None for c in solve.cameras):
         return {"": {c.number: c for c in solve.cameras if c.number is not None}}
-    of_name: dict[str, ForeignCamera] = {}
+    of_name: dict[str, ImportedCamera] = {}
     for camera in solve.cameras:
         name = camera.name.replace("\\", "/")
         if name in of_name:
             raise _refusal(f"{name} has two cameras in {solve.path.name}.", "Use a solve of this one clip alone.")
         of_name[name] = camera
-    tables: dict[str, dict[int, ForeignCamera]] = {}
+    tables: dict[str, dict[int, ImportedCamera]] = {}
     for found in numbered_files(of_name):
         if found.twice:
             raise _refusal(
@@ -373,7 +375,7 @@ def _tables(solve: ForeignSolve) -> dict[str, dict[int, ForeignCamera]]:
     return tables
 
 
-def remarks(solve: ForeignSolve, matched: Matched) -> list[tuple[str, str]]:
+def remarks(solve: ImportedSolve, matched: Matched) -> list[tuple[str, str]]:
     """(sentence, hint) of what the artist should know about the matching."""
     remarks = [*solve.notes, *matched.said]
     if matched.missing:
@@ -386,7 +388,7 @@ def remarks(solve: ForeignSolve, matched: Matched) -> list[tuple[str, str]]:
     return remarks
 
 
-def own_points(solve: ForeignSolve, matched: Matched, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
+def own_points(solve: ImportedSolve, matched: Matched, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
     """The solve's own points as points.npz has them before filtering, and the angle under which they are seen.
 
     Returns xyz float32 [P, 3], rgb uint8 [P, 3], error float32 [P] px of the working frames (0 where unknown), track

@@ -41,7 +41,7 @@ class _Laid:
     """Square difference of the pictures that shows more than noise."""
 
 
-class Leftover:
+class ResidualFlow:
     """Own motion that is left in key frames after the camera's is taken out."""
 
     def __init__(self, picture: Callable[[int], NDArray[np.uint8]], test: StillTest, config: FlowConfig) -> None:

@@ -10,7 +10,7 @@ from torch_backend.footage.images import read_png, write_png
 from torch_backend.lens.lens import Lens, load_lens
 from torch_backend.lens.lens_verdict import left_px, lens_remarks
 from torch_backend.lens.stmap import redistort_map, undistort_map, write_map
-from torch_backend.sfm.ladder import Attempt, next_rung
+from torch_backend.sfm.retries import Attempt, next_strategy
 from torch_backend.sfm.solving import SolveConfig, solve_shot
 from torch_backend.sfm.verdict import Fault
 from torch_backend.shot import Shot
@@ -132,8 +132,8 @@ def test_no_other_lens_is_tried_where_the_map_is_the_lens(tmp_path):
     answer = {"result": {"registered": 9, "lens": lens}}
     best = Attempt("first", tmp_path, answer, Fault("bent", JobError("a")), 9)
     asked = {"camera_model": "SIMPLE_RADIAL", "features": 800}
-    assert next_rung(best, asked, set()) is not None
-    assert next_rung(best, {**asked, "hold_bend": True}, set()) is None
+    assert next_strategy(best, asked, set()) is not None
+    assert next_strategy(best, {**asked, "hold_bend": True}, set()) is None
 
 
 def test_what_is_left_of_the_lens_is_measured_at_the_corner():

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_backend.cameras import foreign
+from torch_backend.cameras import imported
 from torch_backend.cameras.colmap_files import read_model, write_model
 from torch_backend.contract import CameraPath, ExitCode, JobError, read_json
 from torch_backend.footage.pairing import Counted
@@ -45,9 +45,9 @@ def some_poses(count=10):
 
 
 def fake_solve(count, first=101, lens=None):
-    lens = lens or foreign.Lens("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-    cameras = [foreign.ForeignCamera(f"f_{first + n:04d}.png", np.eye(4)[:3], 0) for n in range(count)]
-    return foreign.ForeignSolve(Path("there"), "COLMAP model", [lens], cameras)
+    lens = lens or imported.Lens("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    cameras = [imported.ImportedCamera(f"f_{first + n:04d}.png", np.eye(4)[:3], 0) for n in range(count)]
+    return imported.ImportedSolve(Path("there"), "COLMAP model", [lens], cameras)
 
 
 # ------------------------------------------------------------------------------------------------- reading
@@ -56,11 +56,11 @@ def fake_solve(count, first=101, lens=None):
 def test_transforms_come_out_with_opencv_axes(tmp_path):
     """nerfstudio looks along -z with y up: a point before its camera is before ours, and up in it is up in ours."""
     poses = some_poses()
-    solve = foreign.read(transforms(tmp_path / "transforms.json", poses))
+    solve = imported.read(transforms(tmp_path / "transforms.json", poses))
     assert solve.kind == "transforms.json" and len(solve.cameras) == 10
     for camera, pose in zip(solve.cameras, poses, strict=True):
         np.testing.assert_allclose(camera.pose, pose[:3], atol=1e-12)
-    assert solve.lenses == [foreign.Lens("PINHOLE", 640, 480, (500.0, 510.0, 321.0, 239.0))]
+    assert solve.lenses == [imported.Lens("PINHOLE", 640, 480, (500.0, 510.0, 321.0, 239.0))]
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_transforms_come_out_with_opencv_axes(tmp_path):
     ],
 )
 def test_the_lens_of_transforms(tmp_path, told, model, bend):
-    lens = foreign.read(transforms(tmp_path / "t.json", some_poses(), **PLAIN, **told)).lenses[0]
+    lens = imported.read(transforms(tmp_path / "t.json", some_poses(), **PLAIN, **told)).lenses[0]
     assert (lens.model, lens.params[4:]) == (model, bend)
 
 
@@ -82,7 +82,7 @@ def test_a_lens_can_stand_in_each_frame_and_as_an_angle(tmp_path):
     data = json.loads(file.read_text())
     data["frames"][1] |= {"fl_x": 90.0, "cx": 99.0}
     file.write_text(json.dumps(data))
-    solve = foreign.read(file)
+    solve = imported.read(file)
     assert [c.lens for c in solve.cameras] == [0, 1, 0]
     assert solve.lenses[0].params == pytest.approx((100.0, 100.0, 100.0, 50.0))
     assert solve.lenses[1].params == pytest.approx((90.0, 90.0, 99.0, 50.0))
@@ -99,7 +99,7 @@ def test_a_lens_can_stand_in_each_frame_and_as_an_angle(tmp_path):
     ],
 )
 def test_colmap_lenses(model, params, expected):
-    lens = foreign.lens_from_colmap(model, 640, 480, params)
+    lens = imported.lens_from_colmap(model, 640, 480, params)
     assert (lens.model, lens.params) == expected
 
 
@@ -108,7 +108,7 @@ def test_an_ordinary_lens_bends_as_colmap_says(solved, tmp_path):
     import subprocess
     import sys
 
-    lens = foreign.lens_from_colmap("SIMPLE_RADIAL", 320, 240, (300.0, 161.0, 119.0, -0.06)).scaled(640, 480)
+    lens = imported.lens_from_colmap("SIMPLE_RADIAL", 320, 240, (300.0, 161.0, 119.0, -0.06)).scaled(640, 480)
     code = (
         "import pycolmap, numpy as np, json, sys; r = np.array([[.4, -.3, 1], [-.5, .2, 1]]);"
         "a = pycolmap.Camera(model='SIMPLE_RADIAL', width=320, height=240, params=[300, 161, 119, -.06]);"
@@ -121,7 +121,7 @@ def test_an_ordinary_lens_bends_as_colmap_says(solved, tmp_path):
 
 def test_a_colmap_model_reads_as_pycolmap_wrote_it(solved):
     """solve/colmap is written by COLMAP itself; cameras.json is what came out of it by another way."""
-    solve = foreign.read(solved.shot.solve / "colmap")
+    solve = imported.read(solved.shot.solve / "colmap")
     path = {f.frame: f for f in CameraPath.load(solved.shot.solve / "cameras.json").frames}
     numbers = [int(c.name.rpartition(".")[0]) for c in solve.cameras]
     assert sorted(numbers) == list(range(101, 122, 2))
@@ -151,8 +151,8 @@ def test_a_model_written_is_the_model_read(solved, tmp_path, text):
 @pytest.mark.parametrize("below", ["", "sparse", "sparse/0"])
 def test_the_model_is_found_below(solved, tmp_path, below):
     write_model(tmp_path / below, read_model(solved.shot.solve / "colmap"))
-    assert len(foreign.read(tmp_path).cameras) == 11
-    assert len(foreign.read(tmp_path / below / "cameras.bin").cameras) == 11
+    assert len(imported.read(tmp_path).cameras) == 11
+    assert len(imported.read(tmp_path / below / "cameras.bin").cameras) == 11
 
 
 def test_broken_files_are_a_sentence(solved, tmp_path):
@@ -162,7 +162,7 @@ def test_broken_files_are_a_sentence(solved, tmp_path):
             for other, data in files.items():
                 (tmp_path / other).write_bytes(data[:cut] if other == name else data)
             with pytest.raises(JobError, match=f"These cameras cannot be used: .*{name}"):
-                foreign.read(tmp_path)
+                imported.read(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -183,14 +183,14 @@ def test_unusable_transforms_are_a_sentence(tmp_path, change, words):
     data = {k: v for k, v in {**json.loads(file.read_text()), **change}.items() if v is not None}
     file.write_text(json.dumps(data))
     with pytest.raises(JobError, match=words) as told:
-        foreign.read(file)
+        imported.read(file)
     assert told.value.exit_code == ExitCode.SOLVE
 
 
 @pytest.mark.parametrize("make", [lambda p: p / "gone", lambda p: p])
 def test_nothing_there_is_a_sentence(tmp_path, make):
     with pytest.raises(JobError, match="does not exist|holds no cameras"):
-        foreign.read(make(tmp_path))
+        imported.read(make(tmp_path))
 
 
 # ------------------------------------------------------------------------------------------------- matching
@@ -204,10 +204,10 @@ def test_cameras_are_found_by_the_numbers_in_the_names_of_their_pictures(templat
     solve = fake_solve(20, first=1001)
     for n, camera in enumerate(solve.cameras):
         camera.name = template.format(1001 + n)
-    solve.cameras.append(foreign.ForeignCamera("poster.png", solve.cameras[0].pose, 0))
-    matched = foreign.match(solve, Counted(list(range(1001, 1021))), (640, 480))
+    solve.cameras.append(imported.ImportedCamera("poster.png", solve.cameras[0].pose, 0))
+    matched = imported.match(solve, Counted(list(range(1001, 1021))), (640, 480))
     assert [matched.cameras[n].name for n in range(1001, 1021)] == [template.format(n) for n in range(1001, 1021)]
-    assert not matched.missing and not foreign.remarks(solve, matched)
+    assert not matched.missing and not imported.remarks(solve, matched)
 
 
 def test_cameras_of_two_clips_are_refused_by_their_names():
@@ -215,10 +215,10 @@ def test_cameras_of_two_clips_are_refused_by_their_names():
     for n, camera in enumerate(solve.cameras):
         camera.name = f"{'right' if n % 2 else 'left'}/{n // 2:04d}.png"
     with pytest.raises(JobError, match=r"left/####\.png, right/####\.png"):
-        foreign.match(solve, Counted(list(range(20))), (640, 480))
+        imported.match(solve, Counted(list(range(20))), (640, 480))
     for camera in solve.cameras[1::2]:
         camera.name = camera.name.replace("/", "/9")
-    matched = foreign.match(solve, Counted(list(range(20))), (640, 480))
+    matched = imported.match(solve, Counted(list(range(20))), (640, 480))
     assert matched.cameras[7].name == "left/0007.png" and not matched.missing
 
 
@@ -226,15 +226,15 @@ def test_a_picture_with_two_cameras_is_refused():
     solve = fake_solve(20)
     solve.cameras[3].name = solve.cameras[4].name
     with pytest.raises(JobError, match=r"f_0105\.png has two cameras"):
-        foreign.match(solve, Counted(list(range(101, 121))), (640, 480))
+        imported.match(solve, Counted(list(range(101, 121))), (640, 480))
 
 
 def test_matching_is_by_number_and_says_what_is_missing():
     solve = fake_solve(20)
-    matched = foreign.match(solve, Counted(list(range(105, 125))), (320, 240))
+    matched = imported.match(solve, Counted(list(range(105, 125))), (320, 240))
     assert sorted(matched.cameras) == list(range(105, 121)) and matched.missing == [121, 122, 123, 124]
     assert matched.cameras[110].name == "f_0110.png"
-    assert foreign.remarks(solve, matched)[0][0] == "4 frames have no camera in there: frames 121-124."
+    assert imported.remarks(solve, matched)[0][0] == "4 frames have no camera in there: frames 121-124."
 
 
 @pytest.mark.parametrize("lost", [[], [19], [3, 4, 11], [0]])
@@ -242,22 +242,22 @@ def test_pictures_counted_from_zero_are_no_frame_late_however_many_have_a_camera
     """The last case cannot be told from a count from 1: the first picture has no camera."""
     solve = fake_solve(20, first=0)
     solve.cameras = [c for n, c in enumerate(solve.cameras) if n not in lost]
-    matched = foreign.match(solve, Counted(list(range(1, 21)), clip=(1, 20)), (640, 480))
+    matched = imported.match(solve, Counted(list(range(1, 21)), clip=(1, 20)), (640, 480))
     step = 0 if lost == [0] else 1
     assert all(camera.name == f"f_{frame - step:04d}.png" for frame, camera in matched.cameras.items())
     assert len(matched.cameras) == len(solve.cameras)
-    assert bool(step) == any("numbered 0 to" in words for words, _ in foreign.remarks(solve, matched))
+    assert bool(step) == any("numbered 0 to" in words for words, _ in imported.remarks(solve, matched))
 
 
 def test_too_few_or_another_shape_are_refused():
     with pytest.raises(JobError, match="Only 0 of the 20 frames.* numbered 500 to 509"):
-        foreign.match(fake_solve(10, first=500), Counted(list(range(1, 21))), (640, 480))
+        imported.match(fake_solve(10, first=500), Counted(list(range(1, 21))), (640, 480))
     with pytest.raises(JobError, match="Only 5 of the 20 frames"):
-        foreign.match(fake_solve(20), Counted(list(range(101, 121))), (640, 480), solved=None) and foreign.match(
+        imported.match(fake_solve(20), Counted(list(range(101, 121))), (640, 480), solved=None) and imported.match(
             fake_solve(5), Counted(list(range(101, 121))), (640, 480)
         )
     with pytest.raises(JobError, match="640 x 480 pixels, the shot's frames have another shape, 640 x 360"):
-        foreign.match(fake_solve(20), Counted(list(range(101, 121))), (640, 360))
+        imported.match(fake_solve(20), Counted(list(range(101, 121))), (640, 360))
 
 
 def test_frames_that_are_trained_on_are_what_is_counted():
@@ -265,11 +265,11 @@ def test_frames_that_are_trained_on_are_what_is_counted():
     solve = fake_solve(40)
     solve.cameras = solve.cameras[1::2]  # every other frame, and the step keeps the others
     with pytest.raises(JobError, match="Only 0 of the 20 frames"):
-        foreign.match(solve, Counted(frames), (640, 480), solved=frames[::2])
+        imported.match(solve, Counted(frames), (640, 480), solved=frames[::2])
 
 
 def test_points_without_tracks_count_the_pictures_they_lie_in():
-    lens = foreign.Lens("PINHOLE", 100, 100, (100.0, 100.0, 50.0, 50.0))
+    lens = imported.Lens("PINHOLE", 100, 100, (100.0, 100.0, 50.0, 50.0))
     solve = fake_solve(3, lens=lens)
     for n, camera in enumerate(solve.cameras):
         camera.pose = np.concatenate([np.eye(3), [[-1.5 * n], [0.0], [0.0]]], axis=1)
@@ -279,17 +279,17 @@ def test_points_without_tracks_count_the_pictures_they_lie_in():
         "error": np.array([1.0, 2.0, -1.0]),
         "seen": [np.zeros(0, np.int64)] * 3,
     }
-    matched = foreign.Matched({n: c for n, c in enumerate(solve.cameras)}, [])
-    points = foreign.own_points(solve, matched, (200, 200))
+    matched = imported.Matched({n: c for n, c in enumerate(solve.cameras)}, [])
+    points = imported.own_points(solve, matched, (200, 200))
     assert points is not None
     assert points["track"].tolist() == [2, 0, 2]
     assert points["depth"].tolist() == [4.0, -np.inf, 3.0]
     assert points["error"].tolist() == [2.0, 4.0, 0.0]
     solve.points["seen"] = [np.array([0, 2]), np.array([1]), np.zeros(0, np.int64)]
-    told = foreign.own_points(solve, matched, (200, 200))
+    told = imported.own_points(solve, matched, (200, 200))
     assert told is not None and told["track"].tolist() == [2, 1, 0]
     assert float(told["angle"]) == pytest.approx(math.degrees(math.atan(0.75)))
-    assert foreign.own_points(fake_solve(3), matched, (200, 200)) is None
+    assert imported.own_points(fake_solve(3), matched, (200, 200)) is None
 
 
 def test_what_blender_says_of_a_camera_of_its_scene_is_believed(tmp_path):
@@ -298,22 +298,22 @@ def test_what_blender_says_of_a_camera_of_its_scene_is_believed(tmp_path):
     names = [f"{n}.png" for n in range(1, 11)]
     counted = Counted(list(range(1, 13)), (1, 12), shift=-1)
     file = transforms(tmp_path / "transforms.json", some_poses(), names, **PLAIN, splannequin=facts)
-    solve = foreign.read(file)
-    matched = foreign.match(solve, counted, (640, 480))
+    solve = imported.read(file)
+    matched = imported.match(solve, counted, (640, 480))
     assert solve.world == "scene" and {n: c.name for n, c in matched.cameras.items()} == dict(enumerate(names, 1))
-    said = [sentence for sentence, _ in foreign.remarks(solve, matched)]
+    said = [sentence for sentence, _ in imported.remarks(solve, matched)]
     assert said[0] == "One of two." and len(said) == 2 and "11-12" in said[1]
     data = json.loads(file.read_text())
     for strange in ({"world": 3, "notes": "x"}, [], "scene"):
         file.write_text(json.dumps({**data, "splannequin": strange}))
-        assert (foreign.read(file).world, foreign.read(file).notes) == ("", [])
+        assert (imported.read(file).world, imported.read(file).notes) == ("", [])
     file.write_text(json.dumps({**data, "frames": [{**data["frames"][0], "file_path": "five.png"}]}))
     with pytest.raises(JobError, match="cannot be used"):
-        foreign.read(file)
+        imported.read(file)
 
 
 @pytest.mark.parametrize("ending", ["abc", "FBX", "usdc"])
 def test_files_that_blender_reads_are_said_to_be_blenders(tmp_path, ending):
     (tmp_path / f"set.{ending}").write_bytes(b"x")
     with pytest.raises(JobError, match=f"set.{ending} is read by Blender alone"):
-        foreign.read(tmp_path / f"set.{ending}")
+        imported.read(tmp_path / f"set.{ending}")

@@ -8,7 +8,7 @@ import pytest
 
 from torch_backend.contract import Cancelled, ExitCode, JobError, read_json
 from torch_backend.footage import FootageConfig, import_footage
-from torch_backend.sfm.ladder import Attempt, climb, next_rung
+from torch_backend.sfm.retries import Attempt, next_strategy, solve_with_retries
 from torch_backend.sfm.solving import SolveConfig, _key, solve_shot
 from torch_backend.sfm.verdict import Fault, fault_of
 from torch_backend.shot import Shot
@@ -29,7 +29,7 @@ def rungs(best, **changes):
     """(name, changed) of all that is tried while `best` stays the best."""
     done = ["first"]
     found = []
-    while (rung := next_rung(best, {**ASKED, **changes}, set(done))) is not None:
+    while (rung := next_strategy(best, {**ASKED, **changes}, set(done))) is not None:
         done.append(rung.name)
         found.append((rung.name, *rung.changes.values()))
     return found
@@ -37,8 +37,8 @@ def rungs(best, **changes):
 
 def test_frames_that_are_matched_widely_already_are_not_matched_so_again():
     done = {"first", "features"}
-    assert next_rung(attempt("few"), {**ASKED, "wide": True}, done).name == "lens"
-    assert next_rung(attempt("few"), ASKED, done).name == "pairs"
+    assert next_strategy(attempt("few"), {**ASKED, "wide": True}, done).name == "lens"
+    assert next_strategy(attempt("few"), ASKED, done).name == "pairs"
 
 
 MATCHING = [("features", 8192, 0.0025), ("pairs", True)]
@@ -104,12 +104,12 @@ def test_of_two_tries_that_came_to_the_same_the_first_keeps_its_files(tmp_path, 
             (folder / name).write_text(rung)
         return replace(attempt("poor"), rung=rung, folder=folder)
 
-    monkeypatch.setattr("torch_backend.sfm.ladder._attempt", again)
-    climbed = climb(ASKED, {"frames": []}, True, tmp_path, tmp_path / "log", tools.recorder())
-    assert climbed.best.rung == "first" and len(climbed.tries) > 2
+    monkeypatch.setattr("torch_backend.sfm.retries._attempt", again)
+    solved = solve_with_retries(ASKED, {"frames": []}, True, tmp_path, tmp_path / "log", tools.recorder())
+    assert solved.best.strategy == "first" and len(solved.tries) > 2
     assert (tmp_path / "first" / "poses.json").read_text() == "first"
     left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
-    assert left == {"first/poses.json", *(f"{told['rung']}/database.db" for told in climbed.tries)}
+    assert left == {"first/poses.json", *(f"{told['rung']}/database.db" for told in solved.tries)}
 
 
 @pytest.fixture(scope="module")
@@ -168,8 +168,8 @@ def test_a_fisheye_that_was_taken_for_an_ordinary_lens_is_solved_as_one(tmp_path
     pictures = [tools.room().cast(pose, rays) for pose in tools.handheld(9)]
     request, frames = tools.asked(tmp_path, pictures)
     report = tools.recorder()
-    best = climb(request, frames, True, tmp_path, tmp_path / "log.txt", report).best
-    assert (best.rung, best.fault) == ("lens", None)
+    best = solve_with_retries(request, frames, True, tmp_path, tmp_path / "log.txt", report).best
+    assert (best.strategy, best.fault) == ("lens", None)
     assert best.answer["result"]["camera_model"] == "OPENCV_FISHEYE"
     assert best.answer["result"]["focal_px"] == pytest.approx(focal, rel=0.02)
     assert report.warnings == [
@@ -187,7 +187,7 @@ def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path
     request, frames = tools.asked(tmp_path, pictures, features=250)
     report = tools.recorder()
     with pytest.raises(JobError) as error:
-        climb(request, frames, True, tmp_path, tmp_path / "log.txt", report)
+        solve_with_retries(request, frames, True, tmp_path, tmp_path / "log.txt", report)
     assert error.value.message.startswith("Cameras were found for only ")
     assert error.value.hint.endswith(
         "Tried in vain: more features, more pairs, another lens model and the global mapper."
@@ -203,6 +203,6 @@ def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path
 def test_the_global_mapper_and_wider_pairs_find_the_room_as_well(tmp_path, tools):
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(10)]
     request, frames = tools.asked(tmp_path, pictures, mapper="global", wide=True)
-    answer = climb(request, frames, False, tmp_path, tmp_path / "log.txt", tools.recorder()).best.answer
+    answer = solve_with_retries(request, frames, False, tmp_path, tmp_path / "log.txt", tools.recorder()).best.answer
     assert fault_of(answer, frames) is None and answer["result"]["registered"] == 10
     assert answer["result"]["focal_px"] == pytest.approx(300.0, rel=0.02)

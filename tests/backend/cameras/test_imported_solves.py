@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from tests.backend.cameras.test_foreign import some_poses, transforms
-from torch_backend.cameras import foreign
+from tests.backend.cameras.test_imported import some_poses, transforms
+from torch_backend.cameras import imported
 from torch_backend.cameras.colmap_files import read_model
 from torch_backend.cameras.export import export_cameras
 from torch_backend.cameras.stored import load_points
@@ -17,7 +17,7 @@ from torch_backend.footage.images import read_png
 from torch_backend.footage.pairing import Counted
 from torch_backend.lens.plate_lens import load_plate_lenses
 from torch_backend.lens.undistort import Undistorter
-from torch_backend.sfm.given import doubts, refuse_misfit
+from torch_backend.sfm.imported_cameras import doubts, refuse_misfit
 from torch_backend.sfm.solving import SolveConfig, solve_shot
 from torch_backend.shot import Shot
 
@@ -214,7 +214,7 @@ def test_a_camera_path_comes_in_by_its_frame_numbers(tmp_path):
     frames = [CameraFrame(n, np.eye(4).ravel().tolist(), [400.0, 400.0, 320.0, 240.0]) for n in range(1, 12)]
     file = tmp_path / "path.json"
     file.write_text(json.dumps(CameraPath(640, 480, frames).to_json()))
-    solve = foreign.read(file)
-    matched = foreign.match(solve, Counted(list(range(2, 13))), (320, 240))
+    solve = imported.read(file)
+    matched = imported.match(solve, Counted(list(range(2, 13))), (320, 240))
     assert solve.kind == "camera path" and matched.missing == [12] and not matched.said
     assert solve.lenses[0].scaled(320, 240).params == (200.0, 200.0, 160.0, 120.0)

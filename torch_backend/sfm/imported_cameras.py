@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..array_types import save_arrays
-from ..cameras import foreign
+from ..cameras import imported
 from ..cameras.colmap_files import ColmapCamera, ColmapImage, ColmapModel, ColmapPoints, write_model
 from ..cameras.poses import camera_centre
 from ..contract import POINTS_FILE, REQUEST_FILE, ExitCode, JobError, Reporter
@@ -30,31 +30,31 @@ POOR_AGREEMENT = 0.5
 
 
 @dataclass
-class Taken:
+class ImportedCameras:
     """Imported cameras, matched to the frames of a clip."""
 
-    solve: foreign.ForeignSolve
+    solve: imported.ImportedSolve
     """What was read."""
-    matched: foreign.Matched
+    matched: imported.Matched
     """The frames' cameras."""
 
 
-def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> Taken:
+def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> ImportedCameras:
     """Reads cameras and matches them to the frames of a frames.json; tells `report` which are missing.
 
     JobError (SOLVE) if they cannot be read, are too few, or are of pictures of another shape.
     """
-    solve = foreign.read(cameras)
+    solve = imported.read(cameras)
     listed = frames["frames"]
     size, solved = (frames["width"], frames["height"]), [f["frame"] for f in listed if f["solve"]]
-    matched = foreign.match(solve, counted_of(frames), size, solved)
-    for message, hint in foreign.remarks(solve, matched):
+    matched = imported.match(solve, counted_of(frames), size, solved)
+    for message, hint in imported.remarks(solve, matched):
         report.warning(message, hint)
-    return Taken(solve, matched)
+    return ImportedCameras(solve, matched)
 
 
 def take_over(
-    shot: Shot, frames: dict[str, Any], taken: Taken, options: dict[str, Any], scratch: Path, report: Reporter
+    shot: Shot, frames: dict[str, Any], taken: ImportedCameras, options: dict[str, Any], scratch: Path, report: Reporter
 ) -> dict[str, Any]:
     """Has the worker finish a solve with imported cameras: undistort the frames, and triangulate points where needed.
 
@@ -76,10 +76,10 @@ def take_over(
     Raises:
         JobError: the worker broke off, or not one point agrees with the cameras.
     """
-    imported, matched = taken.solve, taken.matched
+    source, matched = taken.solve, taken.matched
     size = (frames["width"], frames["height"])
     used = sorted({camera.lens for camera in matched.cameras.values()})
-    lenses = [imported.lenses[n].scaled(*size) for n in used]
+    lenses = [source.lenses[n].scaled(*size) for n in used]
     names = {f["frame"]: Path(f["file"]).name for f in frames["frames"]}
     poses = {
         names[n]: {"pose": camera.pose.tolist(), "source": "registered", "lens": used.index(camera.lens)}
@@ -102,8 +102,8 @@ def take_over(
     fx, fy, _, _, *bend = lenses[0].params
     return {
         **answer,
-        "given": imported.kind,
-        "world": imported.world,
+        "given": source.kind,
+        "world": source.world,
         "registered": len(registered),
         "camera_model": lenses[0].model,
         "focal_px": 0.5 * (fx + fy),
@@ -111,9 +111,9 @@ def take_over(
     }
 
 
-def _own_points(taken: Taken, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
-    """The file's own points for pictures of `size` (w, h) as `foreign.own_points`, if enough to train from."""
-    points = foreign.own_points(taken.solve, taken.matched, size)
+def _own_points(taken: ImportedCameras, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
+    """The file's own points for pictures of `size` (w, h) as `imported.own_points`, if enough to train from."""
+    points = imported.own_points(taken.solve, taken.matched, size)
     centres = np.array([camera_centre(camera.pose) for camera in taken.matched.cameras.values()])
     return points if points is not None and _enough(points, centres) else None
 
@@ -133,7 +133,7 @@ def _request(shot: Shot, solved: list[str], known: dict[str, Any], options: dict
 
 
 def _keep_own(
-    points: dict[str, NDArray[Any]], scratch: Path, lenses: list[foreign.Lens], poses: dict[str, dict[str, Any]]
+    points: dict[str, NDArray[Any]], scratch: Path, lenses: list[imported.Lens], poses: dict[str, dict[str, Any]]
 ) -> dict[str, Any]:
     """Writes the file's own points and a model of them into `scratch`; the answer that the worker gives of its own."""
     angle = float(points.pop("angle"))
@@ -180,7 +180,7 @@ def _enough(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> bool:
 
 
 def _write_model(
-    folder: Path, lenses: list[foreign.Lens], poses: dict[str, dict[str, Any]], points: dict[str, NDArray[Any]]
+    folder: Path, lenses: list[imported.Lens], poses: dict[str, dict[str, Any]], points: dict[str, NDArray[Any]]
 ) -> None:
     """Writes the imported cameras as the COLMAP model that a solve of the working frames would leave."""
     cameras = {n: ColmapCamera(n, x.model, x.width, x.height, x.params) for n, x in enumerate(lenses, start=1)}

@@ -1,4 +1,4 @@
-"""A clip whose lens is known before the solve: its frames without the lens, for the mapper to see."""
+"""Undistorts frames before the solve, where an ST map gives the lens."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from .undistort import Undistorter, of_frames
 _WRITERS = 2
 
 
-class Straight:
-    """Working frames that went through a lens's map, in a folder of their own."""
+class UndistortedFrames:
+    """Working frames undistorted by the map of a lens, in a folder."""
 
     folder: Path
-    """Holds a picture of each frame's name."""
+    """Pictures with the names of the frames."""
     undistort: Undistorter
-    """What took the lens out."""
+    """The undistortion that was applied."""
     focal_scale: float
-    """Focal length of the straight frames over that of the original ones, both in pixels."""
+    """Focal length of the undistorted frames over that of the original ones, both in pixels."""
 
     def __init__(self, shot: Shot, frames: dict[str, Any], lens: MapLens, folder: Path, report: Reporter) -> None:
         """Writes those of `frames` (frames.json) into `folder`. JobError where the lens has no way, Cancelled."""
@@ -53,8 +53,8 @@ class Straight:
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
 
-    def told(self, scratch: Path) -> dict[str, Any]:
-        """What of the worker's answer is another, as its pictures were straight; and so is its map in `scratch`."""
+    def answer_changes(self, scratch: Path) -> dict[str, Any]:
+        """Fields of the answer that change as the worker saw undistorted frames. Also adapts the map in `scratch`."""
         file = scratch / "undistort_0.npz"
         with np.load(file, allow_pickle=False) as data:
             pinhole = data["pinhole"]
