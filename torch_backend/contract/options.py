@@ -116,8 +116,8 @@ class ImportParams:
         words="chosen",
         limit=Limit("step between solved frames", 1, 100_000, {0: "one that is chosen"}),
         label="Solve Every",
-        tip="Every how many frames the camera is solved and trained on, all are delivered; 0: chosen by the "
-        "clip's length. Smaller where a solve loses its way, 1: every frame",
+        tip="Interval of the frames that are solved and trained on; all frames are delivered. 0: chosen by the clip's "
+        "length. Set a smaller one where a solve loses track; 1: every frame",
     )
     """Every how many frames are solved and trained on; 0 chooses. All frames are delivered whatever it is."""
     working_height: int = option(
@@ -178,11 +178,11 @@ class ImportParams:
         0.0,
         flag="--pixel-aspect",
         metavar="A",
-        help="how many times as wide as high the footage's pixels are",
+        help="width of the footage's pixels divided by their height",
         words="what the files say, else square",
         limit=Limit("pixel aspect", 0.25, 4.0, {0: "what the files say"}),
         label="Pixel Aspect",
-        tip="How many times as wide as high the footage's pixels are, 2 for most anamorphic lenses; "
+        tip="Width of the footage's pixels divided by their height, 2 for most anamorphic lenses; "
         "0: what the files say",
     )
     """Width of the footage's pixels over their height; 0: what the files say, else 1."""
@@ -275,7 +275,7 @@ class SolveParams:
         switch=True,
         help="hold the focal length of `--focal-mm` as it is; else the solve refines it",
         label="Refine",
-        tip="Let the solve correct the focal length. Off: it is held as it is given",
+        tip="Let the solve correct the focal length. Off: it stays as set",
     )
     """Refine `focal_mm`; else it is held."""
     st_map: str = option(
@@ -297,7 +297,7 @@ class SolveParams:
         help="what `--st-map` does: `undistort` (a map of the undistorted picture: it takes the lens out of a plate), "
         "`redistort` (a map of the original: it puts the lens back into a render)",
         label="Map",
-        tip="Which way the ST map goes: a map does not say it",
+        tip="Direction of the ST map, which its file does not state",
         items={
             "undistort": ("Undistorts", "It takes the lens out of a plate: each of its pixels looks into the original"),
             "redistort": ("Redistorts", "It puts the lens back into a render: its pixels look into undistorted ones"),
@@ -322,7 +322,7 @@ class SolveParams:
         "a global mapper are tried, each where it can help",
         label="Try Again",
         tip="Where a solve fails or is poor, try again: with more features, more pairs of frames, another lens model, "
-        "a global mapper. Each is said, and none is tried where it cannot help",
+        "a global mapper. Each retry is reported, and what cannot help is skipped",
     )
     """Try again in other ways where the solve fails or is poor."""
     ignore_mask: str = option(
@@ -330,10 +330,10 @@ class SolveParams:
         flag="--ignore-mask",
         metavar="MASK",
         parse=ignored_path,
-        help="what is no part of the scene (a logo, dirt, the crew), white: a picture for all frames, a sequence, "
-        "a video, `alpha`: where the footage is transparent, `found`: what the import found to be burnt in, or `none`",
+        help="what is not part of the scene (a logo, dirt, the crew), white: a picture for all frames, a sequence, a "
+        "video, `alpha`: where the footage is transparent, `found`: what the import found to be burnt in, or `none`",
         label="Ignore",
-        tip="Mask of what is no part of the scene, white: a logo, dirt, the hands of the crew. It is not matched, not "
+        tip="Mask of what is not part of the scene, white: a logo, dirt, the hands of the crew. It is not matched, not "
         "learnt and not used to fill. One picture for all frames, a picture of a sequence, or a video",
     )
     """Mask of what is ignored, in white: a picture, a sequence, a video, `MASK_ALPHA` or `MASK_FOUND`. Empty: none."""
@@ -359,7 +359,8 @@ class SolveParams:
         metavar="PATH",
         is_path=True,
         commands=("solve",),
-        help="take these cameras instead: a COLMAP folder, a transforms.json or a camera path",
+        help="use these cameras instead of solving: a COLMAP folder, a transforms.json or a camera path; in Blender's "
+        "command line an Alembic, FBX or USD file, too",
         label="Cameras",
         tip="Folder of a COLMAP model or one of its files, a transforms.json, or a camera path. "
         "Pictures are matched to the clip's frames by the number in their names",
@@ -427,7 +428,7 @@ class TrainParams:
         "support",
         flag="--supervision",
         choices=SUPERVISIONS,
-        help="what holds Gaussians at times at which no frame shows them: `support` (ours), `paper` (the paper's "
+        help="what anchors Gaussians at times at which no frame shows them: `support` (ours), `paper` (the paper's "
         "rule), `none`",
     )
     """support, paper or none: which anchoring losses hold ill-supervised Gaussians."""
@@ -435,8 +436,8 @@ class TrainParams:
         "grad_norm",
         flag="--detector",
         choices=DETECTORS,
-        help="of `--supervision paper`, by what it knows such Gaussians: `grad_norm` (the paper), `grad_signed` (the "
-        "published code), `weight`",
+        help="with `--supervision paper`, how defective Gaussians are detected: `grad_norm` (the paper), `grad_signed` "
+        "(the published code), `weight`",
         heeded_with=("supervision", ("paper",)),
     )
     """`paper`, who is ill-supervised: weight, grad_norm, or grad_signed (the published code's signed sum)."""
@@ -484,12 +485,12 @@ class TrainParams:
         metavar="FOLDER",
         is_path=True,
         help="depth maps of the clip's frames, of a phone's sensor or a network: a folder of EXR, 16-bit PNG or TIFF, "
-        "numbered as the frames; metric, inverse or relative. They tell how far away is what moves",
+        "numbered as the frames; metric, inverse or relative. They give the depth of what moves",
         words="none",
         label="Depth",
         tip="Depth maps of the clip's frames, of a phone's sensor or a network: a folder of EXR, 16-bit PNG or TIFF, "
-        "numbered as the frames. Scale and shift are found. They tell how far away is what moves, in the training and "
-        "in frozen frames; empty: none",
+        "numbered as the frames. Scale and shift are fitted. They give the depth of movers, in the training and in "
+        "frozen frames; empty: none",
     )
     """Depth maps of the frames: a folder, one of its files or a pattern; metric, inverse or relative. Empty: none."""
     resume: bool = option(True, flag="--restart", switch=True, help="do not go on from the run's checkpoint")
@@ -501,7 +502,7 @@ class TrainParams:
         flag="--extend",
         metavar="N",
         commands=("train",),
-        help="add N steps to a finished run, which keeps its settings (other flags are passed over)",
+        help="add N steps to a finished run, which keeps its settings (other flags are ignored)",
         words="none",
         limit=Limit("number of steps to add", 1, 10_000_000, {0: "none"}),
         label="More Steps",
@@ -672,7 +673,7 @@ class MatteParams:
         metavar="FILE",
         is_path=True,
         help='JSON with the lassos: {"mattes": [{"name": NAME, "frame": N, "polygon": [[x, y], ...]}]}, in pixels '
-        "of the frozen frames from the top left corner; several of one name add to each other",
+        "of the frozen frames from the top left corner; lassos of one name add up",
         words="those of the take's mattes",
     )
     """JSON file of lassos; empty: those of before. A matte of before keeps its lassos unless the file has its name."""
