@@ -2,9 +2,9 @@
 
 Warp hands its compilers paths as UTF-8, and Clang and NVRTC open them as Windows' own code page: from a profile such as
 `C:\\Users\\Jörg` neither the headers in `warp/native` nor the folder of compiled kernels can be read, and nothing
-compiles, for the processor no more than for a card. Short (8.3) names do not help: Warp makes the long ones of them.
-So both move to a folder whose name is ASCII, where every user may make one. What lies there is loaded as a library, so
-the folder is one that this user made, and that no other may write. Standard library only.
+compiles, for the processor no more than for a card. Short (8.3) names do not help: Warp makes the long ones of them. So
+both move to a folder whose name is ASCII, where every user may make one. Files in it are loaded as libraries, so this
+user must own the folder and no other user may write to it. Standard library only.
 """
 
 from __future__ import annotations

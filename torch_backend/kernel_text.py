@@ -3,7 +3,7 @@
 A kernel file is a body of C++ for `warp.func_native`, or a part of one. Its head, the lines of `//` before the first
 other line, says what it is and is not compiled; everything after it is, to the letter, because Warp's cache of compiled
 kernels goes by the text. A line `#include "PATH"` stands for such a file, seen from the folder of the line, without its
-head. What stands between @ signs (`@LOW_PASS@`) is put in by the module that uses the file.
+head. The module that uses the file replaces names between @ signs (`@LOW_PASS@`).
 """
 
 import functools

@@ -98,7 +98,7 @@ def _keep_surface(
     shot: Shot, clip: Clip, n: int, found: KeyEvidence, labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None
 ) -> None:
     """Writes the points of a key frame's still surfaces, frame `n`: of what its matte [H, W] calls still, away from all
-    else. What moves is matched by a still point now and then, at a depth at which there is nothing."""
+    else. Some matches of a mover fit a still point by chance, at a depth where there is no surface."""
     apart = (labels != STILL).astype(np.uint8)
     reach = 2 * round(AWAY * clip.width / 640) + 1
     apart = cv2.dilate(apart, np.ones((reach, reach), np.uint8)) > 0

@@ -1,4 +1,4 @@
-"""What the backend is asked for when it is to write a job for a render farm."""
+"""Asks the backend to write a job for a render farm."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def wants_warp(scene: bpy.types.Scene) -> bool:
 
 
 def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
-    """What our node is asked for that the take does not have, in words."""
+    """Sentences about settings of our node that the take has no layers for."""
     inside, remarks = present(node.node_tree).nodes, list[str]()
     if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
         remarks.append("The take has no grain to add: freeze it again.")

@@ -33,7 +33,7 @@ _MAP = "ST Map"
 
 @dataclass(frozen=True)
 class Footage:
-    """What a take says of the footage that it was frozen from."""
+    """Facts in a take about the footage that it was frozen from."""
 
     file: Path
     """The video, or a picture of the sequence."""

@@ -90,7 +90,7 @@ SETTINGS: tuple[Setting, ...] = (
         for name in ("date", "time", "render_time", "memory", "hostname", "filename", "frame")
     ),
 )
-"""What a bake needs of the scene, in the order in which it is set."""
+"""Settings that a bake needs, in the order in which they are set."""
 
 
 def needed(scene: bpy.types.Scene, is_exact: bool, has_cg: bool) -> list[Setting]:

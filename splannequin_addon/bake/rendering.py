@@ -35,7 +35,7 @@ Blender keeps in one global whether Python may write. A render that begins while
 "no" at its end, and Python can write nothing until Blender is started again. It was seen in 4.3.2, of 8 renders after
 the second at Python's usual 5 ms, and after none at 2 s: a draw that is not interrupted leaves no chance for it."""
 _usual_interval = [sys.getswitchinterval()]
-"""What the interval was before the first of the renders that go on."""
+"""The interval before the first of the running renders changed it."""
 _DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (what Blender gives a new file)
 
 
@@ -244,7 +244,7 @@ class Run:
             made: what there is of the picture.
         """
         folder = self._folder_name()
-        # What is cut off is there still, and takes what room there was.
+        # A truncated file still lies on the disk and occupies the last free space.
         if is_full(self._beside, self._room if made is None or not made.exists() else 1 << 18):
             return contract.disk_error(folder)
         return contract.JobError(
@@ -394,7 +394,7 @@ def _in_words(error: OSError) -> BaseException:
 
 
 def _told(scene: bpy.types.Scene) -> list[str]:
-    """What the pictures are by the artist's own choice, where that is easily overlooked."""
+    """Sentences about output settings of the artist that are easily overlooked."""
     render, found = scene.render, list[str]()
     if render.resolution_percentage != 100:
         width, height = scene_setup.render_size(scene)

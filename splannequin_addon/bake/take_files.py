@@ -31,7 +31,7 @@ class Take:
     plate_size: tuple[int, int] = (0, 0)
     """Width and height in pixels of the plate that the take's warp is for; (0, 0): it has none."""
     light: str | tuple[float, ...] = "linear"
-    """What light its frames hold, as `compat.colour_space` has it."""
+    """The light that its frames hold, as `compat.colour_space` names it."""
 
 
 def take_of(folder: Path, depth_scale: float = 1.0) -> Take:

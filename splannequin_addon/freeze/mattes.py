@@ -21,7 +21,7 @@ Corner = tuple[float, float]
 
 
 def params_of(scene: bpy.types.Scene, shot: Path) -> contract.MatteParams:
-    """What the mask that is chosen asks for, at the scene's current frame; its lassos are written into the take.
+    """The request for a matte from the chosen mask at the scene's current frame; its lassos are written into the take.
 
     Lassos of the same name at other frames stay. JobError if there is no take or no mask, or nothing is drawn in it.
     """

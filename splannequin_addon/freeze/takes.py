@@ -110,7 +110,7 @@ def _with_rest(path: contract.CameraPath, old: contract.CameraPath) -> contract.
 
 
 def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.FreezeParams | None:
-    """What a take was asked for with, from its take.json, to render what it lacks; None if it was never finished."""
+    """Parameters of a take, from its take.json, to render its missing frames; None if it was never finished."""
     facts = inventory.read(shot).takes.get(take)
     if facts is None:
         return None
@@ -136,7 +136,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
 
 
 def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
-    """What a take lacks of what Freeze would make now, in one sentence; empty if it is that.
+    """How a take differs from what Freeze would render now, in one sentence; empty if it is that.
 
     Args:
         scene: the scene whose settings are compared.
@@ -208,7 +208,7 @@ def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
 
 
 def read_camera(scene: bpy.types.Scene, step: str) -> contract.FreezeParams | None:
-    """What a step asks for from the artist's camera, read all at once; None if none is chosen."""
+    """Parameters of a freeze from the artist's camera, which is sampled in one go; None if none is chosen."""
     name, folder = own_camera.name_of(scene), selection.shot_folder(scene)
     if not name or folder is None:
         return None

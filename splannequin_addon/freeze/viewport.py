@@ -110,7 +110,7 @@ def suggestions() -> list[dict[str, Any]]:
 
 
 def note() -> str:
-    """What the backend warned of when the session began, in its words; empty if of nothing."""
+    """Warning of the backend when the session began; empty if of nothing."""
     return str(_session.facts.get("note", "")) if _session is not None else ""
 
 

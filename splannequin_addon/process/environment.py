@@ -216,7 +216,7 @@ def _empty(folder: Path) -> None:
 
 
 def findings(facts: str) -> list[str]:
-    """What a backend's doctor (JSON) means for an artist, a sentence each."""
+    """The backend's doctor report (JSON) in sentences for an artist."""
     record = json.loads(facts)
     lines = [f"Python {record['python']}, torch {record['packages'].get('torch')}."]
     if record.get("trains_on") == "cuda":

@@ -48,7 +48,7 @@ class Progress:
 
 @dataclass
 class Work:
-    """What Blender itself does for a step, beside the backend's jobs."""
+    """Work that Blender itself does for a step, in slices of the timer."""
 
     step: str
     """Name of the step."""
@@ -73,7 +73,7 @@ class Watch:
     looked: float = 0.0
     """When the folder was last looked at, monotonic seconds."""
     notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
-    """What a finished step changed in the scene, or why it could not, by the step's name."""
+    """Step's name -> what the finished step changed in the scene, or why it could not."""
     failures: dict[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
     """(sentence, hint) of what failed on Blender's side, by the step's name."""
     work: Work | None = None
@@ -98,7 +98,7 @@ class Watch:
 
 _watches: dict[Path, Watch] = {}
 _meanwhile: list[Callable[[], bool]] = []
-"""What is looked after beside the shots, until it says that it is done."""
+"""Callbacks besides those of shots, called until they return that they are done."""
 _pulses: list[Callable[[], float | None]] = []
 """What is called more often than jobs are looked at."""
 _jobs_next = 0.0

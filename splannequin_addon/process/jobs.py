@@ -27,7 +27,7 @@ _START_SECONDS = 30.0
 """A job without a status this long after it was made never started."""
 _LOG_LINES = 6
 _FIRST_LOOK_SECONDS = 1.0
-"""What a job that is found again wrote is read for so long at once."""
+"""Seconds that the events of a rediscovered job are read in one go."""
 _KILL_SECONDS = 20.0
 """A job that has not ended this long after it was asked to is ended by force on a second request."""
 _LONGEST_SECONDS = 1e7

@@ -93,7 +93,7 @@ class Step:
         return False
 
     def late(self, job: jobs.Job) -> str:
-        """What is said, in place of `finish`, of a job that ended before its shot was chosen; empty: it is finished."""
+        """Sentence, instead of `finish`, about a job that ended before its shot was chosen; empty: it is finished."""
         return ""
 
     def began(self, job: jobs.Job) -> None:

@@ -89,7 +89,7 @@ def _pictures(path: Path) -> tuple[Path, tuple[str, str], dict[int, Path]] | Non
 
 
 def _place(path: Path) -> str:
-    """What all ways to write a path have in common that the system can tell without the file."""
+    """Normal form of a path, as far as the system can tell without opening the file."""
     try:
         return os.path.normcase(os.path.realpath(path))
     except (OSError, ValueError):

@@ -378,6 +378,6 @@ def _mtime(path: Path) -> float:
 
 
 def unwritable(folder: Path, error: OSError, hint: str) -> contract.JobError:
-    """What is said of a folder that cannot be written, with the exit code that the backend's command line gives it."""
+    """The error for a folder that cannot be written, with the exit code of the backend's command line."""
     code = contract.ExitCode.DISK if error.errno in (errno.ENOSPC, errno.EDQUOT) else contract.ExitCode.USAGE
     return contract.JobError(f"Cannot write to {folder}: {error.strerror or error}.", hint, code)

@@ -28,7 +28,7 @@ _SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "lut", "ignore_path"
 _OUTPUT = "filepath"
 """Of a scene's render settings: the output path, which may be ours."""
 _saving: list[str] = []
-"""What `_holders` held before the file that is being saved was given its own."""
+"""Paths of `_holders` as they were before the save, to restore them after it."""
 
 
 def source_of(state: ShotState) -> str:

@@ -1,4 +1,4 @@
-"""What was put into a scene for a shot, kept as pointers in the scene.
+"""Objects that were added to a scene for a shot, kept as pointers in the scene.
 
 A mark on an object would travel with its copies: what the artist duplicates would pass for ours, and be removed. A
 pointer follows the one object through renaming, undo, saving and a full copy of the scene.

@@ -193,7 +193,7 @@ def find(scene: bpy.types.Scene, shot: Path, kind: str) -> bpy.types.Object | No
 def remove(scene: bpy.types.Scene, shot: Path) -> bool:
     """Takes everything that `build` made out of the file. True if there was something.
 
-    What the artist hung on the root or put into the collection stays where it is in the scene.
+    Objects that the artist parented to the root or put into the collection keep their place in the scene.
     """
     if scene_objects.of(scene, shot) is None:
         return False

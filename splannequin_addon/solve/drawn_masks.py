@@ -77,7 +77,7 @@ _BESIDE = re.compile(r"\.[a-z]+-([0-9a-f]{8})-([0-9]{1,10})-([0-9]{1,20})-[0-9a-
 
 
 def _here() -> str:
-    """What tells this computer from others in the name of a folder."""
+    """Digest of this computer's name, for the name of a folder."""
     return hashlib.sha256(contract.computer_name().encode()).hexdigest()[:8]
 
 

@@ -27,7 +27,7 @@ from . import camera_file, camera_samples, scene_camera
 LEAST_TRACKED = 8
 """Frames that a tracked camera has to be solved for."""
 _READING_SECONDS = 0.02
-"""Of each turn of the timer, in which a camera of the scene is sampled."""
+"""Seconds of each turn of the timer that are spent on sampling a camera of the scene."""
 
 
 def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> contract.SolveParams:
@@ -99,7 +99,7 @@ def has_file_for_blender(asked: contract.SolveParams) -> bool:
 
 
 def with_file_read(scene: bpy.types.Scene, asked: contract.SolveParams, shot: Path) -> contract.SolveParams:
-    """What a command line asks of a solve, with the cameras of a file that Blender reads written into the shot.
+    """Solve parameters of a command line. Cameras of a file that Blender reads are written into the shot first.
 
     JobError if they cannot be.
     """

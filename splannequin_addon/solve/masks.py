@@ -16,7 +16,7 @@ from . import drawn_masks, exchange
 LABELS = {"ignore": "Ignore", "people": "People"}
 """Kind of mask -> its name on the panel."""
 _WORDS = {"NONE": "", "ALPHA": contract.MASK_ALPHA, "FOUND": contract.MASK_FOUND}
-"""What is chosen -> what the backend takes for it, where that is no file."""
+"""Choice in the panel -> the backend's word for it, for choices that are not files."""
 
 
 def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolveParams:

@@ -25,7 +25,7 @@ class Plan:
 
 
 def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Plan:
-    """What training the run of a name with a preset means, as the shot stands.
+    """The effect of pressing Train: what happens to the run of that name with this preset.
 
     `depth` is the absolute path of the depth maps that are chosen; empty: those of the run, if it has any.
     """

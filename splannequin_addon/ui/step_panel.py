@@ -30,7 +30,7 @@ class StepPanel(PanelBase):
     step = ""
     operator = ""
     folds = ""
-    """What its parts that can be folded are called in the files that keep how they stand."""
+    """Names of the foldable sub-panels in .blend files, which store their state."""
 
     def _watch(self, context: bpy.types.Context) -> job_timer.Watch | None:
         folder = selection.shot_folder(scene_in(context))
@@ -94,7 +94,7 @@ class StepPanel(PanelBase):
             self.draw_advanced(context, body)
 
     def draw_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """What keeps the step from being done at all, with the button that helps."""
+        """Draws what prevents the step, with the button that helps."""
 
     def draw_always(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """What stays in reach while a step runs."""

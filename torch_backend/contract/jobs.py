@@ -157,7 +157,7 @@ WORK = {
 
 
 def gone(shot: Path, kind: str) -> JobError:
-    """What is told of a job whose shot was moved or deleted while it ran."""
+    """The error of a job whose shot was moved or deleted while it ran."""
     return JobError(
         f"{WORK.get(kind, 'A step')} ended: the shot folder {shot} was moved or deleted meanwhile.",
         "Finished work is in the folder, wherever it is now: choose it there and start again.",

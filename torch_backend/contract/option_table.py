@@ -43,7 +43,7 @@ class Option:
     choices: tuple[str, ...] = ()
     """What it may be."""
     metavar: str | None = None
-    """What --help and the reference write for the value, unit or kind."""
+    """Placeholder of the value in --help and the reference: its unit or kind."""
     parse: Callable[[str], Any] | None = None
     """Text to value, ValueError on what cannot be; None: as the field's type."""
     switch: bool = False

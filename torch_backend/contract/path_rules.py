@@ -1,7 +1,7 @@
 """Where files of another computer lie on this one: the path mapping rules of a render farm.
 
-The engine that runs a farm writes them to a file (Open Job Description, `pathmapping-1.0`). What a shot remembers of
-the computer that it was made on, its footage above all, is looked for by them.
+The engine that runs a farm writes them to a file (Open Job Description, `pathmapping-1.0`). They map paths that a shot
+stores from the computer that made it, such as its footage.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def _checked(owner: str, name: str, hint: Any, value: Any) -> Any:
 
 
 _LARGEST_FLOAT, _LARGEST_INT = 1e300, 1 << 53
-"""What JSON cannot hold without loss, or is no number (NaN, infinity), comes from no file of ours."""
+"""Numbers that JSON cannot hold without loss, NaN and infinity are refused: our files never contain them."""
 
 
 def _short(value: Any) -> str:

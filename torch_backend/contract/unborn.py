@@ -23,7 +23,7 @@ from .shot_folder import (
 from .typed import from_dict
 
 _UNBORN = {INFO_FILE, JOBS_FOLDER, FRAMES_FOLDER}
-"""What an import that did not end well may leave in a shot folder."""
+"""Files that a failed import may leave in a shot folder."""
 _WORK = {SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER}
 
 

@@ -7,8 +7,8 @@ whole trunk often dies in the first steps, and the field stands still for good),
 the field says how things move, the image says where they are. Axes are stretched where the Gaussians are: background
 behind what moves makes the box large, and people a few nodes wide. `published` brings all of that back.
 
-What stays the trainer's for every host, and so is not the published code's: one image per step (2 to 4), the loss, the
-Gaussians' own rates and their growth, and one optimiser for both stages.
+Handled by the trainer for every host, and thus different from the published code: one image per step (2 to 4), the
+loss, the Gaussians' own rates and their growth, and one optimiser for both stages.
 """
 
 from __future__ import annotations

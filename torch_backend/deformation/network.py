@@ -119,7 +119,7 @@ class _Through(AutogradContext, Protocol):
 
 
 class _Network(torch.autograd.Function):
-    """What the heads say, with gradients for the features and all weights."""
+    """Output of the heads, with gradients for the features and all weights."""
 
     @staticmethod
     def forward(ctx: _Through, features: Tensor, threads: int | None, *params: Tensor) -> tuple[Tensor, ...]:

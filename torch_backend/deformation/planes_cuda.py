@@ -29,7 +29,7 @@ from ..torch_types import AutogradContext, applied, once_differentiable, split
 _KERNELS = Path(__file__).with_name("kernels")
 
 refused = ""
-"""What the card's self-test has against these kernels (`train.device`); then `supports` says no, and torch's own path
+"""Why the card's self-test forbids these kernels (`train.device`); then `supports` says no, and torch's own path
 serves. Of the process, as the card is."""
 
 

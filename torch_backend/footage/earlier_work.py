@@ -40,7 +40,7 @@ class EarlierWork:
         return cls(shot, words, record) if words else None
 
     def may_be_same(self, settings: Mapping[str, Any], info: SourceInfo) -> bool:
-        """Whether an import with these settings may give the same pictures, which only decoding them can tell.
+        """True if an import with these settings may give the same pictures; only decoding can decide it.
 
         `settings` and `info` are in the shot's numbers. The key of an import may differ for the same pictures: of a
         range that names all frames, a file that was packed anew, an import of an earlier version.
@@ -83,7 +83,7 @@ class EarlierWork:
         return digest_of(read_frame(path)) if is_whole_png(path) else None
 
     def order(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """What `Shot.publish_frames` is told of it, beside the facts of a new import's frames.json.
+        """Facts for `Shot.publish_frames`, in addition to those of the new frames.json.
 
         Paint and masks stay with a frame that has the same number in the same footage, or the same pixels.
         """

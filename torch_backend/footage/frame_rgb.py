@@ -24,7 +24,7 @@ LUMA = {1: (0.2126, 0.0722), 4: (0.30, 0.11), 5: (0.299, 0.114), 7: (0.212, 0.08
 BT709, BT601, RGB = 1, 5, 0
 VIDEO_RANGE, FULL_RANGE = 1, 2
 MATRIX_OVERRIDES = {"bt709": BT709, "bt601": BT601, "bt2020": 9}
-"""What a person may say instead of the file -> the scaler's matrix."""
+"""Value of --matrix -> the scaler's matrix."""
 RANGE_OVERRIDES = {"video": VIDEO_RANGE, "full": FULL_RANGE}
 
 _WHITE16_OF_VIDEO_RANGE = 65280

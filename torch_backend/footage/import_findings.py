@@ -1,4 +1,4 @@
-"""What the frames of an import are refused or remarked on for."""
+"""Reasons to refuse the frames of an import, and remarks about them."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def _import_key(footage: list[Any], config: FootageConfig, display: Display, shi
 
 
 def _recorded(config: FootageConfig) -> dict[str, Any]:
-    """What was taken of the footage, wherever that lies by now, and whatever it was allowed to replace."""
+    """Settings that decide the imported pictures: without the footage's path, and without the consent to replace."""
     return {name: value for name, value in asdict(config).items() if name not in ("source", "replace")}
 
 

@@ -1,7 +1,7 @@
 """Looks of cameras: a .cube table (1D or 3D) that makes a picture for a display of what a camera recorded.
 
-OpenImageIO's OpenColorIO reads and applies it. What comes out is taken as display-referred sRGB, as players and editors
-show it: working frames, plates and all that leaves are made of that, so they agree. Light beyond white is cut by most
+OpenImageIO's OpenColorIO reads and applies it. Its output counts as display-referred sRGB, as players and editors show
+it: working frames, plates and all that leaves are made of that, so they agree. Light beyond white is cut by most
 tables.
 """
 

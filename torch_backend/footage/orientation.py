@@ -80,7 +80,7 @@ def orientation_of_picture(spec: oiio.ImageSpec) -> Orientation | None:
 
 
 def orientation_of_matrix(matrix: NDArray[np.int32]) -> Orientation | None:
-    """What a display matrix (9 numbers, as MP4 and FFmpeg have it) says; None if it is none of the eight.
+    """The orientation in a display matrix (9 numbers, as in MP4 and FFmpeg); None if it is none of the eight.
 
     Its scale and its offset do not matter: pictures are shown whole, and FFmpeg makes a pixel aspect of two scales.
     """

@@ -401,7 +401,7 @@ def _pixel_aspect(spec: oiio.ImageSpec) -> Fraction | None:
 
 
 def _input_space(file: Path, spec: oiio.ImageSpec, colours: Colours, warnings: list[tuple[str, str]]) -> InputSpace:
-    """What a picture's numbers mean, as a person, its file or a rule of $OCIO says, or as such files mostly mean it."""
+    """Colour space of a picture: from the options, its file or a rule of $OCIO, else the usual one of such files."""
     chosen = colours.space()
     if chosen is not None:
         return chosen

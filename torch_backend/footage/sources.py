@@ -114,7 +114,7 @@ class Source(Protocol):
 
 @dataclass
 class Known:
-    """What an import found out about the frames that are now read again."""
+    """Facts that an import stored about the frames that are read again."""
 
     seconds: dict[int, float]
     """Time of each listed frame since the first of them, by its number."""

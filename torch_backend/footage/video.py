@@ -137,7 +137,7 @@ class VideoSource:
             deep=self._deep,
             extended=not self._space.as_it_stands,
             colour="linear" if self._space.is_light else "srgb",
-            # What is read otherwise than it used to be is imported again; all else keeps its key.
+            # Clips that this version reads differently get a new key and are imported again.
             key=content_key_of({1: path}) + reading_key,
             former_key=[path.name, stat.st_size, stat.st_mtime_ns, *reading_key],
             reading=reading,
@@ -431,7 +431,7 @@ def _reading(frame: av.VideoFrame, space: InputSpace, coding: Coding) -> dict[st
 
 
 def _chosen_space(path: Path, colours: Colours) -> InputSpace | None:
-    """What a person says that a clip's colours are, or a rule of $OCIO for its path."""
+    """Colour space of a clip from the options, or from a rule of $OCIO for its path."""
     return colours.space() or colours.by_rules(path)
 
 
@@ -447,7 +447,7 @@ def _primaries_read(frame: av.VideoFrame, space: InputSpace) -> str:
 
 
 def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> InputSpace:
-    """What the numbers of a frame mean, as the stream says or, if it does not, as players assume."""
+    """Colour space of a frame from the stream's tags, or as players assume without them."""
     transfer, primaries, matrix = int(frame.color_trc), int(frame.color_primaries), int(frame.colorspace)
     known = transfer in TRANSFERS or transfer in UNSAID
     known_primaries = primaries in PRIMARIES or primaries in NEAR_REC709 or primaries in UNSAID

@@ -1,7 +1,7 @@
 """The canonical Gaussians: parameters, optimiser state and per-Gaussian memory, which grow and shrink together.
 
-One primitive, `rebuild`, clones, splits and prunes: it takes the row each new Gaussian comes from. What rides along
-(the gate, the support bitmap) is inherited by children, as the support preset needs (docs/architecture.md).
+One primitive, `rebuild`, clones, splits and prunes: it takes the row each new Gaussian comes from. Children inherit
+per-Gaussian state (the gate, the support bitmap), as the support preset needs (docs/architecture.md).
 """
 
 from __future__ import annotations

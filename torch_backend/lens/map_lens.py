@@ -140,7 +140,8 @@ class MapLens:
     def from_params(
         cls, width: int, height: int, params: Sequence[float], K: Sequence[float] = (1.0, 1.0, 0.0, 0.0)
     ) -> MapLens:
-        """What `params` told, for frames of a size in pixels with intrinsics `K`. ValueError for other numbers."""
+        """The lens that `params` stored, for frames of a size in pixels with intrinsics `K`. ValueError for other
+        numbers."""
         values = [float(value) for value in params]
         forward, degree = (int(value) for value in values[:2])
         terms = tuple(values[8:])

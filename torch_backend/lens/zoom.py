@@ -1,4 +1,4 @@
-"""Whether the lens zooms during the take, by the focal length that each frame would rather have. numpy alone.
+"""Detects a zoom during the take, from the focal length that fits each frame best. numpy alone.
 
 A solve has one focal length for all frames. Where the lens zooms, it moves the cameras along their axes instead, and
 the error stays small. Points at different depths tell the two apart.

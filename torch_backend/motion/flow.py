@@ -35,71 +35,70 @@ class FlowConfig:
     baselines: tuple[int, ...] = (1, 2, 4, 8)
     """A key frame is matched with those this many key frames before and after; each is double the one before."""
     links: int = 4
-    """Matches over the longest baseline are chained this often: 4 links of 8 key frames reach 3 seconds."""
+    """Number of matches over the longest baseline that are chained: 4 links of 8 key frames reach 3 seconds."""
     round_trip: float = 1.2
-    """Greatest distance between a pixel and where the flow there and back ends; above it the pixel is hidden there."""
+    """Largest distance between a pixel and the end of the flow there and back; above it the pixel counts as occluded."""
     tolerance: float = 0.9
-    """A match this far from where the still point is seen may tell of motion."""
+    """Distance of a match from the projected still point above which it may show motion."""
     per_link: float = 0.2
-    """So much more for each further link of a chain."""
+    """Growth of `tolerance` with each further link of a chain."""
     noise: float = 2.0
-    """The tolerance of a pair is at least this many times the median distance in it: blur, shutter, a poor pose."""
+    """Least tolerance of a pair, in median distances of its matches: it covers blur, shutter and a poor pose."""
     most_noise: float = 4.0
-    """But at most this many times what it is otherwise, unless a pose was guessed: what moves may fill the picture."""
+    """Largest tolerance of a pair, in multiples of its usual one, as movers may fill the picture. None if a pose was guessed."""
     contrast: float = 3.0
-    """Only where the picture changes by so much over that distance is it more than an error of the flow."""
+    """Least change of the picture over the distance of a match for it to show motion; below it flow is unreliable."""
     likeness: float = 8.0
-    """Pictures that differ by less show the same."""
+    """Difference up to which two pictures show the same surface."""
     blurred: float = 0.25
-    """Share of another picture's sharpness (mean square step) below which a picture is blurred beside it."""
+    """Sharpness (mean square step), relative to the other picture's, below which a picture counts as blurred."""
     gone_far: float = 0.5
     """Weight, relative to a moving match, of a point that is found neither four key frames before nor after."""
     better: float = 1.5
     """Factor by which the squared difference at the still point's pixel must exceed that at the match to count as
     motion."""
     haste: float = 0.3
-    """Power of a pair's distance in time with which it counts for stillness: what sways is still for a moment."""
+    """Exponent of a pair's distance in time in its weight for stillness: also a sway is still for a moment."""
     doubt: float = 1.0
     """Number of moving matches that are attributed to errors."""
     outline: float = 1.0
-    """So much more of that at outlines, where flow is a mixture of two surfaces."""
+    """Growth of `doubt` at outlines, where flow mixes two surfaces: it is multiplied by up to 1 + this."""
     share: float = 0.4
     """Share of a point's matches that must show motion for a score of 1."""
     sure: float = 4.0
     """Number of matches from which on the confidence in a point is 1."""
     spans: tuple[int, ...] = (4, 8, 16)
-    """Key frames this far before and after are laid over one by its depths, to see what is left of motion."""
+    """Distances in key frames over which residual flow is computed."""
     least: float = 0.67
-    """What is left counts in units of this length,"""
+    """Least unit of residual flow; the unit grows with the noise of a pair (`unusual`)."""
     unusual: float = 3.0
-    """or of so many times its median where that is more, up to `most_left`."""
+    """Unit of residual flow as a multiple of its median in the pair."""
     most_left: float = 12.0
-    """Of the least: what moves may fill the picture."""
+    """Largest unit of residual flow, in multiples of `least`, as movers may fill the picture."""
     most: float = 1.2
-    """More of these units than that tell no more."""
+    """Residual flow, in units, above which more is no further evidence."""
     visible: tuple[float, float] = (2.0, 3.5)
-    """A picture that changes by so much over what is left shows it: by the noise of the pair, from the one to the
-    other."""
+    """Range of the noise of a pair; a change of the picture over the residual flow must exceed it to be visible."""
     bearing: float = 0.3
-    """By so much, of what it is at the match, the picture differs more where nothing moved, if it bears a match out."""
+    """Growth of the difference at the still point, relative to that at the match, that fully confirms a match."""
     rim: float = 1.5
-    """At outlines these units count less by 1 + this."""
+    """Growth of the unit at outlines: residual flow there is divided by up to 1 + this."""
     faint: float = 0.2
-    """So many of these units are nothing yet,"""
+    """Residual flow, in units, up to which the score is 0."""
     clear: float = 0.8
-    """and so many are motion for certain."""
+    """Residual flow, in units, from which on the score is 1."""
     reach: int = 2
-    """Over so many of the longest baselines a surface's scores are gathered along it."""
+    """Number of longest baselines over which scores are gathered along a surface."""
     radius: int = 4
-    """Scores are spread over so many points of the grid, stopping at edges of the picture."""
+    """Radius in grid points over which scores are spread, stopping at edges of the picture."""
     edge: float = 8.0
-    """Smaller differences are no edges."""
+    """Difference between neighbouring pixels below which there is no edge."""
     seed: float = 0.4
-    """An area moves if a point in it has this score,"""
+    """Score that a moving area has to reach at one point at least."""
     grow: float = 0.2
-    """and reaches as far as points have this one."""
+    """Score down to which a moving area extends."""
     blob: float = 10.0
-    """Areas of less than this squared are noise, and holes of less are filled."""
+    """Side in pixels of the smallest area that is kept, and of the smallest hole that is not filled."""
 
 
 class Matches:
@@ -207,7 +206,7 @@ class Seen:
 
 
 def neighbours(matches: Matches, key: int, count: int, config: FlowConfig) -> list[Seen]:
-    """What is seen again of `key` in the keys 0 to `count` - 1 around it."""
+    """Where points of `key` are found in other keys, of 0 to `count` - 1."""
     result: list[Seen] = []
     for side in (-1, 1):
         last = None

@@ -236,7 +236,7 @@ def _own_score(
     """((score, weight, inverse), what is left, evidence): how surely a key frame's points move, 0 to 1, how much is
     known of them, and the inverse depths of still points.
 
-    What is left of motion is looked for if there is none of the key `before`; else that is followed to here.
+    Residual motion is computed unless that of the key `before` is passed, which is then followed to this key.
     """
     seen = neighbours(matches, key, len(clip.keys), config)
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)

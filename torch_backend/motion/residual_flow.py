@@ -1,9 +1,9 @@
-"""What a camera's motion leaves over: sways too slow or too small to tell from the noise of a match.
+"""Residual flow: finds sways that are too slow or too small to separate from the noise of a match.
 
-Another key frame is laid over a key frame by the depth that still points have there, so that still surfaces lie where
-they are and flow has next to nothing to find: what it still finds is known several times better than a match over the
-whole travel. Depths are fitted once more to these better matches, and what no depth explains then is own motion, if
-the pictures bear it out. Tried over a second and more, because sways grow with time.
+Another key frame is warped over a key frame by the depth of still points. Still surfaces then coincide, and the flow
+that is left is several times more precise than a match over the whole distance. Depths are fitted once more to these
+matches. Residual flow that no depth explains is motion, if the pictures confirm it. Spans are a second and more,
+because sways grow with time.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from .flow import FlowConfig, Map, Mask, Seen, dense_flow, sample
 from .still import FEW, Look, Pair, StillTest, Texture, brightness, inside, outlines, still_points
 
 _FINEST, _STRIDE, _DESCENTS, _REFINEMENTS = 1, 4, 16, 2
-"""Of DIS: at half the size of the pictures and not finer, every fourth pixel."""
+"""Settings of DIS: at half the size of the pictures and not finer, every fourth pixel."""
 _SPARSE, _TURNS = 4, 6
-"""Every so manieth point tells of the whole picture, and so often what moves in it is weighed less."""
+"""Stride of the points to which the drift is fitted; iterations of its reweighted fit."""
 _NEAREST = 5.0
-"""What is nearer than the typical depth by more than this counts as this near."""
+"""Upper limit of inverse depth over its median: nearer points are clamped."""
 _FLOOR = 2.0
-"""Square difference of pictures that is less than any noise."""
+"""Squared difference of pictures that is below any noise."""
 
 
 @dataclass
 class _Laid:
-    """A key frame and another one laid over it."""
+    """A key frame and another one that was warped over it."""
 
     pair: Pair
     """Its weight says how alike the pictures are at the match."""
@@ -42,7 +42,7 @@ class _Laid:
 
 
 class ResidualFlow:
-    """Own motion that is left in key frames after the camera's is taken out."""
+    """Motion of objects in key frames after the camera's is removed."""
 
     def __init__(self, picture: Callable[[int], NDArray[np.uint8]], test: StillTest, config: FlowConfig) -> None:
         """`picture` gives key k as in `flow.Matches`."""
@@ -75,7 +75,7 @@ class ResidualFlow:
             seen = np.minimum(texture.change(x, y, length) / each.visible, 1.0)
             evidence.append(np.minimum(length / limit, config.most) * seen * each.gained * each.pair.weight)
             known += each.pair.weight
-        second = np.partition(np.stack(evidence), -2, axis=0)[-2]  # one alone is what is hidden there
+        second = np.partition(np.stack(evidence), -2, axis=0)[-2]  # a single comparison may be an occlusion
         faint = config.faint
         score = (second / (1.0 + config.rim * outlines(inverse)) - faint) / (config.clear - faint)
         return np.clip(score, 0.0, 1.0), np.minimum(known, 1.0)
@@ -84,7 +84,7 @@ class ResidualFlow:
         return self._test.guessed[key] or self._test.guessed[other]
 
     def _limit(self, length: Map, telling: Mask) -> float:
-        """The distance that may tell of motion, from how far matches are off as a rule."""
+        """Unit of residual flow: the distance that may show motion, from the median of the matches."""
         least = self._config.least * self._test.unit
         noise = float(np.median(length[telling])) if np.count_nonzero(telling) >= FEW else 0.0
         return float(np.clip(self._config.unusual * noise, least, self._config.most_left * least))
@@ -94,14 +94,14 @@ class ResidualFlow:
         one = self._picture(key)
         x, y = (cv2.resize(p, one.shape[::-1], interpolation=cv2.INTER_LINEAR) - np.float32(0.5) for p in at)
         brought = cv2.remap(self._picture(other), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        # Past the border there is nothing: the picture itself, that flow stays at rest there.
+        # Outside the other picture it is filled with this one, so that flow is zero there.
         outside = cv2.resize((~within).astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST)
         cv2.copyTo(one, outside, brought)
         flow = np.nan_to_num(dense_flow(self._dis, one, brought))
         return np.asarray(cv2.resize(flow, within.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
     def _laid(self, key: int, other: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
-        """The other key frame, laid over a key frame by inverse depths."""
+        """Another key frame warped over a key frame by inverse depths, with their residual flow."""
         test = self._test
         pair = Pair.between(test, key, Seen(other, test.grid, np.zeros(inverse.shape, bool), 1), self._config)
         at, _ = pair.ray.project(inverse)

@@ -1,4 +1,4 @@
-"""Whether a point that stands still explains what is seen of a surface: its depth, and how many matches say no.
+"""Tests whether a still point explains the matches of a surface: its depth, and how many matches say no.
 
 Where nothing is matched, or where flow smears the motion of what is in front over what is behind it, pictures are
 compared where the point would be seen if it stood still. Maps are on the grid of `flow`.

@@ -26,7 +26,7 @@ LEAST_PARALLAX = 5.0
 """Pixels of a picture 640 wide by which its place in another frame would differ if it were twice as near: an error of
 one moves it by at most a fifth of its depth."""
 MOST_OFF = 0.5
-"""Of the evidence that it stands still, how much may say that it moves."""
+"""Largest weight of moving evidence for a still point, relative to its still evidence."""
 AWAY = 6.0
 """Pixels of a picture 640 wide from what is not known to stand still, at least."""
 PER_KEY = 2048

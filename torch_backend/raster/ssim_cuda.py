@@ -4,9 +4,9 @@ passes, nothing read back.
 The mathematics and the notation are those of `ssim`: separable blurs of x - 0.5, y - 0.5, x^2 + y^2 and x y, cut at the
 border and renormalised per axis; the backward blur is the plain one of values multiplied by the reciprocal weight sums
 first. Passes: 0 blurs down the columns, 1 along the rows and takes the score and the gradient's fields, 2 blurs these
-down, 3 along, and puts the gradient together. A thread is one value of one pixel. What is summed up is
-base + share * SSIM + plain * |x - y|, so that the loss of `train.losses` is one call, without operators of torch round
-it. The same kernel runs on Warp's cpu device, where tests compare it with float64.
+down, 3 along, and puts the gradient together. A thread is one value of one pixel. The sum is base + share * SSIM +
+plain * |x - y|, so that the loss of `train.losses` is one call without further torch operators. The same kernel runs on
+Warp's cpu device, where tests compare it with float64.
 """
 
 import functools

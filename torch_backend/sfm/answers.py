@@ -1,4 +1,4 @@
-"""What the worker leaves beside its request, in formats that need no pycolmap."""
+"""Files that the worker writes next to its request, in formats that need no pycolmap."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def more_features(masks: dict[str, Mask]) -> float:
 
 
 def wants_wide(masks: dict[str, Mask]) -> bool:
-    """Whether so much is masked that frames have to be matched with more than those next to them."""
+    """True if so much is masked that frames have to be matched with more than their neighbours."""
     return _covered(masks) >= _WIDE_SHARE
 
 
@@ -113,7 +113,7 @@ def masks_key(shot: Shot, *kinds: str) -> list[Any]:
 
 
 def load_mask(shot: Shot, kind: str, frame: int) -> NDArray[np.bool_] | None:
-    """What a mask covers of an undistorted frame, bool [H, W] of the working frames; None if the shot has no such mask.
+    """Masked pixels of an undistorted frame, bool [H, W] of the working frames; None if the shot has no such mask.
 
     JobError (SOLVE) if the file of a mask that it has is missing or damaged.
     """

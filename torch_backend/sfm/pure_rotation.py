@@ -1,4 +1,4 @@
-"""Whether a camera only turns on the spot, by the homographies between its frames. numpy alone."""
+"""Detects a camera that only rotates, from the homographies between its frames. numpy alone."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 FOCALS = (0.4, 2.5)
-"""Focal lengths that are looked through, as shares of the picture's width: 103 to 23 degrees wide."""
+"""Range of focal lengths that are tried, as shares of the picture's width: 103 to 23 degrees wide."""
 GIVEN = 1.2
 """Times by which a known focal length may be off: with one, a bend of the lens is made up for."""
 _STEPS = 48
 WIDEST = 0.25
-"""Share of the pairs that are looked at: those between which the picture shifts most."""
+"""Share of the pairs that are tested: those with the largest shift."""
 TRAVELLED = 0.2
-"""Of the shift between two frames, the share that may come from travelling where the camera is said to turn only.
+"""Largest share of the shift between two frames that translation may cause for the camera to count as only rotating.
 Measured in a rendered room: 0.02 turning, 0.5 to 0.7 walking past its walls."""
 _NOISE = 0.004
 """How far from a rotation noise makes one, as the ratio of its largest to its smallest singular value, less one."""

@@ -1,4 +1,4 @@
-"""What the worker is asked for, how it answers, and COLMAP's database in its scratch folder."""
+"""The worker's request and answer, and COLMAP's database in its scratch folder."""
 
 from __future__ import annotations
 

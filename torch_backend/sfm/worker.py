@@ -1,4 +1,4 @@
-"""What runs in the child process of COLMAP, which `start_worker.py` starts.
+"""Entry point of COLMAP's child process, which `start_worker.py` starts.
 
 A process of its own because pycolmap and OpenImageIO cannot share one (see footage/images.py), because COLMAP ends its
 process on a failed check, and because a process can be stopped at any moment. Nothing else imports its parts, which

@@ -309,7 +309,7 @@ class StepTable:
 
 
 def _factors(p: Tensor, group: dict[str, Any]) -> Tensor | None:
-    """What a group's `reach` makes of the rate of each element, laid out as `p` is; None if it is one for all."""
+    """Factor of a group's `reach` on the rate of each element, in the layout of `p`; None if it is one for all."""
     if not group["reach"]:
         return None
     rows = p.detach().reshape(len(p), -1)

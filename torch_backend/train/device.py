@@ -87,7 +87,7 @@ def cuda_refusal() -> str:
 
 
 def failed_self_test() -> tuple[str, str] | None:
-    """What the self-test found wrong with a card that could be used, and what to do about it; None if nothing."""
+    """(sentence, hint) about the fault that the self-test found in a usable card; None if nothing."""
     return _failed(card_verdict())
 
 

@@ -1,4 +1,4 @@
-"""What a trained run leaves unexplained of its frames, and how far things travel in it: what its verdict goes by.
+"""Measures the residual of a trained run in its frames, and how far things travel: what its verdict goes by.
 
 Where the low frequencies of a frame differ from the render at its own time, the run has something else there, whatever
 its sharpness. Travel is that of the picture's surfaces over the clip, in pixels of the very view, at those times only

@@ -1,4 +1,4 @@
-"""What moves by the shot's motion mattes, and the gate's decisions from it.
+"""Movers by the shot's motion mattes, and the gate's decisions from them.
 
 Flow finds movers that a photometric trial does not: on real clips the trial alone opened window reflections, and left
 waving hands closed. Unknown counts as still. A shot without mattes is trained by the trial alone.
@@ -88,7 +88,7 @@ def harden(run: RunView) -> bool:
     model, config = run.model, run.config.gate
     rows = model.open_rows()
     change, mean = _changes(model, rows, pixels_per_unit(run, rows), config)
-    # What is on trial by its matte has no still quarter among it that could say how large noise is.
+    # Gaussians on trial by their matte all move, so their stillest quarter cannot measure the noise.
     noise = config.noise if run.movers is None else 0.0
     stays = stays_open(model.gaussians, rows, change, config, noise)
     if not bool(stays.any()) and run.progress < config.give_up:

@@ -1,7 +1,7 @@
 """The pictures that a run is trained on: the shot's working frames, or where it asks for more the source's own.
 
-Working frames have 720 lines at most unless the import was told otherwise: enough for a processor. What trains on a
-card may be given plates, the source's frames without the lens, on the working frames' display.
+Working frames have 720 lines at most unless the import was told otherwise: enough for a processor. Training on a card
+may use plates: undistorted frames of the source's size, on the working frames' display.
 """
 
 from __future__ import annotations

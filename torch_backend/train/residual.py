@@ -23,7 +23,7 @@ def correlation_of_movers(run: RunView) -> float | None:
 
 
 def signed_residual(run: RunView, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """What the static model lacks at the Gaussians `rows` [M], frame by frame, at half the size.
+    """Residual of the static model at the Gaussians `rows` [M], per frame, at half the size.
 
     Returns (residual [I, M], weight [I, M]): mean of image - render over the pixels that a Gaussian paints, by
     alpha * T, grey, and the sum of those weights; 0 for frames that were not looked at.

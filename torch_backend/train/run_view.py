@@ -1,4 +1,4 @@
-"""What is read of a run in training, by what measures it for the trainer."""
+"""Attributes of a run in training that its measurements read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What moves is learnt from softened pictures while its field is young.
+"""Trains movers on softened pictures in the first steps of their field.
 
 A hand that is farther from where the field has it than Gaussians are wide has nothing that pulls it there, and stays
 where it is most of the time. In pictures of large pixels it overlaps with itself. What stands still is learnt from

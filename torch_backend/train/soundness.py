@@ -46,7 +46,7 @@ class MendedRun(RunView, Protocol):
 
 
 class Soundness:
-    """What is known of a run's steps, and of its frames and field, that are not finite."""
+    """Bookkeeping of a run's steps, frames and fields that are not finite."""
 
     def __init__(self, extent: float, device: torch.device) -> None:
         """`extent`: of the scene, in its units."""

@@ -1,6 +1,6 @@
 """What a static model of a clip shows: the clip learnt in a few hundred steps as a world in which nothing moves.
 
-What a frame shows and such a model cannot, moves or is hard to learn: `motion/misfit.py` tells them apart by other
+What a frame shows and a static model does not is moving or hard to learn: `motion/misfit.py` tells them apart by other
 frames.
 """
 

@@ -140,7 +140,7 @@ class Probe(Protocol):
         ...
 
     def correlation_frames(self) -> float | None:
-        """As `residual.correlation_frames`, of what the static model lacks where Gaussians are open."""
+        """`residual.correlation_frames` of the static model's residual at open Gaussians."""
         ...
 
 
@@ -351,7 +351,7 @@ class StoppingPolicy:
         return (whole - cut) * lasting(degree * every, probe.progress, self.schedule.rates_end) <= self.config.sh_gain
 
     def judge_cameras(self, probe: Probe, refined: Tensor) -> None:
-        """What refined cameras [F, 4, 4] are worth, as they are about to replace those of the run."""
+        """Gain by refined cameras [F, 4, 4], measured before they replace those of the run."""
         if self.joined or self.facts.poses_gain_db is not None:
             return
         without, value = probe.probe_psnr(self.probes), probe.probe_psnr(self.probes, viewmats=refined)

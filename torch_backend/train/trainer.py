@@ -316,15 +316,15 @@ class Trainer:
         return self.carry_out(kind, facts.on(self.device), frame)
 
     def _told(self, frame: int) -> tuple[StepKind, StepFacts]:
-        """What the next step is told of the trained frame at position `frame`. All that is drawn for a step that can be
-        recorded is drawn here; others draw in `carry_out`, too."""
+        """The inputs of the next step, on the trained frame at position `frame`. All that is drawn for a step that can
+        be recorded is drawn here; others draw in `carry_out`, too."""
         model, s, field, c = self.model, self.config.supervision, self.model.field, self.config
         rows, index, time = model.open_rows(), self.train_ids[frame], self.times[frame]
         draws = None
         if field is not None and len(rows) and s.anchors_due(self.iteration, self.progress):
             draws = draw(len(rows), len(self.centres), s, self.generator)
         field_time = time if field is None else field.training_time(time, self.progress, self.generator)
-        # What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
+        # The background colour changes at every step, so that a hole cannot pass for a grey wall.
         background = torch.rand(3, generator=self.generator, device="cpu")
         left, right, share = model.exposure.place(time)
         due = self.targets is not None and self.iteration % self.targets.every == 0

@@ -99,7 +99,7 @@ BarsOf = Callable[[int], "NDArray[np.bool_] | None"]
 
 
 class Compositor:
-    """Makes frozen frames of one run out of plates. What it computes of a plate serves all frames that use it."""
+    """Makes frozen frames of one run out of plates. Results per plate are cached for all frames that use it."""
 
     def __init__(
         self,

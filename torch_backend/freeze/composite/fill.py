@@ -1,4 +1,4 @@
-"""What fills a frozen frame where its primary plate is not believed: splats, and what they missed of other plates."""
+"""Fills a frozen frame where its primary source is not used: splats, and what they missed of other plates."""
 
 from __future__ import annotations
 

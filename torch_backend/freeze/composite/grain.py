@@ -85,7 +85,7 @@ def measure(frames: Sequence[NDArray[Any]]) -> Grain:
     if not found:
         return Grain.none()
     residual, mean, usable = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    # What rounding to whole steps adds is not the plate's grain: it comes back when the frozen frame is rounded.
+    # Quantisation noise is not the plate's grain: the frozen frame gets its own when it is rounded.
     step = 1.0 / (255.0 if frames[0].dtype == np.uint8 else 65535.0)
     variance = np.einsum("nci,nci->nc", residual, residual) / _BLOCK**2
     level = np.minimum((mean * BINS).astype(int), BINS - 1)
@@ -115,7 +115,7 @@ def measure(frames: Sequence[NDArray[Any]]) -> Grain:
 
 
 def draw(grain: Grain, frame: int, rgba: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float32]:
-    """What to add to a frozen frame to give it the plate's grain.
+    """The grain of the plate, to be added to a frozen frame.
 
     Args:
         grain: the plate's.

@@ -1,9 +1,8 @@
 """Depth of what moves in a frozen instant, by the artist's depth map of plate t*.
 
-What moves is seen at t* by one plate alone, so that no parallax tells how far away it is; a depth map does. Where the
-splats of a frozen frame are those that plate t* shows, their inverse depth and the map's are averaged, each weighted by
-its variance. The map's variance is that of its fit. The splats' variance is that of their difference from the map, less
-the map's variance.
+Only one plate shows a mover at t*, so no parallax gives its depth; a depth map does. Where the splats of a frozen frame
+are those that plate t* shows, their inverse depth and the map's are averaged, each weighted by its variance. The map's
+variance is that of its fit. The splats' variance is that of their difference from the map, less the map's variance.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def evidence(
     instant: Visibility | None,
     config: StateConfig,
 ) -> Evidence:
-    """What speaks for another state in plate `frame`, at the pixels of the target view's size of decisions.
+    """Evidence that plate `frame` shows another state than t*, at the resolution of decisions.
 
     Args:
         seen: how the plate sees the target view's points.

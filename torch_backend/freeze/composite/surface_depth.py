@@ -1,7 +1,7 @@
 """Depth of frozen frames that a compositor can use: smooth on surfaces, with the edges of the frame's own picture.
 
 The median depth of splats is that of single Gaussians: a plane looks like shingles, and where Gaussians are translucent
-the depth behind them is taken. What stands still is measured instead, once for all frames of a run:
+the depth behind them is taken. The depth of still surfaces is therefore measured, once for all frames of a run:
 
 1. Key views, spread over the clip, start from the splats' inverse depth of what stands still.
 2. Each plate is compared with the plates of the key views around it. Inverse depth takes Gauss-Newton steps that make
@@ -238,7 +238,7 @@ def _slope(picture: Array, axis: int) -> Array:
 
 @dataclass
 class Splats:
-    """What the splats show of a frame, at its full size."""
+    """The splats' render of a frame at its full size."""
 
     viewmat: NDArray[np.float64]
     """[4, 4] world-to-camera, scene units."""
@@ -288,7 +288,7 @@ def frame_depth(
     sigma = noise * np.maximum(inverse, LEAST_INVERSE)
     inverse, _ = smoothed(inverse, 1.0 / np.square(sigma), (config.small,), config.uneven)  # single splats jut out
     values, sigma = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, sigma))
-    # What moves and what stands still are surfaces of their own, however near they are.
+    # A mover and a still surface stay separate surfaces, however near they are.
     weight = 1.0 / np.square(np.maximum(sigma, LEAST_INVERSE * config.noise))
     still, moved = (fit_planes(values, weight * (of + 1e-9), config.radii[0]) for of in (~mover, mover))
     planes = Planes(*(np.where(mover, *each) for each in zip(moved, still, strict=True)))

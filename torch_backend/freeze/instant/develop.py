@@ -231,7 +231,7 @@ class _FineTuning:
     def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """A frame as the scene has it, [H, W, 3], and bool [H, W]: what it says of the frozen scene.
 
-        What shows through a hole is another colour at every step, so no hole can pass for a grey wall.
+        The background colour changes at every step, so that a hole cannot pass for a grey wall.
         """
         background = torch.full((3,), 0.5, device=self.device) if background is None else background
         marks = torch.stack([self.mover, self.afar], dim=1)

@@ -1,9 +1,9 @@
 """Adds Gaussians for what plate t* shows moving and the frozen scene lacks: a waving hand, an arm raised for a moment.
 
-The field learns from all frames. What only a few of them show is in none of its states, and developing would paint it
-onto the surfaces behind. Plate t* shows it, but not its depth. So it gets the depth of what it is attached to: the
-median over the pixels beside it at which the scene is nearer than where the thing is missing. Floaters of the field,
-which the plate contradicts, are hidden first. A thing that is attached to nothing is left to developing.
+The field learns from all frames. Objects that only a few frames show are in no state of the field, and developing would
+paint them onto the surfaces behind. Plate t* shows it, but not its depth. So it gets the depth of what it is attached
+to: the median over the pixels beside it at which the scene is nearer than where the thing is missing. Floaters of the
+field, which the plate contradicts, are hidden first. A thing that is attached to nothing is left to developing.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ class StaticBaselineConfig:
     plates: int = VIEWS
     """Trained frames that are looked at beside t*, at most, evenly over the clip."""
     neighbours: int = 16
-    """So many nearest open Gaussians are asked together."""
+    """Number of nearest open Gaussians that are decided together."""
     doubted: float = 3.0
     """So many times what the others lose must plate t* gain for what only sways where the mattes say that nothing moves
     at t*: a field also bends to what is wrong with the camera of that one plate, the edge of a desk for instance."""

@@ -1,4 +1,4 @@
-"""What an instant sees from so far away that frames which see it from near know better how it looks."""
+"""Undersampled Gaussians: those that plate t* sees from so far away that nearer frames show them better."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ VERSION = 4
 GROW = 4.0
 """Pixels of pictures 640 wide by which a matte grows: its edge is soft, and hair reaches beyond it."""
 FAR = 2.0
-"""What moves belongs to a standing thing up to so many times its depth."""
+"""Largest ratio of depths up to which a moving pixel belongs to a frozen thing."""
 
 Array = NDArray[np.float32]
 

@@ -93,7 +93,7 @@ def stored_key(folder: TakeFolder, frame: int, spec: FrameSpec) -> str | None:
 
 
 def made_before(take: str) -> tuple[str, str]:
-    """What to say of a take with frames of an earlier version, and why."""
+    """Warning about a take with frames of an earlier version, with the reason."""
     return (
         f"Frames of the take {take} were made by an earlier version, whose files do not say which belong together: "
         "they are made again.",

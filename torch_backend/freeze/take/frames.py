@@ -193,7 +193,7 @@ def _write_frame(
     spec: FrameSpec,
     key: str,
 ) -> None:
-    """Preview and EXR. What the layers are made of is in memory, they themselves only some rows at a time."""
+    """Preview and EXR. The inputs of the layers are in memory; the layers are computed some rows at a time."""
     write_png(folder.preview(output.frame), _preview(image, spec), key)
     size = tuple(image.alpha.shape)
 

@@ -132,7 +132,7 @@ def _finish(
 
 
 def _facts(shot: Shot, params: FreezeParams, take: PlannedTake) -> dict[str, Any]:
-    """What take.json keeps of what was asked for and planned, and where the files lie."""
+    """The record of a take in take.json: parameters, plan and paths."""
     folder, spec = take.folder, take.spec
     return {
         "version": 1,

@@ -1,4 +1,4 @@
-"""What of the plates is no part of the scene, by the mask that the artist gave the solve."""
+"""Ignored pixels of plates, by the artist's mask for the solve: they are not part of the scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ IgnoredOf = Callable[[int], "Tensor | None"]
 
 
 def ignore_mattes(shot: Shot) -> IgnoredOf:
-    """What the masks of a shot's solve say is no part of the scene."""
+    """Pixels that the masks of a shot's solve exclude from the scene."""
     if IGNORE not in given_masks(shot):
         return lambda frame: None
 

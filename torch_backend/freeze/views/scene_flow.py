@@ -21,8 +21,8 @@ _KEPT = 90
 class SceneFlow:
     """From a scene frozen at t* to the clip's frames.
 
-    What was closed at t* (`static_baseline.py`) is not moved. The run's own Gaussians come first in the scene; what
-    stands behind them (`missing.py`) is there at t* alone.
+    Gaussians that were closed at t* (`static_baseline.py`) do not move. The run's own Gaussians come first in the
+    scene; what stands behind them (`missing.py`) is there at t* alone.
     """
 
     def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int) -> None:
@@ -52,7 +52,7 @@ class SceneFlow:
 
     @torch.no_grad()
     def _change(self, frame: int) -> dict[str, Tensor]:
-        """What the field changes from t* to a frame, of the rows that move."""
+        """Change of the deltas from t* to a frame, for the rows that move."""
         if frame not in self._changes:
             then, now = self._field(frame), self._at_t_star
             self._changes[frame] = {name: then[name] - now[name] for name in PARAM_NAMES}
