@@ -37,7 +37,7 @@ class FlowConfig:
     links: int = 4
     """Number of matches over the longest baseline that are chained: 4 links of 8 key frames reach 3 seconds."""
     round_trip: float = 1.2
-    """Largest distance between a pixel and the end of the flow there and back; above it the pixel counts as occluded."""
+    """Largest distance between a pixel and the end of its flow there and back; beyond it the pixel is occluded."""
     tolerance: float = 0.9
     """Distance of a match from the projected still point above which it may show motion."""
     per_link: float = 0.2
@@ -45,7 +45,8 @@ class FlowConfig:
     noise: float = 2.0
     """Least tolerance of a pair, in median distances of its matches: it covers blur, shutter and a poor pose."""
     most_noise: float = 4.0
-    """Largest tolerance of a pair, in multiples of its usual one, as movers may fill the picture. None if a pose was guessed."""
+    """Largest tolerance of a pair, in multiples of its usual one: movers may fill the picture. No limit for guessed
+    poses."""
     contrast: float = 3.0
     """Least change of the picture over the distance of a match for it to show motion; below it flow is unreliable."""
     likeness: float = 8.0
