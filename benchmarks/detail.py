@@ -145,7 +145,7 @@ def save_strip(path: Path, pictures: Sequence[Tensor], crop: tuple[int, int, int
 
 
 def chosen_frames(clip: DetailClip, args: argparse.Namespace) -> list[int]:
-    """The frames that are asked for, else every `--every`-th of those held out of training."""
+    """The frames that are requested, else every `--every`-th of those held out of training."""
     frames = args.frames or clip.held_out()[:: args.every]
     unknown = set(frames) - set(clip.frames)
     if unknown or not frames:

@@ -32,7 +32,7 @@ FLOW_WIDTH = 640
 LEVEL_WINDOW, LEVEL_FLOOR = 31, 8 / 255
 """Pixels over which pictures are levelled before flow is taken, and the contrast below which there is none."""
 TEXTURE_WINDOW, TEXTURE = 9, 4 / 255
-"""Pixels over which structure is looked for, and the least of it: grain of 1 or 2 / 255 is none."""
+"""Pixels over which structure is searched for, and the least of it: grain of 1 or 2 / 255 is none."""
 
 
 def dilate(mask: Tensor, by: int) -> Tensor:

@@ -206,7 +206,7 @@ def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: in
 
 
 def table(name: str, freezes: Sequence[dict[str, Any]]) -> list[str]:
-    """The clip's figures in Markdown, a row per t* and what was looked at."""
+    """The clip's figures in Markdown, a row per t* and what was examined."""
     header = [name, "flow left, moving, px", "still, px", "more", "more, mean of frames", f"frames over {ALLOWED}"]
     header += ["worst frame", "difference, moving, / 255", "still, / 255"]
     lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]

@@ -65,7 +65,8 @@ class Launches:
 
     @contextlib.contextmanager
     def noted(self) -> Iterator[None]:
-        """Notes every launch within. A pointer is known by the tensor that was asked for it; those tensors stay."""
+        """Notes every launch within. A pointer is identified by the tensor that it was taken from; those tensors stay
+        alive."""
         call, ask, modules = cuda._Launcher.__call__, torch.Tensor.data_ptr, (ssim_cuda, adam, planes_cuda)
         launch_on = [module.launch_on for module in modules]
         notes = self

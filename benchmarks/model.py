@@ -179,7 +179,7 @@ def nearest_trained(trainer: Trainer, frame: int) -> int:
 
 
 def configured(args: argparse.Namespace, shot: Shot) -> TrainConfig:
-    """The configuration that is asked for, or that of the trained run that is."""
+    """The configuration that is requested, or that of the trained run that is."""
     if args.run:
         return config_from_json(read_meta(shot.run(args.run) / CHECKPOINT_FILE)["config"])
     params = TrainParams(method=args.method, seed=args.seed, iterations=args.iterations, width=args.width, holdout=8)

@@ -50,7 +50,7 @@ class Finding:
     """One line of the doctor."""
 
     what: str
-    """What was looked at."""
+    """What was examined."""
     state: str
     """ok, note (works without) or missing (does not)."""
     text: str

@@ -38,7 +38,7 @@ class _Drawn(Protocol):
 
 
 def present(pointer: T | None) -> T:
-    """A pointer that is never empty where it is asked for: the window manager of a context, the tree of a group."""
+    """A pointer that is never empty where it is used: the window manager of a context, the tree of a group."""
     assert pointer is not None
     return pointer
 

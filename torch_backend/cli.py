@@ -323,7 +323,7 @@ def run_job(args: argparse.Namespace, console: Console) -> int:
 
 
 def live(args: argparse.Namespace, console: Console) -> int:
-    """`live SHOT`: frames as they are asked for on the standard input."""
+    """`live SHOT`: frames as they are requested on the standard input."""
     from .live import run_live
 
     return run_live(args.shot, args.run, args.device)

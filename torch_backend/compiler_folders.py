@@ -85,7 +85,7 @@ def need_room(kernels: Path) -> None:
 def kernel_refusal(kernels: Path, error: Exception) -> JobError | None:
     """The sentence for a kernel that could not be compiled for the disk's sake; None if the disk was not the reason.
 
-    Not every compiler says why it could not write: a disk with no room left is looked at.
+    Not every compiler says why it could not write, so free space of the disk is checked.
     """
     if isinstance(error, JobError):
         return None

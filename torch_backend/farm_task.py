@@ -150,7 +150,7 @@ def _cancelling(reporter: EngineReporter) -> Generator[None]:
 def asked_of(args: argparse.Namespace, request: dict[str, Any], kind: str) -> Any:
     """The parameters of a kind of job as a task has them: the request's, with paths of this computer.
 
-    ValueError names what cannot be.
+    ValueError names an invalid parameter.
     """
     values = dict(request[kind])
     for setting in args.paths or ():

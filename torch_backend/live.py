@@ -1,4 +1,4 @@
-"""The live station: a warm run that draws frozen views as fast as they are asked for.
+"""The live station: a warm run that draws frozen views as fast as they are requested.
 
 It speaks through its own standard input and output, which belong to the process that started it: nothing listens, and
 when that process ends, so does this one. Messages are those of `contract.write_message`:
@@ -51,7 +51,7 @@ from .train.device import decide_device, unused_words
 _INSTANTS_KEPT = 8
 """Frozen scenes that are kept: going back and forth between keys costs no evaluation of the field."""
 _COARSER = 1.25
-"""Plates may be so many times as coarse as a view that is made of them."""
+"""Factor by which plates may be coarser than a view that is made of them."""
 _DETAIL = CompositeConfig(sources=4, source_views=VisibilityConfig(width=320))
 """A take looks at more plates, more finely: there a plate serves a frame and its neighbours, here perhaps one view."""
 _TINT, _TINTED = (1.0, 0.15, 0.55), 0.75

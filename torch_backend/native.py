@@ -127,7 +127,8 @@ def initialised_warp() -> Any:
 def compiling(folder: Path | None = None) -> Generator[None]:
     """JobError, in a sentence, if a kernel cannot be compiled meanwhile because there is no room for it.
 
-    `folder`: where it lies once it is compiled. LLVM ends the process if it cannot write, so room is looked for first.
+    `folder`: where the compiled kernel is stored. LLVM ends the process if it cannot write, so free space is checked
+    first.
     """
     try:
         if folder is not None and not any(folder.glob("*.o")):
@@ -171,7 +172,8 @@ def build(name: str, text: str) -> Launch:
 
 
 class _Ask:
-    """One stage that is asked for: who has begun and ended is told by lists, which no interrupt leaves halfway."""
+    """One launch of a kernel: lists record which workers began and ended, since no interrupt leaves an append half
+    done."""
 
     def __init__(self, run: Launch, address: int, stage: int, workers: int) -> None:
         self._run, self._address, self._stage = run, address, stage

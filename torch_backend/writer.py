@@ -168,7 +168,7 @@ def _make(path: Path, mine: Writer) -> bool:
         if sys.platform == "win32":
             try:
                 os.rename(partial, path)  # which refuses to replace, there
-            except PermissionError:  # a scanner is at it, or the one of before is just going: it is looked at again
+            except PermissionError:  # a virus scanner holds it, or the previous writer is removing it: checked again
                 return False
         else:
             try:

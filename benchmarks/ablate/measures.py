@@ -28,7 +28,7 @@ Row = dict[str, Any]
 
 
 class FrameMaker:
-    """Frozen frames of one instant, with rules of frames off. Plates are looked at once for all variants."""
+    """Frozen frames of one instant, with rules of frames off. Plates are examined once for all variants."""
 
     def __init__(self, clip: DetailClip, t_star: int, instant: Instant) -> None:
         self.clip, self.t_star, self.instant = clip, t_star, instant
@@ -43,7 +43,7 @@ class FrameMaker:
         return self._images[frame]
 
     def _maker(self, off: frozenset[str]) -> Compositor:
-        """A compositor with rules `off`. What it has of plates serves until how plates are looked at changes."""
+        """A compositor with rules `off`. What it has of plates serves until how plates are examined changes."""
         config = detail_config(off)
         views = {name for name in off if any(each.module.startswith("views.") for each in RULES[name].switches)}
         key = config.source_views, views

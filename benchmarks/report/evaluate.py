@@ -100,7 +100,7 @@ def evaluate_run(
         run_id: names this run's pictures.
         device: what renders.
 
-    JobError if there is no such run; `Cancelled` if a stop was asked for.
+    JobError if there is no such run; `Cancelled` if a stop was requested.
     """
     run, scene = load_run(truth.shot, run_name, device), load_scene(truth.shot)
     held_out = held_out_frames(run, scene)

@@ -216,7 +216,7 @@ class Stage:
         return mixed("ADD", left, denoise.outputs[0])
 
     def _without(self, mover: dict[str, Any], made: Any) -> Any:
-        """A mover less the triangles of the scene's thing, hidden until it is asked for; None if nothing is left."""
+        """A mover less the triangles of the scene's thing, hidden until it is requested; None if nothing is left."""
         with np.load(self.folder / "geometry" / "thing.npz", allow_pickle=False) as data:
             gone = data["gone"]
         if gone.all() or not gone.any():

@@ -108,7 +108,7 @@ def _looked_at(
     group.links.new(enter.outputs["Splat"], factor)
     group.links.new(layers["Combined"], first)
     group.links.new(layers["Splat"], second)
-    # tinted * (1 - plate), by as much as is asked for
+    # tinted * (1 - plate), by the requested amount
     invented = compat.new_math_node(group, "MULTIPLY_ADD")
     invented.inputs[1].default_value, invented.inputs[2].default_value = -_TINTED, _TINTED
     group.links.new(layers["Plate"], invented.inputs[0])
@@ -124,7 +124,7 @@ def _looked_at(
 def _grainy(
     group: bpy.types.NodeTree, enter: bpy.types.Node, layers: dict[str, bpy.types.NodeSocket]
 ) -> bpy.types.NodeSocket:
-    """Socket of the frozen picture with as much of its grain as is asked for; takes of before have none."""
+    """Socket of the frozen picture with as much of its grain as is requested; takes of before have none."""
     if GRAIN not in layers:
         return layers["Combined"]
     node, factor, first, second, summed = compat.new_mix_node(group, "ADD")

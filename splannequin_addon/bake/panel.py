@@ -19,7 +19,7 @@ class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
     folds = "bake"
 
     def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Which take, and which of its frames: Blender's own range and step."""
+        """Which take, and which of its frames: The frame range and step of the scene."""
         layout.prop(settings_of(scene_in(context)), "take_name")
         row = layout.row(align=True)
         row.prop(scene_in(context), "frame_start", text="First")

@@ -46,7 +46,7 @@ class Bake(Step):
         return params
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
-        """Bake: whether the freeze is in the scene's compositor."""
+        """The state of Bake: whether the scene's compositor shows the freeze."""
         props = settings_of(scene)
         if state is None or (props.take_name not in state.takes and props.run_name not in state.runs):
             return View(False, False, [], self.needs)
@@ -75,8 +75,8 @@ class Bake(Step):
         return insertion.insert_freeze(scene, job.shot, job.params["take"])
 
     def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
-        """In turns: Blender reads pictures, compositor and render. It is about the scene where it was asked for, alone;
-        about all that work on the shot, if that is not there any more."""
+        """In turns: Blender reads pictures, compositor and render. Changes only the scene from which the job was
+        started; if that is gone, all scenes that work on the shot."""
         name, take = steps.scene_of(job), str(job.params["take"])
         named = next((s for s in bpy.data.scenes if s.name == name and not library_of(s)), None)
         target = session.scene_of(job.scene_uid) or named  # by its name in another file, and of a job found again

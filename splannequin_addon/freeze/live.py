@@ -1,4 +1,4 @@
-"""A live session of the backend, as Blender holds it: views are asked for, frames arrive. No bpy here.
+"""A live session of the backend, as Blender holds it: views are requested, frames arrive. No bpy here.
 
 The child draws (torch_backend/live.py); two threads move bytes, so that the main thread never waits for a pipe. They
 touch nothing but this module's plain data.

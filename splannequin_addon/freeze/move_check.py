@@ -27,7 +27,7 @@ from . import live, own_camera, takes, viewport
 WIDTH = 160
 """Of the small pictures, in pixels."""
 MOST_FRAMES = 24
-"""Of a camera that are looked at, at equal distances."""
+"""Number of frames of a camera that are drawn, at equal distances."""
 _SUPPORTED = 0.5
 """Support from which on a pixel is no guess: half of what it shows was seen near t*."""
 _PAUSE_SECONDS = 0.005
@@ -112,7 +112,7 @@ def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_tim
 
 
 def share_of(frame: live.Frame | None, asked: contract.LiveView) -> float:
-    """Share of a drawn view's pixels that is a guess, 0..1. JobError if it is not the one that was asked for."""
+    """Share of a drawn view's pixels that is a guess, 0..1. JobError if it is not the requested one."""
     if frame is None or frame.asked.seq != asked.seq:
         raise contract.JobError("The backend could not draw what the camera sees.", "Try again.")
     return float(np.count_nonzero(frame.rgba[..., 0] < _SUPPORTED) / max(1, frame.rgba[..., 0].size))
@@ -163,7 +163,7 @@ class SPLANNEQUIN_OT_check_move(step_operator.StepOperator, bpy.types.Operator):
         return super().poll(context)
 
     def perform(self, context: bpy.types.Context) -> Outcome:
-        """Has the timer look; headless waits for it."""
+        """Lets the timer poll the backend; without a window, waits for it."""
         scene, name = scene_in(context), own_camera.name_of(scene_in(context))
         folder = selection.shot_folder(scene)
         assert folder is not None  # `poll` asked

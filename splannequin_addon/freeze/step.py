@@ -80,8 +80,8 @@ class Freeze(Step):
         return View(True, True, lines, "Next: bake it into your compositor.")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """An instant that nobody chose is the one that was taken; mattes are read again where they are shown; a
-        surface comes into the scene that has its shot, a light into the one that it was asked for in."""
+        """An instant that the artist did not choose is set to the frozen one; mattes are read again where they are
+        shown; a surface is added to scenes with its shot, a light to the scene from which it was started."""
         if job.kind == "mattes":
             return mattes.arrived(job.shot, job.result)
         if job.kind == "surface":

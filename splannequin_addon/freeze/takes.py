@@ -167,7 +167,7 @@ def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool
     Args:
         shot: the shot folder.
         take: name of the take.
-        frames: only these are asked for, as far as the clip or the take's camera has them; None: all between the
+        frames: only these are requested, as far as the clip or the take's camera has them; None: all between the
             take's first and last.
     """
     facts = inventory.read(shot).takes.get(take)

@@ -1,4 +1,4 @@
-"""Child processes of Blender, all of them: how they are started, and those that are asked for one answer. No bpy here.
+"""Child processes of Blender, all of them: how they are started, and backends that answer one question. No bpy here.
 
 Jobs, a set-up and a live session are started here and followed by their own modules; whatever answers once, the doctor,
 an export, ST maps, is a `Question`.
@@ -56,7 +56,7 @@ def start(
 
 @dataclass
 class Question:
-    """A backend that is asked for one answer, beside Blender."""
+    """A backend process that answers one question while Blender goes on."""
 
     process: subprocess.Popen[str]
     _told: tuple[str, str] = ("", "")

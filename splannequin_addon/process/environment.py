@@ -28,7 +28,7 @@ SIZE = "about 1.5 GB on disk (6 GB with CUDA)"
 LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp (Apache) and what they need"
 _STATE = "setup"
 _LOOK_SECONDS = 60.0
-"""An environment's packages are looked at this often while it is asked for, or when it was set up since."""
+"""Seconds after which an environment's packages are checked again while it is in use; also after a set-up."""
 _REMOVED = ".venv-removed-"
 """Begins the name of an environment that was taken away and is being deleted."""
 _SHOWN = 6
@@ -142,7 +142,7 @@ def cancel(setup: SetUp) -> None:
 
 
 def half_made(python: Path) -> bool:
-    """True of an interpreter whose environment the launcher has begun and not finished; one without notes is believed.
+    """True of an interpreter whose environment the launcher has begun and not finished; one without notes is trusted.
 
     As the launcher has it: SETUP_BEGUN stands there while packages are written, SETUP_STAMP once all is there.
     """
@@ -151,7 +151,7 @@ def half_made(python: Path) -> bool:
 
 
 _seen: dict[Path, tuple[float, int, list[str]]] = {}
-"""Environment -> when its packages were looked at, the time of its stamp then, and those that had changed."""
+"""Environment -> when its packages were examined, the time of its stamp then, and those that had changed."""
 
 
 def changed(python: Path) -> list[str]:

@@ -30,7 +30,7 @@ BUDGET_SECONDS = 0.01
 WORKING_SECONDS = 0.04
 """Between two turns of work that Blender does itself."""
 _LOOK_SECONDS = 1.0
-"""How often the shot folder is looked at for changes."""
+"""How often the shot folder is examined for changes."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ _watches: dict[Path, Watch] = {}
 _meanwhile: list[Callable[[], bool]] = []
 """Callbacks besides those of shots, called until they return that they are done."""
 _pulses: list[Callable[[], float | None]] = []
-"""What is called more often than jobs are looked at."""
+"""What is called more often than jobs are examined."""
 _jobs_next = 0.0
-"""When jobs are looked at again while something pulses, monotonic seconds."""
+"""When jobs are examined again while something pulses, monotonic seconds."""
 _layout = (False, False)
 """Whether the empty panel of `lay_out` stands, and whether it is to be turned about."""
 _backend: tuple[contract.JobError | None, float] = (None, 0.0)
@@ -110,7 +110,7 @@ _backend: tuple[contract.JobError | None, float] = (None, 0.0)
 
 
 def watch_of(shot: Path) -> Watch:
-    """What is known of a shot; its jobs are found again the first time it is asked for."""
+    """What is known of a shot; its jobs are found again the first time it is requested."""
     watch = _watches.get(shot)
     if watch is None:
         watch = _watches[shot] = Watch(shot)
@@ -445,7 +445,7 @@ def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
 
 @persistent
 def _on_load(*_: object) -> None:
-    """Another file: its shots are looked at afresh; running jobs go on and are found again."""
+    """Another file: its shots are examined afresh; running jobs go on and are found again."""
     markers.forget()
     sequences.forget_ahead()
     for shot in [s for s, w in _watches.items() if w.running() is None]:

@@ -35,7 +35,7 @@ _LONGEST_SECONDS = 1e7
 _LONGEST_REQUEST = 1 << 24
 """Bytes of a request that are read; one with a t* for each of 100,000 frames takes a fifth."""
 _SILENT_SECONDS = 10 * contract.HEARTBEAT_SECONDS
-"""A job of an older backend is believed dead after this long without a sign of life."""
+"""A job of an older backend is presumed dead after this long without a sign of life."""
 
 
 @dataclass
@@ -73,9 +73,9 @@ class Job:
     over: bool = False
     """It had ended before this Blender met it: what it made is there, and nothing follows from its end."""
     scene_uid: int = 0
-    """`session_uid` of the scene in which this Blender was asked for it; 0 of one that was found again."""
+    """`session_uid` of the scene from which this Blender started the job; 0 of one that was found again."""
     blend: str = ""
-    """Name of the .blend in which it was asked for; empty if nothing tells."""
+    """Name of the .blend from which the job was started; empty if unknown."""
     beat: tuple[float, float] | None = None
     """Last sign of life of a job of another computer, and when it was first seen, monotonic seconds."""
 
@@ -398,7 +398,7 @@ class _End:
 _EVENT_DATA: dict[str, type] = {
     "warning": _Words, "error": _Words, "metric": _Figures, "image": _Picture, "done": _End,
 }  # fmt: skip
-"""What an event has to hold to be believed; those of other types are only handed on."""
+"""What an event has to hold to be trusted; those of other types are only handed on."""
 
 
 def _take_in(job: Job, event: contract.Event) -> None:

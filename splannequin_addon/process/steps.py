@@ -154,12 +154,12 @@ def step_of(job: jobs.Job) -> str:
 
 
 def scene_of(job: jobs.Job) -> str:
-    """Name that the scene had where a job was asked for; empty if nothing tells."""
+    """Name of the scene from which a job was started; empty if unknown."""
     return _noted(job, contract.SCENE_FILE)
 
 
 def blend_of(job: jobs.Job) -> str:
-    """Name of the .blend where a job was asked for; empty if nothing tells."""
+    """Name of the .blend from which a job was started; empty if unknown."""
     return contract.printable(_noted(job, contract.BLEND_FILE), 200)
 
 

@@ -301,7 +301,7 @@ class _Take:
     frames_in_all: int = 0
     """Frames that the take can have; 0 of a take from before this was noted."""
     t_star_asked: int | None = None
-    """t* as it was asked for, which `t_star_frame` may be near; None: suggested, or not noted."""
+    """t* as requested, which `t_star_frame` may be near; None: suggested, or not noted."""
     combined: dict[str, Any] = field(default_factory=dict[str, Any])
     """Of a take that was put together: `base`, and `things`, matte to take."""
 

@@ -1,7 +1,7 @@
 """Where clip, shot folder and what was made from it lie: a folder that is moved as a whole goes on working.
 
 The settings keep paths relative to the .blend once it is saved, as Blender keeps its own. Those of older files, which
-kept them whole, are looked for beside the .blend when it is opened. A shot folder that was here and is gone is told
+kept them whole, are searched for beside the .blend when it is opened. A shot folder that was here and is gone is told
 from one that is still to be made, and can be located.
 """
 
@@ -145,7 +145,7 @@ def _after_save(file: str = "", *_: object) -> None:
 
 @persistent
 def _after_load(*_: object) -> None:
-    """What an older file names by its whole path, and is not there, is looked for beside the .blend."""
+    """What an older file names by its whole path, and is not there, is searched for beside the .blend."""
     if not bpy.data.filepath:
         return
     _read_backslashes()

@@ -57,12 +57,12 @@ def beside(clip: Path) -> Path:
 
 
 def look_again() -> None:
-    """Has `beside` look at the disk when it is asked next: a shot may have been imported since."""
+    """Makes the next call of `beside` look at the disk: a shot may have been imported since."""
     _beside.clear()
 
 
 def settings(scene: bpy.types.Scene) -> list[OneShot]:
-    """The settings of every shot of a scene in order, the chosen one's where they are used; one without a list."""
+    """Settings of all shots of a scene, in the order of the list; those of the chosen shot are the scene's own."""
     held = settings_of(scene)
     return [held if i == held.loaded_shot else item for i, item in enumerate(held.shots)] or [held]
 

@@ -38,7 +38,7 @@ class Picking:
     xyz: np.ndarray
     """All its points, [P, 3] float32, solve units."""
     wanted: int
-    """How many are asked for."""
+    """Number of points that the operator asks for."""
     picked: list[int] = field(default_factory=list[int])
     """Those that were clicked, indices into `xyz`."""
     under: int = -1

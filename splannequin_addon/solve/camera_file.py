@@ -33,7 +33,7 @@ _FILM_SLACK = 0.02
 _NO_GEOMETRY = (
     "curves", "lights", "materials", "meshes", "volumes", "shapes", "skeletons", "blendshapes", "points",
 )  # fmt: skip
-"""What the importer of USD is told to leave out."""
+"""Kinds of data that the USD importer skips."""
 
 
 def is_one(path: str) -> bool:
@@ -45,7 +45,7 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
     """Has a Blender of its own write the camera of a file into a shot, without waiting.
 
     Args:
-        scene: the scene, whose pixel aspect is believed.
+        scene: the scene, whose pixel aspect is used.
         file: the file.
         shot: shot folder; its clip says how many frames a second of the file has.
 

@@ -30,7 +30,7 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
     the scene's frame is put back.
 
     Args:
-        scene: the scene, whose pixel aspect is believed.
+        scene: the scene, whose pixel aspect is used.
         name: of the camera object.
         shot: shot folder.
 

@@ -22,7 +22,7 @@ class Cost:
     seconds: float | None
     """How long it takes; None if nothing was timed yet."""
     measured: bool
-    """A run of this preset was timed; else `seconds` goes by pixels and steps of another's."""
+    """A run of this preset was timed; else `seconds` is based on pixels and steps of another's."""
 
 
 def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:

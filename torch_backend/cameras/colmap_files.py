@@ -82,7 +82,7 @@ class ColmapPoints:
     error: NDArray[np.float64]
     """[P] mean reprojection error in pixels of the images; negative where COLMAP did not say."""
     tracks: list[NDArray[np.int64]]
-    """P arrays of ids of the images that see the point; empty where the file does not tell."""
+    """P arrays of ids of the images that see the point; empty where the file does not say."""
 
 
 @dataclass

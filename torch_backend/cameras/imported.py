@@ -42,7 +42,7 @@ ASPECT_SLACK = 0.01
 RIGID_SLACK = 1e-2
 """How far the columns of a rotation may be from being perpendicular and of length 1."""
 MODEL_FOLDERS = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
-"""Where a COLMAP model is looked for below the folder that was named."""
+"""Where a COLMAP model is searched for below the folder that was named."""
 _ANGLE_POINTS = 2000
 _MOST_NOTES = 8
 _BLENDERS = (".abc", ".fbx", ".usd", ".usda", ".usdc", ".usdz")
@@ -392,7 +392,7 @@ def own_points(solve: ImportedSolve, matched: Matched, size: tuple[int, int]) ->
     """The solve's own points as points.npz has them before filtering, and the angle under which they are seen.
 
     Returns xyz float32 [P, 3], rgb uint8 [P, 3], error float32 [P] px of the working frames (0 where unknown), track
-    uint16 [P] (cameras of the clip that see it; where the file does not tell, those whose picture it lies in), depth
+    uint16 [P] (cameras of the clip that see it; where the file does not say, those whose picture it lies in), depth
     float32 [P] (the least over those), and angle float64 [] (median of the widest angle, degrees). None without any.
     """
     if solve.points is None:

@@ -20,7 +20,7 @@ _NUMBER = re.compile(r"[._-]?(?<![0-9A-Za-z])(?:#+|@+|%0?[0-9]*d|[0-9]+)$")
 def is_imported_from(
     folder: Path, clip: str | Path, told: Callable[[Path, str, int], str] | None = None
 ) -> bool | None:
-    """True if the shot in a folder was imported from a clip, False if from another one; None if nothing tells.
+    """True if the shot in a folder was imported from a clip, False if from another one; None if unknown.
 
     What lies where the shot's footage lay, seen from the shot, is its own: both were moved or copied together.
 

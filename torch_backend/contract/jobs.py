@@ -37,9 +37,9 @@ CAMERAS_KNOWN = "cameras known"
 STEP_FILE = "step"
 """Name of the panel's step that asked for the job; Blender's own."""
 SCENE_FILE = "scene"
-"""Name of the scene that it was asked for in; Blender's own."""
+"""Name of the scene from which Blender started the job."""
 BLEND_FILE = "blend"
-"""Name of the .blend that it was asked for in, without its folder; Blender's own, and not there of an unsaved one."""
+"""Name of the .blend from which Blender started the job, without its folder; missing for an unsaved file."""
 JOB_COMMAND = "-m torch_backend run-job"
 """How the process of a job was called, but for its Python and the job's folder."""
 HEARTBEAT_SECONDS = 2.0
@@ -62,7 +62,7 @@ class Reporter(Protocol):
         """Something the artist should know; the job goes on."""
 
     def check_cancelled(self) -> None:
-        """Raises `Cancelled` if a stop was asked for."""
+        """Raises `Cancelled` if a stop was requested."""
 
 
 @dataclass

@@ -119,7 +119,8 @@ class ImportParams:
         tip="Interval of the frames that are solved and trained on; all frames are delivered. 0: chosen by the clip's "
         "length. Set a smaller one where a solve loses track; 1: every frame",
     )
-    """Every how many frames are solved and trained on; 0 chooses. All frames are delivered whatever it is."""
+    """Interval of the frames that are solved and trained on; 0: chosen by the clip's length. All frames are
+    delivered."""
     working_height: int = option(
         0,
         flag="--working-height",

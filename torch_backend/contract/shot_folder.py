@@ -363,7 +363,7 @@ class TakeFolder:
 
     @property
     def drawn_lassos(self) -> Path:
-        """Lassos that were drawn in Blender, as the last job was asked for them."""
+        """Lassos that were drawn in Blender, as the last job received them."""
         return self.mattes / DRAWN_FILE
 
     @property

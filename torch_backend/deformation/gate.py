@@ -34,8 +34,8 @@ class GateConfig:
     WIDTH: ClassVar[int] = 320
     """Width of the pictures that `pixels` counts in, whatever is trained on: a motion is as large as it looks."""
     STRAY: ClassVar[tuple[float, int]] = 0.25, 2
-    """Who is open later on in a long run paints movers with this share of its paint in so many frames, or closes: less
-    than is asked for to be opened, because mattes miss much of an arm."""
+    """Share of a Gaussian's contribution that must fall on movers, and in how many frames, for it to stay open in a
+    long run. Opening requires more, because mattes miss much of an arm."""
     LONG: ClassVar[int] = 3000
     """Runs of at most this many steps do not close strays. Strays are few then (6 and 25 % of the open Gaussians on two
     clips, 60 % after 9000 steps), and developing treats closed Gaussians as still, which costs arms of which mattes

@@ -106,7 +106,7 @@ def _table(planes: Sequence[Tensor]) -> Tensor:
 
 
 def _like(flat: Tensor, planes: Sequence[Tensor]) -> list[Tensor]:
-    """Views of a flat tensor that lie in it one after the other, each as its plane does."""
+    """Consecutive views of a flat tensor, each with the layout of its plane."""
     parts = split(flat, [p.numel() for p in planes])
     shapes = [(1, p.shape[2], p.shape[3], p.shape[1]) for p in planes]
     return [part.view(shape).permute(0, 3, 1, 2) for part, shape in zip(parts, shapes, strict=True)]

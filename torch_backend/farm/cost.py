@@ -12,9 +12,9 @@ from .template import Needs
 from .work import Step, disk_bytes
 
 ON_A_CARD = ("train", "open", "freeze")
-"""Steps that a graphics card does, where one is asked for."""
+"""Steps that a graphics card does, where one is requested."""
 SPARE = 1.5
-"""Memory that is asked for, over what was seen."""
+"""Memory that is requested, over what was seen."""
 MIB_PER_MEGAPIXEL = 160
 """Memory that a take's frames want by their size: docs/benchmarks.md, "What a frame costs", 640 x 360 against 4K."""
 _OF_FRAMES = ("open", "freeze", "finish", "bake")
@@ -45,7 +45,7 @@ class Estimate:
     tasks: int
     core_hours: float
     card_hours: float
-    """0 where no card is asked for."""
+    """0 where no card is requested."""
     disk_gb: float
     """What the takes, and what is made on the way, will occupy."""
     critical_seconds: float
@@ -60,7 +60,7 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
     Args:
         steps: of all shots, a shot's in their order.
         rates: step's kind -> rate.
-        card: a graphics card is asked for.
+        card: a graphics card is requested.
         bake: takes are baked.
         session_tasks: tasks of a step that a host runs in one session of the engine; 0: all of the host's tasks.
     """

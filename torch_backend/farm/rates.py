@@ -1,4 +1,4 @@
-"""What a unit of work takes: measured here, or on the farm that it is asked for."""
+"""Seconds per unit of work: measured here, or on the farm for which the cost is estimated."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Something burnt into a clip: a logo, a caption. It stands where the world goes by, and smears a frozen frame.
+"""Finds what is burnt into a clip: a logo, a caption. It stays in place while the scene moves, and smears a frozen
+frame.
 
 Edges of the world are elsewhere in every frame once the camera moves; the median of a pixel's gradient over the clip is
 then next to nothing. Where most frames have that very median, the edge belongs to the picture and not to the scene.
-Black bars are none: how strong their edge is depends on what goes by.
+Black bars are none: how strong their edge is depends on what is based on.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 WIDTH = 640
-"""Pictures are looked at so wide, at most."""
+"""Pictures are examined so wide, at most."""
 FRAMES = 48
-"""So many are looked at, at most, evenly over the clip."""
+"""So many are examined, at most, evenly over the clip."""
 _LEAST_FRAMES, _LEAST_WIDTH = 12, 160
 """Of fewer, or smaller ones, nothing is said."""
 _EDGE = 2.0

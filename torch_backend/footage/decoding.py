@@ -14,7 +14,7 @@ import av.filter
 from av.error import FFmpegError
 
 _PROBED = 40
-"""Frames that are looked at for fields, at each of two places."""
+"""Frames that are examined for fields, at each of two places."""
 _COMBED_SHARE = 0.2
 """Share of those that are combed in an interlaced clip, at least."""
 

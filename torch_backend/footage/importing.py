@@ -90,7 +90,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     done = _finished(shot, {k for d in (None, PLAIN) for k in import_keys(opened.info, config, d, shift)})
     if done is not None:
         report.progress("import", 1, 1, "already imported")
-        if shot.info().source != str(source):  # the same footage in another place, where it is looked for from now on
+        if shot.info().source != str(source):  # the same footage in another place, where it is searched for from now on
             shot.update(source=str(source))
         return _result(shot, done)
     opened = renumbered(opened, shift)  # from here on all numbers are the shot's
@@ -440,7 +440,7 @@ def _tell_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], repor
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:
-    """A working frame, no larger than it is looked at: of 48 in 4K all pixels would be 400 MB."""
+    """A working frame, no larger than it is examined: of 48 in 4K all pixels would be 400 MB."""
     pixels = read_frame(path)
     pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)

@@ -145,7 +145,8 @@ def space_names(config: str) -> list[str]:
 
 
 def known_space(name: str, config: str) -> InputSpace | None:
-    """The colour space of this name, alias or role in a configuration; None if it has none, or none of a colour.
+    """The colour space of this name, alias or role in a configuration; None if there is none, or if it is not a colour
+    space.
 
     JobError if the configuration cannot be read, or if nothing leads from it to linear Rec.709.
     """

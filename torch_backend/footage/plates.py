@@ -43,7 +43,7 @@ _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 class Plates:
-    """Undistorted source frames, read as they are asked for; the last few are kept, as codes (see `plate_encoding`).
+    """Undistorted source frames, read as they are requested; the last few are kept, as codes (see `plate_encoding`).
 
     A kept plate takes 3 to 6 bytes a pixel, 50 MB at 3840 x 2160. Not safe to use from several threads.
     """
@@ -130,7 +130,7 @@ class Plates:
         return codes > np.iinfo(codes.dtype).max // 2
 
     def close(self) -> None:
-        """Frees what is held; plates are read anew if they are asked for again."""
+        """Frees what is held; plates are read anew if they are requested again."""
         self._held.clear()
         if self._reader is not None:
             self._reader.close()

@@ -28,7 +28,7 @@ _KEPT = 4
 _AHEAD = 32
 """Distance in frames up to which decoding on is faster than seeking: key frames are usually farther apart."""
 _EARLIER = (0.0, 1.0, 5.0, 20.0)
-"""Seconds before a frame at which a key frame is looked for, in this order."""
+"""Seconds before a frame at which a key frame is searched for, in this order."""
 _LEAST_GAP = 1e-5
 """Seconds between frames that can be told apart: import rounds to 1e-6."""
 

@@ -19,7 +19,7 @@ LONGEST_PIXEL = 4
 
 
 SLOWEST_FPS, FASTEST_FPS = 0.1, 1000.0
-"""Rates of image sequences that are believed: what else a file or a person says is a slip."""
+"""Rates of image sequences that are trusted: what else a file or a person says is a slip."""
 
 
 @dataclass

@@ -364,7 +364,7 @@ class VideoSource:
 
     def _orientation_of(self, frame: av.VideoFrame) -> Orientation:
         """Of one frame: its own, else that of the clip."""
-        # Only a frame that differs is asked for its matrix: PyAV's side data holds the frame that holds it, so that its
+        # The matrix is only read from a frame that differs: PyAV's side data holds the frame that holds it, so that its
         # memory waits for the garbage collector.
         if frame.rotation == self._rotation:
             return self._orientation

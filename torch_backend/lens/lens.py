@@ -35,8 +35,8 @@ _ALONG = 24
 
 
 NARROWEST_DEG, WIDEST_DEG = 12.0, 130.0
-"""Angle of view along the longer side that a clip's lens is believed to have: 171 mm to 8.4 mm on full frame. A focal
-length that nothing in the clip holds runs off beyond them."""
+"""Range of plausible angles of view along the longer side: 171 mm to 8.4 mm on full frame. A focal length that nothing
+in the clip holds runs off beyond them."""
 LEAST_DEG, MOST_DEG = 8.0, 150.0
 """Beyond these it is refused: 257 mm, 4.8 mm."""
 _MOST_STRETCH = 2.0

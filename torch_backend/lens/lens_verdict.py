@@ -18,14 +18,14 @@ FISHEYE_START = 0.45
 MOST_BEND = 1.0
 """Largest plausible first radial coefficient."""
 RUN_OFF = 1.3
-"""Times by which a solve may change a focal length that it was given, before the given one is believed instead."""
+"""Times by which a solve may change a focal length that it was given, before the given one is trusted instead."""
 WIDE_DEG = 100.0
 """Angle of view from which on a lens solved without a fisheye model may be a fisheye."""
 LEFT_SHARE = 0.003
 """How far pictures without its lens may still be bent at the corners, as a share of the diagonal: 2.4 px at 640x480."""
 _SAMPLES = 2048
 _BEYOND = 2.0
-"""How far out of the picture a radial curve is looked at, in corners."""
+"""How far out of the picture a radial curve is examined, in corners."""
 
 
 def angle_deg(model: str, width: int, height: int, params: Sequence[float]) -> float:

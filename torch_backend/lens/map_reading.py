@@ -87,7 +87,7 @@ def read_lens(path: str, way: str, layer: str, frames: dict[str, Any], report: R
         way: one of `contract.ST_MAP_WAYS`.
         layer: the layer that holds it; empty: red and green, or the only pair there is.
         frames: frames.json of the import.
-        report: hears what was assumed, and what the map leaves open.
+        report: receives what was assumed, and what the map leaves open.
 
     Returns:
         The lens with the widest window in which the undistorted frames are whole, without intrinsics.

@@ -34,7 +34,7 @@ _LARGEST_SCALE = 2.0
 _KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
 _LEFT_EVERY = 2
-"""In every so manieth key frame what is left of motion is looked for: sways are slow."""
+"""Interval of the key frames in which residual motion is computed: sways are slow."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weights: more than the one adds nothing, below the other nothing is known."""
 _AHEAD = 32

@@ -23,7 +23,7 @@ _OUTLINE = 0.25
 _NEAR = 2
 """Key frames so near show the same even if one is blurred."""
 _AGREES = 1.5
-"""A match agrees with a point up to so many times the distance from which on it may tell of motion."""
+"""Factor on the tolerance up to which a match agrees with a still point."""
 _MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
 """Square differences: above the one all are alike (hidden, or gone), by the other a point's own depth is preferred."""
 
@@ -116,7 +116,7 @@ class Pair:
     seen: Seen
     ray: Ray
     limit: float
-    """Matches farther than this from where the still point is seen may tell of motion; flow pixels."""
+    """Matches farther than this from where the still point is seen may show motion; flow pixels."""
     other: Look
     """The other's picture, and how its brightness becomes this one's."""
     gain: tuple[float, float] = (1.0, 0.0)
@@ -125,7 +125,7 @@ class Pair:
     right: Mask = field(init=False)
     """Where they show the same."""
     weight: Map = field(init=False)
-    """[h, w] how far each match is believed; 1 where it is found unless another is set."""
+    """[h, w] how far each match is trusted; 1 where it is found unless another is set."""
 
     def __post_init__(self) -> None:
         self.weight = self.seen.found.astype(np.float32)

@@ -159,7 +159,7 @@ def _hits_at_most(device: torch.device) -> int:
 
 
 def forget_demands() -> None:
-    """Drops the lists' sizes: each is asked for anew, by the memory that is free then."""
+    """Drops the lists' sizes: each is requested anew, by the memory that is free then."""
     with _lock:
         _demands.clear()
 

@@ -67,7 +67,7 @@ def take_over(
         taken: what `prepare` found.
         options: the worker's overlap and features.
         scratch: folder that takes poses.json, points.npz, undistort_N.npz and model/, as after a solve.
-        report: hears of progress.
+        report: receives progress.
 
     Returns:
         The worker's answer as after a solve; "given" says that it is none, and holds the kind of file; "world" is that

@@ -18,7 +18,7 @@ MASKED_INLIERS = (50, 15)
 """Matches that a first pair and a further image need where masks leave few, half of COLMAP's: what would mislead is
 masked. A room of which 70 % of 320 x 240 pixels were masked: 26 of 30 images instead of 4."""
 LONG_TRACK = 128
-"""Images of a point's track from which on not all of them are asked for the angle under which it is seen."""
+"""Length of a track in images above which only a part of them is used to measure the triangulation angle."""
 TRIANGULATE_LEAST_DEG = 1.0
 """Smallest angle under which a point is triangulated from known cameras."""
 

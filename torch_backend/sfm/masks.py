@@ -27,7 +27,7 @@ _RIM = 8.0
 """Pixels of a picture 640 wide around what is ignored in which nothing is said to move."""
 _INPAINT_PX = 3.0
 _MOST_FEATURES = 3.0
-"""Of a picture that is mostly masked so many times more features are asked for: masked ones count before they go."""
+"""Factor on the number of features of a mostly masked picture: masked features count until they are dropped."""
 
 _WIDE_SHARE = 0.25
 """Masked share of the picture from which on more frames are matched with each other than their neighbours: what is left

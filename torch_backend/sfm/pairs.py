@@ -69,7 +69,7 @@ def one_thread() -> pycolmap.FeatureMatchingOptions:
 
 
 class _Helper:
-    """A worker process that matches some of the pairs in a copy of the database. A `with` block removes both."""
+    """A child process that matches a part of the pairs in a copy of the database. A `with` block removes both."""
 
     def __init__(self, request: Request, lines: Sequence[str], number: int) -> None:
         self.lines, self._request = lines, request

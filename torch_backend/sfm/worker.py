@@ -11,7 +11,7 @@ Beside the request it writes: model/ (binary COLMAP model), points.npz, poses.js
 each lens, undistort_N.npz (the lens, camera of the undistorted frames, where its pixels lie in the distorted ones).
 
 A request with "known" cameras ({"lenses": [{"model", "width", "height", "params"}], "images": {name: {"lens",
-"pose"}}, "triangulate"}) is not solved: the lenses are undistorted and, if asked for, points are triangulated with the
+"pose"}}, "triangulate"}) is not solved: the lenses are undistorted and, if requested, points are triangulated with the
 poses held. One with pairs to "match" has them matched in its copy of the database, and nothing else (`pairs.py`).
 """
 

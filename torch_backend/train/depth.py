@@ -1,7 +1,7 @@
 """Depth maps of an artist's, fitted to the solve: what a training pulls moving Gaussians to, and a freeze measures by.
 
 runs/NAME/depth.safetensors holds them: inverse depth over the undistorted frames, in 1 / scene units, with each frame's
-uncertainty. A run is known by the files, the solve and `DepthConfig`; what is kept beside it is believed only if it
+uncertainty. A run is known by the files, the solve and `DepthConfig`; what is kept beside it is trusted only if it
 carries the same key.
 """
 

@@ -70,7 +70,7 @@ class SequenceFit:
     kind: str
     """One of `KINDS`: what the maps are linear in."""
     frames: dict[int, FrameFit]
-    """Of every frame that was asked for, ascending."""
+    """Fits of all requested frames, ascending."""
     residual: float
     """Median over the frames of the median relative error of their points."""
     unexplained: float

@@ -1,4 +1,4 @@
-"""Measures the residual of a trained run in its frames, and how far things travel: what its verdict goes by.
+"""Measures the residual of a trained run in its frames, and how far things travel: what its verdict is based on.
 
 Where the low frequencies of a frame differ from the render at its own time, the run has something else there, whatever
 its sharpness. Travel is that of the picture's surfaces over the clip, in pixels of the very view, at those times only
@@ -26,7 +26,7 @@ from .trainer import Trainer
 GRID = 4
 """Cells of the picture along each side, in which is told where something is."""
 MOST = 32
-"""Frames that are looked at, evenly over the clip."""
+"""Frames that are examined, evenly over the clip."""
 BLUR = 0.0125
 """Radius of the two box filters before a difference counts, as a share of the width: 8 pixels of 640."""
 UNEXPLAINED = 0.12

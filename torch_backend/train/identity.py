@@ -23,7 +23,7 @@ from .depth import depth_key
 def asked_for(
     shot: Shot, scene: Scene, run: Path, params: TrainParams, device: torch.device, report: Reporter, depth: list[str]
 ) -> tuple[TrainConfig, str, str | None]:
-    """(numbers, key, motion) of the run that is asked for; motion is the key of its mattes, None without. `depth` is
+    """(numbers, key, motion) of the run that is requested; motion is the key of its mattes, None without. `depth` is
     `depth_identity` of its depth maps.
 
     A preset has other numbers on a card. What was begun or finished with those of the other device stays that run, and

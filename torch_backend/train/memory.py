@@ -50,7 +50,7 @@ class MemoryPlan:
     on_card: bool
     """Do the frames lie on the card?"""
     sentence: str
-    """What was made smaller, and why; empty if it is as it was asked for."""
+    """What was made smaller, and why; empty if it is as requested."""
 
 
 def gaussian_bytes(config: TrainConfig, bins: int) -> int:

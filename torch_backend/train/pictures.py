@@ -61,6 +61,6 @@ def pictures_of(shot: Shot, scene: Scene, config: TrainConfig, report: Reporter)
 
 
 def training_size(scene: Scene, requested_width: int) -> tuple[int, int]:
-    """(width, height) of the training images: the working frames' shape, never larger; as large if 0 is asked for."""
+    """(width, height) of the training images: the working frames' shape, never larger; as large if 0 is requested."""
     width = min(requested_width or scene.width, scene.width)
     return width, max(16, round(scene.height * width / scene.width))

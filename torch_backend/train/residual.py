@@ -12,7 +12,7 @@ from .model import render
 from .run_view import RunView
 
 _LOOKED_AT = 48
-"""Most frames whose residual is looked at."""
+"""Most frames whose residual is examined."""
 
 
 def correlation_of_movers(run: RunView) -> float | None:

@@ -79,7 +79,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     """
     if params.extend:
         return extend_run(shot, params, report)
-    config_from_params(params)  # refuses what does not exist before anything is looked for
+    config_from_params(params)  # refuses what does not exist before anything is searched for
     device = choose_device(params.device, report, "Training")
     run = shot.own(shot.run(params.run))
     shot.own(run / PREVIEWS_FOLDER)
@@ -236,7 +236,7 @@ def planned(
     gaussians: int = 0,
 ) -> MemoryPlan | None:  # fmt: skip
     """How a run of so many trained frames of `size` px, whose images with those held out are `images`, fits its card;
-    said if it is smaller than asked for. None on the processor. gaussians: how many a run has that only goes on."""
+    said if it is smaller than requested. None on the processor. gaussians: how many a run has that only goes on."""
     if device.type == "cpu":
         return None
     plan = plan_memory(config, size, frames, images.nbytes, free_bytes(device), gaussians)

@@ -39,13 +39,13 @@ from .recorder import CudaGraphs
 
 SELF_TEST_VERSION = 4
 _SECONDS = 240.0
-"""A card that has not answered by then hangs; cold, the kernels take tens of seconds to compile."""
+"""Seconds after which a card counts as hanging: without a cache the kernels take tens of seconds to compile."""
 _GAUSSIANS, _WIDTH, _HEIGHT = 300, 64, 48
 _FLIPPED = 0.01
 """Share of pixels that may differ by more than `_PIXEL`: at the alpha cut one may fall on either side."""
 _PIXEL = 3e-4
 _GRADIENT = 2e-2
-"""Relative L2 that a gradient may be off by: what flips at the cut is in it (1e-4 to 4e-3 on fibers)."""
+"""Largest relative L2 error of a gradient, including hits that flip at the alpha cut (1e-4 to 4e-3 with fibers)."""
 _CTRL_C_EXIT = 0xC000013A
 """Exit code of a process on Windows that Ctrl-C ended, or a closed console."""
 _NO_NUMBER = 1e9

@@ -26,7 +26,7 @@ from .trainer import Trainer
 STAGE = "solve: still world"
 STEPS = 400
 """Of training, but at most `PER_FRAME[1]` for each frame: a model that looks longer at few frames learns the movers of
-each of them as well, near its camera. Of many frames each is looked at `PER_FRAME[0]` times."""
+each of them as well, near its camera. Of many frames each is examined `PER_FRAME[0]` times."""
 PER_FRAME = 2, 8
 GAUSSIANS = 20_000
 """At most: coarse, and soon learnt."""

@@ -47,8 +47,8 @@ class StepFacts:
     """What is other in each step. Anywhere, until `on` or `into` brings it to the device."""
 
     numbers: Tensor
-    """[7] float32: normalised time that the field is asked for; the shares of the exposure's two bins; what motion is
-    priced at; the background's colour."""
+    """[7] float32: normalised time at which the field is evaluated; the shares of the exposure's two bins; what motion
+    is priced at; the background's colour."""
     places: Tensor
     """[3] int64: the frame's time bin; the exposure's two bins."""
     viewmat: Tensor
@@ -68,7 +68,7 @@ class StepFacts:
 
     @property
     def asked(self) -> Tensor:
-        """[1] float32 normalised time that the field is asked for."""
+        """[1] float32 normalised time at which the field is evaluated."""
         return self.numbers[:1]
 
     @property

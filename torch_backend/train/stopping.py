@@ -57,7 +57,7 @@ class StoppingConfig:
     stop_gain: float = 0.05
     """Least gain over `stop_window`, after the gate has hardened and of whole pictures, for the run to go on."""
     stop_window: float = 0.15
-    """Share of the run over which that gain is looked for."""
+    """Share of the run over which that gain is searched for."""
     anneal: float = 0.1
     """Share of the run over which a run that has enough brings its learning rates to their end."""
 

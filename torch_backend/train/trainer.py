@@ -164,7 +164,7 @@ class Trainer:
     def extend(self, steps: int, heldout_psnr_db: float | None) -> None:
         """Adds steps to a run that has ended; `heldout_psnr_db` is what it was worth on held-out frames until now.
 
-        The gate stays as it is, nothing grows, anchors and price go on in full, and no early end is looked for.
+        The gate stays as it is, nothing grows, anchors and price go on in full, and no early end is searched for.
         """
         self.extensions.append(Extension(self.iteration, steps, heldout_psnr_db, self.trained_seconds))
         self.policy.joined = True  # a run that ended early may still hold its probe frames back
@@ -251,7 +251,7 @@ class Trainer:
                 self.report.warning(*warning)
 
     def _densify_config(self) -> DensifyConfig:
-        """As configured, but for what fits; the configuration itself stays as it was asked for: it is the run's key."""
+        """As configured, but for what fits; the configuration itself stays as requested: it is the run's key."""
         config = self.config.densify
         return config if self.most is None else dataclasses.replace(config, budget=min(config.budget, self.most))
 
@@ -416,7 +416,7 @@ class Trainer:
             radii, weight = radii * applied, weight * applied
         self.densifier.observe(out.means2d_absgrad[0], radii)
         mark_seen(self.model.gaussians, facts.time_bin, weight)
-        if out.depth_median is not None:  # at steps that mark who was hidden
+        if out.depth_median is not None:  # at steps that mark hidden Gaussians
             view = facts.viewmat, facts.K, out.depth_median[0]
             mark_hidden(self.model.gaussians, rows, facts.time_bin, state, *view)
 

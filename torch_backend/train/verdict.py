@@ -49,12 +49,12 @@ class RunLimits:
 
 @dataclass(frozen=True)
 class RunFigures:
-    """What a run's verdict goes by."""
+    """What a run's verdict is based on."""
 
     width: int
     """Width in pixels of the working frames, in which travel is told."""
     frames: list[int]
-    """[F] numbers of the frames that were looked at, ascending."""
+    """[F] numbers of the frames that were examined, ascending."""
     unexplained: NDArray[np.floating]
     """[F, GRID, GRID] as in `FrameEvidence`."""
     travel: NDArray[np.floating]
@@ -66,7 +66,7 @@ class RunFigures:
     farthest: float
     """99th percentile of the travel of what moves."""
     median_db: float
-    """PSNR of the median frame of those held out; of all that were looked at if none is."""
+    """PSNR of the median frame of those held out; of all that were examined if none is."""
     tenth_db: float
     """PSNR that all but the worst tenth of them reach."""
     held_out: bool

@@ -8,7 +8,7 @@ camera, its time, its exposure), a pixel x is
 n is the primary plate: the frame's own on the clip's poses, the nearest in pose on others. A, its matte, is 1 wherever
 nothing that moves is seen, at t* or in the plate; so a still world is the plate itself, bit for bit. The rest is
 filled: what the model missed in other plates (texture, edges, light) is carried along the surface point that x shows
-to where plate m shows the same point, moved from t* to m as the model moves it. Plate t* is believed even where the
+to where plate m shows the same point, moved from t* to m as the model moves it. Plate t* is trusted even where the
 model cannot explain it, because what it shows is the truth of the frozen instant; others where nothing moves, or where
 they agree with the model. b fades to the splats alone where no plate can be believed. Residuals are carried in display
 space, in which splats blend and highlights have a shoulder; A mixes scene-linear light, so that the same mix of an

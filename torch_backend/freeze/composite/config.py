@@ -14,17 +14,17 @@ class CompositeConfig:
 
     sources: int = 5
     """Plates that a frame is made of, at most: its own and that of t* among them. For what the own one hides as many
-    are looked at on either side, each twice as many frames away as the one before: 1 to 16."""
+    are examined on either side, each twice as many frames away as the one before: 1 to 16."""
     depth_error: float = 0.15
     """Share of the depth by which surfaces may be wrong: with the baseline, an error in pixels, at 1 of which a plate
-    is believed by half. A cautious figure: near plates are right where far ones only look so."""
+    is trusted by half. A cautious figure: near plates are right where far ones only look so."""
     doubt: float = 0.05
-    """Sum of weights at which a pixel is half plate, half splats: what plates say is believed in part, as it is wrong
+    """Sum of weights at which a pixel is half plate, half splats: what plates say is trusted in part, as it is wrong
     in part. On truth the best share of a single plate's residual in what moves is 0.4 to 0.65."""
     sway: float = 3.0
-    """Travel in pixels from t* to a plate at which what moves in it is believed 1/e: longer ones are known less."""
+    """Travel in pixels from t* to a plate at which what moves in it is trusted 1/e: longer ones are known less."""
     sway_trust: float = 0.15
-    """How far a plate of another time is believed in what moves, where the model explains it. Depths that are off by a
+    """How far a plate of another time is trusted in what moves, where the model explains it. Depths that are off by a
     pixel carry plate t* to a wrong place far away in pose; the own plate's residual is at its place, at another time:
     either alone is worse than both."""
     beside: float = 20.0

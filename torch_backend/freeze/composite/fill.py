@@ -252,7 +252,7 @@ def _weight(
     sway: Tensor,
     still: Tensor | float = 1.0,
 ) -> Tensor:
-    """[...] how far a plate is believed at points, `motion` of which belongs to what moves at t*; what stands still in
+    """[...] how far a plate is trusted at points, `motion` of which belongs to what moves at t*; what stands still in
     it by `still` at most."""
     near = _near(source_views, config, target, frame, visibility)
     if frame == target.t:

@@ -32,7 +32,7 @@ SAMPLED = 8
 """Frames of a clip that are measured."""
 _BLOCK = 16
 _FEWEST = 12
-"""Blocks that a level or a channel needs to be believed."""
+"""Blocks that a level or a channel needs to be trusted."""
 _LEAST = 0.05
 """Share of the blocks of a level, the least varying ones, that are taken for grain to begin with."""
 _STANDS_OUT = 3.0

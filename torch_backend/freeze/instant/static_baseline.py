@@ -43,7 +43,7 @@ class StaticBaselineConfig:
     width: int = MEASURED_WIDTH
     """Pixels of the pictures that are compared, at most; never above the working frames'."""
     plates: int = VIEWS
-    """Trained frames that are looked at beside t*, at most, evenly over the clip."""
+    """Trained frames that are examined beside t*, at most, evenly over the clip."""
     neighbours: int = 16
     """Number of nearest open Gaussians that are decided together."""
     doubted: float = 3.0

@@ -226,7 +226,7 @@ def _carried(
 
     def read(number: int) -> TakeFrame:
         if number not in held:
-            held.clear()  # a frame with a lasso is asked for twice in a row if it is the only one
+            held.clear()  # a frame with a lasso is requested twice in a row if it is the only one
             held[number] = read_take_frame(take.folder, number, scene)
         return held[number]
 

@@ -73,7 +73,7 @@ def _without_gaps(scene: Scene, Ks: Tensor) -> tuple[Tensor, Tensor, list[int]]:
 
 
 def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFrame]:
-    """Those of ascending frames that are asked for now: first, last and step. JobError if there is none."""
+    """Those of ascending frames that are requested now: first, last and step. JobError if there is none."""
     numbers = [f.frame for f in frames]
     first = numbers[0] if params.first is None else params.first
     last = numbers[-1] if params.last is None else params.last

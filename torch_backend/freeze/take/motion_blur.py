@@ -41,7 +41,7 @@ class MotionBlurConfig:
     """Distance in pixels between two samples of the longest blur of a frame: further apart, edges show as steps."""
     most: int = 33
     """Samples of a frame, at most: a blur of 32 pixels has one each pixel, a longer one shows faint steps, and no frame
-    takes more than so many times as long."""
+    takes more than this many times as long."""
 
 
 @dataclass(frozen=True)

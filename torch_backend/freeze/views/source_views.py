@@ -36,7 +36,7 @@ LENGTHS_OF = 640
 MARGIN = 2
 """Pixels of those pictures by which an outline may be misplaced: error of flow and depth, motion blur."""
 _VIEWS, _VIEWS_BYTES = 90, 700e6
-"""Plates kept at most. Between two uses of a plate, 16 frames apart, 80 others are looked at: with fewer every one was
+"""Plates kept at most. Between two uses of a plate, 16 frames apart, 80 others are examined: with fewer every one was
 made three times on its way through a take."""
 _RESIDUALS_BYTES = 250e6
 _FINEST = 1280
@@ -91,7 +91,7 @@ class PlateView:
 
 @dataclass(frozen=True)
 class VisibilityConfig:
-    """At what size plates are looked at for decisions, and how finely. Lengths are in pixels of pictures 640 wide."""
+    """At what size plates are examined for decisions, and how finely. Lengths are in pixels of pictures 640 wide."""
 
     width: int = LENGTHS_OF
     """Mattes, depth and visibility are compared at this width at most: they are soft, and the model is no finer."""
@@ -102,7 +102,7 @@ class VisibilityConfig:
     soft, which contradicts nothing. A difference speaks for twice as many pixels around it: half-rejected movers leave
     their outlines."""
     unexplained: float = 0.1
-    """Low-passed difference, display-referred, at which a plate is believed 1/e."""
+    """Low-passed difference, display-referred, at which a plate is trusted 1/e."""
 
 
 class SourceViews:
@@ -154,7 +154,7 @@ class SourceViews:
         )
 
     def view(self, frame: int) -> PlateView:
-        """Plate `frame` as the model has it."""
+        """Plate `frame` with the data that the model has for it."""
         if frame not in self._views:
             self._views[frame] = self._make_view(frame)
             width, height = self.size
@@ -177,7 +177,7 @@ class SourceViews:
         return self._residuals[frame]
 
     def displayed(self, frame: int) -> Tensor:
-        """[H, W, 3] float16: plate `frame`, display-referred, uncut; the last one that was asked for is kept."""
+        """[H, W, 3] float16: plate `frame`, display-referred, uncut; the last one that was requested is kept."""
         if self._displayed is None or self._displayed[0] != frame:
             self._displayed = frame, self.plates.display(frame).half()
         return self._displayed[1]

@@ -45,7 +45,7 @@ class TargetView:
     beyond: tuple[int, int]
     """Pixels of the picture that are overscan, on either side, and above and below."""
     doubt: Tensor
-    """[h, w] in 0..1: where plates of other times are believed only if they agree with the model."""
+    """[h, w] in 0..1: where plates of other times are trusted only if they agree with the model."""
     moved: Tensor
     """[h, w] in 0..1: what moves in the clip, at t* or in the frame's own plate; else `motion`."""
     unseen: Tensor
