@@ -79,7 +79,7 @@ def blender_version(path: str) -> tuple[tuple[int, int], str] | None:
 
 
 def named_blender(path: str) -> Blender:
-    """The Blender at a path that the user named. LauncherError if it is none, or older than the add-on supports."""
+    """The Blender at a path that the user named. LauncherError if it is another program, or too old for the add-on."""
     place = os.path.abspath(path)
     if not os.path.isfile(place):
         raise LauncherError(f"There is no Blender at {place}: give the path of its program.", ExitCode.USAGE)

@@ -210,7 +210,7 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
     first, last = params.first or 0, params.last or 0
     if args.frames:
         first, last = args.first, min(args.first + args.frames - 1, last)
-    folder = str(request.get("output") or shot_name(Path(args.shot)))  # templates of before tell no folder
+    folder = str(request.get("output") or shot_name(Path(args.shot)))  # earlier templates tell no folder
     output = Path(args.output).absolute() / folder / params.take
     part = "frames" if args.step == "bake" else "file"
     script = Path(__file__).resolve().parent.parent / "splannequin_addon" / "run_in_bpy.py"

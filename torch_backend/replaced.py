@@ -37,12 +37,12 @@ def next_name(shot: ShotFolder) -> str:
 
 
 def keep_replaced(shot: ShotFolder, name: str, same: Sequence[int]) -> None:
-    """Moves everything that belongs to the frames of before to SHOT/replaced/NAME; carries on where it was killed.
+    """Moves everything that belongs to the previous frames to SHOT/replaced/NAME; carries on where it was killed.
 
     For `Shot.publish_frames`, while shot.json still describes those frames.
 
     Args:
-        shot: its new frames are in place, those of before are where `replacing_folder` left them.
+        shot: its new frames are in place, the previous ones are where `replacing_folder` left them.
         name: of `next_name`.
         same: frames that show the same picture as before. Paint and masks drawn over them hold, and are copied back.
     """

@@ -65,7 +65,7 @@ def replacing_solve(shot: ShotFolder) -> Generator[Staged]:
         yield staged
         for name in _WHOLE:
             _drop_stale(shot.solve / name, staged.solve / name)
-        for name in STMAP_FILES:  # they are of the lens of before
+        for name in STMAP_FILES:  # they are of the previous lens
             if (shot.solve / name).is_file():
                 (staged.solve / name).touch()
     except BaseException:

@@ -124,7 +124,7 @@ def _looked_at(
 def _grainy(
     group: bpy.types.NodeTree, enter: bpy.types.Node, layers: dict[str, bpy.types.NodeSocket]
 ) -> bpy.types.NodeSocket:
-    """Socket of the frozen picture with as much of its grain as is requested; takes of before have none."""
+    """Socket of the frozen picture with as much of its grain as is requested; earlier takes have none."""
     if GRAIN not in layers:
         return layers["Combined"]
     node, factor, first, second, summed = compat.new_mix_node(group, "ADD")

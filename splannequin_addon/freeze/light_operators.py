@@ -1,4 +1,4 @@
-"""The buttons that make the light of a take the scene's world, and that give the world of before back."""
+"""The buttons that make the light of a take the scene's world, and that give the previous world back."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class SPLANNEQUIN_OT_remove_light(bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Gives the world of before back."""
+        """Gives the previous world back."""
         return step_operator.edit(self, context, "freeze", _removed)
 
 

@@ -159,7 +159,7 @@ def _set(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None
 
 
 def _show(scene: bpy.types.Scene, shot: Path, take: str, mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:
-    """Puts a finished mesh into the scene, in the place of the object of before."""
+    """Puts a finished mesh into the scene, in the place of the previous object."""
     mesh.update()
     mesh.materials.append(_material())
     item = bpy.data.objects.new(mesh.name, mesh)

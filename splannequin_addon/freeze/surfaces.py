@@ -137,7 +137,7 @@ def _set(mesh: bpy.types.Mesh, attribute: str, field: str, values: np.ndarray) -
 
 
 def _show(scene: bpy.types.Scene, shot: Path, take: str, meshes: list[bpy.types.Mesh], facts: dict[str, Any]) -> None:
-    """Hangs finished meshes on the shot's root as catchers of shadows, in the place of those of before."""
+    """Hangs finished meshes on the shot's root as catchers of shadows, in place of the previous ones."""
     remove(scene, shot, take)
     root, entry = present(scene_objects.part(scene, shot, "root")), scene_objects.new(scene, shot)
     stands = placement.in_solve(contract.placement_of(facts))

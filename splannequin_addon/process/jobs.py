@@ -328,7 +328,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def _read_status(folder: Path) -> contract.Status | None:
-    """The status as it stands; None before there is one. ValueError if it is none of ours."""
+    """The status as it stands; None before there is one. ValueError if the file is not one of ours."""
     try:
         data = contract.read_json(folder / contract.STATUS_FILE, contract.SHORT_JSON)
     except OSError:

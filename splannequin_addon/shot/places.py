@@ -178,7 +178,8 @@ def _read_backslashes() -> None:
 
 
 def _slashed(path: str) -> str:
-    """A relative path with slashes; as it is if it is none, or if a file is called so: names may hold backslashes."""
+    """A relative path with slashes. Other paths, and names of existing files, stay: a file name may hold
+    backslashes."""
     if not path.startswith("//") or "\\" not in path or os.path.lexists(paths.absolute(path)):
         return path
     return path.replace("\\", "/")

@@ -23,7 +23,7 @@ def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
     entry, size = scene_objects.of(scene, shot), scene_objects.depth_scale(scene, shot)
     is_other = not is_new and entry is not None and entry.world != inventory.solve_world(shot)
     with rollback.scene_of(scene):
-        motion_overlay.hide(scene, shot)  # it is of the mattes of before
+        motion_overlay.hide(scene, shot)  # it is of the previous mattes
         camera = cameras.build(scene, shot)
         notes = scale.guess_scale(scene, shot, is_new or is_other)
         if is_other and abs(scene_objects.depth_scale(scene, shot) / size - 1.0) > 1e-6:

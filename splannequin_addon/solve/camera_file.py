@@ -23,13 +23,13 @@ from ..shot import inventory, seen_camera
 from . import camera_samples
 
 KINDS = {".abc": "Alembic", ".fbx": "FBX", ".usd": "USD", ".usda": "USD", ".usdc": "USD", ".usdz": "USD"}
-"""Ending of a file's name -> what it is."""
+"""Suffix of a file -> its format."""
 MOST_FRAMES = 100_000
-"""Frames of a file that are read."""
+"""Largest number of frames that are read from a file."""
 LONGEST_SECONDS = 1800.0
-"""How long a file may take."""
+"""Time limit for reading a file."""
 _FILM_SLACK = 0.02
-"""How far the shape of a film back may be from that of the frames without a word."""
+"""Relative difference between the aspects of film back and frames above which a note is written."""
 _NO_GEOMETRY = (
     "curves", "lights", "materials", "meshes", "volumes", "shapes", "skeletons", "blendshapes", "points",
 )  # fmt: skip
@@ -42,7 +42,7 @@ def is_one(path: str) -> bool:
 
 
 def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
-    """Has a Blender of its own write the camera of a file into a shot, without waiting.
+    """Starts a second Blender that writes the camera of a file into a shot; does not wait.
 
     Args:
         scene: the scene, whose pixel aspect is used.
@@ -86,7 +86,7 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
 
 
 def written(asked: children.Question, file: Path, shot: Path) -> Path:
-    """The transforms.json that such a Blender has written. JobError with its own sentence if it wrote none."""
+    """The transforms.json that the second Blender wrote. JobError with that Blender's sentence if it wrote none."""
     asked.answer(f"Blender could not read {file.name}: {{}}", "Import the file, and choose Scene Camera.")
     return contract.ShotFolder(shot).tracking
 
@@ -102,7 +102,7 @@ def read_now(scene: bpy.types.Scene, file: Path, shot: Path) -> Path:
 
 
 def main(words: str) -> int:
-    """Reads the camera that `begin` asks for, in a Blender that nobody works in; returns an exit code."""
+    """Reads the camera that `begin` requests, in the second Blender; returns an exit code."""
     wanted = json.loads(words)
     try:
         scene = _new_file(wanted["size"], wanted["fps"], wanted["aspect"])
@@ -119,8 +119,8 @@ def main(words: str) -> int:
 
 
 def _new_file(size: tuple[int, int], fps: float, aspect: tuple[float, float]) -> bpy.types.Scene:
-    """The scene of an empty file with the clip's rate and size: importers count frames by the one, and camera lenses
-    are of the other."""
+    """The scene of an empty file with the clip's rate and size: importers convert time by the rate, and the lens in
+    pixels depends on the size."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.data.scenes[0]
     scene.render.fps = max(1, round(fps))
@@ -147,7 +147,7 @@ def read(scene: bpy.types.Scene, file: Path, size: tuple[int, int]) -> dict[str,
         raise contract.JobError(f"{file.name} holds no camera.", "Choose another file.", contract.ExitCode.SOLVE)
     for camera in [c for c in cameras if camera_of(c).type == "PERSP"]:
         data = camera_of(camera)
-        if data.sensor_fit == "AUTO":  # files tell apertures, and their width is the pictures'
+        if data.sensor_fit == "AUTO":  # a file states the film back, whose width is that of the pictures
             data.sensor_fit = "HORIZONTAL"
         frames = _frames_of(scene, camera)
         if len(frames) > MOST_FRAMES:
@@ -175,7 +175,7 @@ def _sample(scene: bpy.types.Scene, name: str, number: int, size: tuple[int, int
 
 
 def _frames_of(scene: bpy.types.Scene, camera: bpy.types.Object) -> range:
-    """Frames of a file that a camera has: those of its keys, and of the file where it is read on from there."""
+    """Frames of a camera: those of its keys, or of the whole file where Blender reads its motion from the file."""
     span, owner = camera_samples.keyed(camera), camera
     spans = [span] if span is not None else []
     while owner is not None:
@@ -188,7 +188,7 @@ def _frames_of(scene: bpy.types.Scene, camera: bpy.types.Object) -> range:
 
 
 def _choice(file: Path, camera: bpy.types.Object, count: int) -> list[tuple[str, str]]:
-    """Which of several cameras was taken, as (sentence, hint)."""
+    """Note about the camera that was chosen of several, as (sentence, hint)."""
     if count == 1:
         return []
     return [

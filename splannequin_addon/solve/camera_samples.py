@@ -1,4 +1,4 @@
-"""Samples of an animated camera, and what a transforms.json says of them in the world of a Blender scene."""
+"""Samples of an animated camera, and the transforms.json that holds them in the world of a Blender scene."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from mathutils import Matrix
 
 ANOTHER = "Choose a camera that moves as the clip's did."
-"""What to do with a camera that cannot be the clip's."""
+"""Hint for a camera that cannot be the clip's."""
 _STILL = 1e-6
-"""Largest change of a pose's numbers, relative to its position, that is none: Blender's matrices are float32."""
+"""Largest change of a pose's numbers, relative to its position, of a still camera: Blender's matrices are float32."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def sample_of(number: int, matrix: Matrix, window: Matrix, size: tuple[int, int]
 
 
 def moves(samples: Sequence[Sample]) -> bool:
-    """True if a camera is not everywhere as it is at first."""
+    """True if the camera's pose changes between the samples."""
     poses = np.array([s.stands for s in samples])
     reach = max(1.0, float(np.abs(poses[:, :3, 3]).max()))
     return bool(np.abs(poses - poses[0]).max() > _STILL * reach)
@@ -90,7 +90,7 @@ def _spans(data: bpy.types.AnimData | None) -> list[tuple[float, float]]:
 
 
 def without_ends(samples: Sequence[Sample], span: tuple[float, float] | None) -> list[Sample]:
-    """Samples of a camera but those at both ends where it only stands as it did before: nobody tracked it there.
+    """Samples without those at both ends at which the camera stands still: it was not tracked there.
 
     Args:
         samples: by frame; the camera moves between some of them.
@@ -105,7 +105,7 @@ def without_ends(samples: Sequence[Sample], span: tuple[float, float] | None) ->
 
 
 def _alike(one: Sample, other: Sample) -> bool:
-    """True if a camera is at two frames the same to the last bit, as it is where nothing moves it."""
+    """True if a camera is identical at two frames to the last bit, as where no key moves it."""
     return one.K == other.K and bool((one.stands == other.stands).all())
 
 
@@ -120,7 +120,7 @@ def transforms(
     Args:
         samples: by frame.
         size: width and height in pixels of the pictures that the lens is of.
-        is_numbered_as_shot: a frame number is that of the shot for certain; else the backend finds out.
+        is_numbered_as_shot: frame numbers are those of the shot; else the backend matches them.
         notes: (sentence, hint) for the artist.
     """
     lenses: list[dict[str, Any]] = [dict(zip(("fl_x", "fl_y", "cx", "cy"), s.K, strict=True)) for s in samples]

@@ -25,18 +25,18 @@ from ..shot import scene_objects
 from . import camera_file, camera_samples, scene_camera
 
 LEAST_TRACKED = 8
-"""Frames that a tracked camera has to be solved for."""
+"""Least number of solved frames of a tracked camera."""
 _READING_SECONDS = 0.02
 """Seconds of each turn of the timer that are spent on sampling a camera of the scene."""
 
 
 def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> contract.SolveParams:
-    """What the solve is asked for, from what the artist set; writes cameras that Blender reads into the shot.
+    """Parameters of the solve from the artist's settings; writes cameras that Blender reads into the shot.
 
     Args:
         scene: the scene.
         shot: shot folder, None without one.
-        is_read: what `reads_in_turns` says is written already, or will be.
+        is_read: the cameras that `reads_in_turns` is about are written already, or will be.
 
     JobError names what is missing. OSError if the shot cannot be written.
     """

@@ -120,7 +120,7 @@ def find_image(shot: Path, frame: int) -> bpy.types.Image | None:
 
 
 def _is_of(image: bpy.types.Image, shot: Path, frame: int) -> bool:
-    # Files of before have no digest: their images are trusted.
+    # Earlier files have no digest: their images are trusted.
     return _of(image) == (os.path.abspath(shot), frame) and image.get(_PICTURE) in (
         None,
         inventory.picture_of(shot, frame),

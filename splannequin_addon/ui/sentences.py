@@ -45,7 +45,7 @@ def wrap(
 
 
 def lines(text: str, letters: int) -> list[str]:
-    """A text in lines of at most so many letters, one at least; a figure stays with its unit."""
+    """A text in lines of at most this many letters, one at least; a figure stays with its unit."""
     found = textwrap.wrap(_UNIT.sub(_BOUND, text), letters) or [""]
     return [line.replace(_BOUND, " ") for line in found]
 

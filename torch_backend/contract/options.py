@@ -677,7 +677,7 @@ class MatteParams:
         "of the frozen frames from the top left corner; lassos of one name add up",
         words="those of the take's mattes",
     )
-    """JSON file of lassos; empty: those of before. A matte of before keeps its lassos unless the file has its name."""
+    """JSON file of lassos; empty: the previous ones. An earlier matte keeps its lassos unless the file has its name."""
     remove: str = option("", flag="--remove", metavar="NAME", help="name of a matte to remove", words="none")
     """Matte that is removed; empty: none."""
     matte_format: str = option(

@@ -310,7 +310,7 @@ class TakeFolder:
 
     @property
     def next(self) -> TakeFolder:
-        """Frames that will take the place of those of before when all are done."""
+        """Frames that will take the place of the previous ones when all are done."""
         return TakeFolder(self.root / TAKE_NEXT_FOLDER)
 
     @property

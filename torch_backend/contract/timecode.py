@@ -10,7 +10,7 @@ _TEXT = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.,])(\d\d)")
 
 
 def parse_timecode(text: str) -> str:
-    """The timecode HH:MM:SS:FF, with ";" before FF where frame numbers are dropped; empty if it is none."""
+    """The timecode HH:MM:SS:FF, with ";" before FF where frame numbers are dropped; empty if it is invalid."""
     found = _TEXT.fullmatch(text.strip())
     if found is None or int(found[1]) > 23 or int(found[2]) > 59 or int(found[3]) > 59:
         return ""
@@ -18,7 +18,7 @@ def parse_timecode(text: str) -> str:
 
 
 def later(timecode: str, frames: int, fps: float) -> str:
-    """The timecode `frames` after another one (before it if negative), over midnight too. ValueError if it is none.
+    """The timecode `frames` after another one (before it if negative), over midnight too. ValueError if it is invalid.
 
     It counts in whole frames: 23.976 as 24, 59.94 as 60. Dropping, at 29.97 and 59.94 alone, leaves out the first
     numbers of every minute but each tenth.

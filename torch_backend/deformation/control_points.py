@@ -50,7 +50,7 @@ _EDGES, _SURE_EDGES, _EDGE_RADIUS = 10, 3, 0.1
 _WINDOW = 0.05
 """ARAP: the two times lie within this."""
 _SURROGATES = 16
-"""Pre-stage: at most so many surrogate points per node."""
+"""Pre-stage: at most this many surrogate points per node."""
 _PRUNED = 0.005
 """Pre-stage: surrogates less opaque than this go."""
 _INSTANTS = 16

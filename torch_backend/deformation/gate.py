@@ -63,7 +63,7 @@ class GateConfig:
     moving_share: float = 0.5
     """With motion mattes, a Gaussian is put on trial if this share of what it paints of a frame falls on movers..."""
     moving_frames: int = 3
-    """...in at least so many frames,"""
+    """...in at least this many frames,"""
     moving_often: float = 0.1
     """and in this share of the time bins in which it was seen: a wall that a hand passes is a wall."""
 

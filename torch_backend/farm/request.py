@@ -12,7 +12,7 @@ VERSION = 1
 
 
 def read_request(path: str | Path) -> dict[str, Any]:
-    """What `template` wrote. JobError if it is none, or from a newer version."""
+    """What `template` wrote. JobError if it is invalid, or from a newer version."""
     try:
         data = read_json(path, SHORT_JSON)
         if data.get("version") != VERSION:

@@ -39,7 +39,7 @@ class Step:
         return f"{self.shot.name}: {self.kind}"
 
     def sessions(self, session_tasks: int) -> int:
-        """How often one host enters the job's environment for it: once, or for every so many tasks (0: once)."""
+        """Number of tasks after which a host enters the job's environment again; 0: once for all."""
         tasks = max(1, len(self.t_stars)) * max(1, len(self.starts))
         return -(-tasks // session_tasks) if session_tasks else 1
 

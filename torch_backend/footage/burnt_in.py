@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 WIDTH = 640
-"""Pictures are examined so wide, at most."""
+"""Largest width of the pictures that are used."""
 FRAMES = 48
-"""So many are examined, at most, evenly over the clip."""
+"""Largest number of pictures that are used, evenly over the clip."""
 _LEAST_FRAMES, _LEAST_WIDTH = 12, 160
 """Of fewer, or smaller ones, nothing is said."""
 _EDGE = 2.0
@@ -26,7 +26,8 @@ _ALIKE, _OFTEN = 0.5, 0.75
 """A frame has an edge if its gradient differs from the median by less than this share of it; this share of them must.
 On three clips and five synthetic ones 0.5 at most of the frames agree on any edge of the world, 1.0 on a logo's."""
 _SCENE_OFTEN = 0.35
-"""On half of the world's edges at most so many frames may agree: else the camera hardly moves, and nothing is known."""
+"""Largest number of frames that may agree on half of the scene's edges: above it the camera hardly moves, and no mark
+can be found."""
 _CLOSE = 13
 """Pixels of a picture 640 wide between edges that belong together."""
 _LEAST, _MOST = 60, 0.25

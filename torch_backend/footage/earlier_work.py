@@ -76,7 +76,7 @@ class EarlierWork:
         return all(self._digest(was) in (None, now["digest"]) for was, now in zip(old, new, strict=True))
 
     def _digest(self, row: Mapping[str, Any]) -> str | None:
-        """Digest of an old frame's picture; None if its file is lost, and an import of before noted none."""
+        """Digest of an old frame's picture; None if its file is lost, and an earlier import noted none."""
         if row.get("digest"):
             return str(row["digest"])
         path = self.shot.frames / str(row["file"])

@@ -60,7 +60,7 @@ class LookSpace(InputSpace):
 
 
 def look_space(file: str) -> LookSpace:
-    """The space of pictures that are seen through a .cube file. JobError if it is none, or cannot be read."""
+    """The space of pictures that are seen through a .cube file. JobError if it is invalid, or cannot be read."""
     path = Path(file)
     hint = "Choose a 1D or 3D look as .cube."
     if path.suffix.lower() != ".cube":

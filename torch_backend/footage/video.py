@@ -273,7 +273,7 @@ class VideoSource:
         return 1.5 / self.info.fps if self._interlaced else 0.0
 
     def open(self, threads: int) -> tuple[Any, Any]:
-        """The container and its stream, to be decoded by at most so many threads. JobError if it cannot be opened."""
+        """The container and its stream, to be decoded by at most this many threads. JobError if it cannot be opened."""
         container = self._open()
         stream = stream_of(container, self.path, self.layer)
         stream.thread_type = "AUTO"

@@ -78,7 +78,7 @@ class FrameMetadata:
     version: int = EXR_VERSION
     """Version of these attributes."""
     key: str = ""
-    """What the frame was rendered from, to tell a stale one; empty in frames of before it was noted."""
+    """Key of the inputs of the frame, to detect a stale one; empty in frames of versions that did not store it."""
     light: str = LIGHTS[0]
     """Primaries of the light in the file, one of `LIGHTS`. Arrays here are Rec.709's, whatever it is."""
 

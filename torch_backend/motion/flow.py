@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..array_types import meshgrid
 
 _OUTSIDE = 16.0
-"""Flow leads at most so many flow pixels out of the picture."""
+"""Flow leads at most this many flow pixels out of the picture."""
 Map = NDArray[Any]
 """float32 [h, w], or as said; typed as loosely as OpenCV types what it returns."""
 Mask = NDArray[np.bool_]

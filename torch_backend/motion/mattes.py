@@ -1,7 +1,7 @@
 """The motion matte of a shot: per delivered frame what stands still, what moves by itself, and what is not known.
 
 SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size: STILL, UNKNOWN or MOVING. motion.json beside
-them says which cameras they belong to; mattes of a solve of before are not read, nor are the points of still surfaces
+them says which cameras they belong to; mattes of an earlier solve are not read, nor are the points of still surfaces
 that lie with them (`surface`). What an artist paints goes before what is found: SHOT/motion_paint/NNNNNN.png, which no
 solve touches.
 """

@@ -112,7 +112,7 @@ def _carried(frame: Sight, inverse: Map, other: Sight, grid: tuple[Map, Map]) ->
 
 
 def seeded(mask: Mask, seeds: Mask, least: int) -> Mask:
-    """The 4-connected areas of a mask that hold a seed and at least so many points."""
+    """The 4-connected areas of a mask that hold a seed and at least this many points."""
     count, numbers, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     numbers = np.asarray(numbers, np.int32)
     keep = about[:, cv2.CC_STAT_AREA] >= least

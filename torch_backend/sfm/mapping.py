@@ -12,8 +12,8 @@ from .matching import extract, match
 from .request import SEED, Request, closing_database, say
 
 HELD_SHARE, HELD_WORSE, HELD_ERROR_PX = 0.9, 1.25, 1.0
-"""A usual lens is taken instead of a doubtful one if it places this share of the frames, with errors no more than so
-many times as large, or no more than so many pixels."""
+"""A usual lens replaces an implausible one if it registers this share of the frames, and its error is at most this many
+times as large, or at most this many pixels."""
 MASKED_INLIERS = (50, 15)
 """Matches that a first pair and a further image need where masks leave few, half of COLMAP's: what would mislead is
 masked. A room of which 70 % of 320 x 240 pixels were masked: 26 of 30 images instead of 4."""

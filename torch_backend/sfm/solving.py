@@ -83,7 +83,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 
     Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
     contract.CameraPath in COLMAP's world ("solve units"), OpenCV axes, world-to-camera, pinhole of the undistorted
-    frames. They take the place of a solve of before when all of them are written; until then, and if this one fails,
+    frames. They take the place of an earlier solve when all of them are written; until then, and if this one fails,
     that one stays. A shot already solved from the same frames with the same configuration is left alone.
 
     With an ST map in `config` the frames are undistorted through it first, and the solve finds the focal length alone.
@@ -96,7 +96,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
     """
     _check(config, cameras)
-    for folder in (shot.frames, shot.colmap, *map(shot.masks, MASK_KINDS)):  # files of before are replaced
+    for folder in (shot.frames, shot.colmap, *map(shot.masks, MASK_KINDS)):  # earlier files are replaced
         shot.own(folder)
     settle_solve(shot)
     frames = load_frames(shot)
@@ -188,7 +188,7 @@ def _mask_sources(shot: Shot, config: SolveConfig) -> dict[str, str]:
 def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: dict[str, Mask]) -> str:
     """Tells a solve from others. Masks count by what they cover, wherever they lie."""
     settings = asdict(config)
-    new = ["ignore_mask", "people_mask"]  # solves of before had none of these
+    new = ["ignore_mask", "people_mask"]  # earlier solves had none of these
     new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # the file counts by what is in it
     new += [] if config.focal_mm else ["focal_mm", "sensor_mm", "refine_focal"]
     new += ["retry"] if config.retry else []  # a solve without retries does not count as one with them

@@ -82,7 +82,7 @@ class TrainConfig:
     scale_weight: float = 2e-3
     """Weight of the mean standard deviation in scene units (3DGS-MCMC: 1e-2)."""
     field_every: int = 4
-    """The field's regularisers are evaluated every so many steps, times as strong."""
+    """Interval in steps at which the field's regularisers are evaluated; their weight is multiplied by it."""
     evaluate_every: float = 0.1
     """Share of the run between two measurements on held-out frames."""
     checkpoint_seconds: float = 30.0
@@ -219,7 +219,7 @@ def _gate_for(config: TrainConfig) -> None:
 def config_to_json(config: TrainConfig) -> dict[str, Any]:
     """Plain types for config.json."""
     plain = dataclasses.asdict(config)
-    if not config.plates:  # runs are known by this: those of before there was a choice are the same as without
+    if not config.plates:  # part of the run's key: runs that are older than this choice keep their key
         del plain["plates"]
     return plain
 

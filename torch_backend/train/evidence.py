@@ -36,7 +36,7 @@ MOMENTS = 24
 MOVING_SHARE = 0.3
 """Share of a pixel that has to be of what moves before it is taken to travel."""
 STILL_SHARE = 1 / 640
-"""Travel below this share of the width is none."""
+"""Travel below this share of the width counts as none."""
 
 
 @dataclass(frozen=True)

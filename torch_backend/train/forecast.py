@@ -18,8 +18,8 @@ from .config import PRESETS
 STEPS = 20
 """Steps that are timed; the first of them, in which memory is taken for the first time, counts for nothing."""
 GAUSSIAN_PIXELS = 3.0
-"""A Gaussian takes as long as so many pixels. In a run that grew fast, at 640 x 360, as 3.8: 76 ms of CPU a step with
-19,000, 127 with 58,000, 180 with 122,000. In long ones they become small, and take less."""
+"""Time per Gaussian, in pixels that take as long. In a run that grew fast, at 640 x 360, as 3.8: 76 ms of CPU a step
+with 19,000, 127 with 58,000, 180 with 122,000. In long ones they become small, and take less."""
 LONG_SECONDS = 3600.0
 """A run that takes longer says so in a warning, and what would take less."""
 _SAMPLES = 256

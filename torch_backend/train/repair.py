@@ -45,7 +45,7 @@ _FEW = 0.01
 _THROWN = 0.1
 """Share of the moving Gaussians that a field in order may throw at any instant..."""
 _FAR, _LEAST_FAR = 6.0, 1.0
-"""...by more than so many times their median distance from their middle, and scene units, or than the scene's extent:
+"""...by more than this many times their median distance from their middle, and scene units, or than the scene's extent:
 somebody may walk as far as what moves reaches, and an apple swing by many times its own size. In a healthy run of a
 preview the upper tenth moves by at most 0.05 of that distance; one that came apart threw it hundreds of times as far
 at some instants, and that extent, in which far background counts, was no bound (docs/decisions.md)."""

@@ -64,8 +64,8 @@ class SurfaceDepthConfig:
     keys: int = VIEWS
     """Number of key views, spread evenly over the clip."""
     around: int = 6
-    """Each key view is compared with this many before and after it, and a frame takes its depth from the nearest so
-    many."""
+    """Number of key views before and after a key view with which it is compared, and from which a frame takes its
+    depth."""
     steps: int = 4
     """Number of Gauss-Newton steps."""
     radii: tuple[int, ...] = (3, 8)
@@ -170,7 +170,7 @@ def gauss_newton(
             continue
         count, square = window_means([weight, weight * np.square(shift)], config.small)
         noise = np.sqrt(np.maximum(square / np.maximum(count, 1e-6), _QUANTUM**2))
-        # From so many deviations on, two plates show two points.
+        # Number of standard deviations from which on two plates show different points.
         weight /= np.square(noise * (1.0 + np.square(shift / (SAME * noise))))
         # A slope that steps of 8 bits may have made says nothing of depth.
         steps = np.square(_SURE * _SLOPE_NOISE * _QUANTUM) * (np.square(place.dx) + np.square(place.dy))

@@ -144,7 +144,7 @@ class _FineTuning:
         return FrozenGaussians(state, was.sh_degree, was.support, was.motion, was)
 
     def _train(self, steps: int, instant_share: float, check: Callable[[int], None]) -> None:
-        """So many steps, a share of them on plate t*; `check` is called with how many are done."""
+        """Runs a number of steps, a share of them on plate t*; `check` is called with how many are done."""
         order: list[int] = []
         mean = ParameterMean()
         for n in range(steps):

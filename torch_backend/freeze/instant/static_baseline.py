@@ -47,13 +47,15 @@ class StaticBaselineConfig:
     neighbours: int = 16
     """Number of nearest open Gaussians that are decided together."""
     doubted: float = 3.0
-    """So many times what the others lose must plate t* gain for what only sways where the mattes say that nothing moves
-    at t*: a field also bends to what is wrong with the camera of that one plate, the edge of a desk for instance."""
+    """Factor by which the gain of plate t* must exceed the loss of the others for a Gaussian that only sways where the
+    mattes are still at t*. A field also bends to an error of that one plate's camera, at the edge of a desk for
+    instance."""
     sways: float = 4.0
-    """Pixels of pictures 640 wide from t* to a plate from which on a Gaussian does not only sway: what the run at that
-    plate's time shows better than the twin then counts. Held-still people sway by less; their mean is as good."""
+    """Distance in pixels of pictures 640 wide, from t* to a plate, above which a Gaussian counts as moving and not as
+    swaying. The advantage of the run over the twin at that plate's time is then subtracted. People who hold still sway
+    by less, and their mean is as good."""
     nearer: float = 1.0 / AFAR
-    """A plate sees a Gaussian from near if its distance is at most so much of that at t*."""
+    """Largest distance of a plate that sees a Gaussian from near, relative to the distance at t*."""
 
 
 def apply_static_baseline(

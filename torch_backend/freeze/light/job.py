@@ -56,8 +56,8 @@ class LightConfig:
     """Splats nearer to the point than this share of the median distance are left out, up to twice that they fade in:
     in front of the point one of them would cover a large part of the sphere."""
     inside: float = 3.0
-    """Splats that the point lies in, nearer than so many standard deviations, are left out: a projection that is linear
-    about their middle would smear them across a whole face."""
+    """Splats within this many standard deviations of the point are left out: a projection that is linear about their
+    centre would smear them across a whole face."""
     wide: float = 0.3
     """Splats whose largest standard deviation is more than this share of their distance, 17 degrees, are left out: they
     reach over several faces, each of which would draw another shape of them."""

@@ -94,7 +94,7 @@ def _refined(votes: Tensor, frozen: FrozenGaussians, frame: TakeFrame, config: S
 
 
 def _add(votes: dict[str, Tensor], told: Mapping[str, Tensor]) -> None:
-    """Adds votes to those of before."""
+    """Adds votes to the previous ones."""
     for name, more in told.items():
         votes[name] = votes[name] + more if name in votes else more
 

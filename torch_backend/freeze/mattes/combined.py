@@ -305,7 +305,7 @@ def _living_frame(base: FrozenFrame, plates: Plates, number: int, inner: tuple[s
 def _finish(
     shot: Shot, params: CombineParams, folder: TakeFolder, base: Source, frames: list[int], report: Reporter
 ) -> dict[str, Any]:  # fmt: skip
-    """Contact sheet, video and take.json; frames of before that are none of this take go."""
+    """Contact sheet, video and take.json; earlier frames that are none of this take go."""
     for number in frames_of(folder):
         if number not in frames:
             for old in (folder.frame(number), folder.preview(number)):

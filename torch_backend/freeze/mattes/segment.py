@@ -33,7 +33,7 @@ class SegmentConfig:
     """Share of the frame's width around the thing from which the colours of what surrounds it are learnt; 38 pixels of
     640."""
     least: int = 4
-    """`slack` is at least so many pixels, however small the frame is: a hand that draws misses by 3."""
+    """Least `slack` in pixels at any frame size: a lasso drawn by hand is off by about 3."""
     most: float = 3.0
     """Log-odds of one cue at most, 20 to 1: no cue overrules two others that agree."""
     prior: float = 3.0

@@ -139,7 +139,7 @@ def _compose(
 
 
 def _wrapped(text: str, width: int) -> list[str]:
-    """Words in lines of at most so many pixels; a longer word has a line of its own."""
+    """Words in lines of at most this many pixels; a longer word has a line of its own."""
     lines: list[str] = []
     for word in text.split():
         longer = f"{lines[-1]} {word}" if lines else word

@@ -1,4 +1,4 @@
-"""The folder of a take: which of its frames are right, and how new ones take the place of those of before."""
+"""The folder of a take: which of its frames are right, and how new ones take the place of the previous ones."""
 
 from __future__ import annotations
 
@@ -124,7 +124,8 @@ def clear(take: PlannedTake, done: Set[int]) -> None:
 
 
 def take_over(take: PlannedTake, place: Place) -> None:
-    """The frames rendered beside a take of before stand in its place. Killed meanwhile, the next freeze goes on."""
+    """Moves the frames that were rendered next to an earlier take into its place. If it is killed, the next freeze
+    continues."""
     assert place.beside is not None
     clear(take, place.right_here)
     for n in frames_of(place.beside):

@@ -75,7 +75,7 @@ def freeze_part(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
 def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
     """Completes an opened take whose frames from `params.first` to `params.last` are all there.
 
-    Frames of before that are not right any more are removed. Returns what take.json holds. JobError names frames that
+    Earlier frames that are not right any more are removed. Returns what take.json holds. JobError names frames that
     lack.
     """
     take = _opened(shot, params, report)

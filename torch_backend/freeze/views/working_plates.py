@@ -90,7 +90,7 @@ def showing(trained: list[int], t_star: int) -> list[int]:
 
 
 def spread(frames: list[int], most: int) -> list[int]:
-    """At most so many of ascending frames, evenly."""
+    """At most `most` of ascending frames, evenly spaced."""
     if len(frames) <= most:
         return list(frames)
     step = len(frames) / max(1, most)
