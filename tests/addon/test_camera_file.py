@@ -146,7 +146,7 @@ def test_the_timer_waits_for_the_other_blender_and_ends_it_when_given_up(addon, 
     exchange = addon("solve.exchange")
     turns = exchange.read_in_turns(filmed, shot)
     assert next(turns).text == "Reading the cameras of set.fbx"
-    child = turns.gi_frame.f_locals["asked"]
+    child = turns.gi_frame.f_locals["question"]
     turns.close()
     child.wait(30)
     assert child.process.returncode != 0 and not (shot / "tracking").exists()
