@@ -24,11 +24,11 @@ PACES_FILE = "paces.json"
 """In the notes of the backend's environment, which is this machine's: kind of job -> its last paces."""
 VERSION = 1
 PER_STEP, PER_SOLVED = 0.16, 0.13
-"""Megapixels that a training step and a solved frame cost whatever their size; measured, see docs/farm.md."""
+"""Fixed cost of a training step and of a solved frame, in megapixels; measured, see docs/farm.md."""
 PER_WORKING, FIRST_FRAMES = 3.6, 3.5
-"""Megapixels of frozen frames that one of working frames costs as much as, for what moves and what a plate shows is
-looked for at their size; and how many frames' worth of that the first frame is, which reads most plates first.
-From "What a frame costs" in docs/benchmarks.md."""
+"""Cost of a megapixel of working frames, at whose size masks and visibility are computed, in megapixels of frozen
+frames; and that of a take's first frame, which reads most plates first, in frames. From "What a frame costs" in
+docs/benchmarks.md."""
 _SECONDS = {"import": (1.0, 0.18), "solve": (3.0, 1.7), "train": (3.0, 0.116), "freeze": (15.0, 0.28)}
 """Kind of job -> seconds whatever there is to do, seconds per unit of work: `sitting.mp4` on two cores of an EPYC."""
 BEGINS_WITH = {"import": "import", "solve": "solve", "train": "training", "freeze": "developing"}
