@@ -50,9 +50,12 @@ from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot, write_json
 from torch_backend.train import PRESETS, config_from_params, train_shot
 from torch_backend.train.device import cuda_refusal
+from torch_backend.train.events import schedule_events
+from torch_backend.train.loop import train_to_end
 from torch_backend.train.memory import plan_memory
 from torch_backend.train.pictures import training_size
 from torch_backend.train.recorder import Recorder
+from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -309,7 +312,7 @@ def _whole_runs(stage: Stage) -> dict[str, Any]:
             trainer.recorder = trainer.recorder if records else None
             stage.wait()
             since = time.perf_counter()
-            trainer.run(stage.results / "gpu-scratch.safetensors", lambda _: None)
+            train_to_end(trainer, stage.results / "gpu-scratch.safetensors", lambda _: None)
             stage.wait()
             seconds = time.perf_counter() - since
             rows[f"{'recorded' if records else 'launched'}-{seed}"] = {
@@ -427,7 +430,7 @@ def _trainer(
 
 
 def _step(trainer: Trainer) -> None:
-    trainer.schedule_events()
+    schedule_events(trainer)
     trainer.step()
     trainer.iteration += 1
 
@@ -451,12 +454,12 @@ def _full_hd(stage: Stage) -> dict[str, Any]:
     of them may move, and what of it the card was busy, by how many kernels."""
     many, size, count = (2000, (64, 36), 2) if stage.dry else (1_000_000, (1920, 1080), 30)
     trainer = _trainer(stage, 300, 2000 if stage.dry else 100_000, 64 if stage.dry else 0, "hexplane", size)
-    trainer.schedule_events()
+    schedule_events(trainer)
     figures: dict[str, Any] = {"gaussians": many, "width": size[0], "height": size[1], "frames": len(trainer.times)}
     for name, share in (("static", 0.0), ("tenth", 0.1), ("all", 1.0)):
         if name == "tenth":
             trainer.iteration = 101  # a third: the field is made
-            trainer.schedule_events()
+            schedule_events(trainer)
         if len(trainer.model.gaussians) != many:
             _enlarged(trainer, many)
         trainer.model.gaussians.open[:] = torch.rand(many, device=stage.device) < share
@@ -505,7 +508,7 @@ def _waits(stage: Stage) -> dict[str, Any]:
     places: dict[str, int] = {}
     steps = 0
     while trainer.iteration < (140 if stage.dry else 300):
-        trainer.schedule_events()
+        schedule_events(trainer)
         look = trainer.iteration >= 135 and trainer.iteration % 10 != 0  # the field is there from a third on
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always")
@@ -542,7 +545,7 @@ def _memory(stage: Stage, gb: int) -> dict[str, Any]:
     plan = plan_memory(config, size, len(scene.solved), 0, gb * 10**9 - 900_000_000)
     trainer = _trainer(stage, 60, 2000, 64 if stage.dry else 0, "hexplane")
     trainer.iteration = 21  # a third: the field is made
-    trainer.schedule_events()
+    schedule_events(trainer)
     trainer.model.pieces = 500 if stage.dry else plan.pieces
     _enlarged(trainer, 2000 if stage.dry else plan.gaussians)
     row: dict[str, Any] = {"planned": {"gaussians": plan.gaussians, "pieces": plan.pieces}, "sentence": plan.sentence}
@@ -576,13 +579,13 @@ def _resumed(stage: Stage) -> dict[str, Any]:
     for _ in range(growth.every * max(1, math.ceil(growth.start * trainer.config.iterations / growth.every))):
         _step(trainer)
     path = stage.results / "gpu-scratch.safetensors"
-    trainer.save(path)
+    save_run(trainer, path)
     row: dict[str, Any] = {"at": trainer.iteration}
     for device in dict.fromkeys((stage.device.type, "cpu")):
         other = Trainer(
             trainer.scene, trainer.images.to(device), trainer.train_ids, trainer.config, Warnings(), {}, device
         )
-        other.restore(path)
+        restore_run(other, path)
         before = len(other.model.gaussians)
         for _ in range(3):
             _step(other)

@@ -52,8 +52,10 @@ from torch_backend.train import LoadedRun, adam, config_from_params
 from torch_backend.train.checkpoint import CHECKPOINT_FILE, read_meta
 from torch_backend.train.config import TrainConfig, config_from_json, config_to_json
 from torch_backend.train.ignored import Masks, load_ignored
+from torch_backend.train.loop import train_to_end
 from torch_backend.train.movers import load_movers
 from torch_backend.train.pictures import training_size
+from torch_backend.train.resume import restore_run
 from torch_backend.train.trainer import Trainer
 
 FIGURES = ("still", "moving", "whole", "frozen", "gradient")
@@ -201,9 +203,9 @@ def trained(args: argparse.Namespace, shot: Shot, config: TrainConfig) -> tuple[
     ignored = load_ignored(masks_of(shot), scene, train, width, height)
     trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)
     if args.run or args.again:
-        trainer.restore(shot.run(args.run) / CHECKPOINT_FILE if args.run else left)
+        restore_run(trainer, shot.run(args.run) / CHECKPOINT_FILE if args.run else left)
     else:
-        trainer.run(left, lambda _: None)
+        train_to_end(trainer, left, lambda _: None)
     return trainer, test, time.process_time() - since
 
 

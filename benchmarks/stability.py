@@ -35,6 +35,7 @@ from torch_backend.shot import SHOT_SUFFIX, Shot, content_key, write_json
 from torch_backend.train import TrainConfig, config_from_params
 from torch_backend.train.config import config_to_json
 from torch_backend.train.identity import solve_key
+from torch_backend.train.loop import train_to_end
 from torch_backend.train.metrics import moving_share
 from torch_backend.train.pictures import training_size
 from torch_backend.train.trainer import Trainer
@@ -100,7 +101,7 @@ def train_once(scene: Scene, config: TrainConfig) -> Outcome:
     value = None
     with tempfile.TemporaryDirectory() as folder:
         try:
-            trainer.run(pathlib.Path(folder) / "checkpoint.safetensors", lambda _: None)
+            train_to_end(trainer, pathlib.Path(folder) / "checkpoint.safetensors", lambda _: None)
             value = trainer.heldout_psnr(test, images[len(train) :])
         except JobError as error:
             listener.warnings.append(str(error))

@@ -32,7 +32,7 @@ from torch_backend.raster.cpu import warm_up
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.sfm.masks import IGNORE, load_mask
 from torch_backend.shot import Shot
-from torch_backend.train import config_from_params
+from torch_backend.train import config_from_params, events
 from torch_backend.train import trainer as trainer_module
 from torch_backend.train.ignored import load_ignored
 from torch_backend.train.movers import load_movers
@@ -100,7 +100,7 @@ def watch(trainer: Trainer, parts: Parts) -> None:
         (trainer.optimizer, "step", "Adam"),
         (trainer, "_observe", "what a frame tells of the Gaussians"),
         (trainer, "_schedule_rates", "learning rates"),
-        (trainer, "schedule_events", "densification and gate"),
+        (events, "schedule_events", "densification and gate"),
         (trainer, "_told", "what the step is told"),
     ):
         patch(owner, name, label)
@@ -141,7 +141,7 @@ def measure(trainer: Trainer, parts: Parts, steps: int) -> dict[str, float]:
     whole = []
     for _ in range(steps):
         since = time.perf_counter()
-        trainer.schedule_events()
+        events.schedule_events(trainer)
         trainer.step()
         trainer.iteration += 1
         whole.append(1e3 * (time.perf_counter() - since))
@@ -182,7 +182,7 @@ def main() -> None:
     with torch_threads(3 * width * height):  # as `Trainer.run`
         for share in args.at:
             while trainer.progress < share:
-                trainer.schedule_events()
+                events.schedule_events(trainer)
                 trainer.step()
                 trainer.iteration += 1
             label = f"at {share:.0%}: {len(trainer.model.gaussians)} Gaussians, {len(trainer.model.open_rows())} open"

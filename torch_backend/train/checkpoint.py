@@ -42,7 +42,7 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]
 
 
 MISFITS = (KeyError, TypeError, IndexError, AttributeError, ValueError, RuntimeError)
-"""What a checkpoint that is whole, but not as `Trainer.save` wrote it, ends in: a tensor lacks or has another shape."""
+"""What a checkpoint that is whole, but not as `resume.save_run` wrote it, ends in: a tensor is missing, say."""
 
 
 def misfit(path: Path, error: Exception, code: ExitCode) -> Exception:

@@ -39,10 +39,12 @@ from .device import choose_device
 from .extend import EXTENSION_FILE, pending
 from .identity import asked_for, depth_identity, finished, of_other_pictures, pictures_key, solve_key
 from .ignored import load_ignored
+from .loop import train_to_end
 from .memory import MemoryPlan, free_bytes, plan_memory
 from .metrics import Metrics, summarise
 from .movers import load_movers
 from .pictures import pictures_of
+from .resume import restore_run, save_run
 from .trainer import Trainer
 from .verdict import warn_if_poor
 
@@ -66,7 +68,7 @@ class _Prepared:
         begun_at: iteration that an earlier process had reached; -1: none.
         """
         metrics = Metrics(folder, self.trainer.report, begun_at)
-        self.trainer.run(checkpoint, lambda trainer: metrics.add(trainer, self.test, self.held_out))
+        train_to_end(self.trainer, checkpoint, lambda trainer: metrics.add(trainer, self.test, self.held_out))
         mattes = functools.partial(load_motion, shot)
         return summarise(self.trainer, run, self.test, self.held_out, str(self.trainer.identity["key"]), mattes)
 
@@ -146,18 +148,18 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     prepared = _prepared(shot, scene, config, folder, identity, depth, device, report, int(before["gaussians"]))
     trainer, begun = prepared.trainer, pending(folder, facts) if params.resume else None
     if before["iterations"] != facts["iteration"]:  # it was killed between its last two files: only figures are missing
-        trainer.restore(checkpoint)
+        restore_run(trainer, checkpoint)
     elif begun is not None and begun.steps == params.extend:
-        trainer.restore(beside)
+        restore_run(trainer, beside)
         done = trainer.iteration - begun.from_iteration
         report.progress("training", done, begun.steps, f"resumed at step {trainer.iteration}")
     else:
         if begun is not None:
             report.warning(f"{begun.steps} steps were begun, {params.extend} are asked for: they begin anew.")
-        trainer.restore(checkpoint)
+        restore_run(trainer, checkpoint)
         trainer.extend(params.extend, before["heldout_psnr_db"])
     summary = prepared.trained(shot, params.run, folder, beside, trainer.iteration)
-    trainer.save(checkpoint)
+    save_run(trainer, checkpoint)
     write_json(folder / SUMMARY_FILE, summary)
     remove_file(beside)
     return _told(summary, report)
@@ -265,6 +267,6 @@ def _resume(trainer: Trainer, checkpoint: Path, resume: bool, report: Reporter) 
         return False
     if read_meta(checkpoint).get("key") != trainer.identity["key"]:
         return False
-    trainer.restore(checkpoint)
+    restore_run(trainer, checkpoint)
     report.progress("training", trainer.iteration, trainer.config.iterations, f"resumed at step {trainer.iteration}")
     return True

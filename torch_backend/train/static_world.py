@@ -19,6 +19,7 @@ from ..sfm.masks import IGNORE, load_mask
 from ..shot import Shot
 from .config import config_from_params
 from .ignored import load_ignored
+from .loop import train_to_end
 from .pictures import training_size
 from .run import warm_up
 from .trainer import Trainer
@@ -49,7 +50,7 @@ def static_views(shot: Shot, report: Reporter) -> StaticViews:
     ignored = load_ignored(functools.partial(load_mask, shot, IGNORE), scene, train, width, height)
     heard = _Heard(report)
     trainer = Trainer(scene, load_images(scene, train, width, height), train, config, heard, ignored=ignored)
-    trainer.run(None, lambda _: None)
+    train_to_end(trainer, None, lambda _: None)
     index = {frame: n for n, frame in enumerate(scene.frames)}
 
     @torch.no_grad()

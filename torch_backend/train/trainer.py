@@ -1,25 +1,20 @@
-"""The loop. One image per step; every schedule is a share of the run, so presets differ in numbers only."""
+"""A run in training: its model, and one step on one image. Schedules are shares of the run: presets differ in
+numbers only. `events.py` has what happens between steps, `loop.py` the way to the end, `resume.py` the checkpoint."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
-import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import FORECAST, Cancelled, ExitCode, JobError, Reporter
-from ..deformation import Deformation, Deltas, Rehearsal, Start, field_box, host, split_deltas
-from ..gaussians import Densifier, DensifyConfig, covering, initialise
-from ..native import torch_threads
+from ..contract import Reporter
+from ..deformation import Deltas, field_box, split_deltas
+from ..gaussians import Densifier, DensifyConfig, initialise
 from ..raster import RasterOutput
-from ..raster.cuda import forget_demands
 from ..scene import Scene
 from ..supervision import (
     Anchored,
@@ -34,25 +29,20 @@ from ..supervision import (
     support_loss,
 )
 from ..torch_types import backward, from_numpy, integers, norm_of_all
-from . import memory
 from .average import ParameterMean
-from .checkpoint import MISFITS, load_checkpoint, misfit, optimizer_state, restore_optimizer, save_checkpoint
-from .config import TrainConfig, config_to_json
+from .config import TrainConfig
 from .depth import DepthTargets, FittedDepth, depth_pull
 from .exposure import Exposure
 from .extend import Extension
-from .forecast import Outlook, Stopwatch, smaller_presets, step_work, warning_of
-from .losses import photometric, psnr
-from .model import DynamicModel, render, restore_model
-from .movers import close_strays, harden, on_trial
-from .optimizer import add_field, limit_harmonics, optimizer_of, schedule_rates
+from .losses import psnr
+from .model import DynamicModel, render
+from .optimizer import optimizer_of, schedule_rates
 from .paper import paper_step
 from .poses import Poses, corrected
 from .recorder import Recorder
-from .repair import drop_thrown
 from .residual import correlation_of_movers
 from .softened import SoftenedMovers
-from .soundness import INSPECT_EVERY, Soundness
+from .soundness import Soundness
 from .step_facts import StepFacts, StepKind
 from .stopping import RunSchedule, StoppingPolicy
 
@@ -61,7 +51,7 @@ class Trainer:
     """Optimises one run on one device; images [I, H, W, 3] float16 display-referred, on the device or in host memory.
 
     Random numbers are drawn on the CPU whatever the device is: a run is the same experiment everywhere, and its
-    checkpoint goes on anywhere. On a GPU a step reads nothing back; `run` looks every `INSPECT_EVERY` steps.
+    checkpoint goes on anywhere. On a GPU a step reads nothing back; the loop looks every `INSPECT_EVERY` steps.
 
     Args:
         scene: normalised scene, on the CPU.
@@ -102,7 +92,7 @@ class Trainer:
         self._bins = [bin_of(centres, time) for time in self.times]
         self.centres = centres.to(self.device)
         self.most, self.pieces = most, pieces
-        budget = self._densify_config().budget
+        budget = self.densify_config().budget
         count = len(self.centres)
         known = None if depth is None else depth.at
         gaussians = initialise(scene, images, train, count, config.init, self.generator, budget, self.ignored, known)
@@ -122,13 +112,12 @@ class Trainer:
         low, high = field_box(scene.points)
         self.soundness = Soundness(float(norm_of_all(high - low)), self.device)
         self.poses = Poses(self.times, config.poses, self.device)
-        self._refined = False
+        self.refined = False
+        """True once the corrected cameras are the cameras."""
         self.optimizer = optimizer_of(self.model, self.poses, config)
         self.mean = ParameterMean()
-        self.densifier = Densifier(self._densify_config(), len(gaussians), self.device)
-        self.recorder = self._recorder()
-        self._foretold = False
-        self._saved_at = time.perf_counter()
+        self.densifier = Densifier(self.densify_config(), len(gaussians), self.device)
+        self.recorder = self.new_recorder()
 
     # ------------------------------------------------------------------ the run
 
@@ -169,142 +158,10 @@ class Trainer:
         self.extensions.append(Extension(self.iteration, steps, heldout_psnr_db, self.trained_seconds))
         self.policy.joined = True  # a run that ended early may still hold its probe frames back
 
-    def run(self, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
-        """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured,
-        once more for a step that it goes on from.
-
-        Without a checkpoint nothing is written.
-        """
-        on_cpu = self.device.type == "cpu"
-        with torch_threads(3 * self.width * self.height) if on_cpu else contextlib.nullcontext():
-            self._run(checkpoint, evaluate)
-
-    def _run(self, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
-        begin, length = 0, self.config.iterations
-        if self.extensions:
-            begin, length = self.extensions[-1].from_iteration, self.extensions[-1].steps
-        every = max(1, round(self.config.evaluate_every * length))
-        since = time.perf_counter() - self.trained_seconds
-        started = self.iteration
-        watch = Stopwatch() if self.device.type == "cpu" else None
-        if started > begin and (started - begin) % every == 0:  # a cancel may have ended it in this very evaluation
-            self._with_room(lambda: evaluate(self))
-        try:
-            while self.iteration < self.end:
-                self.report.check_cancelled()
-                loss = self._step_that_fits()
-                if loss is None:
-                    self._make_room(checkpoint)
-                    continue
-                self.iteration += 1
-                self._with_room(lambda: self._average(length))
-                self.trained_seconds = time.perf_counter() - since
-                if watch is not None:
-                    self._foretell(watch, resumed=started > 0)
-                if (self.iteration - begin) % every == 0:
-                    self._with_room(lambda: evaluate(self))
-                    if watch is not None:
-                        watch.begin()
-                if self.iteration % INSPECT_EVERY == 0 or self.iteration == self.end:
-                    self.inspect_nonfinite()
-                    text = f"step {self.iteration}, {len(self.model.gaussians)} Gaussians, loss {float(loss):.4f}"
-                    self.report.progress("training", self.iteration - begin, self.end - begin, text)
-                if time.perf_counter() - self._saved_at > self.config.checkpoint_seconds:
-                    self._with_room(lambda: self.save(checkpoint))
-        except Cancelled:
-            if self.iteration > started:
-                self.save(checkpoint)
-            raise
-        self.trained_seconds = time.perf_counter() - since
-        if self.recorder is not None:
-            self.recorder.forget()
-        self.save(checkpoint)
-
-    def _with_room(self, work: Callable[[], None]) -> None:
-        """Work between steps, which may be begun again: once more, without recordings, where the card's memory ends."""
-        with contextlib.suppress(torch.OutOfMemoryError):
-            return work()
-        if self.recorder is None or not self.recorder.give_up():
-            torch.cuda.empty_cache()
-        return work()
-
-    def _foretell(self, watch: Stopwatch, resumed: bool) -> None:
-        """After a step on the processor: how long the run will still take, once some were timed; the first time a
-        long one says so in words."""
-        pixels, now = self.width * self.height, len(self.model.gaussians)
-        each = watch.step(step_work(pixels, now))
-        if each is None:
-            return
-        grows = self.policy.growing and not self.extensions
-
-        def count(step: int) -> float:
-            return max(now, self.densifier.target(self.initial, step / self.config.iterations)) if grows else now
-
-        left = each * Outlook(pixels, self.iteration, self.end, count).work()
-        self.report.metric(FORECAST, {"of": "training", "seconds_left": round(left, 1)})
-        if not self._foretold:
-            self._foretold = True
-            size = self.scene.width, self.scene.height
-            smaller = smaller_presets(self.config.preset, size, self.initial, each)
-            warning = warning_of(left, self.width, resumed, [row for row in smaller if row.seconds < left])
-            if warning is not None:
-                self.report.warning(*warning)
-
-    def _densify_config(self) -> DensifyConfig:
+    def densify_config(self) -> DensifyConfig:
         """As configured, but for what fits; the configuration itself stays as requested: it is the run's key."""
         config = self.config.densify
         return config if self.most is None else dataclasses.replace(config, budget=min(config.budget, self.most))
-
-    def _step_that_fits(self) -> Tensor | None:
-        """What is due and a step; None if the card's memory ended. Nothing is half done then: growth is all or nothing,
-        and the optimiser comes last."""
-        try:
-            self.schedule_events()
-            return self.step()
-        except torch.OutOfMemoryError:
-            return None  # the frames that hold the step's tensors go with the error
-
-    def _make_room(self, checkpoint: Path | None) -> None:
-        """After the card's memory ended: saves, and makes the run smaller. JobError if there is nothing left to take.
-
-        Frees the recordings of steps first; then the field works in pieces; then the fifth of the Gaussians that cover
-        least is dropped. In the last two cases the number of Gaussians does not grow any more.
-        """
-        model = self.model.gaussians
-        before = len(model)
-        self.optimizer.zero_grad(set_to_none=True)
-        if len(self.densifier.seen) != before:  # it ended between a round of growth and its end
-            self.densifier.reset(before)
-        forget_demands()
-        held = self.recorder is not None and self.recorder.give_up()
-        torch.cuda.empty_cache()
-        if held:
-            return
-        self.save(checkpoint)
-        moving = len(self.model.open_rows())
-        if min(self.model.pieces or moving, moving) > memory.LEAST_PIECE:
-            self.pieces = self.model.pieces = min(self.model.pieces or moving, moving) // 2
-            done = f"what moves is computed in pieces of {self.pieces}"
-        else:
-            kept = min(round(0.8 * before), self.most or before)
-            if kept < memory.LEAST:
-                raise JobError(
-                    f"The graphics card has too little memory for step {self.iteration} with {before} Gaussians.",
-                    "Close other programs that use the card, choose a smaller width, or train on the processor; what "
-                    "is trained so far is kept.",
-                    ExitCode.TRAIN,
-                )
-            rows = covering(model, kept)
-            model.rebuild(rows, torch.zeros(kept, dtype=torch.bool, device=self.device), self.optimizer)
-            self.densifier.reset(kept)
-            done = f"the {before - kept} of {before} Gaussians that cover least were dropped"
-        self.most = len(model)
-        self.densifier.config = self._densify_config()
-        self.report.warning(
-            f"The graphics card ran out of memory at step {self.iteration}: {done}, and no more are made. "
-            "Training goes on.",
-            "Other programs that use the card, closed, would leave it more; so would a smaller width.",
-        )
 
     def step(self) -> Tensor:
         """One optimisation step on one training frame; returns its photometric loss (0-dim). Not finite: left out."""
@@ -420,7 +277,8 @@ class Trainer:
             view = facts.viewmat, facts.K, out.depth_median[0]
             mark_hidden(self.model.gaussians, rows, facts.time_bin, state, *view)
 
-    def _recorder(self) -> Recorder | None:
+    def new_recorder(self) -> Recorder | None:
+        """Records steps on a card; None on the processor."""
         return Recorder(self, self.model.device) if self.device.type == "cuda" else None
 
     def layout(self) -> tuple[object, ...]:
@@ -463,54 +321,17 @@ class Trainer:
         ignored = self.ignored.get(index)
         return None if ignored is None else ignored.to(self.device, non_blocking=True)
 
-    def schedule_events(self) -> None:
-        """What happens between steps: SH degree, densification, the gate."""
-        if not self.extensions:
-            self._schedule_events()
-        self.model.open_rows()  # asked again where they changed: the step itself shall not wait for a GPU
-
-    def _schedule_events(self) -> None:
-        c = self.config
-        for decision in self.policy.decide(self):
-            self.model.sh_degree = decision.degree
-            limit_harmonics(self.model.gaussians, self.optimizer, decision.degree)
-        degree = min(c.sh_degree, int(self.progress / c.sh_every)) if c.sh_every > 0 else c.sh_degree
-        self.model.sh_degree = self.policy.sh_degree(degree)
-        if c.poses.on and not self._refined and self.progress >= c.poses.until:
-            self._freeze_poses()
-        due = self.iteration > 0 and self.iteration % c.densify.every == 0
-        if due and c.densify.start <= self.progress < 0.9:
-            if self.recorder is not None:
-                self.recorder.forget()  # growth takes the place of what they read, and needs the room
-            self.densifier.step(self.model.gaussians, self.optimizer, self.initial, self.progress, self.policy.growing)
-            if self.policy.facts.hardened is not None:  # bare hosts are as they were published
-                drop_thrown(self.model, self.optimizer, self.densifier, self.soundness.memory)
-        if c.method == "static":
-            return
-        if c.method == "auto":
-            # Once more if a card's memory ended in that step: as long as there is no field the gate did not open.
-            if self.iteration == round(c.gate.start * c.iterations) and self.model.field is None:
-                self._open_gate()
-            elif self._on_trial():
-                self._harden_gate()
-            elif self.iteration == round(c.densify.stop * c.iterations) and self.policy.facts.hardened is not None:
-                self.inspect_nonfinite()
-                close_strays(self)
-        elif self.model.field is None and self.progress >= c.field.start:
-            self.model.gaussians.open[:] = True
-            self._create_field()
-
     # ------------------------------------------------------------------ the cameras
 
     def _refines_poses(self) -> bool:
         c = self.config.poses
         return c.on and c.start <= self.progress < c.until
 
-    def _freeze_poses(self) -> None:
+    def freeze_poses(self) -> None:
         """From here on the corrected cameras are the cameras; a frame's that is not trained on too."""
         refined = corrected(self.viewmats, self.poses.at(self.scene.times))
         self.policy.judge_cameras(self, refined)
-        self.viewmats, self._refined = refined, True
+        self.viewmats, self.refined = refined, True
 
     def _viewmat(self, index: int, frame: int | None = None) -> Tensor:
         """[4, 4] of the scene's frame `index`, `frame` among the trained ones, as it is corrected now."""
@@ -519,70 +340,6 @@ class Trainer:
         if frame is None:
             return corrected(self.viewmats[index], self.poses.at(self.scene.times[index : index + 1])[0])
         return corrected(self.viewmats[index], self.poses.values[frame])
-
-    # ------------------------------------------------------------------ the gate
-
-    def _open_gate(self) -> None:
-        """Opens Gaussians on trial (`movers.on_trial`), and creates the deformation field if there are any."""
-        model = self.model.gaussians
-        model.open |= on_trial(self)
-        if bool(model.open.any()):
-            self._create_field()
-
-    def _on_trial(self) -> bool:
-        """Is the trial judged now? At `harden`, and as long as nothing has begun to move, again until `give_up`."""
-        c = self.config
-        if self.model.field is None or self.policy.facts.hardened is not None:
-            return False
-        first, last, every = (round(share * c.iterations) for share in (c.gate.harden, c.gate.give_up, 0.05))
-        return first <= self.iteration <= last and (
-            (self.iteration - first) % max(1, every) == 0 or self.iteration == last
-        )
-
-    def _harden_gate(self) -> None:
-        """Closes for good what did not move or only stands beside it. While nothing moves at all, the trial goes on."""
-        self.inspect_nonfinite()  # one NaN would spoil the neighbours' verdicts
-        if self.model.field is None or not len(self.model.open_rows()):
-            return
-        if harden(self):
-            close_strays(self)
-            self.policy.gate_hardened(self.iteration)
-
-    def _create_field(self) -> None:
-        self.inspect_nonfinite()  # and every bound of the field
-        model, c = self.model.gaussians, self.config
-        means = model.params["means"].detach()[model.open].cpu()
-        harmonics = model.params["shN"].shape[1]
-        start = Start(
-            means, field_box(means), self.scene.points, len(self.train_ids), harmonics, self.generator,
-            lambda: self.policy.time_nodes(self),
-        )  # fmt: skip
-        field = host(c.host).create(c.field, start).to(self.device)
-        # Behind the gate the Gaussians that open say where the motion is.
-        if field.rehearsal > 0 and c.method != "auto":
-            self._rehearse(field)
-        for name, owned in field.owned.items():
-            if name not in model.params:  # memory may have ended between two of them
-                model.adopt(name, owned.shape, owned.value)
-        self.soundness.memory.keep(field, means)
-        # Takes no memory: what is before it can be done again.
-        add_field(self.optimizer, field, model, c, self.soundness.memory.rates)
-        self.policy.field_opened(self.iteration, self.trained_seconds)
-        self.model.field = field
-
-    def _rehearse(self, field: Deformation) -> None:
-        """The host's pre-stage; its steps are steps of the run. Interrupted, it starts again."""
-        steps = round(field.rehearsal * self.config.iterations)
-
-        def loss(state: dict[str, Tensor], frame: int) -> Tensor:
-            self.report.check_cancelled()
-            out = self.render_trained(state, frame, sh_degree=0, with_contributions=False)
-            ignored = self.ignored_at(self.train_ids[frame])
-            return photometric(out.colors[0], self.image_of(frame), self.config.dssim, ignored)
-
-        points, colors = (t.to(self.device) for t in (self.scene.points, self.scene.colors))
-        field.rehearse(Rehearsal(points, colors, self.times, steps, loss, self.generator))
-        self.iteration += steps
 
     # ------------------------------------------------------------------ one step's parts
 
@@ -634,12 +391,12 @@ class Trainer:
 
     # ------------------------------------------------------------------ optimiser
 
-    def _average(self, length: int) -> None:
+    def average(self, length: int) -> None:
         """After a step of a run, or an extension, of so many: its last ones count, and in the end it is their mean."""
         if self.iteration > self.end - round(self.config.average * length):
-            self.mean.add(self._named())
+            self.mean.add(self.named_tensors())
         if self.iteration == self.end:
-            self.mean.put_into(self._named())
+            self.mean.put_into(self.named_tensors())
 
     def _schedule_rates(self) -> None:
         schedule = self.extensions[-1] if self.extensions else self.policy
@@ -697,84 +454,13 @@ class Trainer:
         """As `stopping.Probe` says."""
         return correlation_of_movers(self)
 
-    # ------------------------------------------------------------------ checkpoints
+    # ------------------------------------------------------------------ what is learnt
 
-    def _named(self) -> dict[str, Tensor]:
+    def named_tensors(self) -> dict[str, Tensor]:
+        """Everything that is learnt, by its name in a checkpoint."""
         named: dict[str, Tensor] = {**self.model.gaussians.params, "exposure": self.model.exposure.values}
         if self.config.poses.on:
             named["poses"] = self.poses.values
         if self.model.field is not None:
             named.update({f"field.{n}": p for n, p in self.model.field.named_parameters()})
         return named
-
-    def save(self, path: Path | None) -> None:
-        """Writes everything that `restore` needs; nothing to no path."""
-        if path is None:
-            return
-        tensors = {**self.model.gaussians.state(), **optimizer_state(self._named(), self.optimizer)}
-        if self.model.field is not None:
-            tensors.update(self.model.field.state())
-        tensors.update(self.mean.state())
-        tensors.update(self.soundness.memory.state())
-        d = self.densifier
-        tensors.update({"densify.gradient": d.gradient, "densify.seen": d.seen})
-        tensors["generator"] = self.generator.get_state()
-        tensors["order"] = torch.tensor(self.order, dtype=torch.long, device="cpu")
-        tensors["centres"] = self.centres
-        tensors["exposure"] = self.model.exposure.values
-        if self.config.poses.on:
-            tensors["poses"] = self.poses.values
-        meta = {
-            **self.identity,
-            "config": config_to_json(self.config),
-            "iteration": self.iteration,
-            "initial": self.initial,
-            "extensions": [dataclasses.asdict(extension) for extension in self.extensions],
-            "needs": self.policy.state(),
-            "trained_seconds": self.trained_seconds,
-            "sh_degree": self.model.sh_degree,
-            "field_rates": self.soundness.memory.rates,
-            "train_frames": [self.scene.frames[i] for i in self.train_ids],
-            "width": self.width,
-            "height": self.height,
-        }
-        save_checkpoint(path, tensors, meta)
-        self._saved_at = time.perf_counter()
-
-    def restore(self, path: Path) -> None:
-        """Goes on where `save` was called. JobError if the checkpoint is of other frames, or does not fit."""
-        tensors, meta = load_checkpoint(path)
-        try:
-            self._restore(tensors, meta)
-        except MISFITS as error:
-            raise misfit(path, error, ExitCode.TRAIN) from None
-
-    def _restore(self, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-        if meta["train_frames"] != [self.scene.frames[i] for i in self.train_ids]:
-            raise JobError(
-                "The run's checkpoint was trained on other frames.", "Train with --restart, or another run name.",
-                ExitCode.TRAIN,
-            )  # fmt: skip
-        self.model = restore_model(tensors, meta, self.config, self.device)
-        self.recorder = self._recorder()  # what the one before has seen was of other tensors
-        self.optimizer = optimizer_of(self.model, self.poses, self.config)
-        if self.model.field is not None:
-            rates = self.soundness.memory.rates = float(meta.get("field_rates", 1.0))
-            add_field(self.optimizer, self.model.field, self.model.gaussians, self.config, rates)
-        if self.config.poses.on:
-            self.poses.values.data.copy_(tensors["poses"])
-        restore_optimizer(self._named(), self.optimizer, tensors)
-        self.mean.restore(tensors, self.device)
-        self.soundness.memory.restore(tensors)
-        self.model.pieces = self.pieces
-        self.densifier = Densifier(self._densify_config(), len(self.model.gaussians), self.device)
-        for name in ("gradient", "seen"):
-            setattr(self.densifier, name, tensors[f"densify.{name}"].to(self.device, copy=True))
-        self.generator.set_state(tensors["generator"])
-        self.order = integers(tensors["order"])
-        self.iteration, self.initial = int(meta["iteration"]), int(meta["initial"])
-        self.extensions = [Extension(**facts) for facts in meta.get("extensions", [])]
-        self.policy.restore(meta["needs"])
-        if self.config.poses.on and self.progress >= self.config.poses.until:
-            self._freeze_poses()
-        self.trained_seconds = float(meta["trained_seconds"])

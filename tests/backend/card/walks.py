@@ -53,9 +53,11 @@ def new_trainer(world: Any, quiet: type, method: str, supervision: str, poses: b
 
 def _steps(trainer: Any, count: int) -> dict[str, int]:
     """Takes steps; what the host waited for in those that are no tenth, by operator and place."""
+    from torch_backend.train.events import schedule_events
+
     waits: dict[str, int] = {}
     for _ in range(count):
-        trainer.schedule_events()
+        schedule_events(trainer)
         CARD.waits.clear()
         tenth = trainer.iteration % 10 == 0
         trainer.step()
@@ -97,7 +99,7 @@ def recorded(folder: Path, *methods: str) -> dict[str, Any]:
                 trainer.recorder = recorder if records else None
                 _steps(trainer, 32)
                 model = trainer.model.gaussians
-                values = {name: p.detach()._real.double() for name, p in trainer._named().items()}
+                values = {name: p.detach()._real.double() for name, p in trainer.named_tensors().items()}
                 values |= {name: getattr(model, name)._real.double() for name in ("support", "hidden")}
                 found.append(values)
                 moving = len(trainer.model.open_rows())
@@ -141,13 +143,15 @@ def launches(folder: Path, *methods: str) -> dict[str, Any]:
 
 def resume(folder: Path, method: str) -> dict[str, Any]:
     """A run that is resumed just before a round of growth: moments are cloned before the optimiser's next step."""
+    from torch_backend.train.resume import restore_run, save_run
+
     world, quiet = small_world(folder)
     with pretended_card():
         trainer = new_trainer(world, quiet, method, "support", False)
         _steps(trainer, 5)
-        trainer.save(folder / "x.safetensors")
+        save_run(trainer, folder / "x.safetensors")
         other = new_trainer(world, quiet, method, "support", False)
-        other.restore(folder / "x.safetensors")
+        restore_run(other, folder / "x.safetensors")
         before = len(other.model.gaussians)
         _steps(other, 1)
         moments = other.optimizer.state[other.model.gaussians.params["means"]]
@@ -189,6 +193,7 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
     import torch
 
     from torch_backend.train import memory
+    from torch_backend.train.events import schedule_events
 
     world, quiet = small_world(folder)
     told: dict[str, Any] = {}
@@ -197,7 +202,7 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
             trainer = new_trainer(world, quiet, method, "support", False)
             trainer.recorder = None
             trainer.iteration = 4
-            trainer.schedule_events()
+            schedule_events(trainer)
             peaks: list[tuple[int, int]] = []
             for times in (2, 2):
                 many = len(trainer.model.gaussians) * times
@@ -222,6 +227,7 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
 def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
     """A run whose card has this share of the memory that a step with anchors takes, from the ninth step on."""
     from torch_backend.train import memory
+    from torch_backend.train.loop import train_to_end
 
     world, quiet = small_world(folder)
     memory.LEAST, memory.LEAST_PIECE = 40, 100
@@ -233,7 +239,7 @@ def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
         _steps(trainer, 1)  # the first with anchors, which take most
         CARD.limit = CARD.live + int(float(share) * (CARD.peak - CARD.live))
         before = len(trainer.model.gaussians)
-        trainer.run(folder / "c.safetensors", lambda _: None)
+        train_to_end(trainer, folder / "c.safetensors", lambda _: None)
         saved = (folder / "c.safetensors").is_file()
     warnings = [event[1] for event in trainer.report.events if event[0] == "warning"]
     means = trainer.model.gaussians.params["means"]

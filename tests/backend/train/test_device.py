@@ -14,6 +14,8 @@ from torch_backend.freeze import freeze_shot
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import choose_device, config_from_params, load_run, train_shot
 from torch_backend.train.device import cuda_refusal, decide_device
+from torch_backend.train.events import schedule_events
+from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
 
 ROOT = Path(torch_backend.__file__).parent
@@ -98,17 +100,17 @@ def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
     config = config_from_params(TrainParams(iterations=60, max_gaussians=1500))
     trainer = Trainer(scene, images.cuda(), scene.solved, config, quiet(), {}, "cuda")
     for _ in range(30):
-        trainer.schedule_events()
+        schedule_events(trainer)
         trainer.step()
         trainer.iteration += 1
     path = world.shot.root / "gpu.safetensors"
-    trainer.save(path)
+    save_run(trainer, path)
     for device in ("cpu", "cuda"):
         other = Trainer(scene, images.to(device), scene.solved, config, quiet(), {}, device)
-        other.restore(path)
+        restore_run(other, path)
         assert torch.equal(other.generator.get_state(), trainer.generator.get_state())
         for _ in range(10):
-            other.schedule_events()
+            schedule_events(other)
             loss = other.step()
             other.iteration += 1
         assert loss.device.type == device and bool(torch.isfinite(loss))

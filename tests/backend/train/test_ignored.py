@@ -13,6 +13,7 @@ from torch_backend.scene import load_images, load_scene
 from torch_backend.sfm.masks import IGNORE, load_mask, write_grey
 from torch_backend.shot import write_json
 from torch_backend.train import config_from_params, train_shot
+from torch_backend.train.events import schedule_events
 from torch_backend.train.evidence import gather_evidence
 from torch_backend.train.ignored import load_ignored
 from torch_backend.train.trainer import Trainer
@@ -56,7 +57,7 @@ def shown_behind(world, quiet, ignored):
     found = load_ignored(masks_of(world), scene, scene.solved, WIDTH, HEIGHT) if ignored else {}
     trainer = Trainer(scene, images, scene.solved, config, quiet(), ignored=found)
     for _ in range(150):
-        trainer.schedule_events()
+        schedule_events(trainer)
         trainer.step()
         trainer.iteration += 1
     mask = torch.from_numpy(LOGO)

@@ -11,6 +11,7 @@ from torch_backend.motion.mattes import MOVING, PAINTED, STILL, UNKNOWN, load_mo
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params, load_run, train_shot
 from torch_backend.train.checkpoint import load_checkpoint
+from torch_backend.train.events import schedule_events
 from torch_backend.train.movers import load_movers, mean_of, moving_frames, on_trial
 from torch_backend.train.trainer import Trainer
 
@@ -41,7 +42,7 @@ def trainer_of(world, quiet, steps, movers=True, **changes):
     found = load_movers(lambda frame: load_motion(world.shot, frame), scene, scene.solved, WIDTH, HEIGHT)
     trainer = Trainer(scene, images, scene.solved, config, quiet(), movers=found if movers else None)
     for _ in range(steps):
-        trainer.schedule_events()
+        schedule_events(trainer)
         trainer.step()
         trainer.iteration += 1
     return trainer
@@ -106,11 +107,11 @@ def test_when_growth_of_a_long_run_ends_who_is_open_and_paints_no_mover_closes(p
     mean = mean_of(model, strays)
     trainer.config.densify.every = 1000  # no round of growth at that step
     trainer.iteration = round(config.densify.stop * config.iterations)
-    trainer.schedule_events()
+    schedule_events(trainer)
     assert model.gaussians.open[strays].all(), "a short run is left alone"
     config.iterations = GateConfig.LONG + 1
     trainer.iteration = round(config.densify.stop * config.iterations)
-    trainer.schedule_events()
+    schedule_events(trainer)
     assert len(strays) == 20 and not model.gaussians.open[strays].any()
     assert float(model.gaussians.open[movers].float().mean()) > 0.8
     for name, value in mean.items():

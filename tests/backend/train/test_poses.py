@@ -7,7 +7,9 @@ import torch
 from torch_backend.contract import TrainParams
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
+from torch_backend.train.events import schedule_events
 from torch_backend.train.poses import Poses, PosesConfig, _Gauge, _series, corrected
+from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -64,7 +66,7 @@ def wrong_cameras(world, quiet, on):
     config.poses.on = on
     trainer = Trainer(scene, load_images(scene, scene.solved, 64, 48), scene.solved, config, quiet())
     while trainer.iteration < 320:
-        trainer.schedule_events()
+        schedule_events(trainer)
         trainer.step()
         trainer.iteration += 1
     return trainer, truth
@@ -84,7 +86,7 @@ def shifts(trainer, viewmats):
 def test_wrong_cameras_are_found_and_frozen(world, quiet, tmp_path):
     plain, truth = wrong_cameras(world, quiet, on=False)
     trainer, _ = wrong_cameras(world, quiet, on=True)
-    assert trainer._refined
+    assert trainer.refined
     assert float(trainer.poses.values.detach().mean(0).abs().max()) < 1e-6
     wanted, found = shifts(trainer, truth), shifts(trainer, trainer.viewmats)
     assert float(wanted.norm(dim=-1).mean()) > 0.3
@@ -95,11 +97,11 @@ def test_wrong_cameras_are_found_and_frozen(world, quiet, tmp_path):
     kept, cameras = trainer.poses.values.detach().clone(), trainer.viewmats.clone()
     trainer.step()
     assert torch.equal(trainer.poses.values, kept)
-    trainer.save(tmp_path / "checkpoint.safetensors")
+    save_run(trainer, tmp_path / "checkpoint.safetensors")
     scene = load_scene(world.shot)
     scene.viewmats = plain.viewmats
     again = Trainer(scene, trainer.images, scene.solved, trainer.config, quiet())
-    again.restore(tmp_path / "checkpoint.safetensors")
+    restore_run(again, tmp_path / "checkpoint.safetensors")
     assert torch.equal(again.viewmats, cameras)
 
 

@@ -12,6 +12,8 @@ import torch
 from torch_backend.contract import JobError, TrainParams
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
+from torch_backend.train.events import schedule_events
+from torch_backend.train.loop import TrainingLoop
 from torch_backend.train.recorder import Recorder
 from torch_backend.train.trainer import Trainer
 
@@ -55,7 +57,7 @@ def trained(world, quiet):
         if recording is not None:
             trainer.recorder = Recorder(trainer, torch.device("cpu"), recording)
         for _ in range(steps):
-            trainer.schedule_events()
+            schedule_events(trainer)
             if trainer.iteration == break_at:
                 trainer.soundness.troubled = True
             trainer.step()
@@ -66,7 +68,7 @@ def trained(world, quiet):
 
 
 def equal(one, two):
-    return all(torch.equal(p, q) for p, q in zip(one._named().values(), two._named().values(), strict=True))
+    return all(torch.equal(p, q) for p, q in zip(one.named_tensors().values(), two._named().values(), strict=True))
 
 
 class EveryOther:
@@ -166,18 +168,19 @@ def test_work_between_steps_has_the_room_of_recordings(trained):
         if len(tries) == 1:
             raise torch.OutOfMemoryError("CUDA out of memory")
 
-    recorded._with_room(work)
+    TrainingLoop(recorded, None, lambda _: None)._with_room(work)
     assert tries == [True, False] and recorded.recorder.refused != ""
 
 
 def test_where_memory_ends_the_recordings_go_first_and_the_run_stays_as_it_is(trained, tmp_path):
     recorded = trained(Again(), steps=19)
     before, told = len(recorded.model.gaussians), len(recorded.report.events)
-    recorded._make_room(tmp_path / "c.safetensors")
+    loop = TrainingLoop(recorded, tmp_path / "c.safetensors", lambda _: None)
+    loop._make_room()
     assert recorded.recorder.refused != "" and recorded.pieces is None
     assert len(recorded.model.gaussians) == before and len(recorded.report.events) == told
     with pytest.raises(JobError, match="too little memory"):  # so few Gaussians have nothing else to give
-        recorded._make_room(tmp_path / "c.safetensors")
+        loop._make_room()
 
 
 def test_after_a_step_that_was_left_out_the_next_are_launched(trained):

@@ -13,8 +13,10 @@ from torch_backend.deformation.hexplane import HexPlane
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
 from torch_backend.train.adam import FusedAdam
+from torch_backend.train.events import harden_gate, open_gate, schedule_events
 from torch_backend.train.optimizer import add_field, schedule_rates
 from torch_backend.train.repair import drop_thrown, repair
+from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.trainer import Trainer
 
 HOSTS = METHODS[:-1]
@@ -43,7 +45,7 @@ def go_on(trainer: Trainer, steps: int) -> list[float]:
     """The loop of `Trainer.run`, without its checkpoints; returns the losses of the steps that were applied."""
     losses = []
     for _ in range(steps):
-        trainer.schedule_events()
+        schedule_events(trainer)
         loss = float(trainer.step())
         losses += [loss] if bool(trainer.optimizer.applied) else []
         trainer.iteration += 1
@@ -188,11 +190,11 @@ def test_a_bad_frame_does_not_keep_the_gate_shut(begin):
     trainer = begin("auto", steps=0)
     trainer.images[5] = NAN
     go_on(trainer, 19)
-    trainer._open_gate()
+    open_gate(trainer)
     go_on(trainer, 5)
     assert 5 in trainer.soundness.unusable
     trainer.config.gate.pixels = 1e-6  # any change at all is motion
-    trainer._harden_gate()
+    harden_gate(trainer)
     assert bool(trainer.model.gaussians.open.any())
     assert finite(trainer)
 
@@ -291,7 +293,7 @@ def test_a_round_of_growth_drops_what_is_thrown_behind_a_gate_alone(begin, metho
     count = len(trainer.model.gaussians)
     thrown = bound_between(trainer, 3)
     kept = trainer.model.gaussians.params["means"].detach()[~thrown].clone()
-    trainer.schedule_events()
+    schedule_events(trainer)
     assert len(trainer.model.gaussians) == count - 3 * (method == "auto")
     if method == "auto":
         assert torch.equal(trainer.model.gaussians.params["means"], kept)
@@ -310,9 +312,9 @@ def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin
     trainer = begin("hexplane", 30)
     trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
     trainer.inspect_nonfinite()
-    trainer.save(tmp_path / "checkpoint.safetensors")
+    save_run(trainer, tmp_path / "checkpoint.safetensors")
     resumed = begin("hexplane", 0)
-    resumed.restore(tmp_path / "checkpoint.safetensors")
+    restore_run(resumed, tmp_path / "checkpoint.safetensors")
     rates = [[group[key] for key in ("lr_start", "lr_end")] for group in trainer.optimizer.param_groups]
     assert [[group[key] for key in ("lr_start", "lr_end")] for group in resumed.optimizer.param_groups] == rates
     lr = trainer.config.field.lr_grid
@@ -325,9 +327,9 @@ def test_a_resumed_run_drops_who_is_thrown_as_an_unbroken_one_does(begin, tmp_pa
     trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
     worst = float(trainer.soundness.memory._worst)
     thrown = bound_between(trainer, 5)
-    trainer.save(tmp_path / "checkpoint.safetensors")
+    save_run(trainer, tmp_path / "checkpoint.safetensors")
     resumed = begin("hexplane", 0)
-    resumed.restore(tmp_path / "checkpoint.safetensors")
+    restore_run(resumed, tmp_path / "checkpoint.safetensors")
     memory = resumed.soundness.memory
     assert drop_thrown(resumed.model, resumed.optimizer, resumed.densifier, memory) == 5 == int(thrown.sum())
     assert worst > 0 and "put the field back" in memory.put_back(resumed.model.field, resumed.optimizer)
@@ -402,13 +404,13 @@ def test_a_step_that_memory_did_not_suffice_for_opens_the_gate_once(begin):
         go_on(trainer, 1)
     trainer.iteration -= 1
     field, groups = trainer.model.field, [group.get("name") for group in trainer.optimizer.param_groups]
-    trainer.schedule_events()
+    schedule_events(trainer)
     assert trainer.model.field is field
     assert [group.get("name") for group in trainer.optimizer.param_groups] == groups
 
 
 def test_a_field_that_memory_did_not_suffice_for_is_made_anew(begin, monkeypatch):
-    module, made = sys.modules[Trainer.__module__], []
+    module, made = sys.modules[schedule_events.__module__], []
 
     def short(*arguments):
         made.append(arguments)

@@ -16,10 +16,13 @@ from torch_backend.freeze.frozen import freeze_at, render_frozen
 from torch_backend.scene import load_images, load_scene
 from torch_backend.train import config_from_params
 from torch_backend.train.checkpoint import load_checkpoint
+from torch_backend.train.events import schedule_events
+from torch_backend.train.loop import train_to_end
 from torch_backend.train.model import restore_model
 from torch_backend.train.modelled import modelled
 from torch_backend.train.optimizer import limit_harmonics
 from torch_backend.train.residual import correlation_frames
+from torch_backend.train.resume import restore_run, save_run
 from torch_backend.train.stopping import (
     FieldOpened,
     LimitHarmonics,
@@ -62,7 +65,7 @@ def trainer_of(long_world, quiet, iterations=100, method="auto", **changes):
 
 
 def finish(trainer, folder):
-    trainer.run(folder / "checkpoint.safetensors", lambda _: None)
+    train_to_end(trainer, folder / "checkpoint.safetensors", lambda _: None)
     return trainer
 
 
@@ -138,7 +141,7 @@ def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     runs[1].images[probes] = 1.0  # as good as no picture at all
     for trainer in runs:
         while trainer.iteration < 60:
-            trainer.schedule_events()
+            schedule_events(trainer)
             trainer.step()
             trainer.iteration += 1
     assert bool(runs[0].model.gaussians.open.any())
@@ -147,7 +150,7 @@ def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     assert not runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
     for trainer in runs:
         while trainer.iteration < 99:
-            trainer.schedule_events()
+            schedule_events(trainer)
             trainer.step()
             trainer.iteration += 1
     assert runs[0].model.gaussians.support[:, [runs[0]._bins[n] for n in probes]].any()
@@ -285,7 +288,7 @@ def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     end = modelled(trainer)[-1]
     assert end["detail"] == "stopped at step 90 of 100: nothing more was gained"
     again = trainer_of(long_world, quiet, needs__stop_gain=1e9)
-    again.restore(tmp_path / "checkpoint.safetensors")
+    restore_run(again, tmp_path / "checkpoint.safetensors")
     assert again.end == 90
     on = finish(trainer_of(long_world, quiet, needs__stop_gain=-1e9), tmp_path)
     assert on.policy.stopped is None
@@ -308,12 +311,12 @@ def test_a_resumed_run_decides_the_same(long_world, quiet, tmp_path):
     for stop in (45, 72):
         broken = trainer_of(long_world, quiet, **changes)
         while broken.iteration < stop:
-            broken.schedule_events()
+            schedule_events(broken)
             broken.step()
             broken.iteration += 1
-        broken.save(tmp_path / "broken.safetensors")
+        save_run(broken, tmp_path / "broken.safetensors")
         resumed = trainer_of(long_world, quiet, **changes)
-        resumed.restore(tmp_path / "broken.safetensors")
+        restore_run(resumed, tmp_path / "broken.safetensors")
         finish(resumed, tmp_path)
         expected, got = (copy.deepcopy(json.loads(json.dumps(t.policy.state()))) for t in (whole, resumed))
         for state in (expected, got):

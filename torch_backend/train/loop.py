@@ -1,0 +1,174 @@
+"""A run to its end: steps and what happens between them, checkpoints, the time left, and memory that ends."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..contract import FORECAST, Cancelled, ExitCode, JobError
+from ..gaussians import covering
+from ..native import torch_threads
+from ..raster.cuda import forget_demands
+from . import memory
+from .events import schedule_events
+from .forecast import Outlook, Stopwatch, smaller_presets, step_work, warning_of
+from .resume import save_run
+from .soundness import INSPECT_EVERY
+from .trainer import Trainer
+
+
+def train_to_end(trainer: Trainer, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
+    """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured,
+    once more for a step that it goes on from.
+
+    Without a checkpoint nothing is written.
+    """
+    on_cpu = trainer.device.type == "cpu"
+    with torch_threads(3 * trainer.width * trainer.height) if on_cpu else contextlib.nullcontext():
+        TrainingLoop(trainer, checkpoint, evaluate).run()
+
+
+class TrainingLoop:
+    """The steps of a run until it is over."""
+
+    def __init__(self, trainer: Trainer, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
+        """As in `train_to_end`."""
+        self.trainer, self.checkpoint, self.evaluate = trainer, checkpoint, evaluate
+        self._foretold = False
+        self._saved_at = time.perf_counter()
+
+    def run(self) -> None:
+        """All that are left, as of now."""
+        trainer = self.trainer
+        begin, length = 0, trainer.config.iterations
+        if trainer.extensions:
+            begin, length = trainer.extensions[-1].from_iteration, trainer.extensions[-1].steps
+        every = max(1, round(trainer.config.evaluate_every * length))
+        since = time.perf_counter() - trainer.trained_seconds
+        started = trainer.iteration
+        watch = Stopwatch() if trainer.device.type == "cpu" else None
+        if started > begin and (started - begin) % every == 0:  # a cancel may have ended it in this very evaluation
+            self._with_room(lambda: self.evaluate(trainer))
+        try:
+            while trainer.iteration < trainer.end:
+                trainer.report.check_cancelled()
+                loss = self._step_that_fits()
+                if loss is None:
+                    self._make_room()
+                    continue
+                trainer.iteration += 1
+                self._with_room(lambda: trainer.average(length))
+                trainer.trained_seconds = time.perf_counter() - since
+                if watch is not None:
+                    self._foretell(watch, resumed=started > 0)
+                if (trainer.iteration - begin) % every == 0:
+                    self._with_room(lambda: self.evaluate(trainer))
+                    if watch is not None:
+                        watch.begin()
+                if trainer.iteration % INSPECT_EVERY == 0 or trainer.iteration == trainer.end:
+                    trainer.inspect_nonfinite()
+                    text = f"step {trainer.iteration}, {len(trainer.model.gaussians)} Gaussians, loss {float(loss):.4f}"
+                    trainer.report.progress("training", trainer.iteration - begin, trainer.end - begin, text)
+                if time.perf_counter() - self._saved_at > trainer.config.checkpoint_seconds:
+                    self._with_room(self._save)
+        except Cancelled:
+            if trainer.iteration > started:
+                self._save()
+            raise
+        trainer.trained_seconds = time.perf_counter() - since
+        if trainer.recorder is not None:
+            trainer.recorder.forget()
+        self._save()
+
+    def _with_room(self, work: Callable[[], None]) -> None:
+        """Work between steps, which may be begun again: once more, without recordings, where the card's memory ends."""
+        with contextlib.suppress(torch.OutOfMemoryError):
+            return work()
+        if self.trainer.recorder is None or not self.trainer.recorder.give_up():
+            torch.cuda.empty_cache()
+        return work()
+
+    def _foretell(self, watch: Stopwatch, resumed: bool) -> None:
+        """After a step on the processor: how long the run will still take, once some were timed; the first time a
+        long one says so in words."""
+        trainer = self.trainer
+        pixels, now = trainer.width * trainer.height, len(trainer.model.gaussians)
+        each = watch.step(step_work(pixels, now))
+        if each is None:
+            return
+        grows = trainer.policy.growing and not trainer.extensions
+
+        def count(step: int) -> float:
+            share = step / trainer.config.iterations
+            return max(now, trainer.densifier.target(trainer.initial, share)) if grows else now
+
+        left = each * Outlook(pixels, trainer.iteration, trainer.end, count).work()
+        trainer.report.metric(FORECAST, {"of": "training", "seconds_left": round(left, 1)})
+        if not self._foretold:
+            self._foretold = True
+            size = trainer.scene.width, trainer.scene.height
+            smaller = smaller_presets(trainer.config.preset, size, trainer.initial, each)
+            warning = warning_of(left, trainer.width, resumed, [row for row in smaller if row.seconds < left])
+            if warning is not None:
+                trainer.report.warning(*warning)
+
+    def _step_that_fits(self) -> Tensor | None:
+        """What is due and a step; None if the card's memory ended. Nothing is half done then: growth is all or nothing,
+        and the optimiser comes last."""
+        try:
+            schedule_events(self.trainer)
+            return self.trainer.step()
+        except torch.OutOfMemoryError:
+            return None  # the frames that hold the step's tensors go with the error
+
+    def _make_room(self) -> None:
+        """After the card's memory ended: saves, and makes the run smaller. JobError if there is nothing left to take.
+
+        Frees the recordings of steps first; then the field works in pieces; then the fifth of the Gaussians that cover
+        least is dropped. In the last two cases the number of Gaussians does not grow any more.
+        """
+        trainer = self.trainer
+        model = trainer.model.gaussians
+        before = len(model)
+        trainer.optimizer.zero_grad(set_to_none=True)
+        if len(trainer.densifier.seen) != before:  # it ended between a round of growth and its end
+            trainer.densifier.reset(before)
+        forget_demands()
+        held = trainer.recorder is not None and trainer.recorder.give_up()
+        torch.cuda.empty_cache()
+        if held:
+            return
+        self._save()
+        moving = len(trainer.model.open_rows())
+        if min(trainer.model.pieces or moving, moving) > memory.LEAST_PIECE:
+            trainer.pieces = trainer.model.pieces = min(trainer.model.pieces or moving, moving) // 2
+            done = f"what moves is computed in pieces of {trainer.pieces}"
+        else:
+            kept = min(round(0.8 * before), trainer.most or before)
+            if kept < memory.LEAST:
+                raise JobError(
+                    f"The graphics card has too little memory for step {trainer.iteration} with {before} Gaussians.",
+                    "Close other programs that use the card, choose a smaller width, or train on the processor; what "
+                    "is trained so far is kept.",
+                    ExitCode.TRAIN,
+                )
+            rows = covering(model, kept)
+            model.rebuild(rows, torch.zeros(kept, dtype=torch.bool, device=trainer.device), trainer.optimizer)
+            trainer.densifier.reset(kept)
+            done = f"the {before - kept} of {before} Gaussians that cover least were dropped"
+        trainer.most = len(model)
+        trainer.densifier.config = trainer.densify_config()
+        trainer.report.warning(
+            f"The graphics card ran out of memory at step {trainer.iteration}: {done}, and no more are made. "
+            "Training goes on.",
+            "Other programs that use the card, closed, would leave it more; so would a smaller width.",
+        )
+
+    def _save(self) -> None:
+        save_run(self.trainer, self.checkpoint)
+        self._saved_at = time.perf_counter()
