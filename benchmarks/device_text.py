@@ -29,7 +29,7 @@ import torch
 import warp as wp
 
 from torch_backend.deformation import planes_cuda
-from torch_backend.raster import RasterSettings, cuda, rasterize, ssim_cuda
+from torch_backend.raster import RasterSettings, cuda, hit_lists, rasterize, ssim_cuda
 from torch_backend.raster import cuda_source as source
 from torch_backend.train import adam
 
@@ -297,9 +297,9 @@ def note_scenes(launches: Launches) -> list[tuple[int, int]]:
     def draw(*asked: Any, **more: Any) -> None:
         hits.append(_drawn(*asked, **more))
 
-    step, wide = cuda._HITS_STEP, source.WIDE_FROM
-    cuda._HITS_STEP = 1
-    cuda.forget_demands()
+    step, wide = hit_lists.HITS_STEP, source.WIDE_FROM
+    hit_lists.HITS_STEP = 1
+    hit_lists.forget_demands()
     try:
         with launches.noted():
             draw(_cloud(90, 1, 2), 50, 37, settings=RasterSettings(antialiased=True, absgrad=True), with_depth=True)
@@ -311,8 +311,8 @@ def note_scenes(launches: Launches) -> list[tuple[int, int]]:
             draw(_cloud(50, 4, 3), 50, 20)
             draw(broken(), 40, 30)
     finally:
-        cuda._HITS_STEP, source.WIDE_FROM = step, wide
-        cuda.forget_demands()
+        hit_lists.HITS_STEP, source.WIDE_FROM = step, wide
+        hit_lists.forget_demands()
     return hits
 
 

@@ -45,7 +45,7 @@ from torch_backend.deformation import HexPlane, HexPlaneConfig, planes_cuda
 from torch_backend.freeze import freeze_shot
 from torch_backend.live import LiveSession
 from torch_backend.native import default_threads
-from torch_backend.raster import cuda
+from torch_backend.raster import hit_lists
 from torch_backend.scene import load_images, load_scene, split_frames
 from torch_backend.shot import Shot, write_json
 from torch_backend.train import PRESETS, config_from_params, train_shot
@@ -327,19 +327,19 @@ def _short_list(stage: Stage, name: str) -> dict[str, Any]:
     size = (60, 24, 17) if stage.dry else WORKLOADS[name]  # on fibers in a dry run
     case = raster_bench._Case(room(*size), raster_bench.Body("cuda", stage.device.type))
     times: dict[str, Any] = {}
-    most, step = cuda._HITS_MAX, cuda._HITS_STEP
+    most, step = hit_lists.HITS_MAX, hit_lists.HITS_STEP
     try:
         for what, share in (("whole_ms", 1.0), ("tenth_ms", 0.1)):
-            cuda.forget_demands()
+            hit_lists.forget_demands()
             if share < 1.0:
                 held = max(1, int(share * times["hits"]))
-                cuda._HITS_MAX, cuda._HITS_STEP = held, min(step, held)
+                hit_lists.HITS_MAX, hit_lists.HITS_STEP = held, min(step, held)
             case.image()
-            times["hits"] = max(int(demand.most) for demand in cuda._demands.values())
+            times["hits"] = max(int(demand.most) for demand in hit_lists._demands.values())
             times[what] = round(min(case.run()[1] for _ in range(2 if stage.dry else 5)), 3)
     finally:
-        cuda._HITS_MAX, cuda._HITS_STEP = most, step
-        cuda.forget_demands()
+        hit_lists.HITS_MAX, hit_lists.HITS_STEP = most, step
+        hit_lists.forget_demands()
     return times
 
 

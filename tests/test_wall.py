@@ -40,6 +40,7 @@ ROOMS = (
     "access",
     "properties",
     "compat",
+    "compat_animation",
     "translations",
     "scene",
     "shot",

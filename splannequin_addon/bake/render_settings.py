@@ -20,7 +20,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ...torch_backend import contract
-from .. import compat
+from .. import compat, compat_animation
 from ..access import library_of, settings_of
 from ..scene import scene_setup
 
@@ -221,9 +221,11 @@ def _animated(scene: bpy.types.Scene) -> set[str]:
     data = scene.animation_data
     if data is None:
         return set()
-    found = {curve.data_path for curve in compat.fcurves(scene)} | {driver.data_path for driver in data.drivers}
+    found = {curve.data_path for curve in compat_animation.fcurves(scene)} | {
+        driver.data_path for driver in data.drivers
+    }
     for strip in (strip for track in data.nla_tracks for strip in track.strips):
-        found |= {curve.data_path for curve in compat.curves_of_strip(strip)}
+        found |= {curve.data_path for curve in compat_animation.curves_of_strip(strip)}
     return found
 
 

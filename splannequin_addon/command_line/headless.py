@@ -172,7 +172,7 @@ def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
     stages["bake"] = round(time.perf_counter() - since, 2)
     source = str(inventory.read(shot).info.get("source", args.clip))
     summary = contract.summarise(str(shot), source, results, stages, time.perf_counter() - began)
-    jobs.write_json(output / contract.SUMMARY_FILE, {**summary, **baked})
+    contract.write_json(output / contract.SUMMARY_FILE, {**summary, **baked}, parents=False)
     for line in summary["verdict"]:
         console.say(line)
     console.say(f"Composited frames: {baked['composited_dir']}")
@@ -211,7 +211,7 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
     path = output / contract.SUMMARY_FILE
     summary: dict[str, Any] = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
-    jobs.write_json(path, {**summary, **baked})
+    contract.write_json(path, {**summary, **baked}, parents=False)
     console.say(f"Composited frames: {baked['composited_dir']}")
     return ExitCode.OK
 
@@ -244,7 +244,7 @@ def _bake_a_part(
         first_view.set_up(scene, shot, args.take)
     _save(scene, output / "shot.blend", folder)
     summary = {"version": 1, "shot": str(shot), "take": args.take, **_told(output, numbers)}
-    jobs.write_json(output / contract.SUMMARY_FILE, summary)
+    contract.write_json(output / contract.SUMMARY_FILE, summary, parents=False)
     console.say(f"Composited frames: {folder}")
     return ExitCode.OK
 

@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
-from .. import compat
+from .. import compat_animation
 from ..access import OperatorBase, scene_in, settings_of
 from ..process import backend, begin, job_timer, steps
 from ..scene import session
@@ -68,7 +68,7 @@ def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
 
 def keyed_instants(scene: bpy.types.Scene) -> dict[str, float]:
     """Frame -> t* of a keyed t*, for every frame of the clip and of the scene's range; empty if it is not keyed."""
-    curve = next((c for c in compat.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
+    curve = next((c for c in compat_animation.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
     if curve is None or not settings_of(scene).choose_t_star:
         return {}
     folder = selection.shot_folder(scene)

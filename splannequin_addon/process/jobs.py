@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -322,11 +322,6 @@ def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
     return [contract.printable(line) for line in text.splitlines() if line.strip()][-lines:]
 
 
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """As the contract's, but makes no folder above the file's own: FileNotFoundError in a shot that was moved."""
-    contract.write_json(path, data, parents=False)
-
-
 def _read_status(folder: Path) -> contract.Status | None:
     """The status as it stands; None before there is one. ValueError if the file is not one of ours."""
     try:
@@ -453,28 +448,22 @@ def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
 def _keep(job: Job, status: contract.Status) -> contract.Status:
     """Writes the status of a job that can no longer do so; what another computer writes is not ours to correct."""
     if status.host in ("", contract.computer_name()):
-        write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status))
+        contract.write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status), parents=False)
     return status
 
 
 def _age(folder: Path) -> float:
     """Seconds since a job was made, by the clock of its disk: another computer may have made it."""
-    try:
+    now, made = time.time(), 0.0
+    with contextlib.suppress(OSError):
         now = contract.disk_time(folder)
-    except OSError:
-        now = time.time()
-    return now - _made(folder)
-
-
-def _made(folder: Path) -> float:
-    try:
-        return (folder / contract.REQUEST_FILE).stat().st_mtime
-    except OSError:
-        return 0.0
+    with contextlib.suppress(OSError):
+        made = (folder / contract.REQUEST_FILE).stat().st_mtime
+    return now - made
 
 
 def _kill(job: Job) -> None:
-    """Ends the job's process and its children: our own child, or what is the job's beyond doubt. JobError if not."""
+    """Ends the job's process and its children: our own child, or what is the job's beyond doubt; else JobError."""
     if job.process is not None:
         pid = job.process.pid  # ours until it is waited for: the system gives its number to no other
     else:

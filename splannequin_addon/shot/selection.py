@@ -16,7 +16,7 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
-from .. import compat
+from .. import compat_animation
 from ..access import OneShot, library_of, settings_of
 from ..scene import paths, scene_setup
 from . import scene_objects, source
@@ -132,7 +132,7 @@ def remove(scene: bpy.types.Scene, index: int) -> None:
     if index == held.loaded_shot:
         choose(scene, index + 1 if index + 1 < len(held.shots) else index - 1)
     chosen = held.loaded_shot
-    compat.remove_fcurves(scene, _path(index))
+    compat_animation.remove_fcurves(scene, _path(index))
     _rename(scene, {_path(i): _path(i - 1) for i in range(index + 1, len(held.shots))})
     held.shots.remove(index)
     held.loaded_shot = held.active_shot = chosen - 1 if chosen > index else chosen
@@ -167,7 +167,7 @@ def _copy(one: OneShot, other: OneShot) -> None:
 def _rename(scene: bpy.types.Scene, paths: Mapping[str, str]) -> None:
     """Has the scene's F-curves and drivers lead elsewhere, all at once."""
     drivers = scene.animation_data.drivers if scene.animation_data is not None else ()
-    for curve in [*compat.fcurves(scene), *drivers]:
+    for curve in [*compat_animation.fcurves(scene), *drivers]:
         if curve.data_path in paths:
             curve.data_path = paths[curve.data_path]
 

@@ -16,7 +16,7 @@ import numpy as np
 from mathutils import Matrix, Quaternion
 
 from ...torch_backend import contract
-from .. import compat
+from .. import compat_animation
 from ..access import camera_of, library_of, mesh_of, present
 from ..scene import axes, rollback, sequences
 from ..scene.ownership import TAG
@@ -264,7 +264,7 @@ def key_path(
         poses: camera-to-world, [F, 4, 4], Blender's camera axes, in the world of the camera's parent.
         lenses: [F, 3], see `lenses_of`.
         size: width and height of its pictures in pixels.
-        types: [F] types of the keys, see `compat.set_keys`.
+        types: [F] types of the keys, see `compat_animation.set_keys`.
     """
     data, (width, height) = camera_of(camera), size
     ends = lenses.min(axis=0), lenses.max(axis=0)
@@ -285,11 +285,11 @@ def key_path(
     camera.location, camera.rotation_quaternion = places[-1], turns[-1]
     data.lens, data.shift_x, data.shift_y = lenses[-1].tolist()
     keyed = {"location": np.array(places), "rotation_quaternion": np.array(turns)}
-    compat.set_keys(camera, frames, keyed, types)
+    compat_animation.set_keys(camera, frames, keyed, types)
     if varies:
-        compat.set_keys(data, frames, {n: lenses[:, i : i + 1] for i, n in enumerate(_LENS)})
+        compat_animation.set_keys(data, frames, {n: lenses[:, i : i + 1] for i, n in enumerate(_LENS)})
     else:
-        compat.remove_keys(data, _LENS)
+        compat_animation.remove_keys(data, _LENS)
 
 
 def _plate(shot: Path) -> tuple[bpy.types.Image, int, int] | None:

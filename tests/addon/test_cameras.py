@@ -77,12 +77,12 @@ def test_points_fall_where_the_solve_says(addon, scene, shot, fy):
 
 def test_keys_lie_on_the_clips_frames_and_are_straight(addon, scene, shot):
     camera = addon("solve.cameras").build(scene, shot)
-    curves = list(addon("compat").fcurves(camera))
+    curves = list(addon("compat_animation").fcurves(camera))
     assert len(curves) == 7
     for curve in curves:
         assert [key.co[0] for key in curve.keyframe_points] == [5, 6, 7]
         assert {key.interpolation for key in curve.keyframe_points} == {"LINEAR"}
-    assert not list(addon("compat").fcurves(camera.data)), "a lens that does not change needs no keys"
+    assert not list(addon("compat_animation").fcurves(camera.data)), "a lens that does not change needs no keys"
 
 
 def test_lens_is_keyed_where_it_changes(addon, scene, shot):
@@ -109,7 +109,11 @@ def test_quaternions_take_the_short_way(addon, scene, shot):
     (shot / "solve" / "cameras.json").write_text(json.dumps(path))
     camera = addon("solve.cameras").build(scene, shot)
     keys = np.array(
-        [[k.co[1] for k in c.keyframe_points] for c in addon("compat").fcurves(camera) if "quat" in c.data_path]
+        [
+            [k.co[1] for k in c.keyframe_points]
+            for c in addon("compat_animation").fcurves(camera)
+            if "quat" in c.data_path
+        ]
     )
     assert keys.shape == (4, 40)
     assert (np.sum(keys[:, 1:] * keys[:, :-1], axis=0) > 0.9).all()
@@ -193,7 +197,7 @@ def test_what_refers_to_the_camera_goes_on_with_the_next_solve(addon, scene, sho
 
 
 def test_what_the_artist_set_in_the_camera_stays_over_the_next_solve(addon, scene, shot):
-    cameras, compat = addon("solve.cameras"), addon("compat")
+    cameras, animation = addon("solve.cameras"), addon("compat_animation")
     camera = cameras.build(scene, shot)
     data = camera.data
     data.dof.use_dof, data.dof.aperture_fstop, data.passepartout_alpha, data.clip_end = True, 1.4, 1.0, 1e5
@@ -209,12 +213,12 @@ def test_what_the_artist_set_in_the_camera_stays_over_the_next_solve(addon, scen
     assert data.dof.use_dof and data.dof.aperture_fstop == pytest.approx(1.4) and data.passepartout_alpha == 1.0
     assert data.clip_end == 1e5 and [b.alpha for b in data.background_images] == [0.25, 0.5]
     assert data.background_images[1].image.name == "storyboard"
-    assert {c.data_path for c in compat.fcurves(camera)} == {"location", "rotation_quaternion", "hide_render"}
-    assert {c.data_path for c in compat.fcurves(data)} == {"dof.focus_distance", "lens", "shift_x", "shift_y"}
-    assert [k.co[0] for k in next(iter(compat.fcurves(camera))).keyframe_points] == [5, 6, 7]
+    assert {c.data_path for c in animation.fcurves(camera)} == {"location", "rotation_quaternion", "hide_render"}
+    assert {c.data_path for c in animation.fcurves(data)} == {"dof.focus_distance", "lens", "shift_x", "shift_y"}
+    assert [k.co[0] for k in next(iter(animation.fcurves(camera))).keyframe_points] == [5, 6, 7]
     rewrite(shot, K=poses_of(shot)[0][0]["K"])
     cameras.build(scene, shot)
-    assert {c.data_path for c in compat.fcurves(data)} == {"dof.focus_distance"}, "the lens no longer changes"
+    assert {c.data_path for c in animation.fcurves(data)} == {"dof.focus_distance"}, "the lens no longer changes"
     cameras.remove(scene, shot)
     assert "storyboard" in bpy.data.images
 
@@ -465,7 +469,7 @@ def test_a_keyed_instant_is_followed_frame_by_frame(addon, scene, shot):
     for frame, value in ((5, 5), (7, 7)):
         props.t_star = value
         assert scene.keyframe_insert("splannequin.t_star", frame=frame)
-    for curve in addon("compat").fcurves(scene):
+    for curve in addon("compat_animation").fcurves(scene):
         for key in curve.keyframe_points:
             key.interpolation = "LINEAR"
     ramp = steps.STEPS["freeze"].params(scene).t_star_per_frame

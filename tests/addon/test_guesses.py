@@ -54,7 +54,7 @@ def marked(scene) -> list[tuple[str, int]]:
 def test_keys_of_guesses_have_their_own_colour(addon, failed, shot):
     camera = addon("solve.cameras").build(failed, shot)
     want = ["KEYFRAME"] * 2 + ["EXTREME"] * 3 + ["JITTER", "KEYFRAME", "EXTREME"]
-    for curve in addon("compat").fcurves(camera):
+    for curve in addon("compat_animation").fcurves(camera):
         assert [key.type for key in curve.keyframe_points] == want
 
 

@@ -121,7 +121,7 @@ def test_a_job_of_a_dead_machine_is_not_believed(addon, contract, empty_shot):
     ended.wait()
     now = time.time()
     status = contract.Status("train", "running", ended.pid, now - 900, 12345.0, now - 600, stage="training")
-    jobs.write_json(job.folder / "status.json", dataclasses.asdict(status))
+    contract.write_json(job.folder / "status.json", dataclasses.asdict(status))
     (job.folder / "log.txt").write_text("first\nMemoryError: no room\n")
     found = jobs.latest(empty_shot)["train"]
     assert found.state == "failed"
@@ -193,12 +193,11 @@ def test_new_job_refuses_the_parameters_of_another_kind(addon, contract, empty_s
         addon("process.jobs").new_job(empty_shot, "train", contract.SolveParams())
 
 
-def test_a_broken_write_leaves_what_was_there(addon, tmp_path):
-    jobs = addon("process.jobs")
+def test_a_broken_write_leaves_what_was_there(contract, tmp_path):
     target = tmp_path / "a.json"
-    jobs.write_json(target, {"a": 1})
+    contract.write_json(target, {"a": 1})
     with pytest.raises(ValueError):
-        jobs.write_json(target, {"a": float("nan")})
+        contract.write_json(target, {"a": float("nan")})
     assert json.loads(target.read_text()) == {"a": 1} and [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
@@ -242,7 +241,7 @@ def believed_running(jobs, contract, shot, pid: int, started: float, host: str):
     job = jobs.new_job(shot, "train", contract.TrainParams())
     now = time.time()
     job.status = contract.Status("train", "running", pid, now - 900, started, now - 600, host=host)
-    jobs.write_json(job.folder / "status.json", dataclasses.asdict(job.status))
+    contract.write_json(job.folder / "status.json", dataclasses.asdict(job.status))
     jobs.cancel(job)
     os.utime(job.folder / "cancel", (now - 60, now - 60))
     return job
@@ -281,7 +280,7 @@ def test_a_job_of_another_computer_is_neither_dead_nor_ended(addon, contract, em
         jobs.cancel(job)
     before = (job.folder / "status.json").read_bytes()
     writer = contract.Writer("elsewhere (0a1b2c3d)", innocent.pid, 1.0, "train", job.folder.name, time.time())
-    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
+    contract.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
     for beat in (None, (job.status.heartbeat, time.monotonic() - 600)):
         job.beat = beat
         jobs.poll(job)
@@ -301,7 +300,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     writer = contract.Writer(
         contract.computer_name(), worker.pid, started, "train", "from a terminal", time.time() - 90000
     )
-    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
+    contract.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
     with pytest.raises(contract.JobError) as told:
         addon("process.begin").begin(scene, "import")
     assert told.value.exit_code == contract.ExitCode.USAGE and told.value.hint == "Wait for it or cancel it."
@@ -311,18 +310,20 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     german = addon("translations").translate(told.value.message, "de_DE")
     assert german == f"Das Training von {empty_shot.name} läuft seit {since} auf {where}."
     assert not (empty_shot / "jobs").exists(), "nothing was written"
-    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, host="elsewhere")))
+    contract.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, host="elsewhere")))
     with pytest.raises(contract.JobError, match="on elsewhere since") as told:
         addon("process.begin").begin(scene, "import")
     assert str(empty_shot / "lock.json") in told.value.hint
     ending = jobs.new_job(empty_shot, "train", contract.TrainParams())
-    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name)))
+    contract.write_json(
+        empty_shot / "lock.json", dataclasses.asdict(dataclasses.replace(writer, job=ending.folder.name))
+    )
     told = contract.Status("train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.computer_name())
-    jobs.write_json(ending.folder / "status.json", dataclasses.asdict(told))
+    contract.write_json(ending.folder / "status.json", dataclasses.asdict(told))
     jobs.refuse_second_writer(empty_shot)  # its process has told its end, and lets go in a moment
     worker.kill()
     worker.wait()
-    jobs.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
+    contract.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
     jobs.wait(addon("process.begin").begin(scene, "import", contract.ImportParams(str(clip), 1, 8)))
     assert not (empty_shot / "lock.json").exists()
 
@@ -336,7 +337,7 @@ def test_a_job_that_is_stopped_is_alive_and_can_be_ended_by_another_blender(addo
         time.sleep(0.02)
     os.kill(job.process.pid, signal.SIGSTOP)
     status = json.loads((job.folder / "status.json").read_text())
-    jobs.write_json(job.folder / "status.json", {**status, "heartbeat": time.time() - 600})
+    contract.write_json(job.folder / "status.json", {**status, "heartbeat": time.time() - 600})
     found = jobs.latest(job.shot)["import"]
     assert found.process is None and not found.ended, "it has only slept"
     jobs.cancel(found)

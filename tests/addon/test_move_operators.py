@@ -70,7 +70,7 @@ def test_a_camera_is_an_ordinary_one_that_can_be_edited(addon, scene, shaky):
     bpy.ops.splannequin.move_smooth()
     camera = scene.splannequin.path_camera
     assert scene.camera == camera and not camera.constraints and camera.users_collection
-    curves = list(addon("compat").fcurves(camera))
+    curves = list(addon("compat_animation").fcurves(camera))
     assert {c.data_path for c in curves} == {"location", "rotation_quaternion"}
     before = np.array(path_read(addon, scene, shaky).frames[3].viewmat)
     for point in curves[0].keyframe_points:

@@ -70,7 +70,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
 
 def keyed(addon, scene):
     """Data path -> values of the keys."""
-    return {c.data_path: [k.co[1] for k in c.keyframe_points] for c in addon("compat").fcurves(scene)}
+    return {c.data_path: [k.co[1] for k in c.keyframe_points] for c in addon("compat_animation").fcurves(scene)}
 
 
 def test_a_keyed_instant_goes_with_its_shot(addon, two):

@@ -1,7 +1,8 @@
 """What crosses the wall between Blender and the backend. Standard library only: both sides read this package.
 
     errors          exit codes, and the failure that an artist reads
-    options         what each step may be asked for: option_table makes panel and reference of it
+    options         what each step may be asked for (train_options, take_options; option_choices): option_table makes
+                    panel and reference of it
     verbs           the words of the command lines; command_line makes both of them of it
     jobs            a job's folder: request, status, events
     processes       children, and which process lives
@@ -132,6 +133,23 @@ from .jobs import (
 from .light_facts import LightFacts, light_of_take, point_of
 from .live_messages import LIVE_LIMIT, LIVE_SHOWS, LiveView, read_message, write_message
 from .lock import Writer, busy, gives_back, read_writer
+from .option_choices import (
+    CAMERA_MODELS,
+    CARD_GAUSSIANS,
+    CARD_WIDTH,
+    DETECTORS,
+    DEVICES,
+    HOST_CONFIGS,
+    HOSTS,
+    LAST_FRAME,
+    MATTE_FORMATS,
+    METHODS,
+    PRESET_STEPS,
+    PRESET_WIDTHS,
+    QUERIES,
+    ST_MAP_WAYS,
+    SUPERVISIONS,
+)
 from .option_table import (
     MASK_ALPHA,
     MASK_FOUND,
@@ -146,33 +164,11 @@ from .option_table import (
     panel,
 )
 from .options import (
-    CAMERA_MODELS,
-    CARD_GAUSSIANS,
-    CARD_WIDTH,
-    DETECTORS,
-    DEVICES,
-    HOST_CONFIGS,
-    HOSTS,
-    LAST_FRAME,
     LIMITS,
-    LIVE_SOURCE,
-    MATTE_FORMATS,
-    METHODS,
     PARAMS,
-    PRESET_STEPS,
-    PRESET_WIDTHS,
-    QUERIES,
-    ST_MAP_WAYS,
     STEP_PARAMS,
-    SUPERVISIONS,
-    CombineParams,
-    FreezeParams,
     ImportParams,
-    LightParams,
-    MatteParams,
     SolveParams,
-    SurfaceParams,
-    TrainParams,
     check_params,
 )
 from .pace import (
@@ -266,8 +262,10 @@ from .shot_folder import (
 )
 from .shot_work import FOLDERS_OF_FRAMES, work_words
 from .surface_header import TRIANGLE_FIELDS, VERTEX_FIELDS, SurfaceHeader, read_surface_header, surface_of_take
+from .take_options import LIVE_SOURCE, CombineParams, FreezeParams, LightParams, MatteParams, SurfaceParams
 from .timecode import later, parse_timecode
 from .torch_source import CPU_INDEX, CUDA_INDEX, TORCH_INDEX, brings_cuda, torch_index
+from .train_options import TrainParams
 from .typed import CONTRACT_VERSION, check_version, from_dict
 from .unborn import discard_unborn, refuse_foreign
 from .verbs import BACKEND, BLENDER, COMMANDS, INPUT, VERBS, ExportWords, FarmWords, Verb

@@ -10,8 +10,9 @@ from typing import Any
 
 from .errors import ExitCode, JobError
 from .option_table import Option, default_of, options_of
-from .options import FreezeParams, TrainParams
 from .shot_folder import INFO_FILE, SHOT_SUFFIX
+from .take_options import FreezeParams
+from .train_options import TrainParams
 from .verbs import VERBS, Verb
 
 CODES = "exit codes: " + ", ".join(f"{code.value} {code.name.lower()}" for code in ExitCode)

@@ -16,8 +16,10 @@ from typing import Any, cast
 
 from .files import SHORT_JSON, is_json_object, read_json
 from .installed import SETUP_NOTES
-from .options import PRESET_STEPS, PRESET_WIDTHS, FreezeParams, TrainParams
+from .option_choices import PRESET_STEPS, PRESET_WIDTHS
 from .shot_folder import ShotFolder
+from .take_options import FreezeParams
+from .train_options import TrainParams
 from .writing import write_json
 
 PACES_FILE = "paces.json"

@@ -8,20 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from .option_choices import DEVICE, PLACEMENT
 from .option_table import option
-from .options import (
-    DEVICE,
-    PLACEMENT,
-    STEP_PARAMS,
-    CombineParams,
-    FreezeParams,
-    ImportParams,
-    LightParams,
-    MatteParams,
-    SolveParams,
-    SurfaceParams,
-    TrainParams,
-)
+from .options import STEP_PARAMS, ImportParams, SolveParams
+from .take_options import CombineParams, FreezeParams, LightParams, MatteParams, SurfaceParams
+from .train_options import TrainParams
 
 BACKEND, BLENDER = "backend", "Blender"
 """The sides that have a command line."""

@@ -1,15 +1,7 @@
 """CUDA body of the rasteriser: kernels compiled by Warp, own backward, no word to the host in between.
 
 Needs no CUDA toolkit: Warp brings the compiler and caches what it made. With tensors on the CPU the very same kernels
-run on Warp's CPU fibers: slow, for tests on machines without a GPU.
-
-**The list of hits** has a fixed capacity per call, so that nothing is read back. The first call of a device, camera
-count and image size waits for the number of its hits: no guess would do, from 4 tiles a Gaussian to 40. From then on
-the device keeps the most hits that such a call ever wanted, and sends the figure to the host without anyone waiting for
-it; more Gaussians than before are given as many each. A call with more hits than its list holds is slower, never wrong:
-its tiles then search all Gaussians in depth order (see `cuda_source.py`), and a later call has a larger list. A list
-takes a quarter of the card's free memory at most. `RasterOutput.hits` says, on the device, how many hits a call had and
-how many its list held.
+run on Warp's CPU fibers: slow, for tests on machines without a GPU. `hit_lists.py` says how long the list of hits is.
 
 **CUDA graphs.** `rasterize` and its backward pass can be captured, for instance by `torch.cuda.graph`, after a call of
 the same shapes and its backward pass outside (they compile the kernels). The list then stays as large as it was at
@@ -29,20 +21,14 @@ from ..torch_types import AutogradContext, applied, once_differentiable
 from . import cuda_source as source
 from .constants import TILE
 from .cuda_entry import warp_kernel
+from .hit_lists import Demand, demand_of
 from .reference import expected_depth
 from .settings import RasterOutput, Scene
 
 MAX_CHANNELS = 64 - source.MOMENTS
 """Channels, depth included, that one call can carry."""
-_HITS_MAX = 2**27
-_HITS_STEP = 2**12
-_FULL = 0.9
-"""Share of a list from which on it is made larger."""
-HIT_BYTES = 40
-"""Bytes of one hit: its tile and slot, both sorted, the order that sorts them, and the sort's own scratch."""
 _lock = threading.RLock()
 _kernels: dict[tuple[str, int], Any] = {}
-_demands: dict[tuple[torch.device, int, int, int], "_Demand"] = {}
 
 
 def _structure(wp: Any) -> Any:
@@ -117,93 +103,6 @@ class _Fibers:
     def __exit__(self, *_: object) -> None:
         self.wp.config.enable_cpu_blocks = self.before
         _lock.release()
-
-
-class _Demand:
-    """How many hits calls of one shape want: a running maximum on the device, and its echo on the host."""
-
-    def __init__(self, device: torch.device):
-        # Made for all later calls, so not a tensor of the inference mode that the first one may be in.
-        with torch.inference_mode(False):
-            self.most = torch.zeros(1, dtype=torch.int64, device=device)
-            self.echo = torch.zeros(1, dtype=torch.int64, pin_memory=device.type == "cuda")
-        self.host = self.echo.numpy()
-        self.capacity = self.slots = 0
-
-    def grow(self, hit_count: Tensor) -> None:
-        """Room for a third more than was wanted so far; before that is known, than the hits of this call, which are
-        waited for. hit_count: int32 [slots] on the device."""
-        slots = hit_count.shape[0]
-        demand = int(self.host[0]) if self.capacity else int(hit_count.sum(dtype=torch.int64))
-        if self.slots and slots > self.slots:
-            demand = demand * slots // self.slots
-        self.slots = max(self.slots, slots)
-        if self.capacity == 0 or demand > _FULL * self.capacity:
-            wanted = max(demand * 4 // 3, self.capacity, 1)
-            most = max(min(_hits_at_most(self.most.device), _HITS_MAX), self.capacity, _HITS_STEP)
-            self.capacity = min(-(-wanted // _HITS_STEP) * _HITS_STEP, most)
-
-    def report(self) -> None:
-        """Sends the maximum to the host after the work queued so far; until it arrives, the previous value is read."""
-        if not _capturing(self.most.device):
-            self.echo.copy_(self.most, non_blocking=True)
-
-
-def _hits_at_most(device: torch.device) -> int:
-    """Hits whose list fits a quarter of what is free on the device."""
-    if device.type != "cuda":
-        return _HITS_MAX
-    free, _ = torch.cuda.mem_get_info(device)
-    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return max(1, free // 4 // HIT_BYTES)
-
-
-def forget_demands() -> None:
-    """Drops the lists' sizes: each is requested anew, by the memory that is free then."""
-    with _lock:
-        _demands.clear()
-
-
-def outgrown(device: torch.device, cameras: int, width: int, height: int) -> int:
-    """Hits that calls of this device and size came to want, as far as the host knows, if that is more than they have
-    room for with a margin; else 0."""
-    demand = _demands.get((device, cameras, width, height))
-    wanted = 0 if demand is None else int(demand.host[0])
-    return wanted if demand is not None and wanted > _FULL * demand.capacity else 0
-
-
-def listed(device: torch.device, cameras: int, width: int, height: int) -> int:
-    """Hits that calls of this device and size have room for now."""
-    demand = _demands.get((device, cameras, width, height))
-    return 0 if demand is None else demand.capacity
-
-
-def report_demands(device: torch.device) -> None:
-    """Has the host told what calls came to want: those that a CUDA graph carries out do not tell it themselves."""
-    with _lock:
-        for (of, *_), demand in _demands.items():
-            if of == device:
-                demand.report()
-
-
-def _capturing(device: torch.device) -> bool:
-    return device.type == "cuda" and torch.cuda.is_current_stream_capturing()
-
-
-def _demand(scene: Scene, hit_count: Tensor) -> _Demand:
-    """The demand of calls like this one, of hit_count int32 [slots], brought up to date."""
-    device, cameras = scene.means.device, scene.viewmats.shape[0]
-    with _lock:
-        key = (device, cameras, scene.width, scene.height)
-        if key not in _demands:
-            if _capturing(device):
-                raise RuntimeError(
-                    "capture a rasterize call as a CUDA graph only after one of the same device, image "
-                    "size and number of cameras outside the capture"
-                )
-            _demands[key] = _Demand(device)
-        _demands[key].grow(hit_count)
-        return _demands[key]
 
 
 def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
@@ -308,7 +207,7 @@ class _Binned(NamedTuple):
     """[T] int32"""
 
 
-def _bin(launch: _Launcher, args: Any, demand: _Demand, depth_key: Tensor, hit_count: Tensor, zeros: _Zeros) -> _Binned:
+def _bin(launch: _Launcher, args: Any, demand: Demand, depth_key: Tensor, hit_count: Tensor, zeros: _Zeros) -> _Binned:
     """List the hits tile by tile, front to back."""
     make, capacity = _Maker(depth_key.device), demand.capacity
     slots, tiles = hit_count.shape[0], args.tiles_x * args.tiles_y * args.cameras
@@ -426,7 +325,7 @@ class _Rasterize(torch.autograd.Function):
         _point(args, record=record, aux=aux, hit_count=hit_count, depth_key=depth_key)
         _point(args, radii=out.radii, means2d=out.means2d)
         launch("raster_project", args, slots)
-        binned = _bin(launch, args, _demand(scene, hit_count), depth_key, hit_count, zeros)
+        binned = _bin(launch, args, demand_of(scene, hit_count), depth_key, hit_count, zeros)
         _point(args, image=out.image, alpha=out.alpha, median=out.median, top_id=out.top_id, top_weight=out.top_weight)
         _point(args, weight_sum=out.weight_sum, weight_max=out.weight_max)
         launch("raster_blend", args, source.BLOCK * args.tiles_x * args.tiles_y * cameras, channels)

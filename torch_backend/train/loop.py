@@ -13,7 +13,7 @@ from torch import Tensor
 from ..contract import FORECAST, Cancelled, ExitCode, JobError
 from ..gaussians import covering
 from ..native import torch_threads
-from ..raster.cuda import forget_demands
+from ..raster.hit_lists import forget_demands
 from . import memory
 from .events import schedule_events
 from .forecast import Outlook, Stopwatch, smaller_presets, step_work, warning_of

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 
 from ..contract import ExitCode, JobError
-from ..raster.cuda import HIT_BYTES
+from ..raster.hit_lists import HIT_BYTES
 from ..supervision.support import MAX_BINS
 from .config import TrainConfig
 

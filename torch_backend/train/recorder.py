@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from ..native import warp_stream
-from ..raster.cuda import listed, outgrown, report_demands
+from ..raster.hit_lists import listed, outgrown, report_demands
 from .adam import FusedAdam, StepTable
 from .memory import free_bytes
 from .soundness import INSPECT_EVERY, Soundness

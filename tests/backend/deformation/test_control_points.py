@@ -8,11 +8,9 @@ import torch
 from torch_backend.deformation.control_points import (
     ControlPoints,
     ControlPointsConfig,
-    acceleration_energy,
-    arap_energy,
-    elastic_energy,
 )
 from torch_backend.deformation.geometry import near_identity
+from torch_backend.deformation.node_energies import acceleration_energy, arap_energy, elastic_energy
 from torch_backend.deformation.registry import host_config
 from torch_backend.gaussians.rotations import rotation_matrices
 

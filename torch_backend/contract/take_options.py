@@ -1,0 +1,244 @@
+"""What a take may be asked for: its frozen frames, mattes, several instants in one, a surface, and light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from .light_facts import point_text
+from .option_choices import DEVICE, FRAMES, MATTE_FORMATS, PLACEMENT, QUERIES
+from .option_table import SWITCH, Limit, Option, option, overscan
+
+
+@dataclass
+class FreezeParams:
+    """Frozen frames from a run."""
+
+    run: str = option("main", flag="--run", metavar="NAME", help="name of the run")
+    """Run to freeze."""
+    take: str = option(
+        "freeze",
+        flag="--take",
+        metavar="NAME",
+        help="name of the take",
+        label="Take",
+        tip="Name of the frozen frames; a new name keeps the old",
+    )
+    """Name of the take's folder in takes/."""
+    t_star: int | None = option(
+        None,
+        flag="--t-star",
+        metavar="N",
+        help="frame at which time stands still",
+        words="suggested from support and sharpness",
+        limit=Limit("t*", -FRAMES, FRAMES),
+        label="t*",
+        tip="Frame number of the clip at which time stands still. Keyed, it is followed frame by frame: "
+        "freeze, hold and release",
+    )
+    """Frame number of the clip at which time stands still; None: suggested from support and sharpness."""
+    t_star_per_frame: dict[str, float] = field(
+        default_factory=dict[str, float], metadata={"option": Option(limit=Limit("t* of a frame", -FRAMES, FRAMES))}
+    )
+    """Clip frame number -> t* as a frame number, one per output frame: freeze ramps. Overrides `t_star`."""
+    first: int | None = option(None, limit=Limit("first frame", -FRAMES, FRAMES))
+    """First output frame; None: the clip's first."""
+    last: int | None = option(None, limit=Limit("last frame", -FRAMES, FRAMES))
+    """Last output frame, inclusive; None: the clip's last."""
+    step: int = option(1, limit=Limit("step between frozen frames", 1, 1_000_000))
+    """Every how many frames, from `first`, one is rendered. Frames of the take that were rendered before stay."""
+    camera_path: str = option(
+        "",
+        flag="--camera-path",
+        metavar="FILE",
+        is_path=True,
+        help="JSON camera path to render from",
+        words="the clip's poses",
+    )
+    """JSON file of a CameraPath, in solve units, to render from; empty: the clip's own poses."""
+    query: str = option(
+        "nearest",
+        flag="--freeze-query",
+        choices=QUERIES,
+        help="`nearest`: each Gaussian at its nearest supported time; `plain`: at t* itself",
+    )
+    """nearest: each Gaussian is asked at its nearest supported time to t*; plain: at t* itself."""
+    width: int = option(
+        0,
+        flag="--freeze-width",
+        metavar="PX",
+        help="width of the frozen frames",
+        words="the source's own",
+        limit=Limit("width of the frozen frames", 16, 16_384, {0: "the source's"}),
+        label="Width",
+        tip="Width in pixels of the frozen frames; 0: the source's own, or as the scene renders from a camera "
+        "of your own",
+    )
+    """Width in pixels of the frozen frames; 0: the source's own."""
+    detail: str = option(
+        "on",
+        flag="--detail",
+        choices=SWITCH,
+        help="`on`: frozen frames are made of the plates, where they can be believed; `off`: of the splats alone",
+        label="Detail",
+        tip="Make frozen frames of the plates, where they can be believed: as sharp as the plate. "
+        "Off: of the splats alone, soft throughout",
+    )
+    """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
+    develop: str = option(
+        "on",
+        flag="--develop",
+        choices=SWITCH,
+        help="`on`: before it is rendered, the scene at t* is trained on as a still one, once for each t*, which "
+        "brings back what the run lost; motion that makes other frames worse is held still. `off`: as the run has it",
+        label="Develop",
+        tip="Train the frozen instant on as the still scene that it is, before it is rendered: what moves is "
+        "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each "
+        "t*. Off: the instant as the training left it",
+    )
+    """on: the instant is trained on as the still scene that it is, and kept with the run; off: it stays as the run has
+    it. Of keyed instants, six at most."""
+    overscan: float = option(
+        0.0,
+        flag="--overscan",
+        metavar="PERCENT",
+        parse=overscan,
+        help="picture beyond the frame on every side, or `lens`: as much as the way back through the lens needs",
+        limit=Limit("overscan in percent", 0, 100, {-1: "what the lens needs"}),
+    )
+    """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
+    lens needs. `width` is that of the frame without it."""
+    placement: str = option("", **PLACEMENT)
+    """JSON file of a `Placement`, by which frozen.ply and frozen.usdc leave; empty: the shot's own, else upright."""
+    only_missing: bool = option(False, always=True)
+    """Keep frames of the take that are already rendered from the same run, t* and camera."""
+    grain: bool = option(
+        True, flag="--no-grain", switch=True, help="leave the plate's grain out of the files: a third smaller"
+    )
+    """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
+    passes: bool = option(
+        False,
+        flag="--passes",
+        switch=True,
+        help="motion vectors, normals and positions as layers of the frames",
+        label="Passes",
+        tip="Write motion vectors of the camera's move (Blender's Vector layout), normals and positions as further "
+        "layers of the frames, in the scene's axes and units",
+    )
+    """Write the layers of `FRAME_LAYERS` whose part is passes."""
+    deep: bool = option(
+        False,
+        flag="--deep",
+        switch=True,
+        help="also a deep EXR for each frame, for Nuke, Fusion and Houdini: two samples where two surfaces meet in a "
+        "pixel",
+        label="Deep EXR",
+        tip="Write a deep EXR beside each frame, with two samples where two surfaces meet in a pixel, for deep "
+        "compositing in Nuke, Fusion or Houdini. Blender reads none. Not with Motion Blur",
+    )
+    """Write takes/NAME/deep/NNNNNN.exr: the frame as deep samples in the scene's units."""
+    shutter: float = option(
+        0.0,
+        flag="--shutter",
+        metavar="DEGREES",
+        help="motion blur by the move of a camera path of your own: degrees of 360 that the shutter is open, as a film "
+        "camera's 180; a frame takes as many times as long as its blur is pixels long, 33 times at most",
+        limit=Limit("shutter in degrees", 0, 360),
+    )
+    """Motion blur by the move of `camera_path`, degrees of 360 that the shutter is open around each frame; 0: none."""
+    debug_terms: str = option(
+        "",
+        flag="--debug-terms",
+        metavar="DIR",
+        is_path=True,
+        words="not written",
+        help="for developers: write what decided where each pixel comes from into DIR, an EXR of named channels for "
+        "each frame; every frame is rendered anew",
+    )
+    """Folder for the terms behind each frame's decisions (`torch_backend/freeze/take/debug_terms.py`); empty: none."""
+    device: str = option("auto", **DEVICE)
+    """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
+
+
+@dataclass
+class MatteParams:
+    """Mattes of things in a take, each lassoed at one frame."""
+
+    take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
+    """Name of the take's folder in takes/."""
+    polygons: str = option(
+        "",
+        flag="--polygons",
+        metavar="FILE",
+        is_path=True,
+        help='JSON with the lassos: {"mattes": [{"name": NAME, "frame": N, "polygon": [[x, y], ...]}]}, in pixels '
+        "of the frozen frames from the top left corner; lassos of one name add up",
+        words="those of the take's mattes",
+    )
+    """JSON file of lassos; empty: the previous ones. An earlier matte keeps its lassos unless the file has its name."""
+    remove: str = option("", flag="--remove", metavar="NAME", help="name of a matte to remove", words="none")
+    """Matte that is removed; empty: none."""
+    matte_format: str = option(
+        "exr",
+        flag="--matte-format",
+        choices=MATTE_FORMATS,
+        help="files of the single mattes: `exr` (half floats) or `png` (16 bits)",
+    )
+    """Files of the single mattes: exr or png."""
+    device: str = option("auto", **{**DEVICE, "help": "where to render: `auto` takes an NVIDIA GPU"})
+    """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
+
+
+LIVE_SOURCE = "live"
+"""In `CombineParams.things`, in place of a take: the clip's own plates."""
+
+
+@dataclass
+class CombineParams:
+    """One take made of several: each thing under a matte from a take of its own."""
+
+    take: str = option("combined", flag="--take", metavar="NAME", help="name of the take that is made")
+    """Name of the new take's folder in takes/."""
+    base: str = option("freeze", flag="--base", metavar="TAKE", help="take that shows everything else")
+    """Name of the take that everything else comes from."""
+    things: str = option(
+        "",
+        flag="--things",
+        metavar="MATTE=TAKE,...",
+        help="which thing comes from which take; both takes must have the matte. `MATTE=live`: it goes on living, as "
+        "the clip has it",
+        words="none",
+    )
+    """Pairs of matte and take, separated by commas; `LIVE_SOURCE` in place of a take: the clip itself."""
+
+
+@dataclass
+class SurfaceParams:
+    """The frozen scene of a take as a mesh."""
+
+    take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
+    """Name of the take's folder in takes/."""
+
+
+@dataclass
+class LightParams:
+    """The light of a take's frozen scene at a point, as a panorama."""
+
+    take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
+    """Name of the take's folder in takes/."""
+    position: str = option(
+        "0,0,0",
+        flag="--position",
+        metavar="X,Y,Z",
+        parse=point_text,
+        help="point that the light falls on, in the axes and units of Blender's scene; with an equals sign where it "
+        "begins with a minus: `--position=-1,2,0.5`",
+    )
+    """Three numbers, separated by commas: the point, in the axes and units of Blender's scene."""
+    placement: str = option(
+        "",
+        **{
+            **PLACEMENT,
+            "help": "JSON that says where the solve stands in the scene whose axes and units `--position` has",
+        },
+    )
+    """JSON file of a `Placement`; empty: the shot's own, else upright, in solve units."""
