@@ -19,6 +19,7 @@ from . import backend, job_timer, steps
 
 BUTTONS = {"solve": "solve_camera", "train": "train", "freeze": "freeze"}
 """Step -> its operator, in the order of the work."""
+_READ_SECONDS = 5.0
 
 
 @dataclass
@@ -36,6 +37,19 @@ class Chain:
 
 
 _chains: dict[Path, Chain] = {}
+_paces: tuple[dict[str, float], float] = ({}, 0.0)
+"""Those of this machine, and when they were read, monotonic seconds."""
+
+
+def paces() -> dict[str, float]:
+    """As `contract.paces`, of the backend's environment; read every few seconds, since panels ask at every redraw."""
+    global _paces
+    if not _paces[1] or time.monotonic() - _paces[1] > _READ_SECONDS:
+        found: dict[str, float] = {}
+        with contextlib.suppress(contract.JobError):
+            found = contract.paces(Path(backend.python()).parents[1])
+        _paces = found, time.monotonic()
+    return _paces[0]
 
 
 def missing(scene: bpy.types.Scene) -> list[str]:
@@ -119,7 +133,7 @@ def _expected(scene: bpy.types.Scene, shot: Path, names: list[str]) -> dict[str,
     """Seconds that steps take on this machine; none of a step whose settings cannot be read, which its button says."""
     found: dict[str, float] = {}
     with contextlib.suppress(contract.JobError, OSError, ValueError, KeyError):
-        size, pace = contract.ShotSize.of(contract.ShotFolder(shot)), contract.paces(Path(backend.python()).parents[1])
+        size, pace = contract.ShotSize.of(contract.ShotFolder(shot)), paces()
         for name in names:
             seconds = contract.expected_seconds(name, steps.STEPS[name].params(scene), size)
             found[name] = (seconds or 0.0) * pace.get(name, 1.0)

@@ -25,8 +25,11 @@ class Cost:
     """A run of this preset was timed; else `seconds` is based on pixels and steps of another's."""
 
 
-def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
-    """The cost of every preset, and the run that it was told from, None if the shot has none that was timed."""
+def costs(state: ShotState | None, pace: float | None = None) -> tuple[list[Cost], dict[str, Any] | None]:
+    """The cost of every preset, and the run that it was told from, None if the shot has none that was timed.
+
+    Without such a run it is told from `pace`, that of this machine's earlier trainings (`contract.paces`), if there is.
+    """
     timed = sorted((r for r in state.runs.values() if _per_step(r)), key=_size) if state is not None else []
     # Where nothing may move a step is several times as fast.
     timed = [run for run in timed if run.get("method") != "static"] or timed
@@ -43,6 +46,10 @@ def costs(state: ShotState | None) -> tuple[list[Cost], dict[str, Any] | None]:
         seconds = None
         for run in nearest:
             seconds = steps * _per_step(run) * (width / run["width_px"]) ** 2
+        if not nearest and pace is not None and state is not None and state.frames:
+            size = contract.ShotSize(state.frames, state.size, state.size)
+            expected = contract.expected_seconds("train", contract.TrainParams(preset=preset), size)
+            seconds = None if expected is None else pace * expected
         rows.append(Cost(preset, width, steps, seconds, bool(own)))
     return rows, timed[-1] if timed else None
 

@@ -6,7 +6,7 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import layout_of, scene_in, settings_of
-from ..process import steps
+from ..process import all_steps, steps
 from ..scene import paths
 from ..shot.shot_state import ShotState
 from ..translations import tr
@@ -41,7 +41,8 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
 
     def _presets(self, context: bpy.types.Context, layout: bpy.types.UILayout, state: ShotState | None) -> None:
         """A button for each preset: how large, how many steps, how long on this machine."""
-        props, (rows, basis) = settings_of(scene_in(context)), estimates.costs(state)
+        props, pace = settings_of(scene_in(context)), all_steps.paces().get("train")
+        rows, basis = estimates.costs(state, pace)
         column = layout.column(align=True)
         head = cells(column.row(align=True), _PRESET_WIDTHS)
         for place, text in zip(head, ("Preset", "Pixels", "Steps", "Time"), strict=True):
@@ -54,7 +55,9 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             spent = "-" if row.seconds is None else contract.duration(row.seconds) + ("" if row.measured else " ?")
             for place, text in zip(columns[1:], (str(row.width or "-"), f"{row.steps / 1000:g}k", spent), strict=True):
                 place.label(text=text, translate=False)
-        if basis is None:
+        if basis is None and pace is not None:
+            words = "With a ?: an estimate by this machine's earlier trainings."
+        elif basis is None:
             words = (
                 "Preview took 1.5 to 3.5 minutes on two cores without a graphics card. "
                 "Times here come with the first run."

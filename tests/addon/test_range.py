@@ -167,7 +167,6 @@ def test_a_bake_never_lowers_the_size_of_a_scene_nor_takes_back_what_the_artist_
 
 
 def test_the_camera_is_looked_at_again_only_if_the_take_was_seen_from_one(addon, contract, with_shot, shot):
-    jobs = addon("process.jobs")
     assert not addon("freeze.own_camera").follows_camera(with_shot)
     with_shot.splannequin.path_camera = with_shot.camera
     assert not addon("freeze.own_camera").follows_camera(with_shot), "the take is of the clip's own move"
@@ -181,7 +180,7 @@ def test_the_camera_is_looked_at_again_only_if_the_take_was_seen_from_one(addon,
         frames = [contract.CameraFrame(n, pose, [20.0, 20.0, 8.0, 6.0], "blender") for n in numbers]
         return contract.CameraPath(16, 12, frames)
 
-    jobs.write_json(file, path((5, 6, 7), 0.0).to_json())
+    contract.write_json(file, path((5, 6, 7), 0.0).to_json())
     with_shot.frame_start, with_shot.frame_end = 6, 6
     params = addon("freeze.takes").freeze_from(with_shot, path((6,), 0.5), "bake")
     kept = contract.CameraPath.load(params.camera_path)

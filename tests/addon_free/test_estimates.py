@@ -59,3 +59,16 @@ def test_a_final_run_of_a_card_tells_of_the_sources_pixels(costs):
 def test_a_small_clip_is_not_enlarged(costs):
     rows, _ = costs({"main": run(width_px=320)}, width=640)
     assert (rows["standard"].width, rows["final"].width) == (640, 640)
+
+
+def test_without_a_run_the_machines_earlier_trainings_tell(addon, contract, tmp_path):
+    estimates, state = addon("train.estimates"), addon("shot.shot_state").ShotState(tmp_path)
+    state.info, state.frames = {"width": 1280, "height": 720}, 50
+    rows, basis = estimates.costs(state, pace=2.0)
+    expected = contract.expected_seconds(
+        "train", contract.TrainParams(preset="standard"), contract.ShotSize(50, (1280, 720), (1280, 720))
+    )
+    assert basis is None and [row.preset for row in rows] == list(contract.PRESET_STEPS)
+    assert rows[1].seconds == pytest.approx(2.0 * expected) and not rows[1].measured
+    assert [row.seconds for row in estimates.costs(state)[0]] == [None] * 3
+    assert [row.seconds for row in estimates.costs(None, pace=2.0)[0]] == [None] * 3

@@ -68,14 +68,14 @@ def test_what_changed_is_seen_where_folders_have_no_date(addon, long_shot):
         assert inventory.stamp(long_shot) != stamp
 
 
-def test_what_changed_is_read_again_and_only_that(addon, long_shot, opened):
+def test_what_changed_is_read_again_and_only_that(addon, contract, long_shot, opened):
     read = addon("shot.inventory").read
     read(long_shot)
     (long_shot / "takes" / "freeze" / "000008.exr").touch()
     grown, names = opened(read, long_shot)
     assert grown.takes["freeze"]["frame_count"] == 4 and names == []
     info = json.loads((long_shot / "shot.json").read_text())
-    addon("process.jobs").write_json(long_shot / "shot.json", info | {"name": "renamed"})
+    contract.write_json(long_shot / "shot.json", info | {"name": "renamed"})
     with open(long_shot / "runs" / "main" / "metrics.jsonl", "a") as more:
         more.write('{"seconds": 2.0, "heldout_psnr_db": 21.0}\n')
     changed, names = opened(read, long_shot)
