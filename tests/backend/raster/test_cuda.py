@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.raster_errors import on_host
 from torch_backend.native import initialised_warp
-from torch_backend.raster import RasterOutput, cuda, rasterize
+from torch_backend.raster import RasterOutput, cuda, hit_lists, rasterize
 
 GPU = torch.cuda.is_available()
 needs_gpu = pytest.mark.skipif(not GPU, reason="needs an NVIDIA GPU")
@@ -89,11 +89,11 @@ def test_a_camera_that_is_no_number_is_refused_on_fibers_and_sees_nothing_on_a_g
 
 
 def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
-    monkeypatch.setattr(cuda, "_HITS_STEP", 1)
-    monkeypatch.setattr(cuda, "_demands", {})
+    monkeypatch.setattr(hit_lists, "HITS_STEP", 1)
+    monkeypatch.setattr(hit_lists, "_demands", {})
     scene = covering(tools)
     with monkeypatch.context() as short:
-        short.setattr(cuda, "_HITS_MAX", 96)
+        short.setattr(hit_lists, "HITS_MAX", 96)
         small, small_grads = gradients(scene, device)
     wanted, held = small.hits.tolist()
     assert held == 96 < wanted, "the list should have been too short"
@@ -113,8 +113,8 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
 
 
 def test_the_first_call_of_a_size_lists_all_its_hits(tools, device, monkeypatch):
-    monkeypatch.setattr(cuda, "_HITS_STEP", 1)
-    monkeypatch.setattr(cuda, "_demands", {})
+    monkeypatch.setattr(hit_lists, "HITS_STEP", 1)
+    monkeypatch.setattr(hit_lists, "_demands", {})
     with torch.no_grad():
         wanted, held = run(covering(tools), device).hits.tolist()
         assert wanted > 4 * 24 and wanted <= held <= wanted * 4 // 3 + 1
@@ -133,7 +133,7 @@ def test_kernels_of_a_module_are_made_together(monkeypatch):
 
 
 def test_training_follows_a_first_call_in_inference_mode(tools, device, monkeypatch):
-    monkeypatch.setattr(cuda, "_demands", {})
+    monkeypatch.setattr(hit_lists, "_demands", {})
     scene = tools.cloud(20, 24, 17)
     with torch.inference_mode():
         seen = on_host(run(scene, device))

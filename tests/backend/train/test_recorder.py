@@ -68,7 +68,9 @@ def trained(world, quiet):
 
 
 def equal(one, two):
-    return all(torch.equal(p, q) for p, q in zip(one.named_tensors().values(), two._named().values(), strict=True))
+    return all(
+        torch.equal(p, q) for p, q in zip(one.named_tensors().values(), two.named_tensors().values(), strict=True)
+    )
 
 
 class EveryOther:
