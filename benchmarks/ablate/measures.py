@@ -139,7 +139,7 @@ def _judge_clip(
             if laid is None:  # depth, and with it where things lie, is the same with any rule of frames off
                 laid = _laid(maker, (first, second), (a[0], b[0]))
             pair, still = laid
-            row = _judge_pair(flow, pair, still, shown(a[0]), shown(b[0]), maker.clip.plate(first))
+            row = judge_pair(flow, pair, still, shown(a[0]), shown(b[0]), maker.clip.plate(first))
             row |= {"frame": first, "own": float(a[0].matte.mean())}
             rows[name].append(row | {"decision_s": 0.5 * (a[1] + b[1]), "frame_s": 0.5 * (a[2] + b[2])})
     return {name: {"frames": found} for name, found in rows.items()}
@@ -161,7 +161,7 @@ def _laid(
     return lay_over(clip, both[0], both[1], "delivered"), still
 
 
-def _judge_pair(flow: Flow, pair: Pair, still: Tensor, one: Tensor, two: Tensor, plate: Tensor) -> Row:
+def judge_pair(flow: Flow, pair: Pair, still: Tensor, one: Tensor, two: Tensor, plate: Tensor) -> Row:
     """Figures of two neighbouring frozen frames: error of still pixels, flow left in pixels, flicker of 255."""
     error = (one - plate).double().square().mean(-1)[still]
     left, judged = unexplained_flow(flow, one, two, pair.places, pair.both), textured(one)
