@@ -102,7 +102,7 @@ def test_of_two_tries_that_came_to_the_same_the_first_keeps_its_files(tmp_path, 
         folder.mkdir()
         for name in ("poses.json", "database.db"):
             (folder / name).write_text(rung)
-        return replace(attempt("poor"), rung=rung, folder=folder)
+        return replace(attempt("poor"), strategy=rung, folder=folder)
 
     monkeypatch.setattr("torch_backend.sfm.retries._attempt", again)
     solved = solve_with_retries(ASKED, {"frames": []}, True, tmp_path, tmp_path / "log", tools.recorder())
