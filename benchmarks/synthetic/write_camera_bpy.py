@@ -1,3 +1,4 @@
+# pyright: reportMissingModuleSource=false
 """Writes an animated camera as Alembic or USD with Blender's exporters: `python write_camera_bpy.py JSON FILE...`.
 
 Runs inside a bpy wheel's Python. JSON is a file with `width`, `height`, `fps`, `K` ([3, 3] px, pixel centres at +0.5)
