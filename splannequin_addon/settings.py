@@ -12,6 +12,7 @@ from .properties import BoolProperty, CollectionProperty, IntProperty, PointerPr
 from .shot import scene_objects, selection
 from .solve.settings import SolveSettings
 from .train.settings import TrainSettings
+from .ui import folds
 
 
 def _chosen(props: SPLANNEQUIN_PG_scene, context: bpy.types.Context) -> None:
@@ -33,7 +34,7 @@ class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
     )
 
 
-class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, bpy.types.PropertyGroup):
+class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, folds.Folds, bpy.types.PropertyGroup):
     """The chosen shot of the scene, and what is the scene's own."""
 
     set_up_scene = BoolProperty(

@@ -1,7 +1,8 @@
 """How a shot.blend that was made without a window looks when it is opened in one.
 
 The 3D viewport looks through the solved camera at the instant's frame, the freeze stands behind it, and a light is
-there for what the artist adds. For scenes that we made: nothing of an artist's own file is changed.
+there for what the artist adds. The solve's points are hidden: they would cover the picture. For scenes that we made:
+nothing of an artist's own file is changed.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ def set_up(scene: bpy.types.Scene, shot: Path, name: str) -> None:
     if isinstance(instant, int):
         scene.frame_set(min(max(instant, scene.frame_start), scene.frame_end))
     _light(scene, shot)
+    points = cameras.find(scene, shot, "MESH")
+    if points is not None:
+        points.hide_set(True)
     for screen in bpy.data.screens:
         for area in screen.areas:
             space: Any = area.spaces.active

@@ -58,7 +58,7 @@ class Import(Step):
         timecode = state.timecode_at(scene.frame_current)
         if timecode:
             lines.append(f"Timecode {timecode} at frame {scene.frame_current}.")
-        return View(True, True, lines, "Next: solve the camera.")
+        return View(True, True, lines, "", f"{state.frames} frames")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """The scene is fitted to the clip, which shows behind a camera."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import bpy
 
-from ..access import camera_of, layout_of, present, scene_in, settings_of
+from ..access import camera_of, present, scene_in, settings_of
 from ..process import steps
 from ..shot import markers
 from ..translations import tr
@@ -70,17 +70,17 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
         live.enabled = can_scrub(self._view(context), watch.running() if watch else None)
         self._live(context, live)
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw_body(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The step's body, and the takes to compare."""
-        super().draw(context)
+        super().draw_body(context, layout)
         watch = self._watch(context)
         if watch is None or watch.state is None or not watch.state.listed("take"):
             return
         chosen = watch.state.takes.get(settings_of(scene_in(context)).take_name)
-        body = step_panel.sub_panel(layout_of(self), "mattes", "Mattes") if chosen is not None else None
+        body = step_panel.sub_panel(layout, "mattes", "Mattes") if chosen is not None else None
         if body is not None and chosen is not None:
             self._mattes(context, body, chosen)
-        body = step_panel.sub_panel(layout_of(self), "takes", "Takes")
+        body = step_panel.sub_panel(layout, "takes", "Takes")
         if body is not None:
             listing.draw(body, "take", watch.state, settings_of(scene_in(context)).take_name)
             for damage in watch.state.damaged["take"].values():

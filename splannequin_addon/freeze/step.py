@@ -67,17 +67,12 @@ class Freeze(Step):
             if own_camera.name_of(scene):
                 return View(False, True, [], "Render your camera's move with time standing still.")
             return View(False, True, [], "Render the clip's move with time standing still.")
-        frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
-        instant = f"Time stands still at frame {take['t_star_frame']}"
-        if take["t_star_per_frame"]:
-            instant = "Time stands still as t* was keyed"
-        across, down = take.get("margin", (0, 0))
-        beyond = [f"Overscan: {across} pixels on each side, {down} above and below"] if across or down else []
-        lines = [frames, *beyond, instant, *_own_verdict(state, take)]
-        outdated = takes.outdated(scene, take)
+        outdated, lines = takes.outdated(scene, take), _lines(state, take)
         if outdated:
-            return View(False, True, [*lines, outdated], "Freeze again to bring it up to date.")
-        return View(True, True, lines, "Next: bake it into your compositor.")
+            return View(False, True, [outdated, *lines], "Freeze again to bring it up to date.")
+        verdict = contract.verdict_of(take)
+        brief = verdict.word.capitalize() if verdict is not None else ""
+        return View(True, True, lines, "", brief)
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
         """An instant that the artist did not choose is set to the frozen one; mattes are read again where they are
@@ -119,6 +114,18 @@ class Freeze(Step):
         if session is not None and folder == contract.ShotFolder(shot).runs / session.run and session.shot == shot:
             return "You are scrubbing through this run: stop scrubbing first"
         return ""
+
+
+def _lines(state: ShotState, take: dict[str, Any]) -> list[str]:
+    """What there is of a take: its instant and the first line of its verdict before the rest."""
+    frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
+    instant = f"Time stands still at frame {take['t_star_frame']}"
+    if take["t_star_per_frame"]:
+        instant = "Time stands still as t* was keyed"
+    across, down = take.get("margin", (0, 0))
+    beyond = [f"Overscan: {across} pixels on each side, {down} above and below"] if across or down else []
+    verdict = _own_verdict(state, take)
+    return [instant, *verdict[:1], frames, *beyond, *verdict[1:]]
 
 
 def _own_verdict(state: ShotState, take: dict[str, Any]) -> list[str]:

@@ -82,6 +82,8 @@ class Watch:
     """Jobs that ended well while another shot of the scene was chosen, by the step's name: they wait for this one."""
     unread: tuple[str, str] | None = None
     """(sentence, hint) of why the folder could not be read, which is tried again."""
+    just_ended: str = ""
+    """The step that ended last in this session, until another begins."""
     redraw: bool = False
     """Something changed outside the timer: draw at its next turn."""
 
@@ -91,8 +93,15 @@ class Watch:
             return self.work.step
         return next((step for step, job in self.jobs.items() if not job.ended), None)
 
+    def failed(self) -> str | None:
+        """Name of the step that was begun last, if it failed."""
+        last = self.just_ended or max(self.jobs, key=lambda step: self.jobs[step].folder.name, default="")
+        job = self.jobs.get(last)
+        return last if last in self.failures or (job is not None and job.state == "failed") else None
+
     def fail(self, step: str, error: BaseException) -> None:
         """Notes why a step failed."""
+        self.just_ended = step
         self.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
 
 
@@ -143,6 +152,7 @@ def follow(step: str, job: jobs.Job) -> None:
     """Watches a job that was just started."""
     watch = watch_of(job.shot)
     watch.jobs[step] = job
+    watch.just_ended = ""
     watch.notes.clear()  # what earlier steps said has been read
     watch.failures.pop(step, None)
     steps.STEPS[step].began(job)
@@ -154,6 +164,7 @@ def work(shot: Path, step: str, turns: Iterator[Progress | None]) -> None:
     Nothing of bpy may be kept between two turns.
     """
     watch = watch_of(shot)
+    watch.just_ended = ""
     watch.notes.pop(step, None)
     watch.failures.pop(step, None)
     watch.work = Work(step, turns)
@@ -182,6 +193,7 @@ def _work_on(watch: Watch, doing: Work) -> None:
         watch.fail(doing.step, error)
     if watch.work is doing:  # its last turn may have begun something else
         watch.work = None
+        watch.just_ended = doing.step
 
 
 def meanwhile(turn: Callable[[], bool]) -> None:
@@ -343,6 +355,7 @@ def _turn(watch: Watch, until: float) -> bool:
 def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
     """A job has ended just now: its scenes are changed, at once, in turns, or when its shot is chosen."""
     steps.STEPS[step].ended(job)
+    watch.just_ended = step
     refresh(watch)
     scenes = selection.scenes_of(watch.shot)
     if job.state != "done" or job.applied:

@@ -29,9 +29,13 @@ class View:
     ready: bool
     """What it needs is there."""
     state: list[str] = field(default_factory=list[str])
-    """What there is, a few short lines."""
+    """What there is, in short lines, the most important first: the panel shows two, and the others in a fold."""
     advice: str = ""
     """One sentence: what comes next."""
+    brief: str = ""
+    """The result in one or two words, for the header of a step that is folded."""
+    is_unfinished: bool = False
+    """It has been done, but the scene lacks its result."""
 
 
 class Part(Protocol):

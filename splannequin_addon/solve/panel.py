@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...torch_backend import contract
-from ..access import layout_of, scene_in, settings_of
+from ..access import scene_in, settings_of
 from ..process import steps
 from ..shot import inventory, selection
 from ..ui import icons, step_panel
@@ -27,27 +27,26 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
     operator = "splannequin.solve_camera"
     folds = "camera"
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw_body(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The step's body, and where the solve stands in the scene."""
-        super().draw(context)
+        super().draw_body(context, layout)
         watch = self._watch(context)
-        body = step_panel.sub_panel(layout_of(self), "camera_masks", "Masks")
+        body = step_panel.sub_panel(layout, "camera_masks", "Masks")
         if body is not None:
             self._masks(context, body)
-        body = step_panel.sub_panel(layout_of(self), "camera_motion", "Motion Matte")
+        body = step_panel.sub_panel(layout, "camera_motion", "Motion Matte")
         if body is not None:
             shown = watch is not None and motion_overlay.find(scene_in(context), watch.shot) is not None
             matte_operators.draw(body, shown)
         if watch is None or cameras.find(scene_in(context), watch.shot, "EMPTY") is None:
             return
         if not scale.scaled(scene_in(context), watch.shot):
-            layout = layout_of(self)
             if scale.guessed_scale(scene_in(context), watch.shot):
                 wrap(layout, context, "The scale is a guess from the camera's height.", "INFO")
             else:
                 wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")
             layout.operator("splannequin.align_scale", icon=icons.of("splannequin.align_scale")).selected = False
-        body = step_panel.sub_panel(layout_of(self), "camera_alignment", "Alignment")
+        body = step_panel.sub_panel(layout, "camera_alignment", "Alignment")
         if body is not None:
             align_operators.draw(body)
 

@@ -66,11 +66,13 @@ class Solve(Step):
             return View(False, True, [], "Find where the camera was on every frame.")
         result = state.solve.get("result", state.solve)
         lines = [line for line in (result.get("quality"), guesses.told(result)) if line]
+        word = str(result.get("quality") or "").partition(":")[0]
+        brief = word if word.lower() in contract.VERDICT_WORDS else ""
         if state.lacks_motion:
             lines.append("What moves is not found yet: the training finds it first.")
         if cameras.find(scene, state.folder, "CAMERA") is None:
-            return View(True, True, lines, "The solve is not in this scene: load it.")
-        return View(True, True, lines, "Look through the camera, then train.")
+            return View(True, True, lines, "The solve is not in this scene: load it.", brief, is_unfinished=True)
+        return View(True, True, lines, "", brief)
 
     def is_usable(self, job: jobs.Job) -> bool:
         """The cameras are there while the search for motion goes on."""

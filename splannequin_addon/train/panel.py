@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ...torch_backend import contract
-from ..access import layout_of, scene_in, settings_of
+from ..access import scene_in, settings_of
 from ..process import all_steps, steps
 from ..scene import paths
 from ..shot.shot_state import ShotState
@@ -80,13 +80,13 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
     def _paused(self, context: bpy.types.Context) -> bool:
         return self._plan(context).kind in ("resume", "extension")
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw_body(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The step's body, and the training in pictures."""
-        super().draw(context)
+        super().draw_body(context, layout)
         watch = self._watch(context)
         if watch is None or watch.state is None:
             return
-        self._runs(context, watch.state)
+        self._runs(context, layout, watch.state)
         name, job = settings_of(scene_in(context)).run_name, watch.jobs.get("train")
         run = watch.state.runs.get(name) or watch.state.unfinished.get(name) or {}
         going = job is not None and watch.running() == "train"
@@ -96,7 +96,8 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
             picture, points = run.get("preview"), run.get("history", [])
         else:
             return
-        body = step_panel.sub_panel(layout_of(self), "train_pictures", "Progress", folded=False)
+        shown = "train_pictures" if going else "train_pictures_kept"  # each is folded or not by itself
+        body = step_panel.sub_panel(layout, shown, "Progress", folded=not going)
         if body is None:
             return
         icon = pictures.icon_of(picture) if picture else 0
@@ -114,11 +115,11 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
                 "NONE",
             )
 
-    def _runs(self, context: bpy.types.Context, state: ShotState) -> None:
+    def _runs(self, context: bpy.types.Context, layout: bpy.types.UILayout, state: ShotState) -> None:
         """All runs of the shot, to compare and pick."""
         if not state.listed("run"):
             return
-        body = step_panel.sub_panel(layout_of(self), "runs", "Runs")
+        body = step_panel.sub_panel(layout, "runs", "Runs")
         if body is not None:
             listing.draw(body, "run", state, settings_of(scene_in(context)).run_name)
             for damage in state.damaged["run"].values():

@@ -48,10 +48,10 @@ class Train(Step):
         psnr, moving = run.get("heldout_psnr_db"), run.get("moving_share") or 0.0
         quality = f"{psnr:.1f} dB on frames kept out" if psnr is not None else "no frames kept out"
         size = f"{run['gaussians']:,} Gaussians, {100 * moving:.1f} % may move"
-        verdict = contract.verdict_lines(run)
-        depth = [line] if (line := contract.depth_line(run)) else []
-        lines = [f"Run {settings_of(scene).run_name}: {quality}", size, *depth, *verdict]
-        return View(True, True, lines, "Next: freeze an instant.")
+        verdict, depth = contract.verdict_of(run), contract.depth_line(run)
+        lines = [*(verdict.lines() if verdict is not None else ()), f"Run {settings_of(scene).run_name}: {quality}"]
+        lines += [size, depth] if depth else [size]
+        return View(True, True, lines, "", verdict.word.capitalize() if verdict else "")
 
     def began(self, job: jobs.Job) -> None:
         """A run that is trained anew writes other pictures under the same names."""

@@ -14,6 +14,9 @@ from ..scene import paths
 from ..shot import places, selection
 from ..translations import tr
 
+PANEL = "SPLANNEQUIN_PT_shots"
+"""Identifier of the panel that holds the steps'."""
+
 
 class SPLANNEQUIN_UL_shots(bpy.types.UIList):
     """Shots of the scene"""
@@ -134,23 +137,29 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
 
 
 class SPLANNEQUIN_PT_shots(bpy.types.Panel):
-    """Which shot of the scene the five steps below are about"""
+    """The chosen shot of the scene, with the five steps in it"""
 
-    bl_label = "Shots"
-    bl_idname = "SPLANNEQUIN_PT_shots"
+    bl_label = ""
+    bl_idname = PANEL
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "Splannequin"
-    bl_options = {"HIDE_HEADER"}
+
+    def draw_header(self, context: bpy.types.Context) -> None:
+        """Name of the chosen shot."""
+        chosen = settings_of(scene_in(context)).loaded_shot
+        layout_of(self).label(text=selection.labels(scene_in(context))[chosen], icon="FILE_MOVIE", translate=False)
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        """A button that begins another one."""
+        layout_of(self).operator("splannequin.shot_add", text="", icon="ADD", emboss=False)
 
     def draw(self, context: bpy.types.Context) -> None:
-        """A list once there are several; before, a button."""
+        """A list once there are several."""
         props = settings_of(scene_in(context))
-        row = layout_of(self).row()
         if len(props.shots) < 2:
-            row.label(text=selection.labels(scene_in(context))[0], icon="FILE_MOVIE", translate=False)
-            row.operator("splannequin.shot_add", icon="ADD")
             return
+        row = layout_of(self).row()
         row.template_list(
             "SPLANNEQUIN_UL_shots", "", props, "shots", props, "active_shot", rows=min(len(props.shots), 5)
         )

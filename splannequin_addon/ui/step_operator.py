@@ -41,7 +41,7 @@ class StepOperator(OperatorBase):
             folder = selection.shot_folder(scene_in(context))
             sentence = getattr(error, "message", str(error))
             if folder is not None:
-                job_timer.watch_of(folder).failures[self.step] = (sentence, getattr(error, "hint", ""))
+                job_timer.watch_of(folder).fail(self.step, error)
             self.report({"ERROR"}, tr(f"{sentence} {getattr(error, 'hint', '')}".strip()))
         return {"CANCELLED"}
 

@@ -1,28 +1,36 @@
 """The sidebar tab "Splannequin" in the 3D view: five steps in order, each with its state and what comes next.
 
+Each panel stands in that of the shots, without a header of Blender's: it holds a layout panel, which `folds` opens and
+closes.
+
 Drawing only reads what the job timer keeps; it touches the disk when a shot is met for the first time.
 """
 
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import Any, cast
 
 import bpy
 
 from ...torch_backend import contract
-from ..access import PanelBase, layout_of, scene_in
+from ..access import Icon, PanelBase, layout_of, scene_in, settings_of
 from ..process import job_timer, jobs, steps
 from ..shot import selection
 from ..translations import tr
-from . import icons
+from . import folds, icons, shots_panel
 from .sentences import wrap
 
 CATEGORY = "Splannequin"
+_LINES = 2
+"""Lines of a step's state that are always shown; the others are in a fold, so that the tab fits a 1080p screen."""
 
 
 class StepPanel(PanelBase):
     """What the five panels share. State, settings, one button, progress with Cancel, what comes next."""
+
+    bl_parent_id = shots_panel.PANEL
+    bl_options = {"HIDE_HEADER"}
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -47,17 +55,23 @@ class StepPanel(PanelBase):
             )
         return steps.STEPS[self.step].view(scene_in(context), watch.state if watch else None)
 
-    def _next_done(self, context: bpy.types.Context) -> bool:
-        """True if the step after this one is done: what comes next need not be said any more."""
-        names = list(steps.STEPS)
-        after = names[names.index(self.step) + 1 :]
-        watch = self._watch(context)
-        return bool(after) and steps.STEPS[after[0]].view(scene_in(context), watch.state if watch else None).done
+    def draw(self, context: bpy.types.Context) -> None:
+        """The step's header, and its body while it is open."""
+        parts = layout_of(self).panel_prop(settings_of(scene_in(context)), f"is_{self.step}_open")
+        header, body = cast("tuple[bpy.types.UILayout, bpy.types.UILayout | None]", parts)  # None while it is folded
+        view = self._view(context)
+        header.label(text=self.bl_label, icon=self._icon(context, view))
+        if body is not None:
+            self.draw_body(context, body)
+        elif view.brief:
+            brief = header.row()
+            brief.alignment = "RIGHT"
+            brief.active = False
+            brief.label(text=tr(view.brief), translate=False)
 
-    def draw_header(self, context: bpy.types.Context) -> None:
+    def _icon(self, context: bpy.types.Context, view: steps.View) -> Icon:
         """An icon for the state: a tick, at work, failed, next, or not yet."""
         watch = self._watch(context)
-        view = self._view(context)
         job = watch.jobs.get(self.step) if watch else None
         if watch and watch.running() == self.step:
             icon = "SORTTIME"
@@ -67,26 +81,29 @@ class StepPanel(PanelBase):
             icon = "CHECKMARK"
         else:
             icon = "RADIOBUT_ON" if view.ready else "RADIOBUT_OFF"
-        layout_of(self).label(text="", icon=icon)
+        return icon
 
-    def draw(self, context: bpy.types.Context) -> None:
-        """The step's body."""
-        layout = layout_of(self)
+    def draw_body(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
+        """What the step shows while it is open."""
         watch, view = self._watch(context), self._view(context)
         self.draw_trouble(context, layout)
-        for line in view.state:
+        for line in view.state[:_LINES]:
             wrap(layout, context, line)
+        details = sub_panel(layout, f"{self.folds}_details", "Details") if view.state[_LINES:] else None
+        if details is not None:
+            for line in view.state[_LINES:]:
+                wrap(details, context, line)
         running = watch.running() if watch else None
         settings = layout.column()
         settings.enabled = view.ready and running is None
         self.draw_settings(context, settings)
         self.draw_always(context, layout)
         if watch and running == self.step:
-            self._progress(context, watch)
+            self._progress(context, layout, watch)
         else:
             self._button(context, layout, view, running)
             self._outcome(context, layout, watch, view.state)
-            if running is None and view.advice and not (view.done and self._next_done(context)):
+            if running is None and view.advice and folds.at_hand(scene_in(context)) == self.step:
                 wrap(layout, context, view.advice, "INFO")
         body = sub_panel(layout, f"{self.folds}_more", "Advanced")
         if body is not None:
@@ -118,8 +135,7 @@ class StepPanel(PanelBase):
         step = steps.STEPS[self.step]
         return step.again if view.done else step.button
 
-    def _progress(self, context: bpy.types.Context, watch: job_timer.Watch) -> None:
-        layout = layout_of(self)
+    def _progress(self, context: bpy.types.Context, layout: bpy.types.UILayout, watch: job_timer.Watch) -> None:
         work = watch.work
         if work is not None:
             row = layout.split(factor=0.7, align=True) if work.turns is not None else layout

@@ -47,6 +47,8 @@ def test_it_opens_through_the_camera_on_the_freeze_at_its_instant_with_a_light(b
     assert len(scene.camera.data.background_images) == 2, "the plate can be switched on"
     (light,) = [item for item in scene.objects if item.type == "LIGHT"]
     assert light.data.energy > 0 and not light.hide_render
+    (points,) = [item for item in scene.objects if item.type == "MESH"]
+    assert points.hide_get(), "they would cover the picture; the eye in the outliner shows them"
 
 
 def test_a_take_of_another_camera_is_not_shown_through_the_clips(bake):

@@ -207,7 +207,7 @@ def test_a_finished_shot_shows_its_figures(addon, with_shot, shot):
     assert shown["import"].state == ["3 frames, 5 to 7", "16 x 12, 12.5 fps"]
     assert shown["solve"].state == ["A good solve."] and "load it" in shown["solve"].advice
     assert shown["train"].state == ["Run main: 24.0 dB on frames kept out", "12,345 Gaussians, 5.0 % may move"]
-    assert shown["freeze"].state == ["Take freeze: 3 frames, 16 x 12", "Time stands still at frame 6"]
+    assert shown["freeze"].state == ["Time stands still at frame 6", "Take freeze: 3 frames, 16 x 12"]
     assert not shown["bake"].done and shown["bake"].ready
 
 

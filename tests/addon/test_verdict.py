@@ -24,12 +24,12 @@ def test_a_verdict_stands_once_a_runs_under_train_and_a_takes_under_freeze(addon
     add(shot / "runs" / "main" / "summary.json", verdict=RUN)
     add(shot / "takes" / "freeze" / "take.json", verdict=TAKE, detail={"plate_share": 0.98})
     state = shots.read(shot)
-    assert addon("process.steps").STEPS["train"].view(with_shot, state).state[2:] == [
+    assert addon("process.steps").STEPS["train"].view(with_shot, state).state[:2] == [
         "Fair. It does not hold in frames 10 to 31, lower left.",
         "Choose t* in frames 34 to 73, or train on that range alone.",
     ]
     assert (
-        addon("process.steps").STEPS["freeze"].view(with_shot, state).state[-1]
+        addon("process.steps").STEPS["freeze"].view(with_shot, state).state[1]
         == "Good. 98 % of the picture is plate, 2 % is a guess."
     )
     addon("bake.insertion").insert_freeze(with_shot, shot, "freeze")

@@ -30,6 +30,8 @@ STEPS = (
 )
 WINDOW = tuple(int(n) for n in os.environ.get("SPLANNEQUIN_WINDOW", "1600x1000").split("x"))
 """Pixels; another size is measured with SPLANNEQUIN_WINDOW=960x600, say."""
+PICTURE = os.environ.get("SPLANNEQUIN_PICTURE", "1280x")
+"""Size of the pictures of the window, as ImageMagick takes it."""
 PLAN = "SPLANNEQUIN_PRESS_PLAN"
 """Environment variable: JSON of what the script inside Blender shall do."""
 
@@ -145,9 +147,8 @@ def _photograph(work: Path, output: Path, environ: dict[str, str]) -> None:
     for request in sorted(work.glob("*.shoot")):
         picture = output / f"window-{request.stem}.jpg"
         dump = subprocess.run(["xwd", "-root", "-silent"], env=environ, capture_output=True, check=True).stdout
-        subprocess.run(
-            ["convert", "xwd:-", "-strip", "-resize", "1280x", "-quality", "85", str(picture)], input=dump, check=True
-        )
+        convert = ["convert", "xwd:-", "-strip", "-resize", PICTURE, "-quality", "85", str(picture)]
+        subprocess.run(convert, input=dump, check=True)
         request.unlink()
 
 
@@ -291,7 +292,7 @@ def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
 
     window = bpy.context.window_manager.windows[0]
     wanted = f"bpy.ops.{operator}("
-    for _ in range(12):
+    for look in range(12):
         area, region = _place(window, kind)
         shares = (0.8,) if operator.endswith(".cancel") else (0.33, 0.745, 0.85)  # small ones stand at the right
         rows = range(region.y + region.height - 8, region.y + 4, -9)
@@ -307,7 +308,10 @@ def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
                 _move(window, region.x - 200, y)
                 yield 0.3
             return
-        yield from _scroll_down(kind)
+        if look == 0 and kind == "VIEW_3D":
+            yield from _unfold()
+        else:
+            yield from _scroll_down(kind)
     raise RuntimeError(f"no button of {operator} was found in {kind}")
 
 
@@ -317,6 +321,15 @@ def _place(window, kind: str):
         return _view(window), _sidebar(_view(window))
     area = next(a for a in window.screen.areas if a.type == kind)
     return area, next(r for r in area.regions if r.type == "WINDOW")
+
+
+def _unfold() -> Iterator[float]:
+    """Opens every step of the panel: only the one at hand is open by itself."""
+    import bpy
+
+    for name, _ in STEPS:
+        setattr(bpy.context.scene.splannequin, f"is_{name[2:]}_open", True)
+    yield 0.5
 
 
 def _scroll_down(kind: str = "VIEW_3D") -> Iterator[float]:
@@ -360,18 +373,12 @@ def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
         far = status is not None and status.fraction > share and status.stage.startswith(stage)
         drawn = watch.work is not None and watch.work.progress is not None and watch.work.progress.done > 0
         if not taken and (drawn if name == "5-bake" else far):
-            if name == "3-train" and not cancel:
-                yield from _scroll_down()  # its preview and curve stand below the window's edge
-                yield from _scroll_down()
             yield from _shoot(work, f"{name}-running", settle=2)
             taken = True
             if cancel:
                 yield from _click("splannequin.cancel")
         yield 0.2
     yield 1.5
-    if name == "5-bake":
-        yield from _scroll_down()
-        yield from _scroll_down()  # what the bake changed is a list that is longer than the first turn of the wheel
     yield from _shoot(work, f"{name}-{'cancelled' if cancel else 'done'}")
     if cancel:
         return

@@ -1,0 +1,75 @@
+"""Which steps of the panel are open: the step at hand, and those that the artist opened.
+
+Blender stores whether a registered panel is open, and lets no script change it. A layout panel can take that from a
+property instead. The properties here store nothing: each is computed from the shot whenever the panel is drawn. A step
+that the artist opens or closes stays so until it would be so without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..access import scene_holding
+from ..process import job_timer, steps
+from ..properties import BoolProperty
+from ..shot import selection
+
+_chosen: dict[tuple[int, Path | None, str], bool] = {}
+"""(`session_uid` of the scene, shot folder, step) -> whether the artist left it open."""
+
+
+def at_hand(scene: bpy.types.Scene) -> str:
+    """Name of the step to work on: the one that runs or was the last to fail, else the first with work left."""
+    folder = selection.shot_folder(scene)
+    watch = job_timer.watch_of(folder) if folder is not None else None
+    names = list(steps.STEPS)
+    if watch is None or selection.missing(scene, watch.state) or job_timer.backend_trouble() is not None:
+        return names[0]
+    running, failed = watch.running(), watch.failed()
+    if running or failed:
+        return running or failed or ""
+    views = ((name, steps.STEPS[name].view(scene, watch.state)) for name in names)
+    return next((name for name, view in views if not view.done or view.is_unfinished), names[-1])
+
+
+def is_open(scene: bpy.types.Scene, step: str) -> bool:
+    """True if the panel shows a step's body: it is at hand, has just ended, or the artist opened it."""
+    folder = selection.shot_folder(scene)
+    watch = job_timer.watch_of(folder) if folder is not None else None
+    by_itself = step == at_hand(scene) or (watch is not None and watch.just_ended == step)
+    key = (scene.session_uid, folder, step)
+    if _chosen.get(key) == by_itself:
+        del _chosen[key]
+    return _chosen.get(key, by_itself)
+
+
+def _reader(step: str) -> Callable[[Any], bool]:
+    return lambda settings: is_open(scene_holding(settings), step)
+
+
+def _writer(step: str) -> Callable[[Any, bool], None]:
+    def write(settings: Any, value: bool) -> None:
+        scene = scene_holding(settings)
+        _chosen[scene.session_uid, selection.shot_folder(scene), step] = value
+
+    return write
+
+
+def _property(step: str) -> bool:
+    return BoolProperty(
+        name="Open", description="The panel shows this step", options={"HIDDEN"}, get=_reader(step), set=_writer(step)
+    )
+
+
+class Folds:
+    """Whether each step is open, as properties `is_STEP_open` of a scene's settings."""
+
+    is_import_open = _property("import")
+    is_solve_open = _property("solve")
+    is_train_open = _property("train")
+    is_freeze_open = _property("freeze")
+    is_bake_open = _property("bake")
