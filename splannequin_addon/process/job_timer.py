@@ -112,8 +112,6 @@ _pulses: list[Callable[[], float | None]] = []
 """What is called more often than jobs are examined."""
 _jobs_next = 0.0
 """When jobs are examined again while something pulses, monotonic seconds."""
-_layout = (False, False)
-"""Whether the empty panel of `lay_out` stands, and whether it is to be turned about."""
 _backend: tuple[contract.JobError | None, float] = (None, 0.0)
 """Why there is no backend, and when that was looked up, monotonic seconds."""
 
@@ -373,22 +371,8 @@ def _told(job: jobs.Job) -> tuple[Any, ...]:
     return (shown, len(job.warnings), len(job.history), *job.images.values())
 
 
-def lay_out() -> bool:
-    """Whether an empty panel stands in the sidebar: turned about once after each `redraw`.
-
-    Blender moves panels that grew to their places step by step, by events that a sidebar gets while the mouse is over
-    it: until then they lie on top of each other. When a panel comes or goes it puts all in their places at once.
-    """
-    global _layout
-    stands, stale = _layout
-    _layout = (stands != stale, False)
-    return _layout[0]
-
-
 def redraw() -> None:
     """Draws the sidebar of every 3D view again; the view itself, which may be a heavy scene, is left alone."""
-    global _layout
-    _layout = (_layout[0], True)
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions if area.type == "VIEW_3D" else ():

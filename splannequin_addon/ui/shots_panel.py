@@ -168,31 +168,10 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
         column.operator("splannequin.shot_remove", text="", icon="REMOVE")
 
 
-class SPLANNEQUIN_PT_layout(bpy.types.Panel):
-    """An empty panel that comes and goes, so that Blender puts the others in their places"""
-
-    bl_label = "Splannequin"
-    bl_idname = "SPLANNEQUIN_PT_layout"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "Splannequin"
-    bl_options = {"HIDE_HEADER"}
-    bl_order = 99
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Now and then."""
-        return job_timer.lay_out()
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Nothing."""
-
-
 CLASSES = (
     SPLANNEQUIN_UL_shots,
     SPLANNEQUIN_OT_shot_add,
     SPLANNEQUIN_OT_shot_remove,
     SPLANNEQUIN_OT_locate_shot,
     SPLANNEQUIN_PT_shots,
-    SPLANNEQUIN_PT_layout,
 )

@@ -1,0 +1,86 @@
+"""All data of the open file as a flat list, to be compared before and after an operator, undo and redo."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+_SPARED = {"all_ids", "window_managers", "workspaces", "screens", "libraries", "brushes", "palettes"}
+"""Collections that are no part of an undo step, or that Blender fills itself when an editor is opened."""
+_UNREAD = {
+    "bl_rna", "rna_type", "id_data", "session_uid", "original", "users", "tag", "pixels", "bindcode", "size",
+    "channels", "depth", "resolution", "frame_duration", "animation_data", "fcurves", "file_format", "particle_edit",
+}  # fmt: skip
+"""Properties that are no data of the file, or that Blender computes once something is drawn."""
+_DEPTH = 5
+_MOST = 40
+"""Items of a collection that are read one by one; of more only their number is compared: vertices, keys, points."""
+
+
+def file_state() -> dict[str, Any]:
+    """Path of every property of every data-block -> its value."""
+    found: dict[str, Any] = {}
+    for name in sorted(dir(bpy.data)):
+        blocks = getattr(bpy.data, name)
+        if isinstance(blocks, bpy.types.bpy_prop_collection) and name not in _SPARED:
+            for block in blocks:
+                path = f"{name}[{block.name}]"
+                _read(block, path, found, _DEPTH)
+                found |= {f"{path}[{key}]": str(value) for key, value in block.items()}
+    for action in bpy.data.actions:
+        found[f"actions[{action.name}] keys"] = _keys(action)
+    return found
+
+
+def difference(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """What two states do not share, in words."""
+    return [f"{k}: {one.get(k)} -> {other.get(k)}" for k in sorted({*one, *other}) if one.get(k) != other.get(k)]
+
+
+def _read(thing: Any, path: str, found: dict[str, Any], depth: int) -> None:
+    """Reads a struct and what it holds, down to other data-blocks, whose names stand for them."""
+    found[path] = type(thing).__name__
+    for rna in thing.bl_rna.properties if depth else ():
+        name = rna.identifier
+        if name in _UNREAD or name.startswith(("is_", "has_")):
+            continue
+        if name == "frame_current" and isinstance(thing, bpy.types.ImageUser):  # what was drawn last
+            continue
+        here, value = f"{path}.{name}", getattr(thing, name, None)
+        if rna.type == "COLLECTION":
+            found[here] = len(value)
+            for n, item in enumerate(value if len(value) <= _MOST else ()):
+                _follow(item, f"{here}[{n}]", found, depth)
+        elif rna.type == "POINTER":
+            _follow(value, here, found, depth)
+        elif getattr(rna, "is_array", False):
+            found[here] = [round(v, 5) if isinstance(v, float) else v for v in _flat(value)]
+        else:
+            found[here] = round(value, 5) if isinstance(value, float) else value
+
+
+def _follow(value: Any, path: str, found: dict[str, Any], depth: int) -> None:
+    is_embedded = isinstance(value, bpy.types.NodeTree | bpy.types.Collection) and value.is_embedded_data
+    if value is None or (isinstance(value, bpy.types.ID) and not is_embedded):
+        found[path] = value and value.name
+    else:
+        _read(value, path, found, depth - 1)
+
+
+def _flat(value: Any) -> list[Any]:
+    return [one for row in value for one in (_flat(row) if hasattr(row, "__len__") else [row])]
+
+
+def _keys(action: Any) -> list[tuple[str, int, list[float]]]:
+    """(data path, index, frames and values) of every F-curve."""
+    curves = getattr(action, "fcurves", None)
+    if curves is None:  # Blender 5 has them in layers
+        strips = [strip for layer in action.layers for strip in layer.strips]
+        curves = [curve for strip in strips for bag in strip.channelbags for curve in bag.fcurves]
+    found = []
+    for curve in curves:
+        values = [0.0] * (2 * len(curve.keyframe_points))
+        curve.keyframe_points.foreach_get("co", values)
+        found.append((curve.data_path, curve.array_index, [round(v, 5) for v in values]))
+    return found
