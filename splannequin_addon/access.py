@@ -23,11 +23,9 @@ if TYPE_CHECKING:
     """The settings of a shot: the chosen one's are the scene's."""
     OperatorBase = bpy.types.Operator
     """What a class is that operators have in common, to the checker. Blender takes it for no operator."""
-    PanelBase = bpy.types.Panel
-    """The same of panels."""
 else:
     Outcome, Icon = set, str
-    OneShot = OperatorBase = PanelBase = object
+    OneShot = OperatorBase = object
 
 T = TypeVar("T")
 

@@ -9,11 +9,10 @@ from ..ui import icons, step_panel
 from . import freeze_group
 
 
-class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
-    """Step 5: bake"""
+class BakePanel(step_panel.StepPanel):
+    """Step 5: bake."""
 
-    bl_label = "5  Bake"
-    bl_idname = "SPLANNEQUIN_PT_bake"
+    title = "5  Bake"
     step = "bake"
     operator = "splannequin.bake"
     folds = "bake"
@@ -42,4 +41,4 @@ class SPLANNEQUIN_PT_bake(step_panel.StepPanel, bpy.types.Panel):
             layout.operator(name, icon=icons.of(name))
 
 
-CLASSES = (SPLANNEQUIN_PT_bake,)
+PANEL = BakePanel()

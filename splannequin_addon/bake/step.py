@@ -28,7 +28,8 @@ class Bake(Step):
     button = "Bake and Render"
     again = "Bake Again"
     needs = "Freeze first."
-    classes = (*operators.CLASSES, *farm.CLASSES, *matte_node.CLASSES, *panel.CLASSES)
+    panel = panel.PANEL
+    classes = (*operators.CLASSES, *farm.CLASSES, *matte_node.CLASSES)
     parts = (progress,)
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:

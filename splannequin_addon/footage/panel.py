@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import bpy
 
-from ...torch_backend import contract
 from ..access import scene_in, settings_of
-from ..process import all_steps, backend, job_timer, steps
+from ..process import backend, job_timer, steps
 from ..shot import selection
-from ..translations import tr
 from ..ui import icons, preferences, step_panel
 from ..ui.sentences import wrap
 
 
-class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
-    """Step 1: footage into a shot folder"""
+class ImportPanel(step_panel.StepPanel):
+    """Step 1: footage into a shot folder."""
 
-    bl_label = "1  Import"
-    bl_idname = "SPLANNEQUIN_PT_footage"
+    title = "1  Import"
     step = "import"
     operator = "splannequin.import_clip"
     folds = "footage"
@@ -49,22 +46,6 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
             name = watch.shot.name
             wrap(column, context, f"The shot folder {name} is not there any more: moved, renamed or deleted.", "ERROR")
             box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
-
-    def draw_always(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """All that is left to do until frames are frozen, as one button, and then as one bar."""
-        watch, ahead = self._watch(context), all_steps.missing(scene_in(context))
-        now = all_steps.progress(watch.shot) if watch is not None else None
-        if now is not None:
-            row = layout.split(factor=0.7, align=True)
-            share, left = now
-            row.progress(factor=share, type="BAR", text=tr(f"All steps {100 * share:.0f} %"))
-            row.operator("splannequin.cancel", text="Cancel", icon=icons.of("splannequin.cancel")).step = ""
-            wrap(layout, context, f"about {contract.duration(left)} left", "INFO")
-        elif len(ahead) > 1 and watch is not None and watch.running() is None:
-            row = layout.row()
-            row.scale_y = 1.4
-            text = "Train and Freeze" if "solve" not in ahead else "Solve, Train and Freeze"
-            row.operator("splannequin.all_steps", text=text, icon=icons.of("splannequin.all_steps"))
 
     def _backend_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """No backend, or one that is being set up."""
@@ -98,4 +79,4 @@ class SPLANNEQUIN_PT_footage(step_panel.StepPanel, bpy.types.Panel):
             layout.prop(props, name)
 
 
-CLASSES = (SPLANNEQUIN_PT_footage,)
+PANEL = ImportPanel()

@@ -28,7 +28,8 @@ class Import(Step):
     button = "Import Clip"
     again = "Import Again"
     makes_shot = True
-    classes = (*operators.CLASSES, *panel.CLASSES)
+    panel = panel.PANEL
+    classes = operators.CLASSES
 
     def params(self, scene: bpy.types.Scene) -> contract.ImportParams:
         """The clip and its range; the shot's own clip where none is chosen. JobError without either."""

@@ -20,11 +20,10 @@ def can_scrub(view: steps.View, running: str | None) -> bool:
     return viewport.session() is not None or (view.ready and running is None)
 
 
-class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
-    """Step 4: the freeze"""
+class FreezePanel(step_panel.StepPanel):
+    """Step 4: the freeze."""
 
-    bl_label = "4  Freeze"
-    bl_idname = "SPLANNEQUIN_PT_freeze"
+    title = "4  Freeze"
     step = "freeze"
     operator = "splannequin.freeze"
     folds = "freeze"
@@ -158,4 +157,4 @@ class SPLANNEQUIN_PT_freeze(step_panel.StepPanel, bpy.types.Panel):
             )
 
 
-CLASSES = (SPLANNEQUIN_PT_freeze,)
+PANEL = FreezePanel()

@@ -43,6 +43,7 @@ class Freeze(Step):
     button = "Freeze"
     again = "Freeze Again"
     needs = "Train first."
+    panel = panel.PANEL
     classes = (
         *operators.CLASSES,
         *matte_operators.CLASSES,
@@ -50,7 +51,6 @@ class Freeze(Step):
         *move_check.CLASSES,
         *surface_operators.CLASSES,
         *light_operators.CLASSES,
-        *panel.CLASSES,
     )
     parts = (viewport, hidden_points)
 

@@ -48,6 +48,13 @@ class Part(Protocol):
         """When it is switched off."""
 
 
+class Panel(Protocol):
+    """What draws a step in the tab."""
+
+    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
+        """Its header, and its body while it is open."""
+
+
 class Step:
     """One of the five; made once by its room."""
 
@@ -67,8 +74,10 @@ class Step:
     """What to do before, in a sentence; empty if nothing."""
     makes_shot: ClassVar[bool] = False
     """It begins with a shot folder that is not there yet."""
+    panel: ClassVar[Panel]
+    """Draws it in the tab."""
     classes: ClassVar[tuple[type, ...]] = ()
-    """Its operators and panels, in the order in which they are registered."""
+    """Its operators, in the order in which they are registered."""
     parts: ClassVar[tuple[Part, ...]] = ()
     """Modules of its room with a `register` and an `unregister` of their own."""
 

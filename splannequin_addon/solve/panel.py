@@ -18,11 +18,10 @@ def can_load_camera(running: str | None) -> bool:
     return running not in ("import", "solve")
 
 
-class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
-    """Step 2: where the camera was"""
+class SolvePanel(step_panel.StepPanel):
+    """Step 2: where the camera was."""
 
-    bl_label = "2  Solve"
-    bl_idname = "SPLANNEQUIN_PT_camera"
+    title = "2  Solve"
     step = "solve"
     operator = "splannequin.solve_camera"
     folds = "camera"
@@ -44,7 +43,7 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
             if scale.guessed_scale(scene_in(context), watch.shot):
                 wrap(layout, context, "The scale is a guess from the camera's height.", "INFO")
             else:
-                wrap(layout, context, "The scale is arbitrary: a clip does not tell it.", "INFO")
+                wrap(layout, context, "The scale is arbitrary. Set it if you need real units.", "INFO")
             layout.operator("splannequin.align_scale", icon=icons.of("splannequin.align_scale")).selected = False
         body = step_panel.sub_panel(layout, "camera_alignment", "Alignment")
         if body is not None:
@@ -105,4 +104,4 @@ class SPLANNEQUIN_PT_camera(step_panel.StepPanel, bpy.types.Panel):
         super()._button(context, layout, view, running)
 
 
-CLASSES = (SPLANNEQUIN_PT_camera,)
+PANEL = SolvePanel()

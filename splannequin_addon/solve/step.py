@@ -41,11 +41,11 @@ class Solve(Step):
     button = "Solve Camera"
     again = "Solve Again"
     needs = "Import the clip first."
+    panel = panel.PANEL
     classes = (
         *operators.CLASSES,
         *align_operators.CLASSES,
         *matte_operators.CLASSES,
-        *panel.CLASSES,
     )
     parts = (points, align_operators, operators, mattes)
 

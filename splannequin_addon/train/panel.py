@@ -18,11 +18,10 @@ from .settings import PRESETS
 _PRESET_WIDTHS = (0.32, 0.17, 0.25, 0.26)
 
 
-class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
-    """Step 3: training"""
+class TrainPanel(step_panel.StepPanel):
+    """Step 3: training."""
 
-    bl_label = "3  Train"
-    bl_idname = "SPLANNEQUIN_PT_train"
+    title = "3  Train"
     step = "train"
     operator = "splannequin.train"
     folds = "train"
@@ -65,7 +64,7 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         else:
             where = "graphics card" if basis.get("device") == "cuda" else "processor"
             words = (
-                f"By what run {basis.get('run', '')} took on the {where}. With a ?: an estimate by pixels and steps."
+                f"Times as run {basis.get('run', '')} took on the {where}. A ? marks an estimate from pixels and steps."
             )
         wrap(layout, context, words)
 
@@ -132,4 +131,4 @@ class SPLANNEQUIN_PT_train(step_panel.StepPanel, bpy.types.Panel):
         layout.prop(props, "depth")
 
 
-CLASSES = (SPLANNEQUIN_PT_train,)
+PANEL = TrainPanel()

@@ -26,7 +26,8 @@ class Train(Step):
     button = "Train"
     again = "Train On"
     needs = "Solve the camera first."
-    classes = (*operators.CLASSES, *panel.CLASSES)
+    panel = panel.PANEL
+    classes = operators.CLASSES
     parts = (pictures,)
 
     def params(self, scene: bpy.types.Scene) -> contract.TrainParams:

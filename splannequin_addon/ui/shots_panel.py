@@ -8,14 +8,13 @@ import bpy
 
 from ...torch_backend import contract
 from ..access import Outcome, layout_of, scene_in, settings_of
-from ..process import begin, job_timer
+from ..process import all_steps, begin, job_timer, steps
 from ..properties import BoolProperty, StringProperty
 from ..scene import paths
 from ..shot import places, selection
 from ..translations import tr
-
-PANEL = "SPLANNEQUIN_PT_shots"
-"""Identifier of the panel that holds the steps'."""
+from . import icons
+from .sentences import wrap
 
 
 class SPLANNEQUIN_UL_shots(bpy.types.UIList):
@@ -140,7 +139,7 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
     """The chosen shot of the scene, with the five steps in it"""
 
     bl_label = ""
-    bl_idname = PANEL
+    bl_idname = "SPLANNEQUIN_PT_shots"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "Splannequin"
@@ -155,11 +154,35 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
         layout_of(self).operator("splannequin.shot_add", text="", icon="ADD", emboss=False)
 
     def draw(self, context: bpy.types.Context) -> None:
-        """A list once there are several."""
-        props = settings_of(scene_in(context))
-        if len(props.shots) < 2:
+        """The list of shots once there are several, what does all steps as one, and each step."""
+        layout = layout_of(self)
+        if len(settings_of(scene_in(context)).shots) > 1:
+            self._list(context, layout)
+        self._all_steps(context, layout)
+        for step in steps.STEPS.values():
+            step.panel.draw(context, layout)
+
+    def _all_steps(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
+        """All that is left to do until frames are frozen, as one button, and then as one bar."""
+        folder, ahead = selection.shot_folder(scene_in(context)), all_steps.missing(scene_in(context))
+        if folder is None:
             return
-        row = layout_of(self).row()
+        now = all_steps.progress(folder)
+        if now is not None:
+            row = layout.split(factor=0.7, align=True)
+            share, left = now
+            row.progress(factor=share, type="BAR", text=tr(f"All steps {100 * share:.0f} %"))
+            row.operator("splannequin.cancel", text="Cancel", icon=icons.of("splannequin.cancel")).step = ""
+            wrap(layout, context, f"about {contract.duration(left)} left", "INFO")
+        elif len(ahead) > 1 and job_timer.watch_of(folder).running() is None:
+            row = layout.row()
+            row.scale_y = 1.4
+            text = "Train and Freeze" if "solve" not in ahead else "Solve, Train and Freeze"
+            row.operator("splannequin.all_steps", text=text, icon=icons.of("splannequin.all_steps"))
+
+    def _list(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
+        props = settings_of(scene_in(context))
+        row = layout.row()
         row.template_list(
             "SPLANNEQUIN_UL_shots", "", props, "shots", props, "active_shot", rows=min(len(props.shots), 5)
         )

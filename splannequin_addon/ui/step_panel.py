@@ -1,7 +1,6 @@
 """The sidebar tab "Splannequin" in the 3D view: five steps in order, each with its state and what comes next.
 
-Each panel stands in that of the shots, without a header of Blender's: it holds a layout panel, which `folds` opens and
-closes.
+All of it is one panel of Blender's, in which each step is a layout panel that `folds` opens and closes.
 
 Drawing only reads what the job timer keeps; it touches the disk when a shot is met for the first time.
 """
@@ -14,27 +13,22 @@ from typing import Any, cast
 import bpy
 
 from ...torch_backend import contract
-from ..access import Icon, PanelBase, layout_of, scene_in, settings_of
+from ..access import Icon, scene_in, settings_of
 from ..process import job_timer, jobs, steps
 from ..shot import selection
 from ..translations import tr
-from . import folds, icons, shots_panel
+from . import folds, icons
 from .sentences import wrap
 
-CATEGORY = "Splannequin"
 _LINES = 2
 """Lines of a step's state that are always shown; the others are in a fold, so that the tab fits a 1080p screen."""
 
 
-class StepPanel(PanelBase):
+class StepPanel:
     """What the five panels share. State, settings, one button, progress with Cancel, what comes next."""
 
-    bl_parent_id = shots_panel.PANEL
-    bl_options = {"HIDE_HEADER"}
-
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = CATEGORY
+    title = ""
+    """On the step's header."""
     step = ""
     operator = ""
     folds = ""
@@ -55,12 +49,12 @@ class StepPanel(PanelBase):
             )
         return steps.STEPS[self.step].view(scene_in(context), watch.state if watch else None)
 
-    def draw(self, context: bpy.types.Context) -> None:
+    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """The step's header, and its body while it is open."""
-        parts = layout_of(self).panel_prop(settings_of(scene_in(context)), f"is_{self.step}_open")
+        parts = layout.panel_prop(settings_of(scene_in(context)), f"is_{self.step}_open")
         header, body = cast("tuple[bpy.types.UILayout, bpy.types.UILayout | None]", parts)  # None while it is folded
         view = self._view(context)
-        header.label(text=self.bl_label, icon=self._icon(context, view))
+        header.label(text=self.title, icon=self._icon(context, view))
         if body is not None:
             self.draw_body(context, body)
         elif view.brief:

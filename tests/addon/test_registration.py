@@ -25,7 +25,7 @@ def handlers() -> int:
 
 def test_unregister_leaves_nothing_and_register_twice_registers_once(package):
     before, hooks = ours(), handlers()
-    assert {"SPLANNEQUIN_OT_import_clip", "SPLANNEQUIN_PT_bake", "SPLANNEQUIN_PG_scene"} <= before and hooks >= 11
+    assert {"SPLANNEQUIN_OT_import_clip", "SPLANNEQUIN_PT_shots", "SPLANNEQUIN_PG_scene"} <= before and hooks >= 11
     try:
         package.unregister()
         assert ours() == set() and handlers() == 0
@@ -146,11 +146,11 @@ def test_of_two_installed_copies_the_second_is_refused(root, tmp_path, first):
 
 def test_the_panels_stand_in_order_in_one_tab(addon):
     steps = addon("process.steps").STEPS.values()
-    panels = [c for step in steps for c in step.classes if hasattr(c, "step") and issubclass(c, bpy.types.Panel)]
-    assert [p.bl_label for p in panels] == ["1  Import", "2  Solve", "3  Train", "4  Freeze", "5  Bake"]
-    assert {(p.bl_category, p.bl_space_type, p.bl_region_type) for p in panels} == {("Splannequin", "VIEW_3D", "UI")}
-    for panel in panels:
-        assert panel.operator.partition(".")[2] in dir(bpy.ops.splannequin)
+    assert [step.panel.title for step in steps] == ["1  Import", "2  Solve", "3  Train", "4  Freeze", "5  Bake"]
+    tab = bpy.types.SPLANNEQUIN_PT_shots
+    assert (tab.bl_category, tab.bl_space_type, tab.bl_region_type) == ("Splannequin", "VIEW_3D", "UI")
+    for step in steps:
+        assert step.panel.operator.partition(".")[2] in dir(bpy.ops.splannequin)
 
 
 def test_handlers_and_timer_survive_another_file(addon):

@@ -189,9 +189,8 @@ def test_every_step_is_whole_and_of_the_one_vocabulary(addon, contract):
     for name, step in steps.items():
         assert step.label == name.capitalize() and step.kind in contract.PARAMS and step.button and step.again
         assert bool(step.needs) != step.makes_shot, "one begins, the others say what comes before"
-        (panel,) = [c for c in step.classes if issubclass(c, bpy.types.Panel) and hasattr(c, "step")]
-        (button,) = [c for c in step.classes if getattr(c, "bl_idname", "") == panel.operator]
-        assert panel.step == button.step == name and panel.bl_label.endswith(step.label)
+        (button,) = [c for c in step.classes if getattr(c, "bl_idname", "") == step.panel.operator]
+        assert step.panel.step == button.step == name and step.panel.title.endswith(step.label)
 
 
 @pytest.mark.parametrize("step", ["import", "solve", "train", "freeze", "bake"])

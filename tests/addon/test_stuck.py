@@ -215,14 +215,3 @@ def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp
     assert (found is not None and refused in found.message) or backend.python() != str(python), "the next one is taken"
     (notes / "installing").unlink()
     assert backend.python() == str(python)
-
-
-def test_the_sidebar_is_laid_out_once_after_each_change(addon):
-    supervisor = addon("process.job_timer")
-    supervisor.redraw()
-    supervisor.redraw()
-    first = supervisor.lay_out()
-    assert supervisor.lay_out() == first, "drawn again without a change, panels stay"
-    supervisor.redraw()
-    assert supervisor.lay_out() is not first
-    assert bpy.types.SPLANNEQUIN_PT_layout.bl_category == bpy.types.SPLANNEQUIN_PT_footage.bl_category
