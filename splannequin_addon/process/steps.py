@@ -51,8 +51,8 @@ class Part(Protocol):
 class Panel(Protocol):
     """What draws a step in the tab."""
 
-    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Its header, and its body while it is open."""
+    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_at_hand: bool) -> None:
+        """Its header, and its body while it is open; `is_at_hand` if it is the step to work on."""
 
 
 class Step:

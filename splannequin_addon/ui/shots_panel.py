@@ -13,7 +13,7 @@ from ..properties import BoolProperty, StringProperty
 from ..scene import paths
 from ..shot import places, selection
 from ..translations import tr
-from . import icons
+from . import folds, icons
 from .sentences import wrap
 
 
@@ -159,8 +159,9 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
         if len(settings_of(scene_in(context)).shots) > 1:
             self._list(context, layout)
         self._all_steps(context, layout)
-        for step in steps.STEPS.values():
-            step.panel.draw(context, layout)
+        at_hand = folds.at_hand(scene_in(context))
+        for name, step in steps.STEPS.items():
+            step.panel.draw(context, layout, name == at_hand)
 
     def _all_steps(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
         """All that is left to do until frames are frozen, as one button, and then as one bar."""

@@ -17,7 +17,7 @@ from ..access import Icon, scene_in, settings_of
 from ..process import job_timer, jobs, steps
 from ..shot import selection
 from ..translations import tr
-from . import folds, icons
+from . import icons
 from .sentences import wrap
 
 _LINES = 2
@@ -29,6 +29,8 @@ class StepPanel:
 
     title = ""
     """On the step's header."""
+    is_at_hand = False
+    """It is the step to work on, while it is drawn."""
     step = ""
     operator = ""
     folds = ""
@@ -49,8 +51,9 @@ class StepPanel:
             )
         return steps.STEPS[self.step].view(scene_in(context), watch.state if watch else None)
 
-    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The step's header, and its body while it is open."""
+    def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_at_hand: bool) -> None:
+        """The step's header, and its body while it is open; what comes next only of the step that is at hand."""
+        self.is_at_hand = is_at_hand
         parts = layout.panel_prop(settings_of(scene_in(context)), f"is_{self.step}_open")
         header, body = cast("tuple[bpy.types.UILayout, bpy.types.UILayout | None]", parts)  # None while it is folded
         view = self._view(context)
@@ -97,7 +100,7 @@ class StepPanel:
         else:
             self._button(context, layout, view, running)
             self._outcome(context, layout, watch, view.state)
-            if running is None and view.advice and folds.at_hand(scene_in(context)) == self.step:
+            if running is None and view.advice and self.is_at_hand:
                 wrap(layout, context, view.advice, "INFO")
         body = sub_panel(layout, f"{self.folds}_more", "Advanced")
         if body is not None:
