@@ -57,8 +57,8 @@ def main() -> int:
 class Record:
     """Seconds of each stage, and the sentences that the panel shows in it."""
 
-    def __init__(self, told: dict[str, Any]) -> None:
-        self.told = told
+    def __init__(self, told: dict[str, Any], work: Path) -> None:
+        self.told, self.work = told, work
         self.told.update(seconds={}, sentences={}, ended=[], searches=0, longest_tick_ms=0.0)
         self.stage, self.began, self.seen = "", time.monotonic(), set[str]()
 
@@ -68,6 +68,7 @@ class Record:
         if self.stage:
             self.told["seconds"][self.stage] = round(now - self.began, 1)
         self.stage, self.began, self.seen = stage, now, set()
+        (self.work / "told.json").write_text(json.dumps(self.told))  # what there is by now, should Blender be ended
 
     def hear(self, text: str) -> None:
         """Notes a sentence once in each stage; sentences that differ in their figures are one."""
@@ -114,7 +115,8 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     """The artist: yields seconds to wait between what it does."""
     import bpy
 
-    work, record = Path(plan["work"]), Record(told)
+    work = Path(plan["work"])
+    record = Record(told, work)
     clip = Path(shutil.copy(plan["clip"], work / "sitting.mp4"))
     record.enter("install")
     bpy.ops.extensions.package_install_files(filepath=plan["zip"], repo="user_default", enable_on_install=True)
