@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import bpy
 
@@ -47,12 +46,12 @@ def is_open(scene: bpy.types.Scene, step: str) -> bool:
     return _chosen.get(key, by_itself)
 
 
-def _reader(step: str) -> Callable[[Any], bool]:
+def _reader(step: str) -> Callable[[bpy.types.bpy_struct], bool]:
     return lambda settings: is_open(scene_holding(settings), step)
 
 
-def _writer(step: str) -> Callable[[Any, bool], None]:
-    def write(settings: Any, value: bool) -> None:
+def _writer(step: str) -> Callable[[bpy.types.bpy_struct, bool], None]:
+    def write(settings: bpy.types.bpy_struct, value: bool) -> None:
         scene = scene_holding(settings)
         _chosen[scene.session_uid, selection.shot_folder(scene), step] = value
 

@@ -5,7 +5,7 @@ import ast
 import bpy
 
 CHANGES_NO_SCENE = {
-    "import_clip", "solve_camera", "train", "freeze", "bake", "all_steps",  # start a job; its end is an undo step of its own
+    "import_clip", "solve_camera", "train", "freeze", "bake", "all_steps",  # start jobs, whose ends are undo steps
     "add_splats", "add_surface", "add_light",  # the same: the timer reads the file
     "render", "cancel", "live", "open_log", "set_up", "cancel_setup", "check_backend", "remove_backend",
     "write_stmaps", "export_cameras", "export_for_farm", "remove_run", "remove_take", "clear_motion",  # files on disk
