@@ -21,6 +21,9 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+# With Mesa's cache of shaders Blender 5.2 was ended by SIGBUS, in a thread that compiles them.
+os.environ.setdefault("MESA_SHADER_CACHE_DISABLE", "true")
+
 STEPS = (
     ("1-import", "splannequin.import_clip"),
     ("2-solve", "splannequin.solve_camera"),
