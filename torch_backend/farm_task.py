@@ -119,11 +119,12 @@ def run_task(args: argparse.Namespace) -> int:
             reporter.fail(f"{error.message} {error.hint}".rstrip())
             return error.exit_code
         except Exception as error:
-            traceback.print_exc()
             known = None
             if isinstance(error, OSError):
                 known = disk_error(args.shot) if is_disk_full(error) else path_error(error)
-            known = known or contract.unexpected("The task", error, "the log")
+            if known is None:
+                traceback.print_exc()
+                known = contract.unexpected("The task", error, "the log")
             reporter.fail(f"{known.message} {known.hint}".rstrip())
             return known.exit_code
 

@@ -126,6 +126,22 @@ def test_a_request_that_is_none_is_said(submitted, tmp_path, capsys):
     assert "openjd_fail: tiny.splannequin, open: " in capsys.readouterr().out
 
 
+def test_a_file_that_cannot_grow_is_said_without_a_traceback(submitted, tmp_path):
+    """Linux alone: a limit on the size of each file, as of a full disk."""
+    resource = pytest.importorskip("resource")
+    request = {"version": 1, "name": "tiny", "amounts": {}, "takes": {"104": "a"}, "first": 101, "last": 102}
+    (tmp_path / "request.json").write_text(json.dumps({**request, "freeze": {"develop": "off", "detail": "off"}}))
+    shot = shutil.copytree(submitted / "shots" / "tiny.splannequin", tmp_path / "tiny.splannequin")
+    words = ["farm-task", "open", "--shot", str(shot), "--request", str(tmp_path / "request.json"), "--t-star=104"]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "torch_backend", *words], capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10)),
+    )  # fmt: skip
+    assert done.returncode == ExitCode.DISK, done.stdout + done.stderr
+    assert "openjd_fail: tiny, open a: " in done.stdout and "Traceback" not in done.stderr
+
+
 def test_a_host_without_blender_says_so(task, monkeypatch, submitted, tmp_path, capsys):
     from torch_backend.farm_task import BLENDER_VARIABLE
 
