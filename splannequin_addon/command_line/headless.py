@@ -209,7 +209,7 @@ def bake_take(args: argparse.Namespace, console: Console) -> int:
         arrival.load_camera(scene, shot)
     baked = _bake(scene, fresh, shot, args.take, output, console, span, args.as_warp or None)
     path = output / contract.SUMMARY_FILE
-    summary: dict[str, Any] = contract.read_json(path) if path.is_file() else {"version": 1, "shot": str(shot)}
+    summary = _summary_of(path, shot, args.take)
     summary.setdefault("wall_seconds_by_stage", {})["bake"] = round(time.perf_counter() - began, 2)
     contract.write_json(path, {**summary, **baked}, parents=False)
     console.say(f"Composited frames: {baked['composited_dir']}")
@@ -382,6 +382,17 @@ def _set_up(
     changes += insertion.insert_freeze(scene, shot, take, warp)
     for change in changes:
         console.say(f"  {change}")
+
+
+def _summary_of(path: Path, shot: Path, take: str) -> dict[str, Any]:
+    """What a summary.json says of this take of this shot. A new summary if it is of another, damaged, or not there."""
+    fresh: dict[str, Any] = {"version": 1, "shot": str(shot), "take": take}
+    try:
+        found = {**fresh, **contract.read_json(path)}
+    except (OSError, ValueError):
+        return fresh
+    is_same = all(found[name] == value for name, value in fresh.items())
+    return found if is_same and isinstance(found.get("wall_seconds_by_stage", {}), dict) else fresh
 
 
 def _told(output: Path, numbers: list[int]) -> dict[str, Any]:

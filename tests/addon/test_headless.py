@@ -15,6 +15,26 @@ import pytest
 from bpy.app.handlers import persistent
 
 
+@pytest.mark.parametrize(
+    "found",
+    [
+        '{"version": 1, "shot": "/another.splannequin", "registered": 3}',
+        '{"version": 1, "take": "another", "registered": 3}',
+        '{"version": 1, "wall_seconds_by_stage": 1}',
+        '{"version": 1, "regis',
+    ],
+)
+def test_a_summary_of_another_bake_or_a_damaged_one_is_written_anew(run, shot, tmp_path, found):
+    """As a bake into the folder of an earlier one finds it."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "summary.json").write_text(found)
+    assert run("bake", "--shot", shot, "--output", out, "--first", "5", "--last", "5")[0] == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["shot"] == str(shot) and summary["take"] == "freeze" and "registered" not in summary
+    assert set(summary["wall_seconds_by_stage"]) == {"bake"}
+
+
 def test_bake_leaves_frames_a_file_and_a_summary(run, shot, tmp_path, pictures, layers, addon, scene):
     out = tmp_path / "out"
     out.mkdir()
