@@ -16,7 +16,7 @@ from .footage.images import is_whole_png
 from .motion.flow import FlowConfig
 from .motion.mattes import MOTION_VERSION, MOVING, STILL, UNKNOWN, read_found, record_of, solve_key, write_matte
 from .motion.moving import Clip, Labels, StaticViews, scored_ahead
-from .motion.surface import AWAY, KeyEvidence, surface_points, write_surface
+from .motion.surface import AWAY, KeyEvidence, is_damaged, surface_points, write_surface
 from .sfm.masks import IGNORE, PEOPLE, limited, load_mask
 from .sfm.verdict import doubt_of
 from .shot import Shot, make_folder, need_disk, write_json
@@ -55,12 +55,12 @@ def find_motion(
     path = load_cameras(shot)
     files = {camera.frame: shot.matte(camera.frame) for camera in path.frames}
     anew = with_points and done.get("key") == key and not any(folder.glob("*" + SURFACE))
-    if not anew and done.get("key") == key and all(is_whole_png(file) for file in files.values()):
+    if not anew and done.get("key") == key and all(_is_whole(shot, frame) for frame in files):
         return MotionResult(**done["result"])
     need_disk(shot.root, 0.1 * path.width * path.height * len(files), "The motion matte")
     _begin(folder, key)
     clip = Clip(shot)
-    written = {n for n, frame in enumerate(clip.frames) if not anew and is_whole_png(files[frame])}
+    written = {n for n, frame in enumerate(clip.frames) if not anew and _is_whole(shot, frame)}
     shares = np.zeros((len(files), 3))
     for n in written:
         shares[n] = _shares(read_found(files[clip.frames[n]]))
@@ -81,6 +81,11 @@ def find_motion(
     write_json(folder / MOTION_FILE, {"version": MOTION_VERSION, "key": key, "result": result})
     (folder / MOTION_UNFINISHED_FILE).unlink(missing_ok=True)
     return result
+
+
+def _is_whole(shot: Shot, frame: int) -> bool:
+    """True if the matte of a frame is whole, and the points found with it are not damaged."""
+    return is_whole_png(shot.matte(frame)) and not is_damaged(shot.surface(frame))
 
 
 def _static_views(shot: Shot, static_model: StaticModel | None, report: Reporter) -> StaticViews | None:

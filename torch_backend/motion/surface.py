@@ -106,6 +106,11 @@ def read_surface(folder: Path) -> SurfacePoints:
     return SurfacePoints(np.concatenate(xyz), np.concatenate(rgb), np.concatenate(frames))
 
 
+def is_damaged(path: Path) -> bool:
+    """True if a file of points is there and cannot be read."""
+    return path.is_file() and _arrays(path) is None
+
+
 def _arrays(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
     """(xyz, rgb) of a file; None if they cannot be read, or are not what was written."""
     try:

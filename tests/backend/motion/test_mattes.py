@@ -214,6 +214,15 @@ def test_mattes_that_are_there_are_left_alone(swaying, quiet):
     assert stamps(shot) == before
 
 
+def test_damaged_points_of_surfaces_are_found_again(swaying, tmp_path, quiet):
+    shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
+    before = {path: path.read_bytes() for path in sorted(shot.motion.iterdir())}
+    victim = next(path for path in before if path.suffix == ".npz")
+    victim.write_bytes(before[victim][:500])
+    assert find_motion(shot, quiet(), static_model=None) == swaying[2]
+    assert {path: path.read_bytes() for path in sorted(shot.motion.iterdir())} == before
+
+
 def test_mattes_whose_search_was_cancelled_are_looked_for_again(swaying, tmp_path, quiet):
     """Else a training that found the old ones outdated, and was paused, would go on without any."""
     shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
