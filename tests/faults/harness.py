@@ -1,12 +1,14 @@
 """Runs jobs of a small shot in real child processes, disturbs them, and checks what is left on disk.
 
-A case is drawn from a seed: a fault, a kind of job and a moment. Each case works on a copy of one prepared shot. A job
-counts as whole if its files equal those of the same job undisturbed.
+A case is drawn from a seed: a fault, a kind of job and a moment. Each case works on a copy of one prepared folder. A
+job counts as whole if its files equal those of the same job undisturbed. Kinds of `PROGRAMS` take longer, or start
+processes of their own: solves, tasks of a farm, the launcher, Blender.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -18,13 +20,16 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import av
+import OpenImageIO as oiio
 
+from launcher.blender import BPY_WHEELS, choose_wheels
+from launcher.environments import backend_environment, bpy_environment
 from torch_backend import contract
 from torch_backend.contract import (
     CombineParams,
@@ -33,6 +38,7 @@ from torch_backend.contract import (
     ImportParams,
     LightParams,
     MatteParams,
+    SolveParams,
     SurfaceParams,
     TrainParams,
 )
@@ -42,8 +48,15 @@ PATIENCE_SECONDS = 300.0
 """A job that runs longer hangs; the slowest takes 20 s on one core."""
 ORPHAN_SECONDS = 20.0
 """How long processes of an ended job may take to notice that it ended."""
-VOLATILE = {"seconds", "created", "ms_per_step", "train_seconds", "trained_seconds", "beside"}
-"""Keys of JSON files that differ between two undisturbed runs: times, and the path from the shot to its footage."""
+VOLATILE = {
+    "seconds", "created", "ms_per_step", "train_seconds", "trained_seconds", "beside", "wall_seconds",
+    "wall_seconds_by_stage", "ended", "cpu_seconds", "memory_mib",
+}  # fmt: skip
+"""Keys of JSON files that differ between two undisturbed runs: times, memory, the path from the shot to its footage."""
+SEEK_TABLE = b"\xb1\xea\x92\x8f"
+"""Last bytes of a compressed .blend that was written to its end."""
+MARK = "SPLANNEQUIN_FAULT_CASE"
+"""Environment variable by which the processes of a child are found, whatever sessions they are in."""
 
 
 # ------------------------------------------------------------------------------------------------- what runs
@@ -53,17 +66,20 @@ VOLATILE = {"seconds", "created", "ms_per_step", "train_seconds", "trained_secon
 class Kind:
     """A kind of job that is disturbed."""
 
-    params: Callable[[Path], Any]
+    params: Callable[[Path], Any] = lambda _: None
     """Its parameters, from the folder with footage and lassos."""
-    is_import: bool = False
-    """True if it works on an empty shot instead of the prepared one."""
+    base: str = "shot"
+    """Name of the folder that it begins with, a key of `prepare.BASES`."""
     words: tuple[str, ...] = ()
-    """Words of the command line instead of a job; OUT stands for the output folder, SHOT for the shot."""
+    """Words of the command line instead of a job. SHOT is the shot, OUT the output folder, FILES the folder with
+    footage and requests, ARTIST an artist's .blend."""
+    program: str = "backend"
+    """What runs the words: `backend`, `launcher`, or `blender`."""
 
 
 TAKE: dict[str, Any] = {"t_star": 108, "first": 104, "last": 107, "develop": "off", "device": "cpu"}
-KINDS: dict[str, Kind] = {
-    "import": Kind(lambda files: ImportParams(source=str(files / "clip")), is_import=True),
+JOBS: dict[str, Kind] = {
+    "import": Kind(lambda files: ImportParams(source=str(files / "clip")), "empty"),
     "train": Kind(lambda _: TrainParams(run="second", iterations=40, holdout=8, max_gaussians=900, device="cpu")),
     "freeze": Kind(lambda _: FreezeParams(take="new", detail="off", **TAKE)),
     "freeze of plates": Kind(lambda _: FreezeParams(take="new", **{**TAKE, "last": 105})),
@@ -71,8 +87,27 @@ KINDS: dict[str, Kind] = {
     "combine": Kind(lambda _: CombineParams(take="both", base="base", things="drawn=base")),
     "surface": Kind(lambda _: SurfaceParams(take="base")),
     "light": Kind(lambda _: LightParams(take="base", position="0,0,0")),
-    "export": Kind(lambda _: None, words=("export", "SHOT", "--format", "ply", "--take", "base", "--output", "OUT")),
+    "export": Kind(words=("export", "SHOT", "--format", "ply", "--take", "base", "--output", "OUT")),
 }
+_STATION = ("--shot", "SHOT", "--request", "FILES/stations.json")
+_OF_TAKE = ("--shot", "SHOT", "--request", "FILES/take.json", "--first=104", "--frames", "4")
+_BAKE = ("bake", "--shot", "SHOT", "--take", "base", "--output", "OUT")
+_FREEZE = "--take new --t-star 108 --first 104 --last 105 --detail off --develop off --device cpu --output OUT"
+PROGRAMS: dict[str, Kind] = {
+    "solve": Kind(lambda _: SolveParams(), "room"),
+    "farm import": Kind(base="nothing", words=("farm-task", "import", *_STATION), program="launcher"),
+    "farm solve": Kind(base="room", words=("farm-task", "solve", *_STATION), program="launcher"),
+    "farm open": Kind(words=("farm-task", "open", *_OF_TAKE, "--t-star=108"), program="launcher"),
+    "farm freeze": Kind(base="opened", words=("farm-task", "freeze", *_OF_TAKE, "--t-star=108"), program="launcher"),
+    "farm bake": Kind(
+        base="artist", words=("farm-task", "bake", *_OF_TAKE, "--t-star=1", "--output", "OUT"), program="launcher"
+    ),
+    "launcher freeze": Kind(base="artist", words=("freeze", "SHOT", *_FREEZE.split()), program="launcher"),
+    "blender bake": Kind(base="artist", words=_BAKE, program="blender"),
+    "blender bake into a file": Kind(base="artist", words=(*_BAKE, "--blend", "ARTIST"), program="blender"),
+    "blender surface": Kind(base="artist", words=("surface", "SHOT", "--take", "base"), program="blender"),
+}
+KINDS = JOBS | PROGRAMS
 FAULTS = (
     "kill", "stop and continue", "interrupt", "disk full", "file size limit", "read-only", "memory limit",
     "truncated file", "bit flips", "two at once", "clock", "renamed shot",
@@ -98,11 +133,11 @@ class Case:
         return f"case {self.number}: {self.fault}, {self.kind}, {when} {self.moment:.2f}"
 
 
-def draw(seed: int, number: int) -> Case:
+def draw(seed: int, number: int, kinds: Collection[str]) -> Case:
     """The case of a number: faults take turns, kinds and moments are drawn."""
     drawn = random.Random(f"{seed}-{number}")
     turn = random.Random(f"{seed}-turn-{number // len(FAULTS)}").sample(FAULTS, len(FAULTS))
-    kind = drawn.choice(list(KINDS))
+    kind = drawn.choice(list(kinds))
     return Case(number, turn[number % len(FAULTS)], kind, drawn.random() < 0.15, drawn.random(), f"{seed}-{number}")
 
 
@@ -113,7 +148,9 @@ class Prepared:
     shot: Path
     """Shot with frames, cameras, mattes, the run `main`, and the take `base` with the matte `drawn`."""
     files: Path
-    """Folder with footage and lassos for the jobs."""
+    """Folder with footage, lassos and requests for the jobs."""
+    bases: dict[str, Path] = field(default_factory=dict[str, Path])
+    """Name -> folder that kinds begin with."""
     finished: dict[str, Path] = field(default_factory=dict[str, Path])
     """Kind -> a folder as it is after the undisturbed job."""
     expected: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
@@ -131,7 +168,7 @@ class Child:
 
     process: subprocess.Popen[bytes]
     output: Path
-    """What it printed."""
+    """What it printed; the name is the child's `MARK`, too."""
     job: Path | None
     """Folder of the job, None for a command."""
     began: float
@@ -141,7 +178,7 @@ class Child:
         try:
             return self.process.wait(PATIENCE_SECONDS)
         except subprocess.TimeoutExpired:
-            os.killpg(self.process.pid, signal.SIGKILL)
+            _kill(_marked(self.output.name))
             self.process.wait()
             raise AssertionError("the process hung") from None
 
@@ -149,43 +186,72 @@ class Child:
         return self.output.read_text(encoding="utf-8", errors="replace")
 
     def orphans(self) -> list[int]:
-        """Processes of its session that still live after `ORPHAN_SECONDS`; they are ended."""
+        """Processes of it, in whatever sessions, that still live after `ORPHAN_SECONDS`; they are ended."""
         until = time.monotonic() + ORPHAN_SECONDS
-        while (left := _session(self.process.pid)) and time.monotonic() < until:
+        while (left := _marked(self.output.name)) and time.monotonic() < until:
             time.sleep(0.05)
-        for pid in left:
-            os.kill(pid, signal.SIGKILL)
+        _kill(left)
         return left
 
 
-def _session(leader: int) -> list[int]:
-    """Living processes of a session."""
+def _marked(mark: str) -> list[int]:
+    """Living processes whose environment has a mark. One that ended and is not waited for yet has no environment."""
     found: list[int] = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, _, _, session = stat.read_text(encoding="utf-8").rpartition(")")[2].split()[:4]
-        except (OSError, ValueError):
-            continue  # it ended meanwhile
-        if int(session) == leader and state != "Z":
-            found.append(int(stat.parent.name))
+    for environment in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):  # it ended meanwhile, or is another user's
+            if f"{MARK}={mark}".encode() in environment.read_bytes().split(b"\0"):
+                found.append(int(environment.parent.name))
     return found
+
+
+def _kill(processes: list[int]) -> None:
+    for pid in processes:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+@functools.cache
+def blender_python() -> str:
+    """Python of a bpy wheel, 5.2 first; empty if the environments that the launcher wants are not set up."""
+    wheels = [bpy_environment(series) for series in sorted(BPY_WHEELS, reverse=True)]
+    wanted = [backend_environment(), *(bpy_environment(series) for series, _ in choose_wheels()[:1])]
+    is_set_up = len(wanted) == 2 and all(environment.ready() for environment in wanted)
+    return next((wheel.python for wheel in wheels if wheel.ready()), "") if is_set_up else ""
+
+
+def can_run(kind: str) -> bool:
+    """False for a kind with Blender where that is not set up: no test sets it up."""
+    needs_blender = kind in ("farm bake", "launcher freeze") or KINDS[kind].program == "blender"
+    return not needs_blender or blender_python() != ""
 
 
 def start(folder: Path, kind: str, prepared: Prepared, limits: Mapping[int, int] | None = None) -> Child:
     """Starts a job as the add-on does. `folder` holds the shot as `shot.splannequin`."""
     limits = limits or {}
     shot, job, what = folder / "shot.splannequin", None, KINDS[kind]
-    words = [w.replace("SHOT", str(shot)).replace("OUT", str(folder / "out")) for w in what.words]
+    places = {"SHOT": shot, "OUT": folder / "out", "FILES": prepared.files, "ARTIST": folder / "artist.blend"}
+    words = [functools.reduce(lambda word, name: word.replace(name, str(places[name])), places, w) for w in what.words]
     if not words:
         job = contract.new_job(shot, kind.partition(" ")[0], what.params(prepared.files))
         words = ["run-job", str(job)]
-    return start_words(words, job, limits)
+    return start_words(words, job, limits, what.program)
 
 
-def start_words(words: list[str], job: Path | None, limits: Mapping[int, int]) -> Child:
-    """Starts `python -m torch_backend WORDS`."""
+def start_words(words: list[str], job: Path | None, limits: Mapping[int, int], program: str = "backend") -> Child:
+    """Starts a program of `Kind.program` with words."""
     command = contract.python_child(sys.executable, "torch_backend", *words)
+    if program == "launcher":
+        command["args"] = [sys.executable, str(ROOT / "splannequin.py"), *words]
+    if program == "blender":
+        command["args"] = [blender_python(), "-P", str(ROOT / "splannequin_addon" / "run_in_bpy.py"), *words]
     output = _scratch() / f"{time.monotonic_ns()}.txt"
+    environment = {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "SPLANNEQUIN_BACKEND_PYTHON": sys.executable,
+        "SPLANNEQUIN_BLENDER_COMMAND": json.dumps([blender_python(), "-P"]),
+        MARK: output.name,
+    }
 
     def limit() -> None:
         for what, value in limits.items():
@@ -195,7 +261,7 @@ def start_words(words: list[str], job: Path | None, limits: Mapping[int, int]) -
         process = subprocess.Popen(
             command["args"],
             cwd=command["cwd"],
-            env=contract.child_environment(ROOT) | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            env=contract.child_environment(ROOT) | environment,
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=subprocess.STDOUT,
@@ -243,10 +309,12 @@ def snapshot(folder: Path) -> dict[str, str]:
         name = path.relative_to(folder).as_posix()
         if not path.is_file() or path.is_symlink() or "/jobs/" in f"/{name}" or contract.is_half_written(path.name):
             continue
-        if path.name in (contract.WRITER_FILE, contract.METRICS_FILE):
-            continue  # metrics hold seconds in each line
+        if path.name in (contract.WRITER_FILE, contract.METRICS_FILE, "blender.log", "colmap.log"):
+            continue  # metrics and logs hold seconds in each line
         if ".kept." in path.name:
             continue  # pictures that a damaged frames.json no longer lists: an import keeps them, see strangers.py
+        if path.suffix == ".blend1":
+            continue  # Blender's backup of an earlier bake
         found[name] = _digest(path, str(folder))
     return found
 
@@ -260,6 +328,10 @@ def _digest(path: Path, folder: str) -> str:
             (length,) = struct.unpack("<Q", data[:8])
             facts = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["splannequin"])
             data = _steady_text(facts) + data[8 + length :]
+        if path.name == "shot.blend" and data.endswith(SEEK_TABLE):  # two saves differ by addresses
+            data = SEEK_TABLE
+        if path.parent.name == "composited" and contract.is_whole_picture(path):  # Blender adds the date
+            data = oiio.ImageBuf(str(path)).get_pixels(oiio.UINT8).tobytes()
         # The same frames come out as one of two videos, by how their memory is aligned: compared by what is decoded.
         if path.suffix == ".mp4" and contract.is_whole_picture(path):
             with av.open(str(path)) as video:
@@ -283,17 +355,9 @@ def differences(found: Mapping[str, str], expected: Mapping[str, str]) -> list[s
 
 
 def copy_of(prepared: Prepared, kind: str, folder: Path, finished: bool = False) -> Path:
-    """A folder for a case: with the prepared shot, an empty one for an import, or that of a finished job."""
-    folder.mkdir(parents=True, exist_ok=True)
-    target = folder / "shot.splannequin"
-    if finished:
-        shutil.copytree(prepared.finished[kind], folder, dirs_exist_ok=True)
-    elif KINDS[kind].is_import:
-        target.mkdir()
-        shutil.copy(prepared.files / "empty.json", target / "shot.json")
-    else:
-        shutil.copytree(prepared.shot, target)
-    return folder
+    """A folder for a case: as its kind begins, or that of a finished job."""
+    source = prepared.finished[kind] if finished else prepared.bases[KINDS[kind].base]
+    return Path(shutil.copytree(source, folder, dirs_exist_ok=True))
 
 
 def complaints_about(child: Child, code: int, folder: Path, may_break: bool = False) -> list[str]:

@@ -1,7 +1,7 @@
 """Disturbs jobs and checks: nothing finished is lost, no process is left, and no half file is believed.
 
-pytest tests/faults/test_faults.py --faults 200               # nightly
-pytest tests/faults/test_faults.py --faults 1 --faults-from N # one case again
+pytest tests/faults/test_faults.py --faults 200 --program-faults 40              # nightly
+pytest tests/faults/test_faults.py --faults 1 --program-faults 0 --faults-from N # one case again
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -29,12 +29,16 @@ from torch_backend.contract import ExitCode
 
 from .harness import (
     FAULTS,
+    JOBS,
     KINDS,
     NEEDS_MOUNT,
+    PROGRAMS,
     Case,
     Child,
+    Kind,
     Prepared,
     await_moment,
+    can_run,
     complaints_about,
     copy_of,
     differences,
@@ -48,16 +52,25 @@ from .prepare import run_undisturbed
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals, limits and /proc as Linux has them")
 
 
+@pytest.mark.parametrize(
+    ("kinds", "number", "usual"), [(JOBS, "--faults", 30), (PROGRAMS, "--program-faults", 3)], ids=["jobs", "programs"]
+)
 def test_jobs_survive_faults(
-    small_shot: Prepared, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+    kinds: Mapping[str, Kind],
+    number: str,
+    usual: int,
+    small_shot: Prepared,
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+    monkeypatch: pytest.MonkeyPatch,
 ):
     option = request.config.getoption
-    seed, first, count = option("--seed", 65), option("--faults-from", 0), option("--faults", 30)
+    seed, first, count = option("--seed", 65), option("--faults-from", 0), option(number, usual)
     monkeypatch.setenv("SPLANNEQUIN_FAULTS_SCRATCH", str(tmp_path / "printed"))
-    cases = [draw(seed, n) for n in range(first, first + count)]
-    if not can_mount(tmp_path):
-        cases = [case for case in cases if case.fault not in NEEDS_MOUNT]
-    prepared = dataclasses.replace(small_shot, finished={}, expected={}, spans={})
+    cases = [draw(seed, n, kinds) for n in range(first, first + count)]
+    may_mount = can_mount(tmp_path)
+    cases = [case for case in cases if (may_mount or case.fault not in NEEDS_MOUNT) and can_run(case.kind)]
+    prepared = dataclasses.replace(small_shot, bases={}, finished={}, expected={}, spans={})
     run_undisturbed(prepared, tmp_path, {case.kind for case in cases})
     failed: dict[Case, list[str]] = {}
     with ThreadPoolExecutor(2) as pool:
@@ -70,9 +83,11 @@ def test_jobs_survive_faults(
 
 
 def table(cases: list[Case], failed: dict[Case, list[str]]) -> str:
-    """Fault, cases and failures, a line each."""
-    ran, bad = (collections.Counter(case.fault for case in some) for some in (cases, failed))
-    return "\n".join(f"{fault:<20} {ran[fault]:>4} cases, {bad[fault]} failed" for fault in FAULTS if ran[fault])
+    """Fault or kind, cases and failures, a line each."""
+    ran, bad = (
+        collections.Counter(word for case in some for word in (case.fault, case.kind)) for some in (cases, failed)
+    )
+    return "\n".join(f"{word:<25} {ran[word]:>4} cases, {bad[word]} failed" for word in (*FAULTS, *KINDS) if ran[word])
 
 
 def run(case: Case, prepared: Prepared, root: Path) -> list[str]:
@@ -136,9 +151,7 @@ def check_kept(case: Case, prepared: Prepared, folder: Path) -> list[str]:
 
 def snapshot_of_start(case: Case, prepared: Prepared) -> dict[str, str]:
     """Of what a case begins with."""
-    if KINDS[case.kind].is_import:
-        return {}
-    return {f"shot.splannequin/{name}": digest for name, digest in snapshot(prepared.shot).items()}
+    return {} if KINDS[case.kind].base == "empty" else snapshot(prepared.bases[KINDS[case.kind].base])
 
 
 def check_again(case: Case, prepared: Prepared, folder: Path) -> list[str]:
@@ -219,9 +232,7 @@ def disk_full(case: Case, prepared: Prepared, folder: Path, drawn: random.Random
 
 def growth(case: Case, prepared: Prepared) -> int:
     """Bytes that the undisturbed job adds, without its job folder."""
-    finished = prepared.finished[case.kind]
-    started = 0 if KINDS[case.kind].is_import else size_of(prepared.shot)
-    return max(0, size_of(finished) - started)
+    return max(0, size_of(prepared.finished[case.kind]) - size_of(prepared.bases[KINDS[case.kind].base]))
 
 
 def size_of(folder: Path) -> int:
