@@ -409,21 +409,27 @@ def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
     """Saves the file with paths relative to it, so that its folder can be moved and rendered elsewhere."""
     files = bpy.context.preferences.filepaths
     backups = files.save_version
-    try:
-        # The first save gives the file its place; what is relative to it is only known then.
-        bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
-        files.save_version = 0
-        scene = scene_in(bpy.context)
-        sequences.relative_images()
-        scene.render.filepath = rendering.output_path(frames)
-        bpy.ops.wm.save_as_mainfile(filepath=str(blend), check_existing=False)
-    except RuntimeError as error:
-        message = f"{blend.name} could not be saved: {str(error).strip()}"
-        if rendering.is_full(blend.parent, os.path.getsize(bpy.data.filepath) if bpy.data.filepath else 1 << 20):
-            raise contract.disk_error(blend.parent, message) from error
-        raise contract.JobError(f"{message}.", f"Can {blend.parent} be written to?", ExitCode.BAKE) from error
-    finally:
-        files.save_version = backups
+    contract.sweep_half_written(blend.parent)
+    with contract.atomic_path(blend) as half:  # Blender reports success for a compressed file that is cut off
+        try:
+            # The first save gives the file its place; what is relative to it is only known then.
+            bpy.ops.wm.save_as_mainfile(filepath=str(half), check_existing=False)
+            files.save_version = 0
+            scene = scene_in(bpy.context)
+            sequences.relative_images()
+            scene.render.filepath = rendering.output_path(frames)
+            bpy.ops.wm.save_as_mainfile(filepath=str(half), check_existing=False)
+            if not contract.is_whole_picture(half):
+                raise contract.disk_error(blend.parent, f"{blend.name} could not be saved")
+        except RuntimeError as error:
+            message = f"{blend.name} could not be saved: {str(error).strip()}"
+            if rendering.is_full(blend.parent, os.path.getsize(half) if half.exists() else 1 << 20):
+                raise contract.disk_error(blend.parent, message) from error
+            raise contract.JobError(f"{message}.", f"Can {blend.parent} be written to?", ExitCode.BAKE) from error
+        finally:
+            files.save_version = backups
+        if backups and blend.exists():
+            contract.replace_file(blend, blend.with_name(f"{blend.name}1"))
 
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:

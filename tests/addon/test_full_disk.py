@@ -64,6 +64,27 @@ def test_a_full_disk_is_said_and_earlier_frames_stay(addon, shot, small_disk, ar
     assert main([*bake[:-1], "file"]) == 7, "a picture of nothing is none"
 
 
+def test_a_file_that_a_full_disk_cuts_off_is_said_and_the_earlier_one_stays(
+    addon, shot, small_disk, artists_file, capfd
+):
+    """Of a compressed file Blender 5.2 says that it is saved."""
+    bpy.context.preferences.filepaths.use_file_compression = True
+    bake = ["bake", "--shot", shot, "--output", small_disk, "--blend", artists_file("PNG")]
+    bake = [str(word) for word in bake]
+    main = addon("command_line.headless").main
+    assert main(bake) == 0
+    blend = small_disk / "shot.blend"
+    good, size = blend.read_bytes(), sum(path.stat().st_size for path in (small_disk / "composited").iterdir())
+    fill(small_disk, size + len(good) // 2)
+    capfd.readouterr()
+    assert main(bake) == 8
+    assert "shot.blend could not be saved" in capfd.readouterr().err.splitlines()[-1]
+    assert blend.read_bytes() == good and not list(small_disk.glob(".*"))
+    (small_disk / "filler").unlink()
+    assert main(bake) == 0
+    assert (small_disk / "shot.blend1").read_bytes() == good
+
+
 def test_the_buttons_render_says_a_full_disk_and_earlier_frames_stay(addon, scene, shot, small_disk):
     scene.splannequin.shot_path = str(shot)
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")

@@ -55,6 +55,12 @@ def test_a_cut_off_movie_is_told_from_a_whole_one(addon, scene, tmp_path, contai
     check(addon, path, -3)
 
 
+@pytest.mark.parametrize("is_compressed", [True, False])
+def test_a_cut_off_blend_is_told_from_a_whole_one(addon, tmp_path, is_compressed):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "file.blend"), compress=is_compressed)
+    check(addon, tmp_path / "file.blend", -1)
+
+
 def check(addon, path: Path, last: int) -> None:
     is_whole, data = addon("bake.rendering").contract.is_whole_picture, path.read_bytes()
     assert is_whole(path)

@@ -15,7 +15,7 @@
     unborn          what a failed import leaves behind
     files, typed    reading what may come from anywhere, and plain JSON into dataclasses
     identity        what a file is known by: its content
-    picture_files   whether a picture or movie is whole
+    picture_files   whether a picture, a movie or a .blend is whole
     writing         atomic files and folders
     camera_path     a pinhole camera over frames
     placement       where a solve stands in Blender's scene

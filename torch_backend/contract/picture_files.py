@@ -1,4 +1,4 @@
-"""Tells whether a picture or movie is whole, without decoding it.
+"""Tells whether a picture, a movie or a .blend is whole, without decoding it.
 
 Blender reports success for a file that was cut off by a full disk, and reads most cut-off files without a word.
 
@@ -21,7 +21,7 @@ _LINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 
 
 
 def is_whole_picture(path: Path) -> bool:
-    """True if a file is a whole picture or movie; False too if it is not there.
+    """True if a file is a whole picture, movie or .blend; False too if it is not there.
 
     Of a format without a trailer, a stated size or a table, only an empty file is noticed.
     """
@@ -59,6 +59,18 @@ def _damaged(file: BinaryIO, size: int) -> bool:
     return False
 
 
+def _compressed_blend(file: BinaryIO, size: int) -> bool:
+    """Frames of Zstandard fill the file up to their seek table."""
+    file.seek(size - 9)
+    frames, _, mark = struct.unpack("<IBI", file.read(9))
+    table = 8 * frames
+    if mark != 0x8F92EAB1 or table + 17 > size:
+        return False
+    file.seek(size - 9 - table)
+    lengths = sum(length for length, _ in struct.iter_unpack("<II", file.read(table)))
+    return lengths + 8 + table + 9 == size
+
+
 def _png(file: BinaryIO, size: int) -> bool:
     """Every chunk has the right CRC, and the last one is IEND."""
     at = 8
@@ -78,7 +90,7 @@ def _png(file: BinaryIO, size: int) -> bool:
 
 def _ends_with(*ends: bytes) -> Callable[[BinaryIO, int], bool]:
     def check(file: BinaryIO, size: int) -> bool:
-        file.seek(max(size - 8, 0))
+        file.seek(max(size - 32, 0))
         return file.read().endswith(ends)
 
     return check
@@ -279,10 +291,13 @@ _MARKS: tuple[tuple[bytes, Callable[[BinaryIO, int], bool]], ...] = (
     (b"\x01\xda", _iris),
     (b"\x1a\x45\xdf\xa3", _matroska),
     (b"OggS", _ogg),
+    (b"\x28\xb5\x2f\xfd", _compressed_blend),
+    (b"BLENDER17", _ends_with(b"ENDB" + bytes(28))),  # the header of the last, empty block, since 5.0
+    (b"BLENDER-", _ends_with(b"ENDB" + bytes(20))),
 )
 _SUFFIXES: dict[str, Callable[[BinaryIO, int], bool]] = {".tga": _targa}
 _MARKED = {
     ".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".dpx", ".cin", ".hdr", ".rgb", ".jp2", ".j2c",
-    ".mp4", ".mov", ".mkv", ".webm", ".avi", ".ogv",
+    ".mp4", ".mov", ".mkv", ".webm", ".avi", ".ogv", ".blend",
 }  # fmt: skip
 """Suffixes of formats whose files begin with a mark."""
