@@ -14,11 +14,8 @@ from typing import Any
 import bpy
 
 from ...torch_backend import contract
-from ..access import camera_of
 from ..bake import take_files
-from ..bake.take_files import Take
-from ..scene import numbered, sequences
-from ..scene.ownership import TAG
+from ..freeze import shown_frames
 from ..shot import inventory, scene_objects
 from ..solve import cameras
 
@@ -35,36 +32,17 @@ def set_up(scene: bpy.types.Scene, shot: Path, name: str) -> None:
         return
     facts = inventory.read(shot).takes.get(name, {})
     if not facts.get("camera_path"):  # else its frames are of another camera's view
-        _show_freeze(camera_of(camera), take_files.take_of(contract.ShotFolder(shot).takes / name))
+        take = take_files.take_of(contract.ShotFolder(shot).takes / name)
+        shown_frames.show(scene, shot, name, take.first, take.last)
     instant = facts.get("t_star_frame")
     if isinstance(instant, int):
         scene.frame_set(min(max(instant, scene.frame_start), scene.frame_end))
     _light(scene, shot)
-    points = cameras.find(scene, shot, "MESH")
-    if points is not None:
-        points.hide_set(True)
     for screen in bpy.data.screens:
         for area in screen.areas:
             space: Any = area.spaces.active
             if area.type == "VIEW_3D" and space.region_3d is not None:
                 space.region_3d.view_perspective = "CAMERA"
-
-
-def _show_freeze(data: bpy.types.Camera, take: Take) -> None:
-    """The take's frames behind the camera, in place of the plate, which stays there to be switched on."""
-    path = numbered.frame_path(take.folder, take.first)
-    image = sequences.load_sequence(path, f"Frozen {take.folder.name}", take.light)
-    shown = next((b for b in data.background_images if b.image == image), None)
-    background = shown or data.background_images.new()
-    for other in data.background_images:
-        if other != background and other.image is not None and other.image.get(TAG):
-            other.show_background_image = False
-    background.image = image
-    sequences.show_sequence(background.image_user, image, take.first, take.last)
-    background.frame_method, background.display_depth, background.alpha = "FIT", "BACK", 1.0
-    if all(take.size):
-        background.scale = max(1.0 + 2.0 * beyond / size for beyond, size in zip(take.margin, take.size))
-    data.show_background_images = True
 
 
 def _light(scene: bpy.types.Scene, shot: Path) -> None:

@@ -22,6 +22,7 @@ from . import (
     operators,
     own_camera,
     panel,
+    shown_frames,
     splats,
     surface_operators,
     surfaces,
@@ -92,7 +93,11 @@ class Freeze(Step):
             return [f"The take {job.result['take']} is chosen: {job.result['frames']} frames."]
         if not settings_of(scene).choose_t_star:
             settings_of(scene).t_star = int(job.result["t_star_frame"])
-        return []
+        if job.result.get("camera_path"):  # the frames are of another camera's view
+            return []
+        return shown_frames.show(
+            scene, job.shot, str(job.result["take"]), int(job.result["first"]), int(job.result["last"])
+        )
 
     def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
         """Has the timer read a surface."""

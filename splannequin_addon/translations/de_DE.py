@@ -203,6 +203,7 @@ MESSAGES: dict[str, str] = {
     "There is nothing to do: import a clip, or freeze again with the button below": "Es ist nichts zu tun: einen Clip importieren oder mit dem Knopf weiter unten erneut einfrieren",
     "Solve the camera, train, and freeze t*, each with its own settings, as soon as the step before is done. What is there already stays": "Kamera lösen, trainieren und t* einfrieren, jeder Schritt mit seinen eigenen Einstellungen, sobald der vorige fertig ist. Was schon da ist, bleibt",
     "With a ?: an estimate by this machine's earlier trainings.": "Mit ?: geschätzt nach früheren Trainings auf diesem Rechner.",
+    "The camera shows the frames of {}; the points are hidden.": "Die Kamera zeigt die Bilder von {}; die Punkte sind ausgeblendet.",
     "All steps {} %": "Alle Schritte {} %",
     "about {} left": "noch etwa {}",
     "{} s": "{} s",

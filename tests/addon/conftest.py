@@ -123,6 +123,19 @@ def new_take() -> Callable[[Path, str], Path]:
 
 
 @pytest.fixture
+def previews() -> Callable[[Path, str], None]:
+    """previews(shot, take) writes the previews that the backend leaves beside frozen frames."""
+
+    def write(shot: Path, take: str = "freeze") -> None:
+        folder = shot / "takes" / take / "preview"
+        folder.mkdir()
+        for n in make_frames.FRAMES:
+            write_png(folder / f"{n:06d}.png", np.full((make_frames.HEIGHT, make_frames.WIDTH, 3), 20 * n, np.uint8))
+
+    return write
+
+
+@pytest.fixture
 def clip() -> Path:
     """The bundled clip."""
     return ROOT / "examples" / "sitting.mp4"

@@ -8,8 +8,10 @@ import pytest
 
 
 @pytest.fixture
-def bake(addon, shot, tmp_path):
+def bake(addon, shot, tmp_path, previews):
     """bake(t_star, ...) bakes the shot's take at that instant and opens the file; returns its scene."""
+
+    previews(shot)
 
     def run(t_star=6, blend=None, **facts):
         path = shot / "takes" / "freeze" / "take.json"
@@ -41,7 +43,8 @@ def test_it_opens_through_the_camera_on_the_freeze_at_its_instant_with_a_light(b
     assert set(views()) == {"CAMERA"} and scene.frame_current == frame
     (freeze,) = shown(scene.camera)
     assert scene.camera.data.show_background_images and freeze.display_depth == "BACK"
-    assert os.path.normpath(bpy.path.abspath(freeze.image.filepath)) == str(shot / "takes" / "freeze" / "000005.exr")
+    preview = shot / "takes" / "freeze" / "preview" / "000005.png"
+    assert os.path.normpath(bpy.path.abspath(freeze.image.filepath)) == str(preview)
     assert (freeze.image_user.frame_start, freeze.image_user.frame_offset) == (5, 4)
     assert freeze.image.filepath.startswith("//"), "the folder can be moved"
     assert len(scene.camera.data.background_images) == 2, "the plate can be switched on"

@@ -99,3 +99,24 @@ def test_shots_of_one_name_are_told_apart_in_the_list(addon, scene, tmp_path, pl
             bpy.ops.splannequin.shot_add()
         scene.splannequin.shot_path = str(tmp_path / f"{place}.splannequin")
     assert addon("shot.selection").labels(scene) == called
+
+
+def test_a_freeze_that_has_ended_is_seen_through_the_solved_camera(addon, contract, with_shot, shot, previews):
+    previews(shot)
+    bpy.ops.splannequin.load_camera()
+    camera = with_shot.camera
+    (plate,) = camera.data.background_images
+    job = addon("process.jobs").new_job(shot, "freeze", contract.FreezeParams(take="freeze"))
+    job.result = {"take": "freeze", "t_star_frame": 6, "first": 5, "last": 7, "camera_path": "elsewhere.json"}
+    step = addon("process.steps").STEPS["freeze"]
+    assert step.finish(with_shot, job) == [] and plate.show_background_image, "it is another camera's view"
+    job.result["camera_path"] = ""
+    for _ in range(2):  # frozen again
+        assert len(step.finish(with_shot, job)) == 1
+        plate, frozen = camera.data.background_images
+        assert not plate.show_background_image and frozen.show_background_image
+        assert bpy.path.abspath(frozen.image.filepath).endswith("000005.png")
+        assert (frozen.image_user.frame_start, frozen.image_user.frame_duration) == (5, 3)
+    assert addon("solve.cameras").find(with_shot, shot, "MESH").hide_get()
+    bpy.ops.splannequin.remove_shot()
+    assert not [image for image in bpy.data.images if image.name.startswith("Frozen")]

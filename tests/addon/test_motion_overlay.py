@@ -48,8 +48,9 @@ def test_it_is_tinted_where_something_moves_and_clear_where_the_plate_stands_sti
     assert list(camera.background_images) == [plate] and not [i for i in bpy.data.images if "Motion over" in i.name]
 
 
-def test_the_plate_is_seen_below_it_and_the_freeze_again_afterwards(addon, scene, loaded):
+def test_the_plate_is_seen_below_it_and_the_freeze_again_afterwards(addon, scene, loaded, previews):
     """In a shot.blend the freeze stands before the plate."""
+    previews(loaded)
     addon("command_line.first_view").set_up(scene, loaded, "freeze")
     camera = addon("solve.cameras").find(scene, loaded, "CAMERA").data
     toggle()

@@ -1,0 +1,41 @@
+"""The frozen frames behind the solved camera, in place of the plate, which stays there to be switched on again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ...torch_backend import contract
+from ..access import camera_of
+from ..scene import sequences
+from ..scene.ownership import TAG
+from ..shot import scene_objects
+
+
+def show(scene: bpy.types.Scene, shot: Path, name: str, first: int, last: int) -> list[str]:
+    """Shows the previews of the take `name`: they are as large as its frames, and Blender reads them faster than EXRs.
+
+    The solve's points are hidden in all view layers, since they would cover the picture. Returns what was changed, in
+    words; nothing without a solved camera.
+    """
+    camera = scene_objects.part(scene, shot, "camera")
+    path = contract.TakeFolder(contract.ShotFolder(shot).takes / name).preview(first)
+    if camera is None or not path.is_file():
+        return []
+    data = camera_of(camera)
+    image = sequences.load_sequence(path, f"Frozen {name}", "srgb")
+    shown = next((b for b in data.background_images if b.image == image), None)
+    background = shown or data.background_images.new()
+    for other in data.background_images:
+        if other.image is not None and other.image.get(TAG) and other.display_depth == "BACK":
+            other.show_background_image = other == background
+    background.image = image
+    sequences.show_sequence(background.image_user, image, first, last)
+    background.frame_method, background.display_depth, background.alpha = "FIT", "BACK", 1.0
+    data.show_background_images = True
+    points = scene_objects.part(scene, shot, "points")
+    for layer in scene.view_layers:
+        if points is not None and points.name in layer.objects:
+            points.hide_set(True, view_layer=layer)
+    return [f"The camera shows the frames of {name}; the points are hidden."]
