@@ -29,7 +29,7 @@ def full_shot(addon, contract, shot) -> Path:
         (folder / "status.json").write_text(json.dumps({**status, "stage": "s", "fraction": 0.5, "host": "elsewhere"}))
         told = [("warning", {"message": "m", "hint": "h"}), ("image", {"label": "preview", "path": "p.png"})]
         told += [("metric", {"stage": "s", "values": {"seconds": 1, "heldout_psnr_db": 2}})]
-        told += [("done", {"state": "done", "result": {"t_star_frame": 6}})]
+        told += [("done", {"state": "done", "result": {"t_star_frame": 6, "take": "freeze", "first": 5, "last": 7}})]
         lines = [{"type": t, "seq": n, "time": 1.0, "data": d, "version": 1} for n, (t, d) in enumerate(told)]
         (folder / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         (folder / "log.txt").write_text("a line\n")

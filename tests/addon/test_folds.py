@@ -47,7 +47,7 @@ def test_what_ended_stays_open_beside_the_next_until_another_begins(addon, contr
     job = addon("process.jobs").new_job(shot, "freeze", contract.FreezeParams())
     timer.follow("freeze", job)
     assert opened(with_shot) == ["freeze"], "it runs"
-    done = contract.Event("done", 1, 1.0, {"result": {"t_star_frame": 6}})
+    done = contract.Event("done", 1, 1.0, {"result": {"t_star_frame": 6, "take": "freeze", "first": 5, "last": 7}})
     (job.folder / contract.EVENTS_FILE).write_text(json.dumps(done.__dict__) + "\n")
     status = contract.Status("freeze", "done", 1, 1.0, 2.0, 2.0, fraction=1.0)
     contract.write_json(job.folder / contract.STATUS_FILE, status.__dict__)

@@ -262,9 +262,25 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
     props.shot_path, props.t_star = str(shot), 5
     bpy.ops.splannequin.shot_add()
     props.shot_path, props.t_star = str(other), 7
-    frozen = ended(addon, contract, shot, "freeze", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
+    frozen = ended(
+        addon,
+        contract,
+        shot,
+        "freeze",
+        "freeze",
+        contract.FreezeParams(),
+        {"t_star_frame": 6, "take": "freeze", "first": 5, "last": 7},
+    )
     solved = ended(addon, contract, shot, "solve", "solve", contract.SolveParams(), {})
-    baked = ended(addon, contract, shot, "bake", "freeze", contract.FreezeParams(), {"t_star_frame": 6})
+    baked = ended(
+        addon,
+        contract,
+        shot,
+        "bake",
+        "freeze",
+        contract.FreezeParams(),
+        {"t_star_frame": 6, "take": "freeze", "first": 5, "last": 7},
+    )
     for _ in range(100):  # a turn has a budget, and the machine may be busy
         supervisor.tick()
         if all(job.ended for job in (frozen, solved, baked)):
