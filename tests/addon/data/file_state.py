@@ -27,7 +27,7 @@ def file_state() -> dict[str, Any]:
             for block in blocks:
                 path = f"{name}[{block.name}]"
                 _read(block, path, found, _DEPTH)
-                found |= {f"{path}[{key}]": str(value) for key, value in block.items()}
+                found |= {f"{path}[{key}]": str(_plain(value)) for key, value in block.items()}
     for action in bpy.data.actions:
         found[f"actions[{action.name}] keys"] = _keys(action)
     return found
@@ -66,6 +66,11 @@ def _follow(value: Any, path: str, found: dict[str, Any], depth: int) -> None:
         found[path] = value and value.name
     else:
         _read(value, path, found, depth - 1)
+
+
+def _plain(value: Any) -> Any:
+    """A custom property without its address. Before 5.0 the properties of add-ons are among them."""
+    return value.to_dict() if hasattr(value, "to_dict") else value.to_list() if hasattr(value, "to_list") else value
 
 
 def _flat(value: Any) -> list[Any]:
