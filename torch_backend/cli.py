@@ -170,7 +170,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
 
 
 def _rest_of_the_way(shot: Shot, requests: dict[str, Any], spent: float) -> contract.WholeWay | None:
-    """The jobs after the import, which took `spent` seconds; None if how long they take cannot be told."""
+    """The jobs after the import, which took `spent` seconds; None if their time cannot be estimated."""
     try:
         size, pace = contract.ShotSize.of(shot), contract.paces(Path(sys.prefix))
     except (OSError, ValueError):

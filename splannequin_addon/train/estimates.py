@@ -26,9 +26,9 @@ class Cost:
 
 
 def costs(state: ShotState | None, pace: float | None = None) -> tuple[list[Cost], dict[str, Any] | None]:
-    """The cost of every preset, and the run that it was told from, None if the shot has none that was timed.
+    """The cost of every preset, and the run that it was estimated from, None if the shot has none that was timed.
 
-    Without such a run it is told from `pace`, that of this machine's earlier trainings (`contract.paces`), if there is.
+    Without such a run it is estimated from `pace`, that of this machine's earlier trainings (`contract.paces`).
     """
     timed = sorted((r for r in state.runs.values() if _per_step(r)), key=_size) if state is not None else []
     # Where nothing may move a step is several times as fast.

@@ -13,6 +13,7 @@ from ..process import all_steps, job_timer, jobs, steps
 from ..properties import StringProperty
 from ..shot import selection
 from ..translations import tr
+from . import step_operator
 
 
 class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
@@ -53,7 +54,7 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class SPLANNEQUIN_OT_all_steps(bpy.types.Operator):
+class SPLANNEQUIN_OT_all_steps(step_operator.StepOperator, bpy.types.Operator):
     """Solve the camera, train, and freeze t*, each with its own settings, as soon as the step before is done. What is
     there already stays"""
 
@@ -64,9 +65,7 @@ class SPLANNEQUIN_OT_all_steps(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Off before the import, while a step runs, and when all are done."""
-        folder = selection.shot_folder(scene_in(context))
-        if folder is not None and job_timer.watch_of(folder).running():
-            cls.poll_message_set(tr("A step of this shot is running"))
+        if not super().poll(context):
             return False
         if not all_steps.missing(scene_in(context)):
             cls.poll_message_set(tr("There is nothing to do: import a clip, or freeze again with the button below"))

@@ -93,9 +93,9 @@ class ShotSize:
         """Pixels down a frozen frame that is so wide, without overscan."""
         return max(16, round(self.source[1] * width / self.source[0]))
 
-    def trained_width(self, asked: int, preset: str) -> int:
-        """Pixels across a training's pictures; `asked`: 0 is the preset's."""
-        return min(asked or PRESET_WIDTHS[preset] or self.working[0], self.working[0])
+    def trained_width(self, width: int, preset: str) -> int:
+        """Width in pixels of a training's pictures; `width`: as configured, 0 for the preset's."""
+        return min(width or PRESET_WIDTHS[preset] or self.working[0], self.working[0])
 
 
 def expected_seconds(kind: str, params: Any, size: ShotSize) -> float | None:
