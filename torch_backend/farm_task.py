@@ -99,7 +99,7 @@ def run_task(args: argparse.Namespace) -> int:
     """Runs one task, arguments as `contract.verbs.TaskWords`; returns an `ExitCode`. Says why if it failed."""
     began = time.time() - time.process_time()  # what was imported counts
     reporter = EngineReporter(f"{Path(args.shot).name}, {args.step}")
-    with _cancelling(reporter):
+    with contract.working_on(Path(args.shot).absolute()), _cancelling(reporter):
         try:
             request = read_request(args.request)
             take = f" {request['takes'][args.t_star]}" if "takes" in request else ""

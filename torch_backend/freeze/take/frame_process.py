@@ -31,6 +31,7 @@ from ...contract import (
     from_dict,
     path_error,
     read_message,
+    working_on,
     write_message,
 )
 
@@ -57,7 +58,8 @@ def main() -> int:
     if message is None:
         return ExitCode.CANCELLED
     try:
-        _render(message[0], stream)
+        with working_on(Path(message[0]["shot"])):
+            _render(message[0], stream)
     except KeyboardInterrupt:
         return ExitCode.CANCELLED
     except (JobError, OSError) as error:

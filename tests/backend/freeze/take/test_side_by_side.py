@@ -1,12 +1,16 @@
 """Frames by several processes: the same bytes as by one, whoever is killed meanwhile; and nobody is left behind."""
 
+import dataclasses
 import os
+import shutil
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from torch_backend.contract import Cancelled, FreezeParams, JobError, TakeFolder
+from torch_backend.contract import Cancelled, ExitCode, FreezeParams, JobError, TakeFolder, read_message, write_message
 from torch_backend.freeze.take.cameras import in_range
 from torch_backend.freeze.take.folder import make_folders
 from torch_backend.freeze.take.frames import render_frames
@@ -121,6 +125,40 @@ def test_what_stops_one_of_them_is_told_as_if_there_were_one(own, quiet):
         plate.write_bytes(data)
     told = [(error.value.message, error.value.hint, error.value.exit_code) for error in (by_one, by_two)]
     assert told[0] == told[1]
+
+
+RENAMED = """
+import sys
+from pathlib import Path
+from torch_backend.freeze.take import frame_process, frames
+write, shot, moved = frames._write, *map(Path, sys.argv[1:])
+def rename_and_write(*of):
+    if shot.exists():
+        shot.rename(moved)
+    write(*of)
+frames._write = rename_and_write
+sys.exit(frame_process.main())
+"""
+
+
+def test_nothing_is_written_under_the_former_name_of_a_shot_that_was_renamed(own, quiet):
+    params, take, _ = opened(own, "renamed", quiet())
+    moved = own.root.with_name("renamed.splannequin")
+    request = {
+        "shot": str(own.root), "folder": str(take.folder.root), "t_star": take.t_star, "keys": take.all_keys,
+        "params": dataclasses.asdict(params), "frames": [103, 104],
+    }  # fmt: skip
+    command = [sys.executable, "-c", RENAMED, str(own.root), str(moved)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[4])
+    try:
+        write_message(process.stdin, request)
+        said = [header["kind"] for header, _ in iter(lambda: read_message(process.stdout), None)]
+        assert process.wait() != ExitCode.OK and said[-1] == "error"
+        assert moved.exists() and not own.root.exists()
+    finally:
+        process.kill()
+        shutil.rmtree(own.root, ignore_errors=True)
+        moved.rename(own.root)
 
 
 def test_as_many_as_cores_frames_and_memory_allow():
