@@ -53,9 +53,8 @@ def choose_output(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
     """Gives the scene an output path if it still has Blender's default; returns what was changed, in words."""
     if scene.render.filepath not in _DEFAULT_OUTPUTS:
         return []
-    folder = default_output(shot, take)
-    scene.render.filepath = output_path(folder)
-    return [f"Output path set to {folder}."]
+    scene.render.filepath = output_path(default_output(shot, take))
+    return ["The output path is now in the shot's folder."]
 
 
 def output_path(folder: Path) -> str:

@@ -405,7 +405,7 @@ MESSAGES: dict[str, str] = {
     "Dither set to 0, so that pixels stay exact.": "Dither auf 0 gesetzt, damit Pixel genau bleiben.",
     "Film set to transparent.": "Film auf transparent gesetzt.",
     "The depth pass was switched on.": "Der Tiefen-Pass wurde eingeschaltet.",
-    "Output path set to {}.": "Ausgabepfad auf {} gesetzt.",
+    "The output path is now in the shot's folder.": "Der Ausgabepfad liegt jetzt im Ordner des Shots.",
     "The scene's own render was led into the freeze: objects stand among the frozen people by depth.": "Das eigene Rendering der Szene wurde in den Freeze geleitet: Objekte stehen der Tiefe nach zwischen den eingefrorenen Menschen.",
     "The scene had no compositor tree: a minimal one was made.": "Die Szene hatte keinen Compositor-Baum: ein kleinster wurde angelegt.",
     "The compositor was switched on.": "Der Compositor wurde eingeschaltet.",
