@@ -78,7 +78,7 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
     key = import_key(open_source(str(footage), config.fps, config.layer).info, config)
     record |= {"config": settings, "key": key, "bits": 8, "beside": ""}
     write_json(copy / "frames" / "frames.json", record)
-    for checkpoint in (copy / "runs").glob("*/checkpoint.safetensors"):  # these files stand for the smaller training pictures
+    for checkpoint in (copy / "runs").glob("*/checkpoint.safetensors"):  # they were trained on the smaller pictures
         tensors, facts = load_checkpoint(checkpoint)
         save_checkpoint(checkpoint, tensors, {**facts, "pictures": key})
     made = Shot.open(copy)
