@@ -51,8 +51,8 @@ class Host:
     openjd: str
     """Python with openjd-cli."""
     blender: str
-    """Blender's program; empty: a bpy wheel."""
-"""Blender's program; empty to use a bpy wheel."""
+    """Blender's program; empty to use a bpy wheel."""
+
 
 @dataclass
 class Job:

@@ -53,8 +53,8 @@ STEPS, RATE, DECAY = 150, 0.15, 1e-4
 
 
 @dataclass
-"""All frames of one run. Pictures are [N, h, w, 3], display-referred, at the size of decisions."""
-    """All frames of one run, pictures [N, h, w, 3] display-referred, at the size of decisions."""
+class Case:
+    """All frames of one run. Pictures are [N, h, w, 3], display-referred, at the size of decisions."""
 
     name: str
     """Scene and training seed."""
