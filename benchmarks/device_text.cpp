@@ -1,9 +1,10 @@
 // Runs the GPU variant of the project's kernels on a CPU: reads launches from a file and prints their results.
 // `device_text.py` writes kernels.inc and the launches, and documents the build and the comparison.
 //
-// A block has 128 threads, in warps of 32. Without THREADS each thread is a fiber with its own stack, and fibers switch at
-// votes, shuffles and barriers. That is fast and deterministic, and detects a barrier that not all threads reach. With
-// THREADS each is a system thread, for the thread sanitizer. Blocks run one after another, because shared memory is static.
+// A block has 128 threads, in warps of 32. Without THREADS each thread is a fiber with its own stack, and fibers switch
+// at votes, shuffles and barriers. That is fast and deterministic, and detects a barrier that not all threads reach.
+// With THREADS each is a system thread, for the thread sanitizer. Blocks run one after another, because shared memory is
+// static.
 
 #include <algorithm>
 #include <atomic>
