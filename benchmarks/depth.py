@@ -54,7 +54,7 @@ NEAR_MOVER = 3
 BEYOND = 0.01
 """Relative error above which a card placed by depth visibly passes through a surface."""
 FARTHEST = 1000.0
-"""Depth in metres at which all greater depths are clamped, including the sky's."""
+"""Depth in metres to which all greater depths are clamped, including the sky's."""
 REGIONS = ("still", "moving")
 
 

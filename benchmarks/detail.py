@@ -1,13 +1,12 @@
-"""Compares frozen frames with plate detail to the plates of a real clip: `python -m benchmarks.detail SHOT --results
-DIR`.
+"""Frozen frames with plate detail against the plates of a real clip: `python -m benchmarks.detail SHOT --results DIR`.
 
 SHOT is a trained shot folder, which stays unchanged. Frames held out of training are judged at the suggested t* and at
-an instant half a clip away. Each of these is compared with the frame's plate: the run's Gaussians alone (splats), the
-developed instant's (developed), plate detail without the plate of the same pose (withheld), and the delivered frame.
-Figures: PSNR of the whole frame, of the best 90 % of the pixels and of still pixels, and gradients relative to the
-plate's. In whole frames people have moved since t*, which no freeze can match. The difference of the two instants is
-measured where nothing moves. Writes detail-NAME.json and strips (plate, splats, developed, withheld, delivered) at
-100 % to DIR.
+an instant half a clip away. Each of these pictures is compared with the frame's plate: the run's Gaussians alone
+(splats), the developed instant's (developed), plate detail without the plate of the same pose (withheld), and the
+delivered frame. Figures: PSNR of the whole frame, of the best 90 % of the pixels and of still pixels, and gradients
+relative to the plate's. In whole frames people have moved since t*, which no freeze can match. The difference of the
+two instants is measured where nothing moves. Writes detail-NAME.json and strips (plate, splats, developed, withheld,
+delivered) at 100 % to DIR.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class View:
     image: FrozenImage
     """Render of the Gaussians alone, at the delivered instant."""
     detailed: CompositeFrame
-    """With plate detail."""
+    """The frame with plate detail."""
     splats: Tensor
     """[H, W, 3] Gaussians alone over grey, in [0, 1]."""
     picture: Tensor
@@ -110,8 +110,7 @@ class DetailClip:
         return freeze_at(self.run.model, self.scene.time_of_frame(t_star), span_of(self.scene, self.run))
 
     def frozen(self, t_star: int, keep: bool = False) -> FrozenGaussians:
-        """The developed instant from which takes are rendered. `keep`: save it with the run, for other processes to
-        load."""
+        """The developed instant from which takes are rendered. `keep`: save it with the run for other processes."""
         if t_star not in self._frozen:
             made = self.field(t_star)
             if self.develop and t_star in self.run.train_frames:

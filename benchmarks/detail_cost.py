@@ -95,8 +95,7 @@ def _around(frames: Sequence[int], poses: Sequence[int]) -> list[int]:
 
 
 def _enlarge(source: Path, target: Path, factor: int, rng: np.random.Generator) -> None:
-    """Repeats each pixel `factor` x `factor` times and adds grain, because smooth pictures decode faster than
-    footage."""
+    """Repeats each pixel `factor` x `factor` times and adds grain, as smooth pictures decode faster than footage."""
     pixels = read_png(source)
     pixels = (pixels >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels
     large = pixels.repeat(factor, 0).repeat(factor, 1).astype(np.int16)

@@ -1,8 +1,7 @@
 """Figures of frozen frames with plate detail, as pure functions: still pixels, and flow that camera motion explains.
 
 Pictures are display-referred [H, W, 3] in [0, 1], masks bool [H, W], places [H, W, 2] in pixels (x, y) with pixel
-centres at +0.5, cameras OpenCV world-to-camera [4, 4] and K [3, 3] in pixels. No code is shared with the judged
-product.
+centres at +0.5, cameras OpenCV world-to-camera [4, 4] and K [3, 3] in pixels. The product shares none of this code.
 """
 
 # Packages of requirements/bench.txt may be absent; each use handles that case.
@@ -117,8 +116,7 @@ def seen_again(places: Tensor, expected: Tensor, depth: Tensor) -> Tensor:
 
 
 class Flow:
-    """Dense optical flow between two pictures (DIS). It compares structure only, so that drifting exposure has no
-    effect."""
+    """Dense optical flow between two pictures (DIS), of structure only, so that drifting exposure has no effect."""
 
     def __init__(self) -> None:
         if importlib.util.find_spec("cv2") is None:
@@ -167,8 +165,9 @@ def textured(image: Tensor) -> Tensor:
 def unexplained_flow(flow: Flow, a: Tensor, b: Tensor, places: Tensor, both: Tensor) -> Tensor:
     """Residual flow in pixels [H, W] between `a` and `b` warped to `a`, after the camera's motion.
 
-    `b` is warped by `places` before the flow is computed, so that the flow is near zero where nothing moves; larger
-    flow is wrong at every depth edge. Pixels that only `a` sees (not `both`) are filled from `a`, to avoid false flow.
+    `b` is warped by `places` before the flow is computed, so that the flow is near zero where nothing moves. Flow of
+    several pixels is wrong at every depth edge. Pixels that only `a` sees (not `both`) are filled from `a`, to avoid
+    false flow.
     """
     brought = torch.where(both[..., None], sampled(b, places), a)
     return flow(a, brought).norm(dim=2)

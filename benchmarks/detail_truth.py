@@ -102,8 +102,8 @@ def perceived(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """{region: {variant: mean dB over the poses in which the region is not empty}}, without regions that are always
-    empty."""
+    """{region: {variant: mean dB over poses where the region is not empty}}; regions that are always empty are left
+    out."""
     found = {}
     for region in (WHOLE, *REGIONS, HELD):
         known = [row for row in rows if row[SPLATS].get(region) is not None]

@@ -4,8 +4,8 @@
 
 SCENE is a folder of benchmarks/synthetic; seeds 0 to 9 are for tuning. Its shot and an `auto` run for every training
 seed are made in DIR if missing. For every instant and pose with truth, the evidence is computed as for a frozen frame.
-The fit minimises the sum of two losses. The first is the mean squared error of a mix by the posterior of the plate and
-its fill (the frame with that plate withheld), relative to the plate's own mean squared error. The second is the
+The fit minimises the sum of two losses. The first is the mean squared error of a mixed frame, relative to the plate's.
+The posterior mixes the plate and its fill, which is the frame with that plate withheld. The second loss is the
 cross-entropy of the posterior with whether plate and truth differ. Afterwards the bias alone is chosen by the PSNR of
 mixed frames. Prints the weights and the PSNR of frames mixed by them. `--cross` judges each scene by weights fitted on
 the others.
@@ -140,8 +140,7 @@ def fit(cases: Sequence[Case]) -> StateWeights:
 
 
 def judged(case: Case, weights: StateWeights) -> dict[str, float]:
-    """dB of frames mixed by the weights, whole and moving, of the plate alone and of the fill alone; share of the
-    fill."""
+    """{figure: value}: dB of the mix, of the plate alone and of the fill alone, whole and moving; share of the fill."""
     config = StateConfig(weights=weights)
     values = torch.tensor([getattr(weights, name) for name in NAMES])
     odds = case.evidence @ values + weights.bias

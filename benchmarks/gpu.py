@@ -265,8 +265,7 @@ def _frames_host(stage: Stage, body: raster_bench.Body) -> dict[str, Any]:
 
 
 def _late_step(stage: Stage) -> dict[str, Any]:
-    """Host and GPU figures (`_host`, `_busy`) of a late step of `preview`, when its field exists and its trial is
-    over."""
+    """Host and GPU figures (`_host`, `_busy`) of a late step of `preview`, with its field made and its trial over."""
     scene = load_scene(stage.scratch_shot())
     few, width = (600, 64) if stage.dry else (PRESETS["preview"]().densify.budget, PRESETS["preview"]().width)
     config = config_from_params(
@@ -483,8 +482,7 @@ def _full_hd(stage: Stage) -> dict[str, Any]:
 
 
 def _busy(stage: Stage, trainer: Trainer) -> dict[str, Any]:
-    """Per step, over three steps of torch's profiler: busy ms of the GPU, number of kernels, the ten longest
-    kernels."""
+    """Per step, over three profiled steps: busy ms of the GPU, number of kernels, the ten longest kernels."""
     if stage.device.type != "cuda":
         return {}
     kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
@@ -505,8 +503,7 @@ def _busy(stage: Stage, trainer: Trainer) -> dict[str, Any]:
 
 
 def _waits(stage: Stage) -> dict[str, Any]:
-    """Code lines where the host waits for the GPU, by torch's sync debug mode, in steps whose number is no multiple of
-    10."""
+    """Code lines where the host waits for the GPU, by torch's sync debug mode, without every tenth step."""
     trainer = _trainer(stage, 400, 600 if stage.dry else 100_000, 64 if stage.dry else 640, "hexplane")
     places: dict[str, int] = {}
     steps = 0

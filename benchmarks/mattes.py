@@ -70,8 +70,7 @@ def person_masks(scene: SyntheticScene, t_star: int, poses: Sequence[int]) -> di
 
 
 def best_poses(scene: SyntheticScene, t_star: int, masks: dict[str, dict[int, NDArray[np.bool_]]]) -> dict[str, int]:
-    """Person -> the pose that shows the largest share of the person, to a twentieth; among equals, the largest in
-    pixels.
+    """Person -> the pose that shows the largest share of them, rounded to a twentieth; ties go to the most pixels.
 
     The share is relative to the full silhouette: unoccluded, and in a frame three times as wide and high.
     """

@@ -1,16 +1,16 @@
 """The model alone against plates held out of training: `python -m benchmarks.model SHOT --results DIR`.
 
 Trains `--method` on a solved shot, which stays unchanged. Figures are in dB at the training size, means over the
-held-out frames. Each frame at its own time gives S, moving and whole. S covers still pixels: the motion matte is still,
-with no mover within 8 px at a width of 640. F covers frozen still pixels: time is frozen at each instant, seen from the
-held-out frames at least a quarter of the clip away, where neither that frame's matte nor the matte of t* has a mover.
-The instants are `--t-star` and one half a clip away. With `--develop` both are developed as a freeze does, for any
-method. Then F, the best 90 % and the gradient energy of those frames are judged before and after, at the training size
-and at `LARGE` pixels. `--held N` judges moving pixels of N held-out frames, with time frozen at that frame; neither
-training nor development has used its plate. Tune with `--phase` other than 0. Seconds are CPU time of one thread.
-`--set` changes any number of the configuration, for example `--set gate.start=0.4 densify.budget=50000`;
-`--develop-set` any of `DevelopConfig`. `--again` judges the training left in DIR by an earlier call with the same
-`--name`.
+held-out frames. Each frame at its own time gives S, moving and whole. S covers the pixels that the motion matte calls
+still, with no mover within 8 px at a width of 640. F covers still pixels of frames frozen at each instant. These are
+seen from the held-out frames at least a quarter of the clip away; neither that frame's matte nor the matte of t* may
+have a mover in the pixel. The instants are `--t-star` and one half a clip away. With `--develop` both are developed as
+a freeze does, for any method. Then F, the best 90 % and the gradient energy of those frames are judged before and
+after, at the training size and at `LARGE` pixels. `--held N` judges moving pixels of N held-out frames, with time
+frozen at that frame; neither training nor development has used its plate. Tune with `--phase` other than 0. Seconds are
+CPU time of one thread. `--set` changes any number of the configuration, for example `--set gate.start=0.4
+densify.budget=50000`; `--develop-set` any of `DevelopConfig`. `--again` judges the training left in DIR by an earlier
+call with the same `--name`.
 """
 
 from __future__ import annotations

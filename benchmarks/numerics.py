@@ -61,7 +61,7 @@ def _errors(e: Errors) -> str:
 
 
 _CLOSE = (120.0, 1e-5)
-"""Least PSNR in dB and largest gradient error with which a case is left out of the table."""
+"""A case is left out of the table if all bodies have at least this PSNR in dB and at most this gradient error."""
 
 
 def _cases(bodies: list[str], names: list[str]) -> list[str]:

@@ -11,12 +11,13 @@ SHOT is solved from CLIP, TAKE is a take of it. Every VIDEO has a frame for each
 its width. Prints means over the take's frames, for the take, its Gaussians alone, and each video:
 
 * whole, best 90 %: PSNR in dB against the clip's own frame. A frozen frame should equal that frame wherever nothing
-  moves; the best 90 % ignores the worst tenth of the pixels, for movers. The take is compared without lens distortion,
-  as solved; a video is compared unchanged. So each method is compared with its own input.
+  moves; the best 90 % leaves the worst tenth of the pixels to movers. The take is compared without lens distortion, as
+  solved; a video is compared unchanged. So each method is compared with its own input.
 * gradient: mean gradient magnitude relative to the clip's frame; 1 is as sharp as the plate.
 
-A method that returns the clip unchanged would score perfectly. Check by eye whether movers really stand still. (The
-share of pixels that move against the cameras does not show it: flow noise hides it in every eighth frame.)
+A method that returns the clip unchanged would score perfectly. Check by eye whether movers stand as they did at the
+instant. (The share of pixels that move against the cameras does not show it: flow noise hides it in every eighth
+frame.)
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Times the rasteriser on four seeded workloads: `python -m benchmarks.raster [W0 W1 ...] [--json FILE]`.
+"""Times the rasteriser on seeded workloads: `python -m benchmarks.raster [W0 W1 ...] [--json FILE]`.
 
 Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). Errors are measured by
 `benchmarks/numerics.py`.
@@ -31,7 +31,7 @@ from benchmarks.workload import WORKLOADS, Workload, room
 from torch_backend.raster import RasterSettings, rasterize
 
 SLOW_MS = 1000.0
-"""Time of a first frame in ms above which a body gets at most `SLOW_ROUNDS` rounds."""
+"""A body whose first two frames both take longer than this, in ms, gets at most `SLOW_ROUNDS` rounds."""
 SLOW_ROUNDS = 5
 
 

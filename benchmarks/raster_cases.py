@@ -21,8 +21,7 @@ class Case:
     psnr: float = 100.0
     """Least PSNR in dB at pixels without flips, relative to a peak of 1 or the brightest channel if greater."""
     gradient: float | None = 5e-4
-    """Largest relative L2 gradient error of any input at pixels without flips. None for ill-posed cases: only
-    finite."""
+    """Largest relative L2 gradient error of any input at pixels without flips; None requires finite values only."""
     flips: float = 0.02
     """Largest share of pixels with flips."""
     note: str = ""

@@ -58,8 +58,7 @@ def places_of(truth: RayScene, view: View) -> list[NDArray[np.float64]]:
 def shadow(surface: RayScene, view: View, of: Set) -> NDArray[np.float32]:
     """[H, W] in 0..1: share of the lamp's light that passes the ball, at the surface point of each pixel.
 
-    1 where no surface is visible, or where the surface itself blocks all light, because a shadow catcher is empty
-    there.
+    1 where no surface is visible or the surface itself blocks all light, because a shadow catcher is empty there.
     """
     rays = view.rays()
     distance = surface.cast(np.broadcast_to(view.eye, rays.shape), rays).distance.astype(np.float64)

@@ -164,9 +164,9 @@ def make_scenes(
 ) -> list[str]:
     """Sources of the synthetic scenes of a size. Missing scenes are rendered in a child process.
 
-    `kinds`: of `synthetic.sizes.KINDS`; with any of `LIMITS`, which break an assumption of the method, only the first
-    seed. `bpy`: a Python with Blender's module; None finds one near the repository. RuntimeError with the child's last
-    line if a scene cannot be made.
+    `kinds`: names from `synthetic.sizes.KINDS`. If any of them is in `LIMITS`, only the first seed is used. `bpy`: a
+    Python with Blender's module; None finds one near the repository. RuntimeError with the child's last line if a
+    scene cannot be made.
     """
     seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: 1 if {*kinds} & {*LIMITS} else SIZES[size].scenes]
     command = [sys.executable, "-P", "-m", "benchmarks.sources", "--size", size, "--out", str(folder)]

@@ -67,8 +67,7 @@ def off_truth(places: NDArray[np.float64], truth: RayScene, views: Sequence[View
 
 
 def figures(off: NDArray[np.float64]) -> dict[str, float]:
-    """Number of points, share seen by plates, and of the seen: median and 90th percentile of distance, share
-    `BEYOND`."""
+    """Number of points, share seen by plates; of these, median and 90th percentile of distance, share `BEYOND`."""
     seen = off[np.isfinite(off)]
     row = {"points": float(len(off)), "seen": len(seen) / max(len(off), 1)}
     if len(seen):
@@ -78,8 +77,7 @@ def figures(off: NDArray[np.float64]) -> dict[str, float]:
 
 
 def judge(truth: SyntheticTruth, run: str, t_star: int, every: int) -> dict[str, dict[str, float]]:
-    """{part: `figures`} for room and people: of the surface, of the surface at the frames' pixels, of the frames'
-    depth.
+    """{part: `figures`} for room and people: of the surface, of the surface at frames' pixels, of the frames' depth.
 
     "shadow" has the number of its pictures, and mean and worst likeness.
     """
@@ -110,8 +108,7 @@ def judge(truth: SyntheticTruth, run: str, t_star: int, every: int) -> dict[str,
 
 
 def points_of(folder: TakeFolder) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """(points [P, 3] from the depth of a take's frames, their eyes [P, 3], bool [P] movers), every `THINNED`-th
-    pixel."""
+    """(points [P, 3] from a take's depth, their eyes [P, 3], bool [P] movers), of every `THINNED`-th pixel."""
     points: list[NDArray[np.float64]] = []
     eyes: list[NDArray[np.float64]] = []
     moves: list[NDArray[np.bool_]] = []

@@ -1,9 +1,10 @@
 """Picture of two combined instants against its rendered truth: `python -m benchmarks.two_instants SCENE ...`.
 
-Usage: `... SCENE ... --results DIR`. SCENE and DIR are as for `benchmarks.mattes`, which makes the takes and the
-mattes. For each ordered pair of instants (base, instant) and each person visible in both lassoed frames, `combine`
-inserts the person as at `instant` into the take of `base`. The truth is rendered from the scene with this one person at
-`instant`; this needs a Python with bpy (`--bpy`, or the one made by set-up).
+The full call is `python -m benchmarks.two_instants SCENE ... --results DIR`. SCENE and DIR are as for
+`benchmarks.mattes`, which makes the takes and the mattes. For each ordered pair of instants (base, instant) and each
+person visible in both lassoed frames, `combine` inserts the person as at `instant` into the take of `base`. The truth
+is rendered from the scene with this one person at `instant`; this needs a Python with bpy (`--bpy`, or the one made by
+set-up).
 
 The loss of combining is the PSNR of the two separate takes minus that of the combined picture. Each pixel is assigned
 to a take by `SAMPLES` squared rays: to the base if its instant shows the surfaces of the combined scene, else to the
@@ -48,7 +49,7 @@ from torch_backend.freeze.take.folder import frames_of
 from torch_backend.shot import Shot, write_json
 
 SAMPLES = 3
-"""Rays per side of a pixel. The base owns a pixel only if all of its rays agree, else the instant if all agree."""
+"""Rays per side of a pixel. A pixel belongs to an instant only if all of its rays agree with that instant."""
 SAME_METRES = 1e-3
 """Two hits of one ray closer than this in metres are one surface; people sway by more between two instants."""
 BASE, INSTANT, UNKNOWN = range(3)

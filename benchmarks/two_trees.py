@@ -22,7 +22,7 @@ import torch
 
 INSTANTS, PAIRS, SEED, WIDTH = 6, 2, 62, 640
 SHOWN = ("still", "flicker", "moving_p50", "excess")
-"""Compared figures of `ablate`: dB of still pixels; flicker of 255; median flow left in px at 640; excess of flow."""
+"""Compared figures of `ablate`: dB of still pixels; flicker of 255; median residual flow in px at 640; its excess."""
 
 
 def plan(clips: list[Path]) -> dict[str, dict[str, list[tuple[int, int]]]]:

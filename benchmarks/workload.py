@@ -24,8 +24,7 @@ WORKLOADS = {
 
 @dataclass
 class Workload:
-    """Float32 arrays of one scene: linear scales, opacities in (0, 1), colors [N, 3]; g [H, W, 3] is d loss / d
-    image."""
+    """Float32 arrays of a scene: linear scales, opacities in (0, 1), colors [N, 3]; g [H, W, 3] is d loss / d image."""
 
     means: np.ndarray
     quats: np.ndarray

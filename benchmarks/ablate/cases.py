@@ -38,7 +38,7 @@ class Case:
     t_stars: list[int]
     """Frame numbers of its instants, in the order in which they are judged."""
     truth: TruthScene | None
-    """Frame numbers of its instants, in the order of judging."""
+    """Rendered truth; None for a clip."""
 
 
 def scene_case(folder: Path, seed: int, results: Path, lent: Path | None = None) -> Case:

@@ -87,7 +87,7 @@ def _freeze(module: str) -> Any:
 
 
 def _baseline(**numbers: Any) -> tuple[Switch, ...]:
-    """Switches for the static baseline with other numbers. Its class is replaced, because it takes its own default."""
+    """Switches that preset the configuration of the static baseline's class with other numbers."""
     config = dataclasses.replace(StaticBaselineConfig(), **numbers)
     return (Switch(MAKER, "StaticBaseline", partial(partial, config=config), of_original=True),)
 

@@ -138,8 +138,7 @@ def judged(clip: DetailClip, masks: Painted) -> Iterable[tuple[Row, View, Labels
 def _let_go(clip: DetailClip, t_star: int, frame: int, view: View) -> tuple[Tensor, Tensor]:
     """bool [H, W] rejected pixels of each of `METHODS`."""
     detailed = view.detailed
-    # At the clip's own poses the own plate is the primary source. If another plate is, no pixel of the own plate is
-    # kept.
+    # At the clip's own poses the own plate is the primary source. Otherwise no pixel of the own plate is kept.
     delivered = (detailed.matte < LET_GO) | (detailed.primary != frame)
     own, frozen = clip.mattes(frame, t_star, view)
     return delivered, torch.maximum(own, frozen) > MOVER_MATTE

@@ -1,2 +1,1 @@
-"""Turns folders of runs and ground truth into figures: metrics, tables, plots and one page. Only reads these
-folders."""
+"""Turns folders of runs and ground truth into figures: metrics, tables, plots, one page. Folders are only read."""

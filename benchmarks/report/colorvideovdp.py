@@ -28,8 +28,7 @@ def available() -> bool:
 
 @torch.no_grad()
 def sequence_jod(frames: Tensor, truth: Tensor, fps: float) -> float | None:
-    """Quality of a sequence in just-objectionable differences: 10 is identical, less is worse. None without the
-    package.
+    """Quality of a sequence in just-objectionable differences (10 is identical); None without the package.
 
     Args:
         frames, truth: [F, H, W, 3] display-referred in [0, 1]; one frame is judged as a still picture.

@@ -148,8 +148,7 @@ def _shown(
 ) -> Detailed:
     """Scores every pose of every instant in one variant of the frame against the truth.
 
-    The delivered frame at the pose of t* is plate t*, which is the truth. It gets no row, because it would raise the
-    means.
+    The delivered frame at the pose of t* is plate t*, which is the truth. It gets no row, as it would raise the means.
     """
     rows: list[FrameScore] = []
     jod: dict[str, float | None] = {}

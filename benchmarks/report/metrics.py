@@ -220,8 +220,7 @@ class Paired:
     frame_se: float | None
     """Standard error if all frames were independent. It is too small, because frames of one run are correlated."""
     verdict: str
-    """win if a is better by more than twice `se`; loss if worse by as much; else, or with under four units,
-    undecided."""
+    """win or loss if a is better or worse by more than twice `se` and there are at least four units; else undecided."""
 
 
 def paired(a: Mapping[Key, float | None], b: Mapping[Key, float | None], more_is_better: bool = True) -> Paired | None:

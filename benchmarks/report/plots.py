@@ -136,8 +136,7 @@ def strip(path: Path, results: Path, record: RunRecord, title: str, most: int = 
 
 
 def methods_strip(path: Path, results: Path, runs: Sequence[tuple[str, RunRecord]], title: str) -> Path | None:
-    """One frame as frozen by every method, after the truth: the frame common to all with the greatest spread in
-    PSNR."""
+    """One frame as frozen by every method, after the truth: the common frame with the greatest spread in PSNR."""
     if not runs:
         return None
     kept = [{(p.t_star, p.pose): p for p in run.pictures} for _, run in runs]

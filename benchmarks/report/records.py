@@ -19,8 +19,8 @@ RECORD_VERSION = 4
 PICTURES = "pictures"
 """Folder of pictures in the folder of the records."""
 SPLATS, DEVELOPED, WITHHELD, DELIVERED = "splats", "developed", "withheld", "delivered"
-"""Variants of a frozen frame: Gaussians of the run alone; Gaussians of the developed instant alone; plate detail on it
-without the plate of its own pose; the delivered frame."""
+"""Variants of a frozen frame: Gaussians of the run alone; Gaussians of the developed instant alone; the developed
+instant with plate detail, without the plate of its own pose; the delivered frame."""
 
 
 @dataclass

@@ -37,8 +37,7 @@ def _weights(path: Path) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def distance_map(image: Tensor, truth: Tensor) -> Tensor | None:
-    """[H, W] distance of two pictures [H, W, 3] in [0, 1] at every pixel; None without weights or with a side below 32
-    pixels.
+    """[H, W] distance map of two pictures [H, W, 3] in [0, 1]; None without weights or if a side is below 32 pixels.
 
     Its mean is the published distance, except for the layers' upsampling.
     """

@@ -215,8 +215,8 @@ def _costs(settings: Sequence[Setting]) -> Table:
 
 
 def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
-    """Compared pairs (a, b): hosts with and without anchors, ours and each other host (including static), developed
-    instants or plate detail and Gaussians alone."""
+    """Compared pairs (a, b): hosts with and without anchors; ours and each other host, including static; developed
+    instants or plate detail, and Gaussians alone."""
     pairs: list[tuple[Setting, Setting]] = []
     for group in _places(settings):
         at = {(s.variant, s.host, s.supervision): s for s in group if s.shown == SPLATS}

@@ -35,7 +35,7 @@ within half a second of that plate."""
 HELD_THINGS = ("raised", "turned", "resting", "leaving", "set_down")
 """An arm raised once; a head that turns unseen; a hand that leaves a table; a person who leaves; a box put down."""
 THINGS = (*PANES, "wall", "swinging", "arm", "hair", *HELD_THINGS, HELD)
-"""All things of hard scenes. Also the still wall near panes; an object swinging on a thread; a gesturing arm; hair."""
+"""Names of all things of hard scenes, including the still wall near panes, a swinging object, a gesturing arm, hair."""
 RIGID = "rigid"
 """The region of a real clip in which the plate is the truth."""
 
@@ -165,6 +165,6 @@ class RealScene:
         return {}
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """static and moving pixels: more than 95 % of the pixel is still or moves. Unknown pixels are neither."""
+        """`static` and `moving` pixels: more than 95 % of the pixel is still, or moves. Unknown pixels are neither."""
         shares = motion_shares(self.shot, frame, width, height)
         return {"moving": shares["moving"] > 0.95, "static": shares["still"] > 0.95}

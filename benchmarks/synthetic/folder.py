@@ -42,8 +42,7 @@ class Regions:
 
     @classmethod
     def of(cls, data: Mapping[str, NDArray]) -> Regions:
-        """The regions from the arrays of an .npz file. A frame of the clip has no `seen`, so all of it counts as
-        seen."""
+        """Regions from the arrays of an .npz file. Clip frames have no `seen`; all their pixels count as seen."""
         moving = data["moving"]
         things = {name.removeprefix(THING): data[name] for name in data if name.startswith(THING)}
         seen = data["seen"] if "seen" in data else np.ones_like(moving)

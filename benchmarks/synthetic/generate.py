@@ -43,7 +43,8 @@ SHUTTER_FRAMES, SUBFRAMES, SUBFRAME_OVERSIZE = 0.5, 3, 2
 `oversize` of these pictures. The camera moves by 2.5 px during the shutter at `quick`, so pictures are 0.8 px apart.
 Each picture samples the pixels anew, which allows a smaller `oversize`."""
 WALK_METRES = 3.2
-"""Length of the walk in `walker`. It goes against the camera, because walking along with it looks like being nearer."""
+"""Length in metres of the walk in `walker`. It goes against the camera's motion; with it, the walker would look
+nearer."""
 
 
 @dataclass
@@ -143,8 +144,7 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
 def _write_held(
     folder: Path, plan: dict[str, Any], size: Size, camera: CameraMove, scene: Held, movers: list[Mover]
 ) -> None:
-    """Writes geometry/held.npz, and adds to the plan the held things, pictures of their other state, and motion
-    blur."""
+    """Writes geometry/held.npz; adds held things, pictures of their other state, and motion blur to the plan."""
     things = [thing for part in scene.parts for thing in part.things]
     with atomic_path(folder / "geometry" / "held.npz") as partial:
         np.savez(partial, allow_pickle=False, **{thing.name: thing.faces for thing in things})

@@ -31,7 +31,7 @@ def turn(yaw: float) -> Array:
 
 
 class Builder:
-    """Collects the faces of one mesh. The scale of a material is its picture's size in metres; 0 stretches it over a
+    """Collects the faces of one mesh. A material's scale is its picture's size in metres; 0 stretches it over a
     face."""
 
     def __init__(self, scales: list[float]) -> None:

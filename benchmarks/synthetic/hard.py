@@ -51,7 +51,7 @@ class Staging:
 
     ahead: WallAhead | None = None
     first: tuple[float, float] | None = None
-    """Position of the first person, with whom the scene's thing is."""
+    """Position of the first person, whose arm or hair is the scene's thing."""
     apple: tuple[float, float] | None = None
     """x, y of the hanging apple."""
     clear: list[Keepout] = field(default_factory=list)

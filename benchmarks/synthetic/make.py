@@ -43,7 +43,7 @@ Say = Callable[[str], None]
 
 
 class BpyMissingError(RuntimeError):
-    """No Python with bpy was found; the message tells the remedy."""
+    """No Python with bpy was found; the message says what to do."""
 
 
 def default_folder() -> Path:

@@ -288,8 +288,7 @@ class Bodies:
         return out["vertices"].numpy().astype(np.float64)
 
     def _sway(self, person: Person, rng: np.random.Generator, seconds: Array, vertices: Array) -> Array:
-        """Tilts the body about its feet, moved to the origin, by fractions of a degree; seated people by a fifth of
-        that."""
+        """Tilts the body about its feet (moved to the origin) by fractions of a degree; a fifth of that when seated."""
         r = person.restless * (0.2 if person.pose in SEATED else 1.0)
         tilt = np.radians(r * np.array([0.45, 0.35, 0.25]) * wander(rng, seconds, 3.5, 3))
         feet = vertices[0, self.influence["feet"] > 0.5].mean(axis=0) * [1.0, 1.0, 0.0]

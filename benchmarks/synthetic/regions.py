@@ -46,11 +46,11 @@ NUDGE = 1e-4
 STILL_SECONDS = 0.5
 """Seconds before and after a plate without motion in a pixel of the region `held`."""
 ELSEWHERE_METRES, SWAY_METRES = 0.04, 0.02
-"""Displacement in metres from which a surface point counts as elsewhere, and up to which it counts as still. See
+"""Displacements in metres: above the first a surface point counts as elsewhere, up to the second as still. See
 docs/synthetic.md for the sway of people who hold still."""
 WALL_METRES, WALL_DEPTH = 0.6, 0.04
-"""Distance around a pane within which its wall counts, and greatest distance of a wall point from the pane's plane. The
-second includes bare wall and pictures, but no furniture."""
+"""Distances in metres: around a pane within which its wall counts, and greatest distance of a wall point from the
+pane's plane. `WALL_DEPTH` includes pictures on the wall, but no furniture."""
 
 
 @dataclass
@@ -123,8 +123,7 @@ class View:
         return -self.matrix[:3, :3].T @ self.matrix[:3, 3]
 
     def rays(self, dx: float = 0.5, dy: float = 0.5) -> Array:
-        """[H*W, 3] world directions of unit depth through the pixels, at offset (dx, dy) in each; by default the
-        centres."""
+        """[H*W, 3] world directions of unit depth through the pixels, at offset (dx, dy) in each (default: centre)."""
         x, y = np.meshgrid(np.arange(self.width) + dx, np.arange(self.height) + dy)
         local = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
         return local.reshape(-1, 3) @ self.matrix[:3, :3]
@@ -333,8 +332,7 @@ def held_elsewhere(
 
 
 def _displaced(geometry: Geometry, hits: Hits, time: int, other: int) -> Array:
-    """[R] distance in metres of the surface points hit by rays at frame `time` from their positions at frame
-    `other`."""
+    """[R] distance in metres of surface points hit by rays at frame `time` from their positions at frame `other`."""
     corners = geometry.triangles[np.maximum(hits.face, 0)] - len(geometry.static)
     which = np.flatnonzero((hits.face >= 0) & (corners[:, 0] >= 0))
     moved = np.zeros(len(hits.face))

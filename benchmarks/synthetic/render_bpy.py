@@ -65,8 +65,7 @@ class Stage:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
         self._settings()
-        # In a scene with panes, all other objects have their own collection, which is a holdout in the panes' view
-        # layer.
+        # In a scene with panes, all other objects are in their own collection, a holdout in the panes' view layer.
         self.collection = self.scene.collection
         if plan.get("panes"):
             self.collection = self._collection("things")
@@ -125,11 +124,9 @@ class Stage:
         settings.exr_codec = "NONE"
 
     def _develop(self) -> None:
-        """Sets up the compositor: it denoises the light on surfaces separately, then multiplies by the surfaces'
-        colour.
+        """Sets up the compositor: it denoises light separately, then multiplies by the surfaces' colour.
 
-        The colour pass is almost free of noise. A denoiser that gets light and texture together confuses noise and
-        texture.
+        The colour pass is almost free of noise. A denoiser of light and texture together confuses noise and texture.
         """
         layer = self.scene.view_layers[0]
         for name in ("diffuse_direct", "diffuse_indirect", "diffuse_color", "emit", "environment"):
@@ -219,8 +216,7 @@ class Stage:
         return mixed("ADD", left, denoise.outputs[0])
 
     def _without(self, mover: dict[str, Any], made: Any) -> Any:
-        """A mover without the triangles of the scene's thing, initially hidden; None if all or no triangles are
-        removed."""
+        """A mover without the triangles of the scene's thing, initially hidden; None if all or none are removed."""
         with np.load(self.folder / "geometry" / "thing.npz", allow_pickle=False) as data:
             gone = data["gone"]
         if gone.all() or not gone.any():

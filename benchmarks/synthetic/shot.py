@@ -225,8 +225,7 @@ def _triangulated(scene: SyntheticScene, shot: Shot, names: list[str]) -> dict[s
 
 
 def surface_points(scene: SyntheticScene) -> dict[str, NDArray]:
-    """Points on surfaces visible in some frames, with half a pixel of noise: xyz [P, 3] metres, rgb, error px,
-    track."""
+    """Points on surfaces seen in some frames, with half a pixel of noise: xyz [P, 3] metres, rgb, error px, track."""
     rng = stream(scene.seed, "surface points")
     chosen = [scene.frames[i] for i in np.linspace(0, len(scene.frames) - 1, SURFACE_FRAMES).round().astype(int)]
     xyz, rgb = [], []
