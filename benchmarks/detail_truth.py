@@ -1,11 +1,11 @@
 """Plate detail against rendered truth: `python -m benchmarks.detail_truth SCENE ... --results DIR`.
 
 SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 for tuning, 100 to 109 for reporting). Its shot, with exact
-cameras by default, and an `auto` run are made in DIR if missing. Prints the mean PSNR over all poses and instants with
-truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and the gains. Prints the ST-LPIPS as
-well if its weights are installed; this metric tolerates shifts of two pixels. For scenes with a small mover it also
-prints the mover's recall (`benchmarks/report/things.py`). The pose of t* itself is excluded, because plate t* is its
-truth. Writes truth-NAME.json to DIR.
+cameras by default, and an `auto` run are made in DIR if missing. Prints mean PSNR by region over all poses and instants
+with truth, for splats -> developed -> withheld (without the plate of the pose) -> delivered, and the gains. Prints
+ST-LPIPS as well if its weights are installed; this metric tolerates shifts of two pixels. For scenes with a small mover
+it also prints the mover's recall (`benchmarks/report/things.py`). The pose of t* itself is excluded, because plate t*
+is its truth. Writes truth-NAME.json to DIR.
 
 Pictures are judged at the run's size, or with `--delivered` at plate size, as delivered to the artist.
 """

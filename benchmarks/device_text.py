@@ -1,10 +1,10 @@
 """Runs the project's kernels on a CPU in their GPU variant (`__CUDA_ARCH__`), plain and under sanitizers.
 
 Warp's cpu device runs the other variant: shuffles through memory, no votes, plain atomics. This tool records launches
-on that device with their buffers before and after: a few small scenes (the rasteriser's kernels, on fibers), SSIM and
-the loss, Adam, and a field's planes. `device_text.cpp` repeats them with real votes and shuffles per warp, and atomics.
-The tool cannot detect races between blocks, errors of stream order, reads of uninitialised memory, or the rounding of a
-GPU's exp2 and division.
+on that device, with their buffers before and after. The launches are those of a few small scenes (the rasteriser, on
+fibers), of SSIM and the loss, of Adam, and of a field's planes. `device_text.cpp` repeats them with real votes and
+shuffles per warp, and atomics. The tool cannot detect races between blocks, errors of stream order, reads of
+uninitialised memory, or the rounding of a GPU's exp2 and division.
 
     python -m benchmarks.device_text                the launches against Warp's cpu device
     python -m benchmarks.device_text --sanitize     once more under address and undefined, and under thread (minutes)

@@ -2,10 +2,10 @@
 
     python -m benchmarks.farm --output DIR [--openjd PYTHON] [--blender BLENDER] [--measure]
 
-Makes short clips of the bundled one, exports them as a job from import to bake, and runs it with `openjd run`: two
-hosts at once, each on its own core, with shuffled tasks and a new session for every few tasks. Prints the estimate
-beside the measurement: processor seconds of every process, including the engine, and elapsed time. Then freezes and
-bakes the same instants on one machine with all its cores, and compares every frame bit for bit.
+Makes short clips of the bundled one, exports them as a job from import to bake, and runs it with `openjd run`. Two
+hosts run at once, each on its own core, with shuffled tasks and a new session for every few tasks. Prints estimated and
+measured processor seconds of every process, including the engine, and elapsed time. Then freezes and bakes the same
+instants on one machine with all its cores, and compares every frame bit for bit.
 
 `--measure` first runs the job of another clip, of one instant in longer parts, and estimates by its rates. Without it
 the program's rates are used. `--openjd` is a Python with openjd-cli (requirements/test.txt). Linux and macOS. Run it on
@@ -174,7 +174,7 @@ def run(folder: Path, host: Host, session_tasks: int, at_once: int, seed: int) -
 
 
 def told(said: dict[str, Any], job: Job, clock: float, at_once: int) -> None:
-    """Prints the estimate beside the measurement."""
+    """Prints the estimate and the measurement side by side."""
     took: dict[str, list[float]] = {}
     for shot in sorted((job.folder / "shots").glob(f"*{SHOT_SUFFIX}")):
         for record in records.read(shot):

@@ -44,8 +44,8 @@ LABEL_WEIGHT = 0.1
 DIFFERS = 0.03, 0.09
 """Display-referred differences of plate and truth at which the label `differs` leaves 0 and reaches 1."""
 SHIFTS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
-"""Candidates added to the fitted bias. The one with the highest PSNR of smoothed, mixed frames is chosen, because the
-fit ignores smoothing and ramp, and its cross-entropy weighs missed and needlessly rejected pixels equally."""
+"""Candidates added to the fitted bias; the highest PSNR of smoothed, mixed frames decides. The fit ignores smoothing
+and ramp, and its cross-entropy weighs missed and needlessly rejected pixels equally."""
 ALIKE = 0.02
 """dB of PSNR within which two biases count as equally good; the one that rejects less is taken."""
 STEPS, RATE, DECAY = 150, 0.15, 1e-4

@@ -227,8 +227,8 @@ def _profile(stage: Stage, name: str) -> dict[str, Any]:
 
 
 def _host(stage: Stage, run: Callable[[], Any], count: int) -> dict[str, Any]:
-    """Host time of one of `count` runs: ms in total, without a profiler. cProfile adds the functions that take most,
-    each [calls, own us, us including callees]; it overstates small functions."""
+    """Mean host time of `count` runs: ms in total, without a profiler, and the functions that take most, by cProfile,
+    each as [calls, own us, us including callees]. cProfile overstates small functions."""
     for _ in range(5):
         run()
     stage.wait()

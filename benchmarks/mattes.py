@@ -4,13 +4,13 @@ SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 for tuning, 100 to 109 f
 cameras, an `auto` run and a take for each instant are made in DIR if missing. Truth is the set of pixels whose centre
 shows a person, found by rays through the scene's triangles.
 
-Each person is lassoed once per instant, at the frame that shows the largest share of them (`--lasso-at t-star`: at the
-instant's frame, which may show a sliver). The lasso is the outline of the truth in that frame, with a corner every
-`--corner` pixels, each moved by up to `--sloppy` pixels in any direction. An occluder may split a person; then each
-part with at least a twentieth of the pixels gets a polygon. All other frames of the take that show at least `LEAST`
-pixels of the person are judged (every `--every`-th of the clip, including t*). The figure is the intersection over
-union of truth and the matte, thresholded at 0.5. Seconds are given up to the job's first matte, including loading the
-run, and per further frame with all its mattes.
+Each person is lassoed once per instant, at the frame that shows the largest share of them. With `--lasso-at t-star` it
+is the instant's frame, which may show only a sliver. The lasso is the outline of the truth in that frame, with a corner
+every `--corner` pixels. Each corner is moved by up to `--sloppy` pixels in any direction. If an occluder splits a
+person, each part with at least a twentieth of the pixels gets a polygon. All other frames of the take that show at
+least `LEAST` pixels of the person are judged (every `--every`-th of the clip, including t*). The figure is the
+intersection over union of truth and the matte, thresholded at 0.5. Seconds are given up to the job's first matte,
+including loading the run, and per further frame with all its mattes.
 
 Writes mattes-NAME.json to DIR.
 """

@@ -3,8 +3,8 @@
 Trains `--method` on a solved shot, which stays unchanged. Figures are in dB at the training size, means over the
 held-out frames. Each frame at its own time gives S, moving and whole. S covers the pixels that the motion matte calls
 still, with no mover within 8 px at a width of 640. F covers still pixels of frames frozen at each instant. These are
-seen from the held-out frames at least a quarter of the clip away; neither that frame's matte nor the matte of t* may
-have a mover in the pixel. The instants are `--t-star` and one half a clip away. With `--develop` both are developed as
+seen from the held-out frames at least a quarter of the clip away. A pixel with a mover in that frame's matte or in the
+matte of t* is excluded. The instants are `--t-star` and one half a clip away. With `--develop` both are developed as
 a freeze does, for any method. Then F, the best 90 % and the gradient energy of those frames are judged before and
 after, at the training size and at `LARGE` pixels. `--held N` judges moving pixels of N held-out frames, with time
 frozen at that frame; neither training nor development has used its plate. Tune with `--phase` other than 0. Seconds are
@@ -60,9 +60,9 @@ from torch_backend.train.resume import restore_run
 from torch_backend.train.trainer import Trainer
 
 FIGURES = ("still", "moving", "whole", "frozen", "gradient")
-"""S, moving, whole and F in dB; gradient energy of the render at its own time relative to the plate's."""
+"""PSNR in dB of S, moving, whole and F; gradient energy of the render at its own time, relative to the plate's."""
 LARGE = 640
-"""Greatest width of the second size at which frozen frames are judged, that of the working frames."""
+"""Greatest width of the second size at which frozen frames are judged; equals the width of the working frames."""
 OF_FROZEN = ("frozen", "best_90", "gradient")
 """Figures of a frozen frame at another pose: F and its best 90 % in dB; gradient energy relative to the plate's."""
 _MARGIN = 8 / 640

@@ -12,7 +12,7 @@ its width. Prints means over the take's frames, for the take, its Gaussians alon
 
 * whole, best 90 %: PSNR in dB against the clip's own frame. A frozen frame should equal that frame wherever nothing
   moves; the best 90 % leaves the worst tenth of the pixels to movers. The take is compared without lens distortion, as
-  solved; a video is compared unchanged. So each method is compared with its own input.
+  solved; a video is compared unchanged. Each method is thus compared with its own footage.
 * gradient: mean gradient magnitude relative to the clip's frame; 1 is as sharp as the plate.
 
 A method that returns the clip unchanged would score perfectly. Check by eye whether movers stand as they did at the

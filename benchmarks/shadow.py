@@ -41,7 +41,7 @@ class Set:
         return cls(ball, ball + TO_LAMP + disc)
 
     def stops(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """bool [...]: whether the ball blocks the segment between points [..., 3] and points [..., 3]."""
+        """bool [...]: whether the ball blocks the segment between points `begin` and `end`, each [..., 3]."""
         along, off = end - begin, self.ball - begin
         share = np.clip((off * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-20), 0.0, 1.0)
         return np.asarray(np.linalg.norm(share[..., None] * along - off, axis=-1) < RADIUS)

@@ -5,8 +5,8 @@
 SHOT is a solved shot folder, which stays unchanged, or a scene of benchmarks/synthetic, whose shot with exact cameras
 is made in FILE's folder. Every run uses the product's loop, schedules, growth and gate with the numbers in `CHANGES`.
 FILE keeps each finished run, so an interrupted benchmark continues where it stopped. The table gives held-out PSNR at
-the frames' own times, the number of steps skipped as non-finite, the number of repair warnings, and the number of runs
-that ended more than 3 dB below the median of their row.
+the frames' own times, and numbers of steps skipped as non-finite, of repair warnings, and of diverged runs, which ended
+more than 3 dB below the median of their row.
 """
 
 import argparse

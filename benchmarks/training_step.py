@@ -4,8 +4,8 @@ SHOT is a solved shot folder, which stays unchanged. One run of the preset train
 held out, four frames later) and the shot's motion mattes. `--steps` steps are timed at each share of the run in `--at`.
 Parts are means over these steps, in ms. The time of an inner part is subtracted from the outer one, and time outside of
 all parts is listed as the rest.
-Parts of the backward pass are separated by the times at which the gradients of the images and of the Gaussians arrive,
-because autograd traverses the graph in reverse order of construction.
+Autograd traverses the graph in reverse order of construction. So the parts of the backward pass are separated by the
+times at which the gradients of the images and of the Gaussians arrive.
 """
 
 import argparse

@@ -53,7 +53,7 @@ class FrameMaker:
         return self._compositor[1]
 
     def make(self, frame: int, off: frozenset[str]) -> tuple[CompositeFrame, float, float]:
-        """(frame with rules `off`, CPU seconds of its decisions, CPU seconds of all but the render)."""
+        """(frame with rules `off`, CPU seconds of its decisions, CPU seconds without the Gaussians' render)."""
         clip, image = self.clip, self.image(frame)
         output = OutputFrame(frame, *clip.camera(frame), float(self.t_star), float(frame))
         spent, compositor = [0.0], self._maker(off)

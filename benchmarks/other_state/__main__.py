@@ -2,11 +2,11 @@
 
     python -m benchmarks.other_state SHOT ... --results DIR
 
-SHOT is a trained shot folder of `sitting`, `kitchen` or `hall` (shared/footage), which stays unchanged. For every
-painted pair of t* and frame: IoU, precision and recall of the pixels rejected by the delivered frame, and of those that
-motion mattes alone would reject; and the share of unchanged pixels that is rejected. Writes other-state-NAME.json to
-DIR and, with `--pictures`, a picture of each pair. The pictures show the footage: those of `kitchen` and `hall` must
-not enter the repository.
+SHOT is a trained shot folder of `sitting`, `kitchen` or `hall` (shared/footage), which stays unchanged. Every painted
+pair of t* and frame gives IoU, precision and recall of the pixels rejected by the delivered frame, and of those that
+motion mattes alone would reject. A further figure is the share of unchanged pixels that is rejected. Writes
+other-state-NAME.json to DIR and, with `--pictures`, a picture of each pair. The pictures show the footage: those of
+`kitchen` and `hall` must not enter the repository.
 """
 
 from __future__ import annotations

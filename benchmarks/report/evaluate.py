@@ -185,9 +185,9 @@ def freeze_run(
 
 
 def develop_run(shot: Shot, run: LoadedRun, scene: Scene, t_star: int, query: str, report: Reporter) -> FrozenGaussians:
-    """The scene from which a take of frame `t_star` is rendered, saved with the run; developed for a training frame.
+    """The scene from which a take of frame `t_star` is rendered, developed if the run trained on that frame.
 
-    The shot needs motion mattes, which `plate_detail` computes.
+    The scene is saved with the run. The shot needs motion mattes, which `plate_detail` computes.
     """
     return Instants(shot, run, scene, query, [float(t_star)]).at(float(t_star), report)
 

@@ -12,7 +12,7 @@ from .things import LEAST_PIXELS, RECALL_APART, RECALL_DISTANCE, overall
 from .truth import PANES
 
 RECALLED = ("swinging", "arm")
-"""Things with measured recall."""
+"""Things whose recall is measured."""
 
 
 def pane_rows(settings: Sequence[Setting]) -> list[list[str]]:

@@ -1,7 +1,7 @@
 """ST-LPIPS, the shift-tolerant learnt distance of pictures (Ghildyal and Liu, ECCV 2022), on AlexNet.
 
-The package stlpips-pytorch supplies the weights. Its code cannot be imported with a CPU-only torch and is not used:
-this network is written from the layers' shapes and the paper's description. Blurred subsampling replaces AlexNet's
+The package stlpips-pytorch supplies the weights. Its code cannot be imported with a CPU-only torch and is not used.
+This network is written from the layers' shapes and the paper's description. Blurred subsampling replaces AlexNet's
 strides: a binomial 3x3 filter, stride 2, borders reflected by 2 pixels.
 """
 

@@ -30,8 +30,8 @@ REGIONS = ("seen", "never_seen", "moving", "static")
 PANES = ("glass", "mirror")
 """Panes of a hard scene: pixels of a window's pane and of a mirror in which nothing moves, by truth."""
 HELD = "held"
-"""Optional region: pixels where the plate of the pose shows another state than t*, although nothing moves in them
-within half a second of that plate."""
+"""Optional region: pixels where the plate of the pose shows another state than t*, although they are still within half
+a second of that plate."""
 HELD_THINGS = ("raised", "turned", "resting", "leaving", "set_down")
 """An arm raised once; a head that turns unseen; a hand that leaves a table; a person who leaves; a box put down."""
 THINGS = (*PANES, "wall", "swinging", "arm", "hair", *HELD_THINGS, HELD)

@@ -41,7 +41,7 @@ class Builder:
         self.materials: list[int] = []
 
     def rect(self, origin: ArrayLike, along: ArrayLike, up: ArrayLike, material: int) -> None:
-        """Adds a rectangle from `origin` along two vectors (metres), facing along x up."""
+        """Adds a rectangle from `origin` along two vectors (metres), facing their cross product `along` × `up`."""
         o, a, b = (np.asarray(v, np.float64) for v in (origin, along, up))
         self._quad(np.array([o, o + a, o + a + b, o + b]), float(np.linalg.norm(a)), float(np.linalg.norm(b)), material)
 

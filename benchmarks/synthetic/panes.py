@@ -23,7 +23,7 @@ MIRROR_SHARE = 0.95
 
 @dataclass(frozen=True)
 class Pane:
-    """A rectangle that reflects on the side towards along x up."""
+    """A rectangle that reflects on the side of the cross product `along` × `up`."""
 
     kind: str
     """GLASS or MIRROR."""

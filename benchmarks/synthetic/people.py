@@ -168,7 +168,7 @@ class Bodies:
         """{name: [V] soft field over the body}; clothes and hair begin where it exceeds 0.5."""
         z, y = self.rest_vertices[:, 2], self.rest_vertices[:, 1]
         w = self.influence
-        # The hair line falls from the forehead to the nape. Its unit is half the distance between the eyes.
+        # The hair line falls from the forehead to the nape. The unit is half the distance between the eyes.
         unit = self.eye[0]
         hair_line = (z - self.eye[2] - 1.9 * unit) - 0.8 * (self.eye[1] - 0.3 * unit - y)
         above_waist = np.clip((z - WAIST) / 0.02 + 0.5, 0.0, 1.0)

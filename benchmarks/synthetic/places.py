@@ -237,7 +237,7 @@ class Furnisher:
     def wall(
         self, origin: Array, along: Array, length: float, height: float, window: tuple[float, float] | None
     ) -> None:
-        """Adds a wall facing the room (along x up points into it), with a window from `window[0]` to `window[1]`."""
+        """Adds a wall facing the room (`along` × z points into it), with a window from `window[0]` to `window[1]`."""
         texture = ("plaster", "wallpaper", "bricks", "plaster", "concrete")[self.rng.integers(5)]
         skin, board = self.material(texture), self.material("planks", False)
         up = np.array([0.0, 0.0, 1.0])

@@ -315,7 +315,7 @@ class Stage:
     def _go_to(self, time: float, elsewhen: dict[str, float]) -> None:
         """Moves all movers to a time in fractional frames, interpolated linearly between neighbouring frames.
 
-        `elsewhen`: {mover: its time instead}.
+        `elsewhen`: {mover: another time for this mover}.
         """
         if (time, elsewhen) == self.time:
             return

@@ -12,8 +12,9 @@ LIMITS = ("moving-shadow", "exposure-ramp", "fast-mover", "rolling-shutter")
 VERDICTS = ("walker", "still", "tripod")
 """Kinds of scenes for testing the verdict: a person walks through, nothing moves, the camera only turns."""
 HARD = ("glass", "swinging", "arm", "hair", "held")
-"""Kinds of scenes, each with a thing that a freeze tends to lose: a window and a mirror, an apple on a thread, an arm
-that waves or points, fine hair before a bright window, and things that are still in two states (held.py)."""
+"""Kinds of scenes, each with a thing that a freeze tends to lose. These are a window and a mirror, an apple on a
+thread, an arm that waves or points, fine hair before a bright window, and things that are still in two states
+(held.py)."""
 HELD = "held"
 """The kind of held.py, and the region of its truth that showed another state."""
 THING = "thing_"
