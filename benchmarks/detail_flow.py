@@ -124,7 +124,7 @@ class Pair:
     moving: Tensor
     """Visible points that move in either frame or moved at t*, except near points visible in only one frame."""
     still: Tensor
-    """Visible points that move in none of these, with the same exception."""
+    """Visible points that are still in both frames and at t*, with the same exception."""
 
 
 def lay_over(clip: DetailClip, a: Shown, b: Shown, what: str) -> Pair:

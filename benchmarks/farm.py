@@ -40,7 +40,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CLIP = ROOT / "examples" / "sitting.mp4"
 CLIP_FRAMES = 74
 OTHER_FRAMES = 20
-"""Frames of the shot that gives the rates. Parts of 8 frames and one of 4 separate fixed cost from cost per frame."""
+"""Frames of the shot that gives the rates. Its parts have 8 or 4 frames, to separate fixed cost and cost per frame."""
 TASKSET = ("taskset", "--cpu-list")
 
 

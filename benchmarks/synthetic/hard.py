@@ -37,7 +37,7 @@ BRIGHT_WINDOW, BRIGHT_SKY = 3.4, 3.5
 """Width in metres of the window behind the hair, and strength of its sky (other rooms: 1.6). The sky is near white but
 mostly not clipped; otherwise only a strand that covers most of a pixel would be visible."""
 EVENING_SKY = 0.5
-"""Strength of the sky behind glass. It is as bright as the room, so that reflections are visible."""
+"""Strength of the sky behind glass. The sky is as bright as the room, so that reflections are visible."""
 STRANDS, STRAND_STEPS, STRAND_SIDES = 800, 6, 3
 STRAND_METRES, STRAND_RADIUS = (0.1, 0.3), 0.0008
 """Shortest and longest strand, and its radius at the root in metres: a tenth of a pixel wide at `quick`."""
@@ -68,7 +68,7 @@ class Thing:
     faces: NDArray[np.bool_]
     """[F] triangles of the mover in the mask."""
     gone: NDArray[np.bool_]
-    """[F] triangles removed for pictures of the background; all False for no such pictures."""
+    """[F] triangles removed for pictures of the background; if all are False, no such pictures are made."""
 
 
 def share_in_view(views: Array, point: Array) -> float:

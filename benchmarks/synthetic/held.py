@@ -56,7 +56,7 @@ SPOTS, GOOD_SPOTS, LAYOUTS = 400, 150, 20
 """Number of random places tried for a role, number of the best ones kept, and number of random layouts of these.
 Layouts are improved place by place; the one with the best view of every role is used."""
 COLUMN_SHARE = 0.45
-"""Position of the column on the line from head to camera. Nearer to the camera it hides more than the head."""
+"""Position of the column on the line from head to camera. A column nearer to the camera hides more than the head."""
 HEAD_RADIUS, ARM_RADIUS = 0.13, 0.4
 """Radius in metres, around a head and around other held things, that should be visible."""
 COLUMN_HEIGHT = 2.1
@@ -206,7 +206,7 @@ def _spot(
     away = eyes[len(eyes) // 2] - place
     away = away / np.linalg.norm(away)
     facing = float(np.arctan2(away[0], -away[1]))
-    # The body faces (sin, -cos) of its heading. Turned to its left, its right arm is nearer to the camera.
+    # The body faces (sin, -cos) of its heading. If it is turned to its left, the right arm is nearer to the camera.
     turned = {RAISED: 0.0, TURNED: 0.0, RESTING: 40.0, SET_DOWN: 55.0}
     solid, column = [np.array([*place, 0.3])], None
     if role == LEAVING:

@@ -53,8 +53,7 @@ class Size:
     """Divisor of texture sizes; texels finer than the picture's pixels would only be noise."""
 
     def t_star_indices(self) -> list[int]:
-        """Zero-based frame indices of the instants, spread over the multiples of 8; the first frame only if all are
-        used."""
+        """Zero-based frame indices of the instants, spread over the multiples of 8; without the first frame if few."""
         candidates = list(range(0, self.frames, T_STAR_STEP))
         if self.t_stars >= len(candidates):
             return candidates
