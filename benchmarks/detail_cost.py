@@ -1,7 +1,7 @@
 """Cost of a frozen frame with plate detail: `python -m benchmarks.detail_cost SHOT --results DIR`.
 
-SHOT is a trained shot folder, which stays unchanged. Its plates are enlarged, with grain, to numbered PNG files in a
-temporary folder, or copied at factor 1. For one freeze, the Gaussians' render and plate detail are computed along the
+SHOT is a trained shot folder, which stays unchanged. Its plates are enlarged by whole factors (also 1), with grain, to
+numbered PNG files in a temporary folder. For one freeze, the Gaussians' render and plate detail are computed along the
 clip's poses with two threads, and not written. Each size and number of frames runs in its own process, to report its
 peak memory: memory must not grow with the number of frames. Writes cost-NAME.json to DIR. Run it on an idle machine;
 the spread shows whether it was idle.
