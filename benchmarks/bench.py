@@ -1,12 +1,12 @@
-"""The benchmark of the method: hosts x supervision x presets on scenes with truth, and the report of it.
+"""Benchmark of the method: hosts x supervision x presets on scenes with truth, and its report.
 
     python3 splannequin.py bench [--quick] [--ablations]
     python -m benchmarks.bench --size medium --seeds 2 --results DIR
-    python -m benchmarks.bench --truth FOLDER --shot SHOT --results DIR    scenes of one's own
+    python -m benchmarks.bench --truth FOLDER --shot SHOT --results DIR    your own scenes
 
-Every run is a child process: it trains (or goes on from its checkpoint), freezes, scores, and writes
-RESULTS/<run-id>.json whole. A run that has its file is not run again, so an interrupted benchmark goes on where it was.
-With `--jobs N`, N children run at once on cores of their own; children end when this process does, however it ends.
+Each run is a child process: it trains (or resumes from its checkpoint), freezes, scores, and writes
+RESULTS/<run-id>.json atomically. Runs with a record are skipped, so an interrupted benchmark can continue.
+With `--jobs N`, N children run at once, each on its own cores. Children end when this process ends for any reason.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as cli.main does: spinning threads starve others
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch, as in cli.main: spinning threads starve others
 
 from benchmarks.report.records import RECORD_VERSION, RunRecord, finished, machine_facts, save_record
 from benchmarks.report.truth import TruthScene
@@ -40,17 +40,17 @@ from torch_backend.train.config import config_to_json
 from torch_backend.train.device import choose_device
 
 HOSTS = {"hexplane": "4DGaussians", "mlp": "Deformable 3DGS", "control_points": "SC-GS"}
-"""TrainConfig.method of each published host -> its name."""
+"""TrainConfig.method of each published host -> the method's name."""
 QUICK_GAUSSIANS = 5000
 QUERIES = {"none": "plain", "paper": "plain", "support": "nearest"}
-"""Supervision -> how its runs are frozen: as published, at t* itself; `support` asks where a Gaussian was seen."""
+"""Supervision -> time query of its freeze: `plain` at t* itself, as published; `nearest` where a Gaussian was seen."""
 HOLDOUT = 8
-"""Every how many frames one is kept out of training."""
+"""One of every `HOLDOUT` frames is held out of training."""
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """One thing taken away from, or changed in, a method."""
+    """One change to a method, or one part removed from it."""
 
     name: str
     host: str
@@ -60,7 +60,7 @@ class Ablation:
     training: Mapping[str, Any] = field(default_factory=dict)
     """Field of TrainParams -> value."""
     query: str = ""
-    """Empty: as `QUERIES` says."""
+    """Time query of the freeze; empty for the value in `QUERIES`."""
 
 
 ABLATIONS = (
@@ -85,35 +85,35 @@ ABLATIONS = (
     Ablation("frozen where seen nearest", "hexplane", "paper", query="nearest"),
     Ablation("no exposure", "auto", "support", {"exposure.on": False}),
 )
-"""The paper's and ours. The main table's detector is grad_norm; its hosts with `support` are those without a gate.
-What only freezes otherwise is not trained again."""
+"""Ablations of the paper and of this project. The main table's detector is grad_norm. Hosts with `support` have no
+gate. Ablations that only change the freeze share a training run."""
 
 
 @dataclass
 class RunSpec:
-    """One run of the plan: what its child process is told."""
+    """One run of the plan, passed to its child process."""
 
     source: str
-    """Where the scene is, see `load_source`."""
+    """Location of the scene, see `load_source`."""
     scene_key: str
-    """Content of the scene."""
+    """Content hash of the scene."""
     host: str
     supervision: str
     preset: str
     variant: str = "default"
     seed: int = 0
     query: str = ""
-    """How Gaussians are asked at t*: nearest or plain; empty: as `QUERIES` says."""
+    """Time query of Gaussians at t*: nearest or plain; empty for the value in `QUERIES`."""
     overrides: dict[str, Any] = field(default_factory=dict)
     """Dotted field of TrainConfig -> value."""
     training: dict[str, Any] = field(default_factory=dict)
     """Field of TrainParams -> value."""
     iterations: int = 0
-    """0: the preset's; the same for the next two."""
+    """0 uses the preset's value; also for `width` and `max_gaussians`."""
     width: int = 0
     max_gaussians: int = 0
     holdout_phase: int = 0
-    """Which of every `HOLDOUT` frames is kept out: one that spares the instants."""
+    """Index of the held-out frame within every `HOLDOUT`, chosen to keep the instants in training."""
     device: str = "auto"
     """cpu, cuda or auto."""
 
@@ -121,7 +121,7 @@ class RunSpec:
         self.query = self.query or QUERIES[self.supervision]
 
     def params(self, run: str) -> TrainParams:
-        """The training job's parameters. ValueError if one of `training` does not exist."""
+        """The training job's parameters. ValueError for an unknown name in `training`."""
         unknown = set(self.training) - {f.name for f in dataclasses.fields(TrainParams)}
         if unknown:
             raise ValueError(f"a training job has no parameter {min(unknown)}")
@@ -140,7 +140,7 @@ class RunSpec:
         )
 
     def config(self) -> TrainConfig:
-        """Every number of the run. ValueError if something of it does not exist."""
+        """The full training configuration. ValueError for an unknown parameter or override."""
         config = config_from_params(self.params("bench"))
         for path, value in {"holdout_phase": self.holdout_phase, **self.overrides}.items():
             override(config, path, value)
@@ -148,19 +148,19 @@ class RunSpec:
 
     @property
     def run_name(self) -> str:
-        """The training run's folder in the shot: runs that differ only in how they are asked share it."""
+        """The training run's folder in the shot. Runs that differ only in their time query share it."""
         return f"bench-{content_key(config_to_json(self.config()))}"
 
     @property
     def run_id(self) -> str:
-        """Name of the record: readable, and hashed from scene and settings, not from the code."""
+        """Name of the record: readable words and a hash of scene and settings, not of the code."""
         words = f"{Path(self.source).stem}-{self.host}-{self.supervision}-{self.preset}-{self.variant}-s{self.seed}"
         key = content_key(RECORD_VERSION, self.scene_key, config_to_json(self.config()), self.query, self.device)
         return re.sub(r"[^\w-]+", "-", words).strip("-")[:80] + f"-{key}"
 
 
 def override(config: Any, path: str, value: Any) -> None:
-    """Sets a dotted field of a configuration. ValueError if there is none of that name."""
+    """Sets a dotted field of a configuration. ValueError for an unknown field."""
     *parents, name = path.split(".")
     for parent in parents:
         config = getattr(config, parent, None)
@@ -173,7 +173,7 @@ def override(config: Any, path: str, value: Any) -> None:
 
 
 def _settings(reference: bool, ablations: bool) -> tuple[list[RunSpec], list[str]]:
-    """What `plan` runs on every scene, and sentences about what of it is missing."""
+    """(settings that `plan` runs on every scene, sentences about missing ones)."""
     offered = [host for host in HOSTS if host in METHODS]
     supervised = [s for s in ("none", "paper", "support") if s in SUPERVISIONS]
     settings = [RunSpec("", "", host, supervision, "preview") for host in offered for supervision in supervised]
@@ -215,12 +215,12 @@ def plan(
     methods: Sequence[str] = (),
     **common: Any,
 ) -> tuple[list[RunSpec], list[str]]:
-    """(runs, sentences about what is missing): hosts x {none, paper, support}, auto and static, then ablations.
+    """(runs, sentences about missing ones): hosts x {none, paper, support}, auto and static, then ablations.
 
-    Runs are ordered so that an interrupted benchmark has compared something on every scene: by setting, then scene.
-    `reference` adds the hosts with the published sizes, rates and schedules, without and with `paper`. `methods`, where
-    given, are the only values of TrainConfig.method that run. `common` goes to every `RunSpec`: iterations, width,
-    max_gaussians, device.
+    Runs are ordered by setting, then scene, so that an interrupted benchmark has compared settings on every scene.
+    `reference` adds the hosts with the published sizes, rates and schedules, without supervision and with `paper`.
+    `methods` limits TrainConfig.method to these values, unless empty. `common` goes to every `RunSpec`: iterations,
+    width, max_gaussians, device.
     """
     settings, notes = _settings(reference, ablations)
     settings = [setting for setting in settings if not methods or setting.host in methods]
@@ -245,7 +245,7 @@ def plan(
 
 
 def hold_out_phase(scene: TruthScene) -> int:
-    """The hold-out phase that keeps the fewest instants out of training; 0 (used elsewhere) if it can be."""
+    """The hold-out phase that holds out the fewest instants; among equals the lowest. 0 for a real clip."""
     if scene.kind == "real":
         return 0
     loaded = load_scene(scene.shot)
@@ -261,9 +261,9 @@ def hold_out_phase(scene: TruthScene) -> int:
 
 
 def run_plan(runs: Iterable[RunSpec], results: Path, jobs: int = 1) -> list[str]:
-    """Runs what has no record yet, `jobs` children at once. Returns sentences about runs that failed.
+    """Runs every spec without a record, `jobs` children at once. Returns sentences about failed runs.
 
-    Runs that share a training run come one after the other. KeyboardInterrupt ends the children at their next
+    Specs that share a training run are run one after the other. KeyboardInterrupt stops the children at their next
     checkpoint and is raised again.
     """
     failures = []
@@ -300,17 +300,17 @@ def run_plan(runs: Iterable[RunSpec], results: Path, jobs: int = 1) -> list[str]
 
 
 def cores() -> list[int]:
-    """Numbers of the cores that this process may use."""
+    """Numbers of the CPU cores available to this process."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
 
 
 def default_jobs(device: str) -> int:
-    """Two runs at once where there are two cores for them: most of a step does not divide. A GPU does one at a time."""
+    """2 on CPUs with two or more cores, because most of a training step is not parallel; 1 on a GPU."""
     return 1 if choose_device(device).type == "cuda" else min(2, len(cores()))
 
 
 def _start(spec: RunSpec, results: Path, slot: int, jobs: int) -> subprocess.Popen[bytes]:
-    """Starts one spec in a process of its own on its share of the cores, its output to RESULTS/logs."""
+    """Starts one spec in a child process on its share of the cores, with its output in RESULTS/logs."""
     request = results / "requests" / f"{spec.run_id}.json"
     write_json(request, dataclasses.asdict(spec))
     log = results / "logs" / f"{spec.run_id}.txt"
@@ -321,7 +321,7 @@ def _start(spec: RunSpec, results: Path, slot: int, jobs: int) -> subprocess.Pop
     threads = {f"{library}_NUM_THREADS": str(share) for library in ("OMP", "MKL", "OPENBLAS")}
     with open(log, "w", encoding="utf-8") as out:
         try:
-            # A child is born on its parent's cores. Where none can be chosen, each run takes all: its record says so.
+            # A child inherits its parent's cores. Without sched_setaffinity each run uses all cores (see its record).
             if hasattr(os, "sched_setaffinity") and jobs > 1:
                 os.sched_setaffinity(0, {mine[(slot * share + n) % len(mine)] for n in range(share)})
             return subprocess.Popen(
@@ -342,7 +342,7 @@ def _close(child: subprocess.Popen[bytes]) -> None:
 
 
 def work(request: Path, results: Path, jobs: int) -> int:
-    """The child: trains, freezes, scores, writes the record. Returns an exit code."""
+    """Work of the child process: trains, freezes, scores, writes the record. Returns an exit code."""
     end_with_parent()
     spec: RunSpec = from_dict(RunSpec, read_json(request))
     if spec.run_id != request.stem:
@@ -354,14 +354,14 @@ def work(request: Path, results: Path, jobs: int) -> int:
 
 
 def train_spec(spec: RunSpec, truth: TruthScene, jobs: int) -> tuple[int, str, dict[str, Any]]:
-    """Trains what is not trained yet, alone: (exit code, device, facts of the training that its summary has not)."""
+    """Trains a spec unless it is trained: (exit code, device, facts of the training that its summary lacks)."""
     run_name, known = spec.run_name, PRESETS[spec.preset]
-    # The job's parameters name a preset; meanwhile this process knows one more, with the plan's overrides in it.
+    # The job's parameters name a preset. During this call the preset of that name includes the plan's overrides.
     PRESETS[spec.preset] = lambda: _overridden(known(), spec)
     try:
         if config_from_params(spec.params(run_name)) != spec.config():
             raise ValueError(f"an override of {spec.run_id} is set by the job's parameters: give it there")
-        # A child of a benchmark that was killed a moment ago may still be at its last checkpoint.
+        # A child of a benchmark that was just killed may still be writing its last checkpoint.
         with locked(truth.shot.root / "bench" / f"{run_name}.lock"):
             return _train(spec, truth, run_name, jobs)
     finally:
@@ -376,11 +376,11 @@ def _train(spec: RunSpec, truth: TruthScene, run_name: str, jobs: int) -> tuple[
     pace = {"threads": default_threads(), "jobs": jobs}
     if not trained:
         if not whole and pace.items() != {name: facts.get(name) for name in pace}.items():
-            pace = dict.fromkeys(pace)  # it was begun at another pace: nothing can be said of its seconds
+            pace = dict.fromkeys(pace)  # training began at another pace, so its seconds are unknown
         facts = {"version": 1, **pace, "train_cpu_seconds": None}
         write_json(path, facts)
     since = time.process_time()
-    # Several children train runs of one shot at once, each under the lock of its run's name.
+    # Several children train runs of one shot at once, each under a lock named after its run.
     code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print, alone=False)
     if code != ExitCode.OK:
         return int(code), "", facts
@@ -399,7 +399,7 @@ def _overridden(config: TrainConfig, spec: RunSpec) -> TrainConfig:
 def _judge(
     spec: RunSpec, truth: TruthScene, run_name: str, results: Path, trained: dict[str, Any], trained_on: str
 ) -> int:
-    """Scores the trained run, on the device that trained it, and writes its record."""
+    """Scores the trained run on the device that trained it, and writes its record."""
     from benchmarks.report.evaluate import evaluate_run
 
     measured = evaluate_run(truth, run_name, spec.query, results, spec.run_id, Log(), trained_on)
@@ -476,7 +476,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _command(args: argparse.Namespace, argv: Sequence[str] | None) -> str:
-    """What was typed: in this process's own words, or, where the launcher started it, in the launcher's."""
+    """The command line that the user typed, for this module or, if the launcher started it, for the launcher."""
     words = list(sys.argv[1:] if argv is None else argv)
     if not args.tied:
         return subprocess.list2cmdline(["python", "-m", "benchmarks.bench", *words])

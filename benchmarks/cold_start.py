@@ -1,8 +1,8 @@
 """Seconds until the first frame of a new process, with an empty and with a full kernel cache: `python
 -m benchmarks.cold_start [--rounds N]`. A frame is 100 Gaussians on 64 x 48 px, forward and backward, on the CPU.
 
-Each round starts processes of its own. `import` is what importing the rasteriser takes once torch is imported; `first`
-the first call, `second` the one after it.
+Each round starts new processes. `import` is the time to import the rasteriser after torch; `first` and `second` are
+the times of the first two calls.
 """
 
 import argparse
@@ -37,7 +37,7 @@ print(json.dumps({"import": imported - start, "first": first, "second": second})
 
 
 def one(cache: pathlib.Path) -> dict[str, float]:
-    """Seconds of a new process whose Warp cache is the folder `cache`."""
+    """Seconds of each part of a new process whose Warp cache is the folder `cache`."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(cache)}
     run = subprocess.run(
         [sys.executable, "-P", "-c", CHILD], cwd=ROOT, env=environment, capture_output=True, text=True, check=True

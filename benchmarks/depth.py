@@ -1,20 +1,20 @@
 """Depth of frozen frames against truth: `python -m benchmarks.depth SCENE ... --results DIR`.
 
-SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot and an `auto` run
-for each training seed are made in DIR if they are missing. Judged is the depth that a take writes as Z, at the size of
-the plates, for every instant and pose that has a truth. Truth is the depth of the scene's triangles along the rays
-through the pixel centres. It is in metres; exact cameras have scale 1, solved ones that of their similarity.
+SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 for tuning, 100 to 109 for reporting). Its shot and an `auto`
+run for each training seed are made in DIR if missing. The benchmark judges the depth that a take writes as Z, at plate
+size, for every instant and pose with truth. Truth is the depth of the scene's triangles along the rays through the
+pixel centres, in metres. Exact cameras have scale 1, solved ones the scale of their similarity.
 
-Two regions are judged apart, by truth: `still`, and `moving` (people and what they move). Sky, glass and mirrors are
-left out. Figures pool the pixels of all frames of a scene:
+Two regions are judged separately, by truth: `still`, and `moving` (people and what they move). Sky, glass and mirrors
+are excluded. Figures pool the pixels of all frames of a scene:
 
 - Median of |depth - truth| / truth, and the share of pixels beyond 1 %, inside surfaces: at least `INSIDE` pixels from
   every occlusion boundary and from the border of the region.
 - F-score of occlusion boundaries at a tolerance of one pixel: see `occlusion_edges`.
-- The shares of pixels inside surfaces whose error is below one and two of the standard deviations that the frame gives:
-  68 and 95 % of Gaussian errors are.
+- The shares of pixels inside surfaces whose error is below one and two of the standard deviations given by the frame
+  (68 and 95 % for Gaussian errors).
 
-DIR gets depth-NAME.json.
+Writes depth-NAME.json to DIR.
 """
 
 from __future__ import annotations
@@ -42,28 +42,28 @@ from torch_backend.contract import SWITCH
 from torch_backend.shot import write_json
 
 INSIDE = 2
-"""Pixels between what counts as inside a surface and the next occlusion boundary."""
+"""Distance in pixels from the nearest occlusion boundary at which a pixel counts as inside a surface."""
 STEP = 1.05
-"""Ratio of the depths of two neighbouring pixels from which on one occludes the other."""
+"""Ratio of the depths of two neighbouring pixels above which one occludes the other."""
 SAME_SLOPE = 0.5
-"""A step in inverse depth is a slope, not an occlusion, if a step beside it is at least this share of it."""
+"""A step in inverse depth is a slope, not an occlusion, if an adjacent step is at least this share of it."""
 TOLERANCE = 1
-"""Pixels, along rows and columns, by which a boundary may be off."""
+"""Tolerance of a boundary's position in pixels, along rows and columns."""
 NEAR_MOVER = 3
-"""A boundary belongs to `moving` if something that moves is this near, in pixels: else to `still`."""
+"""A boundary within this many pixels of a mover belongs to `moving`, any other to `still`."""
 BEYOND = 0.01
-"""Relative error from which on a card placed by depth visibly passes through a surface."""
+"""Relative error above which a card placed by depth visibly passes through a surface."""
 FARTHEST = 1000.0
-"""Metres beyond which everything counts as equally far, sky included."""
+"""Depth in metres to which all greater depths are clamped, including the sky's."""
 REGIONS = ("still", "moving")
 
 
 def occlusion_edges(depth: Tensor) -> Tensor:
     """bool [H, W]: pixels that occlude a neighbour in their row or column, from depth [H, W] in metres.
 
-    The nearer of two neighbours is such a pixel if their depths differ by a factor of `STEP`, and inverse depth does
-    not change by nearly as much, in the same direction, on either side of the pair: that is a slanted surface, or a
-    boundary that is smeared over several pixels.
+    The nearer of two neighbours is such a pixel if their depths differ by a factor of `STEP` and no adjacent step in
+    inverse depth is nearly as large in the same direction. A large adjacent step means a slanted surface, or a boundary
+    smeared over several pixels.
     """
     inverse = 1.0 / depth.clamp(1e-3, FARTHEST)
     return _edges_in_rows(inverse) | _edges_in_rows(inverse.T).T
@@ -83,23 +83,23 @@ def _edges_in_rows(inverse: Tensor) -> Tensor:
 
 @dataclass
 class Pooled:
-    """What is known of one region of a scene: errors inside surfaces, and counts of boundary pixels."""
+    """Pooled values of one region of a scene: errors inside surfaces, and counts of boundary pixels."""
 
     errors: list[Tensor] = field(default_factory=list[Tensor])
     """Relative errors of depth, [P] per frame."""
     deviations: list[Tensor] = field(default_factory=list[Tensor])
-    """[P] per frame: errors in standard deviations; empty if frames have none."""
+    """Errors in standard deviations, [P] per frame; empty if frames have none."""
     found: int = 0
-    """Boundary pixels of the frames that have one of the truth within `TOLERANCE`,"""
+    """Number of boundary pixels of the frames within `TOLERANCE` of a true one."""
     shown: int = 0
-    """of so many;"""
+    """Number of boundary pixels of the frames."""
     recalled: int = 0
-    """boundary pixels of the truth that have one of the frames so near,"""
+    """Number of true boundary pixels within `TOLERANCE` of one of the frames."""
     true: int = 0
-    """of so many."""
+    """Number of true boundary pixels."""
 
     def add_boundary(self, depth: Tensor, truth: Tensor, region: Tensor) -> None:
-        """Boundary pixels of one frame that lie in `region`."""
+        """Adds the boundary pixels of one frame in `region`."""
         true_edges, edges = occlusion_edges(truth), occlusion_edges(depth)
         self.found += int((edges & region & dilate(true_edges, TOLERANCE)).sum())
         self.shown += int((edges & region).sum())
@@ -107,7 +107,7 @@ class Pooled:
         self.true += int((true_edges & region).sum())
 
     def add_surface(self, depth: Tensor, truth: Tensor, region: Tensor, sigma: Tensor | None) -> None:
-        """Pixels of one frame that lie inside surfaces of `region`."""
+        """Adds the pixels of one frame inside surfaces of `region`."""
         sky = ~torch.isfinite(truth)
         outside = occlusion_edges(truth) | sky | ~region
         inside = ~dilate(outside, INSIDE)
@@ -117,8 +117,8 @@ class Pooled:
             self.deviations.append(off / sigma[inside].clamp_min(1e-9))
 
     def figures(self) -> dict[str, float | None]:
-        """median and beyond (shares), boundary_f, precision, recall, within_1_sigma, within_2_sigma; None where nothing
-        is known."""
+        """median and beyond (shares), boundary_f, precision, recall, within_1_sigma, within_2_sigma; None for a figure
+        without data."""
         errors = torch.cat(self.errors) if self.errors else torch.empty(0)
         deviations = torch.cat(self.deviations) if self.deviations else torch.empty(0)
         precision = self.found / self.shown if self.shown else None

@@ -1,11 +1,12 @@
-"""Frozen frames made of plates, against the plates of a real clip: `python -m benchmarks.detail SHOT --results DIR`.
+"""Frozen frames with plate detail against the plates of a real clip: `python -m benchmarks.detail SHOT --results DIR`.
 
-SHOT is a trained shot folder; nothing is written into it. For t* as suggested and one half a clip away, on frames held
-out of training: splats alone as the run has them (splats) and of the developed instant (developed), of that plate
-detail with the plate of the same pose withheld, and what is delivered, each against that plate: PSNR whole, of the best
-90 % of the pixels, of still pixels, and gradients over the plate's. Whole frames hold people who moved since, whom no
-freeze at another instant can match. Then what two instants differ by where nothing moves. DIR gets detail-NAME.json and
-strips (plate, splats, developed, withheld, delivered) at 100 %.
+SHOT is a trained shot folder, which stays unchanged. Frames held out of training are judged at the suggested t* and at
+an instant half a clip away. Each of these pictures is compared with the frame's plate: the run's Gaussians alone
+(splats), the developed instant's (developed), plate detail without the plate of the same pose (withheld), and the
+delivered frame. Figures: PSNR of the whole frame, of the best 90 % of the pixels and of still pixels, and gradients
+relative to the plate's. In whole frames people have moved since t*, which no freeze can match. The difference of the
+two instants is measured where nothing moves. Writes detail-NAME.json and strips (plate, splats, developed, withheld,
+delivered) at 100 % to DIR.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ from torch_backend.footage.images import write_png
 from torch_backend.shot import write_json
 
 FIGURES = {"whole_db": "whole, dB", "best_90_db": "best 90 %, dB", "still_db": "still, dB", "gradient": "gradient"}
-"""Figure of a picture -> in the table."""
+"""Figure of a picture -> its column in the table."""
 CROP = (640, 480)
-"""Pixels of a picture that a strip shows, at most."""
+"""Largest size (width, height) in pixels of each picture in a strip."""
 Row = dict[str, Any]
 
 
@@ -60,9 +61,9 @@ def judge_frame(clip: DetailClip, frame: int, t_star: int) -> tuple[Row, dict[st
 def judge(
     clip: DetailClip, t_stars: Sequence[int], frames: Sequence[int], strips: Path | None = None, worst: int = 0
 ) -> dict[str, Any]:
-    """All figures of a clip. With `strips`, a folder, every frame's pictures side by side are written there.
+    """All figures of a clip. `strips`: a folder for every frame's pictures side by side, or None.
 
-    `worst` > 0 keeps only the strips of so many frames at each t*, those with the lowest best-90 % dB withheld.
+    `worst` > 0 keeps only the strips of the `worst` frames at each t* with the lowest best-90 % dB of `withheld`.
     """
     result: dict[str, Any] = {"t_stars": list(t_stars), "size": [clip.width, clip.height], "freezes": []}
     result["motion_from"] = clip.motion_from
@@ -132,7 +133,7 @@ def table(name: str, result: dict[str, Any]) -> list[str]:
 
 
 def save_strip(path: Path, pictures: Sequence[Tensor], crop: tuple[int, int, int, int] | None = None) -> None:
-    """Pictures [H, W, 3] side by side at 100 %, cut to `crop` (x, y, width, height) or to the middle."""
+    """Writes pictures [H, W, 3] side by side at 100 %, cropped to `crop` (x, y, width, height) or to the centre."""
     height, width = pictures[0].shape[:2]
     w, h = min(width, CROP[0]), min(height, CROP[1])
     x, y, w, h = crop or ((width - w) // 2, (height - h) // 2, w, h)
@@ -145,7 +146,7 @@ def save_strip(path: Path, pictures: Sequence[Tensor], crop: tuple[int, int, int
 
 
 def chosen_frames(clip: DetailClip, args: argparse.Namespace) -> list[int]:
-    """The frames that are requested, else every `--every`-th of those held out of training."""
+    """The requested frames, or every `--every`-th frame held out of training. ValueError if unknown or none."""
     frames = args.frames or clip.held_out()[:: args.every]
     unknown = set(frames) - set(clip.frames)
     if unknown or not frames:
@@ -155,7 +156,7 @@ def chosen_frames(clip: DetailClip, args: argparse.Namespace) -> list[int]:
 
 
 def common_arguments(parser: argparse.ArgumentParser) -> None:
-    """Those that all benchmarks of a real clip take."""
+    """Adds the arguments shared by all benchmarks of a real clip."""
     parser.add_argument("shot", type=Path)
     parser.add_argument("--run", default="main", metavar="NAME")
     parser.add_argument("--t-star", type=int, nargs="+", metavar="N", help="default: suggested, and half a clip away")
@@ -168,13 +169,13 @@ def common_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def develop_argument(parser: argparse.ArgumentParser) -> None:
-    """Whether instants are developed."""
+    """Adds `--develop`: whether instants are developed."""
     text = "off: instants stay as the run has them"
     parser.add_argument("--develop", default="on", choices=SWITCH, help=text)
 
 
 def name_of(shot: Path) -> str:
-    """What a shot's files are called: its folder's name, or its parent's where it is called `shot`."""
+    """Name of a shot's result files: its folder's name, or the parent's if the folder is called `shot`."""
     return shot.absolute().parent.name if shot.stem == "shot" else shot.stem
 
 

@@ -1,4 +1,4 @@
-"""A trained shot as the benchmarks of plate detail look at it: its plates, its frozen frames, what moves where."""
+"""A trained shot for the benchmarks of plate detail: its plates, frozen frames and moving regions."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from torch_backend.shot import Shot
 from torch_backend.train import load_run
 
 BACKDROP = 0.5
-"""Grey behind what no Gaussian covers, as in previews."""
+"""Grey level behind uncovered pixels, as in previews."""
 VARIANTS = ("splats", "developed", "withheld", "delivered")
-"""Splats alone as the run has them; those of the developed instant; of it with plate detail, the plate of the same pose
-withheld; with all plates. Nothing is developed with `--develop off`."""
+"""Gaussians of the run alone; Gaussians of the developed instant alone; the developed instant with plate detail,
+without the plate of the same pose; and with all plates. With `--develop off` there is no `developed`."""
 
 
 @dataclass
@@ -46,23 +46,23 @@ class View:
     """One frozen frame."""
 
     image: FrozenImage
-    """Splats alone, of the instant as it is delivered."""
+    """Render of the Gaussians alone, at the delivered instant."""
     detailed: CompositeFrame
-    """With plate detail."""
+    """The frame with plate detail."""
     splats: Tensor
-    """[H, W, 3] splats alone before grey, in [0, 1]."""
+    """[H, W, 3] Gaussians alone over grey, in [0, 1]."""
     picture: Tensor
-    """[H, W, 3] with plate detail before grey, in [0, 1]."""
+    """[H, W, 3] with plate detail over grey, in [0, 1]."""
 
 
 class DetailClip:
-    """A run of a shot. Pictures are of `width` x `height`: the plates' own size unless another width is given.
+    """A run of a shot. Pictures are `width` pixels wide; 0 uses the plates' size.
 
-    Instants are developed as a take's are; nothing is written into the shot.
+    Instants are developed as for a take; the shot stays unchanged.
     """
 
     def __init__(self, shot: Shot, run: str = "main", width: int = 0, develop: bool = True) -> None:
-        """JobError if the shot is not solved or the run not trained."""
+        """JobError if the shot is not solved or the run is not trained."""
         self.develop = develop
         self.shot = shot
         self.run, self.scene = load_run(shot, run, torch.device("cpu")), load_scene(shot)
@@ -78,7 +78,7 @@ class DetailClip:
 
     @property
     def motion_from(self) -> str:
-        """Which mattes say what moves."""
+        """Name of the mattes that define motion."""
         found = self.matte(self.frames[0]) is not None
         return "the shot's motion mattes" if found else "the gate, which misses movers: the shot has no motion mattes"
 
@@ -93,7 +93,7 @@ class DetailClip:
         return [self.scene.frames[i] for i in test]
 
     def instants(self) -> list[int]:
-        """The suggested t*, and the trained frame half a clip from it."""
+        """The suggested t*, and the training frame nearest to half a clip from it."""
         suggested = choose_t_star(self.shot, self.scene, self.run, FreezeParams(), Log())
         half = len(self.frames) // 2
         at = self.frames.index(suggested)
@@ -106,11 +106,11 @@ class DetailClip:
         return self.scene.viewmats[index], self.Ks[index]
 
     def field(self, t_star: int) -> FrozenGaussians:
-        """The run at an instant, as it was trained."""
+        """The trained run at an instant, before development."""
         return freeze_at(self.run.model, self.scene.time_of_frame(t_star), span_of(self.scene, self.run))
 
     def frozen(self, t_star: int, keep: bool = False) -> FrozenGaussians:
-        """The run at an instant as takes are rendered from it; `keep`: with the run, for others to load."""
+        """The developed instant from which takes are rendered. `keep`: save it with the run for other processes."""
         if t_star not in self._frozen:
             made = self.field(t_star)
             if self.develop and t_star in self.run.train_frames:
@@ -120,25 +120,25 @@ class DetailClip:
         return self._frozen[t_star]
 
     def splats(self, frame: int, t_star: int, frozen: FrozenGaussians | None = None) -> FrozenImage:
-        """The frozen frame by splats alone, with mattes and depth; of `frozen`, or the instant as it is delivered."""
+        """Render of Gaussians alone, with mattes and depth, from `frozen` or from the delivered instant."""
         viewmat, K = self.camera(frame)
         model, exposed_at = self.run.model, self.scene.time_of_frame(frame)
         frozen = frozen or self.frozen(t_star)
         return render_frozen(frozen, viewmat, K, self.width, self.height, model.exposure, exposed_at)
 
     def view(self, frame: int, t_star: int, withheld: Collection[int] = (), image: FrozenImage | None = None) -> View:
-        """The frozen frame with plate detail; `image` is that of `splats`, if it is at hand."""
+        """The frozen frame with plate detail. `image`: the result of `splats`, if already computed."""
         image = image or self.splats(frame, t_star)
         detailed = self.detailed(frame, t_star, image, withheld)
         return View(image, detailed, over(image.color, image.alpha), over(detailed.color, detailed.alpha))
 
     def detailed(self, frame: int, t_star: int, image: FrozenImage, withheld: Collection[int] = ()) -> CompositeFrame:
-        """The frozen frame of plates as a take makes it, from its render by `splats`."""
+        """The frozen frame with plate detail as in a take, from its render by `splats`."""
         output = OutputFrame(frame, *self.camera(frame), float(t_star), float(frame))
         return self.compositor.frame(output, self.frozen(t_star), image, self.width, self.height, withheld)
 
     def depth(self, frame: int, t_star: int, view: View) -> tuple[Tensor, Tensor]:
-        """(depth, its standard deviation) of a frozen frame as a take writes it, [H, W] each in scene units."""
+        """(depth, its standard deviation) of a frozen frame as written by a take, each [H, W] in scene units."""
         measured = self.measured.at(t_star, self.frozen(t_star))
         return self.depths.of(*self.camera(frame), view.detailed.depth, view.image.motion, view.picture, measured)
 
@@ -147,7 +147,7 @@ class DetailClip:
         return self.plates.display(frame).clamp(0.0, 1.0)
 
     def matte(self, frame: int) -> Tensor | None:
-        """The motion matte of a frame, [H, W] in 0..1; None if none was found."""
+        """The motion matte of a frame, [H, W] in 0..1; None if the shot has none."""
         matte = load_motion(self.shot, frame)
         if matte is None:
             return None
@@ -155,10 +155,10 @@ class DetailClip:
         return F.interpolate(values, (self.height, self.width), mode="nearest-exact")[0, 0]
 
     def mattes(self, frame: int, t_star: int, view: View) -> tuple[Tensor, Tensor]:
-        """(matte of what moves in the frame, matte of what of the frozen frame moves at t*), each [H, W] in 0..1.
+        """(matte of movers in the frame, matte of the frozen frame's points that move at t*), each [H, W] in 0..1.
 
-        The second is that of frame t*, brought here by the frozen depth; 0 where t* does not look. Without mattes in
-        the shot both are the gate's, as the frozen frame shows it.
+        The second is the matte of frame t*, warped to this frame by the frozen depth; 0 outside the view of t*. If the
+        shot has no mattes, both are the gate's matte in the frozen frame.
         """
         own, of_t_star = self.matte(frame), self.matte(t_star)
         if own is None or of_t_star is None:
@@ -169,9 +169,9 @@ class DetailClip:
         return own, torch.where(known, sampled(of_t_star, places, nearest=True), 0.0)
 
     def still(self, frame: int, t_star: int, view: View) -> Tensor:
-        """Pixels of the frame in which the frozen frame must show what the plate shows, bool [H, W].
+        """bool [H, W] pixels where the frozen frame must equal the plate.
 
-        What is masked as no part of the scene, such as a burnt-in logo, is not among them: the freeze removes it.
+        Excludes pixels masked as no part of the scene, such as a burnt-in logo, because the freeze removes them.
         """
         own, frozen = self.mattes(frame, t_star, view)
         ignored = self.compositor.seen.view(frame).ignored
@@ -180,10 +180,10 @@ class DetailClip:
 
 
 def over(color: Tensor, alpha: Tensor) -> Tensor:
-    """Premultiplied colour [H, W, 3] before grey, in [0, 1]."""
+    """Premultiplied colour [H, W, 3] over grey, in [0, 1]."""
     return (color + (1.0 - alpha[..., None]) * BACKDROP).clamp(0.0, 1.0)
 
 
 def open_clip(path: str | Path, run: str = "main", width: int = 0, develop: bool = True) -> DetailClip:
-    """The clip of a shot folder."""
+    """Opens the clip of a shot folder."""
     return DetailClip(Shot.open(path), run, width, develop)

@@ -1,10 +1,10 @@
-"""What a frozen frame made of plates costs: `python -m benchmarks.detail_cost SHOT --results DIR`, on a quiet machine.
+"""Cost of a frozen frame with plate detail: `python -m benchmarks.detail_cost SHOT --results DIR`.
 
-SHOT is a trained shot folder; nothing is written into it. Its plates are taken as they are and enlarged, with grain, to
-numbered PNG files in a temporary folder; along the clip's poses, with two threads, splats and plate detail of one
-freeze are made and not written. Each size and number of frames has a process of its own, whose peak memory is told:
-more frames of the same size must not take more. DIR gets cost-NAME.json. Run it when nothing else runs: the spread says
-whether that was so.
+SHOT is a trained shot folder, which stays unchanged. Its plates are enlarged by whole factors (also 1), with grain, to
+numbered PNG files in a temporary folder. For one freeze, the Gaussians' render and plate detail are computed along the
+clip's poses with two threads, and not written. Each size and number of frames runs in its own process, to report its
+peak memory: memory must not grow with the number of frames. Writes cost-NAME.json to DIR. Run it on an idle machine;
+the spread shows whether it was idle.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ from torch_backend.train.checkpoint import load_checkpoint, save_checkpoint
 THREADS = 2
 WIDTHS = (640, 1280, 3840)
 ALLOWED = {640: 0.4, 1280: 1.5, 3840: 14.0}
-"""Width of 16:9 frames -> seconds that one may take."""
+"""Width of 16:9 frames -> allowed seconds per frame."""
 PATHS = {640: (24, 150), 1280: (12, 48), 3840: (6, 18)}
-"""Width -> frames along the path: memory must not grow with them."""
+"""Width -> numbers of frames along the path; memory must not grow with them."""
 _REAL = 3
-"""Plates before and after the path that are enlarged; others, rarely looked at, share their files."""
+"""Number of plates before and after the path that are really enlarged. Others are rarely read and share files."""
 
 
 def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Shot:
-    """A copy of the shot's solve and run whose footage is its frames `factor` times as wide, as numbered PNG files.
+    """A copy of the shot's solve and run whose footage is its frames, `factor` times as wide, as numbered PNG files.
 
-    ValueError if the shot's plates cannot be read from there.
+    ValueError if the shot's plates cannot be read from that footage.
     """
     copy = folder / shot.root.name
     for part in ("solve", "runs"):
@@ -78,7 +78,7 @@ def enlarged(shot: Shot, folder: Path, factor: int, poses: Sequence[int]) -> Sho
     key = import_key(open_source(str(footage), config.fps, config.layer).info, config)
     record |= {"config": settings, "key": key, "bits": 8, "beside": ""}
     write_json(copy / "frames" / "frames.json", record)
-    for checkpoint in (copy / "runs").glob("*/checkpoint.safetensors"):  # they were trained on these, smaller
+    for checkpoint in (copy / "runs").glob("*/checkpoint.safetensors"):  # they were trained on the smaller pictures
         tensors, facts = load_checkpoint(checkpoint)
         save_checkpoint(checkpoint, tensors, {**facts, "pictures": key})
     made = Shot.open(copy)
@@ -95,7 +95,7 @@ def _around(frames: Sequence[int], poses: Sequence[int]) -> list[int]:
 
 
 def _enlarge(source: Path, target: Path, factor: int, rng: np.random.Generator) -> None:
-    """Each pixel becomes `factor` x `factor` of them, with grain: smooth pictures would be read faster than footage."""
+    """Repeats each pixel `factor` x `factor` times and adds grain, as smooth pictures decode faster than footage."""
     pixels = read_png(source)
     pixels = (pixels >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels
     large = pixels.repeat(factor, 0).repeat(factor, 1).astype(np.int16)
@@ -104,7 +104,7 @@ def _enlarge(source: Path, target: Path, factor: int, rng: np.random.Generator) 
 
 
 def measure(shot: Path, run: str, width: int, poses: Sequence[int], develop: bool) -> dict[str, Any]:
-    """In a process of its own: seconds of each frame, and peak memory before and after."""
+    """Seconds of each frame, and peak memory before and after. Call it in a new process."""
     import resource
 
     torch.set_num_threads(THREADS)
@@ -120,7 +120,7 @@ def measure(shot: Path, run: str, width: int, poses: Sequence[int], develop: boo
         made = clip.detailed(pose, t_star, image)
         rows.append({"frame": pose, "splats": splats, "whole": time.perf_counter() - since})
         sources |= {int(frame) for frame in made.source.unique().tolist()} - {0}
-        del image, made  # as a take does: a frame is written and let go before the next is made
+        del image, made  # as a take does: each frame is freed before the next
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "width": clip.width,
@@ -135,12 +135,12 @@ def measure(shot: Path, run: str, width: int, poses: Sequence[int], develop: boo
 
 
 def _mb(rss: int) -> float:
-    """Megabytes of a ru_maxrss, which macOS gives in bytes."""
+    """Megabytes of a ru_maxrss, which is in bytes on macOS and in KiB elsewhere."""
     return rss / 1e6 if sys.platform == "darwin" else rss * 1024 / 1e6
 
 
 def in_child(shot: Shot, run: str, width: int, poses: Sequence[int], develop: bool = False) -> dict[str, Any]:
-    """`measure` in a process of its own. RuntimeError with its last words if it fails."""
+    """`measure` in a child process. RuntimeError with its last line of stderr if it fails."""
     work = json.dumps({"shot": str(shot.root), "run": run, "width": width, "poses": list(poses), "develop": develop})
     threads = {f"{library}_NUM_THREADS": str(THREADS) for library in ("OMP", "MKL", "OPENBLAS")}
     command = [sys.executable, "-P", "-m", "benchmarks.detail_cost", "--work", work]
@@ -158,9 +158,9 @@ def middle_poses(clip: DetailClip, count: int) -> list[int]:
 
 
 def summary(found: dict[str, Any]) -> dict[str, Any]:
-    """Median, least and greatest seconds of a frame over the second half of the path, and those of the first frame.
+    """Median, least and greatest seconds per frame over the second half of the path, and those of the first frame.
 
-    The first ones look at the plates around for all that follow.
+    The first frames also load the nearby plates for all later ones.
     """
     whole = [row["whole"] for row in found["frames"]]
     later = whole[len(whole) // 2 :]
@@ -170,7 +170,7 @@ def summary(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def table(sizes: Sequence[dict[str, Any]]) -> list[str]:
-    """A row per size and number of frames in Markdown."""
+    """Markdown rows, one per size and number of frames."""
     header = ["size", "frames", "s per frame, median", "least", "most", "the first", "of it splats", "allowed"]
     header += ["peak MB", "before"]
     lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
@@ -210,7 +210,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             counts = args.frames or PATHS.get(width, (12, 36))
             poses = middle_poses(clip, max(counts))
             shot = enlarged(Shot.open(args.shot), Path(folder), width // clip.scene.width, poses)
-            if args.develop == "on":  # here, whose memory is not told: that is done once for a take
+            if args.develop == "on":  # in this process, whose memory is not reported: a take develops once
                 large = DetailClip(shot, args.run)
                 large.frozen(large.instants()[0], keep=True)
             for count in counts:

@@ -1,10 +1,10 @@
-"""Figures of frozen frames made of plates, as pure functions: where nothing moves, what a camera's motion explains.
+"""Figures of frozen frames with plate detail, as pure functions: still pixels, and flow that camera motion explains.
 
 Pictures are display-referred [H, W, 3] in [0, 1], masks bool [H, W], places [H, W, 2] in pixels (x, y) with pixel
-centres at +0.5, cameras OpenCV world-to-camera [4, 4] and K [3, 3] in pixels. None of it is shared with what is judged.
+centres at +0.5, cameras OpenCV world-to-camera [4, 4] and K [3, 3] in pixels. The product shares none of this code.
 """
 
-# Packages of requirements/bench.txt may be absent; each use says what to do then.
+# Packages of requirements/bench.txt may be absent; each use handles that case.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from torch.nn import functional as F
 from benchmarks.report.metrics import best_share_psnr, gradient_magnitude, psnr_of
 
 STILL_MATTE = 0.05
-"""A pixel is still if its motion matte is below this,"""
+"""A still pixel has a motion matte below this."""
 STILL_MARGIN = 8
-"""and no mover is this near, in pixels,"""
+"""A still pixel is farther than this from every mover, in pixels."""
 MOVER_MATTE = 0.75
-"""where a matte above this is a mover: *unknown* (0.5) is neither still nor one."""
+"""A mover has a matte above this; *unknown* (0.5) counts as neither still nor moving."""
 SAME_DEPTH = 0.03
-"""Two views see the same point if its depths differ by less than this share."""
+"""Two views see the same point if the relative difference of its depths is below this."""
 FLOW_WIDTH = 640
-"""Pixels of width at which flow is computed."""
+"""Picture width in pixels at which flow is computed."""
 LEVEL_WINDOW, LEVEL_FLOOR = 31, 8 / 255
-"""Pixels over which pictures are levelled before flow is taken, and the contrast below which there is none."""
+"""Window in pixels of the local normalisation before flow, and the contrast added to its divisor."""
 TEXTURE_WINDOW, TEXTURE = 9, 4 / 255
-"""Pixels over which structure is searched for, and the least of it: grain of 1 or 2 / 255 is none."""
+"""Window in pixels of the structure tensor, and the least structure; grain of 1 or 2 / 255 stays below it."""
 
 
 def dilate(mask: Tensor, by: int) -> Tensor:
-    """A mask with a margin of `by` pixels."""
+    """A mask dilated by `by` pixels."""
     return F.max_pool2d(mask.float()[None, None], 2 * by + 1, 1, by)[0, 0] > 0.5
 
 
 def still_pixels(matte: Tensor, mover: Tensor | None = None, margin: int = STILL_MARGIN) -> Tensor:
-    """Where nothing moves: bool [H, W] from a motion matte [H, W] in 0..1.
+    """bool [H, W] still pixels, from a motion matte [H, W] in 0..1.
 
-    `mover` are pixels to stay away from, besides those of the matte itself.
+    `mover`: additional moving pixels, which also get the margin.
     """
     movers = matte > MOVER_MATTE
     movers = movers if mover is None else movers | mover
@@ -51,7 +51,7 @@ def still_pixels(matte: Tensor, mover: Tensor | None = None, margin: int = STILL
 
 
 def picture_figures(image: Tensor, plate: Tensor, still: Tensor) -> dict[str, float | None]:
-    """What acceptance asks of one frame: PSNR in dB, whole, of its best 90 % and of still pixels, and gradients."""
+    """Acceptance figures of one frame: PSNR in dB of the whole, of its best 90 % and of still pixels, and gradients."""
     error = (image.clamp(0.0, 1.0) - plate.clamp(0.0, 1.0)).double().square().mean(2)
     sharp = gradient_magnitude(plate)
     return {
@@ -63,7 +63,7 @@ def picture_figures(image: Tensor, plate: Tensor, still: Tensor) -> dict[str, fl
 
 
 def mean_difference(a: Tensor, b: Tensor, where: Tensor) -> float | None:
-    """Mean absolute difference of two pictures over a mask; None if that is empty."""
+    """Mean absolute difference of two pictures over a mask; None for an empty mask."""
     return float((a.clamp(0.0, 1.0) - b.clamp(0.0, 1.0)).abs().mean(2)[where].mean()) if where.any() else None
 
 
@@ -73,9 +73,9 @@ def mean_difference(a: Tensor, b: Tensor, where: Tensor) -> float | None:
 def induced_places(
     depth: Tensor, from_view: Tensor, from_K: Tensor, to_view: Tensor, to_K: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where another camera sees the points that this one sees: (places [H, W, 2], their depths there [H, W]).
+    """Reprojection of one camera's points into another: (places [H, W, 2], their depths there [H, W]).
 
-    `depth` [H, W] is planar. Points behind the other camera have depth 0 or less there.
+    `depth` [H, W] is planar. Points behind the other camera have depth 0 or less.
     """
     height, width = depth.shape
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -90,7 +90,7 @@ def induced_places(
 
 
 def sampled(values: Tensor, places: Tensor, nearest: bool = False) -> Tensor:
-    """`values` [H, W, C] or [H, W] at places; what lies outside has the border's value."""
+    """`values` [H, W, C] or [H, W] at places; places outside get the border's value."""
     height, width = values.shape[:2]
     channels = values.float()[..., None] if values.ndim == 2 else values.float()
     grid = places * torch.tensor([2.0 / width, 2.0 / height]) - 1.0
@@ -102,13 +102,13 @@ def sampled(values: Tensor, places: Tensor, nearest: bool = False) -> Tensor:
 
 
 def inside(places: Tensor, width: int, height: int, border: float = 1.0) -> Tensor:
-    """Which places lie in a picture, at least `border` pixels from its edge."""
+    """Mask of the places inside a picture, at least `border` pixels from its edge."""
     x, y = places[..., 0], places[..., 1]
     return (x > border) & (x < width - border) & (y > border) & (y < height - border)
 
 
 def seen_again(places: Tensor, expected: Tensor, depth: Tensor) -> Tensor:
-    """Which points, at `places` and depths `expected` of another view, are what that view sees: its depth [H, W]."""
+    """Mask of the points at `places` and depths `expected` that another view with `depth` [H, W] sees unoccluded."""
     height, width = depth.shape
     found = sampled(depth, places, nearest=True)
     near = (expected - found).abs() <= SAME_DEPTH * torch.maximum(expected, found).clamp_min(1e-6)
@@ -116,7 +116,7 @@ def seen_again(places: Tensor, expected: Tensor, depth: Tensor) -> Tensor:
 
 
 class Flow:
-    """Dense optical flow between two pictures (DIS), of structure alone: brightness may drift between them."""
+    """Dense optical flow between two pictures (DIS), of structure only, so that drifting exposure has no effect."""
 
     def __init__(self) -> None:
         if importlib.util.find_spec("cv2") is None:
@@ -126,7 +126,7 @@ class Flow:
         self._dis: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def __call__(self, a: Tensor, b: Tensor) -> Tensor:
-        """[H, W, 2] from pixels of `a` to their places in `b`, less the pixels; x, y."""
+        """[H, W, 2] displacement (x, y) from pixels of `a` to their places in `b`."""
         levels = [(_levelled(v) * 255.0).round().byte().numpy() for v in (a, b)]
         return torch.from_numpy(np.asarray(self._dis.calc(levels[0], levels[1], None)))
 
@@ -136,12 +136,12 @@ def _luma(image: Tensor) -> Tensor:
 
 
 def _box(values: Tensor, width: int) -> Tensor:
-    """Mean over a window of `width` pixels, cut at the border."""
+    """Mean over a window of `width` pixels, clipped at the border."""
     return F.avg_pool2d(values[None, None], width, 1, width // 2, count_include_pad=False)[0, 0]
 
 
 def _levelled(image: Tensor) -> Tensor:
-    """Luma with local mean and contrast taken out, [H, W] in 0..1. Flow takes an exposure that drifts for motion."""
+    """Luma normalised by local mean and contrast, [H, W] in 0..1. Otherwise flow takes drifting exposure for motion."""
     luma = _luma(image)
     mean = _box(luma, LEVEL_WINDOW)
     deviation = (_box(luma.square(), LEVEL_WINDOW) - mean.square()).clamp_min(0.0).sqrt()
@@ -149,9 +149,10 @@ def _levelled(image: Tensor) -> Tensor:
 
 
 def textured(image: Tensor) -> Tensor:
-    """Where a picture has structure in two directions, bool [H, W]: elsewhere flow is a guess.
+    """bool [H, W] pixels with structure in two directions; elsewhere flow is unreliable.
 
-    The smaller eigenvalue of the structure tensor over `TEXTURE_WINDOW` pixels; its root is a difference per pixel.
+    Uses the smaller eigenvalue of the structure tensor over `TEXTURE_WINDOW` pixels. Its root is a difference per
+    pixel.
     """
     luma = _luma(image)
     x = F.pad(luma[:, 2:] - luma[:, :-2], (1, 1)) / 2.0
@@ -162,22 +163,23 @@ def textured(image: Tensor) -> Tensor:
 
 
 def unexplained_flow(flow: Flow, a: Tensor, b: Tensor, places: Tensor, both: Tensor) -> Tensor:
-    """How far, in pixels [H, W], picture `b` is from where the camera's motion puts the points of `a`.
+    """Residual flow in pixels [H, W] between `a` and `b` warped to `a`, after the camera's motion.
 
-    `b` is brought to `a` by `places` first, so that what is measured is near nothing where nothing moves: flow of whole
-    pixels is off at every edge in depth. What only `a` sees (not `both`) is filled with `a` itself, lest it disturb.
+    `b` is warped by `places` before the flow is computed, so that the flow is near zero where nothing moves. Flow of
+    several pixels is wrong at every depth edge. Pixels that only `a` sees (not `both`) are filled from `a`, to avoid
+    false flow.
     """
     brought = torch.where(both[..., None], sampled(b, places), a)
     return flow(a, brought).norm(dim=2)
 
 
 def unsteadiness(a: Tensor, b: Tensor, places: Tensor) -> Tensor:
-    """Absolute difference [H, W], mean over channels, of `a` and `b` brought to it by `places`."""
+    """Absolute difference [H, W], mean over channels, of `a` and `b` warped to `a` by `places`."""
     return (a.clamp(0.0, 1.0) - sampled(b.clamp(0.0, 1.0), places)).abs().mean(2)
 
 
 class Histogram:
-    """Values in pixels of many frames, for percentiles to 0.01."""
+    """Histogram of pixel values over many frames, for percentiles to 0.01."""
 
     STEP, TOP = 0.01, 64.0
 
@@ -185,7 +187,7 @@ class Histogram:
         self._counts = torch.zeros(round(self.TOP / self.STEP), dtype=torch.int64)
 
     def add(self, values: Tensor) -> None:
-        """Any number of values of 0 or more."""
+        """Adds values of 0 or more, of any shape."""
         at = (values.flatten() / self.STEP).long().clamp(0, len(self._counts) - 1)
         self._counts += torch.bincount(at, minlength=len(self._counts))
 
@@ -199,5 +201,5 @@ class Histogram:
 
     @property
     def count(self) -> int:
-        """How many values there are."""
+        """Number of values."""
         return int(self._counts.sum())

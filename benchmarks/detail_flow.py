@@ -1,15 +1,15 @@
-"""Does anything still move in a frozen shot? `python -m benchmarks.detail_flow SHOT --results DIR`.
+"""Residual motion in a frozen shot: `python -m benchmarks.detail_flow SHOT --results DIR`.
 
-SHOT is a trained shot folder; nothing is written into it. Along the clip's poses, at 640 pixels, frames n and n + 1 of
-the frozen shot are laid over one another by the frozen depth and the cameras. Then, where things move in the clip and
-where nothing does:
+SHOT is a trained shot folder, which stays unchanged. Along the clip's poses, at 640 pixels, frame n + 1 of the frozen
+shot is warped to frame n by the frozen depth and the cameras. Two figures follow, for regions that move in the clip and
+for still ones:
 
-- honesty: optical flow that is left, in pixels, at the 99th percentile of the pixels that have texture. What moved and
-  still moves reads more there than still pixels of the same frames do.
-- steadiness: mean absolute difference of the two, of 255.
+- honesty: 99th percentile of the residual optical flow in pixels, over textured pixels. A mover that still moves in
+  the frozen shot has more flow than still pixels of the same frames.
+- steadiness: mean absolute difference of the two frames, of 255.
 
-The same of the plates (where what moves does move) and of splats alone. DIR gets flow-NAME.json and strips of the worst
-frames: frame n, n + 1 laid over it, the flow that is left (black 0, white 2 pixels), what counts as moving.
+The same is measured of the plates (where movers do move) and of the Gaussians alone. Writes flow-NAME.json and strips
+of the worst frames to DIR: frame n, warped frame n + 1, residual flow (black 0, white 2 pixels), moving regions.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ from benchmarks.sources import in_words
 from torch_backend.shot import write_json
 
 WHAT = ("plate", "splats", "delivered")
-"""Of what the flow is taken."""
+"""Pictures whose flow is measured."""
 PERCENT = 99.0
 ALLOWED = 0.25
-"""Pixels that moving regions may read more than still ones."""
+"""Allowed excess in pixels of the flow of moving regions over still ones."""
 HIDDEN_MARGIN = 4
-"""Pixels to stay away from what only one of two frames sees."""
+"""Margin in pixels around points visible in only one of two frames."""
 LEAST = 200
-"""Pixels that a region of one frame needs to have a percentile."""
+"""Least number of pixels of a region in one frame for a percentile."""
 
 
 @dataclass
@@ -67,30 +67,30 @@ class Shown:
 
     frame: int
     depths: dict[str, Tensor]
-    """Of each of `WHAT`, [H, W]: the frozen depth, which has a surface more where plates showed one."""
+    """{each of `WHAT`: [H, W] frozen depth}; plates may add a surface to it."""
     pictures: dict[str, Tensor]
-    """Of each of `WHAT`."""
+    """{each of `WHAT`: [H, W, 3] picture}."""
     own: Tensor
     """[H, W] motion matte of the frame, 0..1."""
     matte_t_star: Tensor
-    """[H, W] that of t*, brought here."""
+    """[H, W] motion matte of t*, warped to this frame."""
 
 
 class Sums:
-    """Flow and difference of one of `WHAT` over frames, by region."""
+    """Flow and difference of one of `WHAT`, accumulated over frames by region."""
 
     def __init__(self) -> None:
         self.flow = {region: Histogram() for region in ("moving", "still")}
         self._steady = {region: [0.0, 0] for region in self.flow}
 
     def add(self, region: str, flow: Tensor, difference: Tensor) -> None:
-        """Values [V] of one frame's region."""
+        """Adds values [V] of one frame's region."""
         self.flow[region].add(flow)
         self._steady[region][0] += float(difference.sum())
         self._steady[region][1] += len(difference)
 
     def figures(self) -> dict[str, Any]:
-        """{region: {p99_px, unsteady_255, pixels}}, and the excess of moving over still."""
+        """{region: {p99_px, unsteady_255, pixels, textured}}, and the excess of moving over still."""
         found: dict[str, Any] = {}
         for region, (total, count) in self._steady.items():
             found[region] = {
@@ -105,7 +105,7 @@ class Sums:
 
 
 def show(clip: DetailClip, frame: int, t_star: int) -> Shown:
-    """The frame with everything that is compared."""
+    """The frame with all compared pictures, depths and mattes."""
     view = clip.view(frame, t_star)
     own, matte_t_star = clip.mattes(frame, t_star, view)
     pictures = {"plate": clip.plate(frame), "splats": view.splats, "delivered": view.picture}
@@ -115,20 +115,20 @@ def show(clip: DetailClip, frame: int, t_star: int) -> Shown:
 
 @dataclass
 class Pair:
-    """Two neighbouring frames laid over one another. Masks are bool [H, W] in pixels of the first."""
+    """Correspondence of two neighbouring frames. Masks are bool [H, W] in pixels of the first."""
 
     places: Tensor
     """[H, W, 2] of the first frame's pixels in the second, by frozen depth and cameras."""
     both: Tensor
-    """What both frames see."""
+    """Points visible in both frames."""
     moving: Tensor
-    """Of that, what moves in either frame, or shows what moved at t*; a little away from what only one sees."""
+    """Visible points that move in either frame or moved at t*, except near points visible in only one frame."""
     still: Tensor
-    """Likewise what moves in neither."""
+    """Visible points that are still in both frames and at t*, with the same exception."""
 
 
 def lay_over(clip: DetailClip, a: Shown, b: Shown, what: str) -> Pair:
-    """Frames a and b as a `Pair`, by the depth of one of `WHAT`."""
+    """Correspondence of frames a and b, by the depth of one of `WHAT`."""
     places, depth = induced_places(a.depths[what], *clip.camera(a.frame), *clip.camera(b.frame))
     both = seen_again(places, depth, b.depths[what]) & inside(places, clip.width, clip.height, 4.0)
     own_b, matte_t_star_b = (sampled(matte, places, nearest=True) for matte in (b.own, b.matte_t_star))
@@ -139,7 +139,7 @@ def lay_over(clip: DetailClip, a: Shown, b: Shown, what: str) -> Pair:
 
 
 def judge_pair(flow: Flow, clip: DetailClip, a: Shown, b: Shown, sums: dict[str, Sums]) -> dict[str, Any]:
-    """Figures of frames a and b, added to `sums`: {what: {moving, still, excess: px}}."""
+    """Figures of frames a and b, also added to `sums`: {what: {moving, still, excess: px}}."""
     row: dict[str, Any] = {"frame": a.frame, "next": b.frame}
     for what in WHAT:
         pair = lay_over(clip, a, b, what)
@@ -177,15 +177,15 @@ def _px(value: float | None) -> str:
 
 
 def worst_frames(rows: Sequence[dict[str, Any]], count: int) -> list[dict[str, Any]]:
-    """The frames whose moving regions read most above still ones, worst first."""
+    """The frames with the greatest excess of moving over still regions, worst first."""
     judged = [row for row in rows if row["delivered"]["excess"] is not None]
     return sorted(judged, key=lambda row: -row["delivered"]["excess"])[:count]
 
 
 def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: int) -> None:
-    """Strips of the worst frames: frame n, n + 1 laid over it, flow that is left, what counts as moving.
+    """Writes strips of the worst frames: frame n, warped frame n + 1, residual flow, moving regions.
 
-    Those of an earlier run at the same instant are removed.
+    Removes strips of an earlier run at the same instant.
     """
     flow = Flow()
     for old in folder.glob(f"t{freeze['t_star']:06d}_*.png"):
@@ -206,7 +206,7 @@ def save_worst(clip: DetailClip, freeze: dict[str, Any], folder: Path, count: in
 
 
 def table(name: str, freezes: Sequence[dict[str, Any]]) -> list[str]:
-    """The clip's figures in Markdown, a row per t* and what was examined."""
+    """Markdown rows of the clip's figures, one per t* and picture."""
     header = [name, "flow left, moving, px", "still, px", "more", "more, mean of frames", f"frames over {ALLOWED}"]
     header += ["worst frame", "difference, moving, / 255", "still, / 255"]
     lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
@@ -224,12 +224,12 @@ def table(name: str, freezes: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def excesses(freeze: dict[str, Any], what: str) -> list[float]:
-    """By how many pixels moving regions read more than still ones in each frame that has both."""
+    """Excess in pixels of moving over still regions, for each frame with both."""
     return [row[what]["excess"] for row in freeze["frames"] if row[what]["excess"] is not None]
 
 
 def pairs_of(clip: DetailClip, args: argparse.Namespace) -> list[tuple[int, int]]:
-    """Neighbouring frames of the clip: all, those from each of `--frames`, or every `--every`-th pair."""
+    """Pairs of neighbouring frames: all or those starting at `--frames`, every `--every`-th of them."""
     frames = clip.frames
     pairs = [pair for pair in itertools.pairwise(frames) if not args.frames or pair[0] in args.frames]
     if not pairs:

@@ -1,13 +1,13 @@
 """Plate detail against rendered truth: `python -m benchmarks.detail_truth SCENE ... --results DIR`.
 
-SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot, with exact
-cameras, and an `auto` run are made in DIR if they are not there. Printed is the mean PSNR of all poses and instants
-that have a truth, splats -> developed -> plate of the pose withheld -> delivered, by region, and what is gained; and
-their ST-LPIPS, if its weights are there: a metric of pictures that forgives a shift by two pixels. Of scenes with a
-small mover it also tells how much of that is there (`benchmarks/report/things.py`). The pose of t* itself does not
-count: plate t* is its truth. DIR gets truth-NAME.json.
+SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 for tuning, 100 to 109 for reporting). Its shot, with exact
+cameras by default, and an `auto` run are made in DIR if missing. Prints mean PSNR by region over all poses and instants
+with truth, for splats -> developed -> withheld (without the plate of the pose) -> delivered, and the gains. Prints
+ST-LPIPS as well if its weights are installed; this metric tolerates shifts of two pixels. For scenes with a small mover
+it also prints the mover's recall (`benchmarks/report/things.py`). The pose of t* itself is excluded, because plate t*
+is its truth. Writes truth-NAME.json to DIR.
 
-Pictures are judged at the size of the run, or with `--delivered` as an artist gets them: at that of the plates.
+Pictures are judged at the run's size, or with `--delivered` at plate size, as delivered to the artist.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from torch_backend.train import load_run
 
 VARIANTS = (SPLATS, DEVELOPED, WITHHELD, DELIVERED)
 PERCEIVED = "st_lpips"
-"""In a row: the same by ST-LPIPS; less is better."""
+"""Key of a row: figures by ST-LPIPS, lower is better."""
 RECALLED = "recalled"
-"""In a row: {variant: {thing: [pixels that show it, pixels that should]}}, {} of scenes without a small mover."""
+"""Key of a row: {variant: {thing: [pixels that show it, pixels that should]}}; {} for scenes without a small mover."""
 
 
 def trained(truth: TruthScene, source: str, seed: int, iterations: int, gaussians: int) -> str:
-    """Name of the scene's run, trained first if it is not. RuntimeError if that fails."""
+    """Name of the scene's run, trained if missing. RuntimeError if training fails."""
     spec = RunSpec(
         source, truth.key, "auto", "support", "preview", seed=seed, iterations=iterations, max_gaussians=gaussians,
         holdout_phase=hold_out_phase(truth),
@@ -56,7 +56,7 @@ def trained(truth: TruthScene, source: str, seed: int, iterations: int, gaussian
 
 
 def trained_scenes(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[tuple[SyntheticTruth, dict[int, str]]]:
-    """Each scene of `scene_arguments`, and the names of its runs by training seed; what is missing is trained."""
+    """Yields each scene of `scene_arguments` and the names of its runs by training seed. Trains missing runs."""
     for folder in args.scenes:
         truth, source = load_synthetic(folder, args.results, args.cameras), f"{args.cameras}:{folder.absolute()}"
         yield truth, {seed: trained(truth, source, seed, args.iterations, args.gaussians) for seed in seeds}
@@ -65,10 +65,10 @@ def trained_scenes(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[t
 def judge(
     truth: TruthScene, run_name: str, t_stars: Sequence[int], every: int = 1, develop: bool = True, width: int = 0
 ) -> list[dict[str, Any]]:
-    """Every pose of every instant: [{t_star, pose, variant: {region: dB or None}, `PERCEIVED`, `RECALLED`}].
+    """Rows for every pose of every instant: [{t_star, pose, variant: {region: dB or None}, `PERCEIVED`, `RECALLED`}].
 
-    Not developed is as splats are. But for the pose of t* itself: what is delivered there is plate t*, which is the
-    truth to the byte. `width`: pixels of the pictures; 0: the plates' own.
+    Without development, `developed` equals `splats`. The pose of t* is excluded: its delivered frame is plate t*, which
+    is byte for byte the truth. `width`: pixels of the pictures; 0 uses the plates' size.
     """
     clip, rows = DetailClip(truth.shot, run_name, width, develop), []
     size = clip.width, clip.height
@@ -97,12 +97,13 @@ def _pictures(clip: DetailClip, pose: int, t_star: int) -> dict[str, Tensor]:
 
 
 def perceived(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """As `means`, of ST-LPIPS; empty where its weights are missing."""
+    """`means` of ST-LPIPS; empty without its weights."""
     return means([row[PERCEIVED] for row in rows])
 
 
 def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """{region: {variant: mean dB over the poses in which the region is not empty}}; regions that never are."""
+    """{region: {variant: mean dB over poses where the region is not empty}}; regions that are always empty are left
+    out."""
     found = {}
     for region in (WHOLE, *REGIONS, HELD):
         known = [row for row in rows if row[SPLATS].get(region) is not None]
@@ -112,7 +113,7 @@ def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def gains_text(of: dict[str, float]) -> str:
-    """Each of `VARIANTS`."""
+    """Text of the dB of each of `VARIANTS`."""
     return " -> ".join(f"{of[v]:.2f}" for v in VARIANTS)
 
 
@@ -130,7 +131,7 @@ def table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
 
 
 def perceived_table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
-    """Mean ST-LPIPS by scene and region in Markdown; nothing where it was not measured."""
+    """Mean ST-LPIPS by scene and region in Markdown; [] if it was not measured."""
     lines = [
         f"| {scene} | {region} | {' -> '.join(f'{of[v]:.4f}' for v in VARIANTS)} |"
         for scene, regions in found.items()
@@ -141,7 +142,7 @@ def perceived_table(found: dict[str, dict[str, dict[str, float]]]) -> list[str]:
 
 
 def recalls(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, tuple[float | None, float | None]]]:
-    """{thing: {variant: share of its pixels that is there, in all poses and in the worst}}."""
+    """{thing: {variant: share of its pixels that are shown, over all poses and in the worst one}}."""
     things = dict.fromkeys(thing for row in rows for of in row[RECALLED].values() for thing in of)
     return {
         thing: {v: overall([row[RECALLED][v][thing] for row in rows if thing in row[RECALLED][v]]) for v in VARIANTS}
@@ -150,7 +151,7 @@ def recalls(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, tuple[float |
 
 
 def recall_table(found: dict[str, dict[str, dict[str, tuple[float | None, float | None]]]]) -> list[str]:
-    """Recall by scene and thing in Markdown; nothing where there is no small mover."""
+    """Recall by scene and thing in Markdown; [] without a small mover."""
     lines = [
         f"| {scene} | {thing} | {' -> '.join(' / '.join(_share(s) for s in of[v]) for v in VARIANTS)} |"
         for scene, things in found.items()
@@ -165,7 +166,7 @@ def _share(share: float | None) -> str:
 
 
 def scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of every benchmark that trains on synthetic scenes and judges their frozen frames."""
+    """Adds the arguments of every benchmark that trains on synthetic scenes and judges their frozen frames."""
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR")
     parser.add_argument("--cameras", choices=("exact", "solved"), default="exact")

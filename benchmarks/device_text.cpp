@@ -1,9 +1,10 @@
-// Runs what a GPU would compile of our kernels, on a CPU: launches from a file in, how they end out.
-// `device_text.py` writes kernels.inc and the launches, and says how this is built and what is compared.
+// Runs the GPU variant of the project's kernels on a CPU: reads launches from a file and prints their results.
+// `device_text.py` writes kernels.inc and the launches, and documents the build and the comparison.
 //
-// A block has 128 threads, in warps of 32. Plain, each is a fiber with a stack of its own, and they take turns at votes,
-// shuffles and barriers: quick, always in the same order, and a barrier that not all reach is told. With THREADS each is
-// a thread of the system, for the thread sanitizer. Blocks run one after the other: shared memory is static.
+// A block has 128 threads, in warps of 32. Without THREADS each thread is a fiber with its own stack, and fibers switch
+// at votes, shuffles and barriers. That is fast and deterministic, and detects a barrier that not all threads reach.
+// With THREADS each is a system thread, for the thread sanitizer. Blocks run one after another, because shared memory is
+// static.
 
 #include <algorithm>
 #include <atomic>
@@ -140,7 +141,7 @@ static bool run_block() {
         if (all_of(0, BLOCK, ENDED)) return true;
         bool moved = false;
         for (int first = 0; first < BLOCK; first += WARP) {
-            // A vote or shuffle names all 32 lanes: one that has ended never comes.
+            // A vote or shuffle needs all 32 lanes, so it never completes after one has ended.
             bool met = true;
             for (int i = first; i < first + WARP; i++) met &= fibers[i].state == AT_WARP;
             for (int i = first; met && i < first + WARP; i++) fibers[i].state = RUNS;
@@ -160,7 +161,7 @@ static void take(void* into, size_t bytes) {
     if (bytes && fread(into, 1, bytes, file) != bytes) { fprintf(stderr, "the launches end too early\n"); exit(2); }
 }
 
-// What a pointer leads to: where it was when the launch was noted, and where it is now.
+// Memory reached by a pointer: its address when the launch was recorded, and its address now.
 struct Region {
     char name[32];
     int kind;  // 1: floats, 2: a table with addresses among its words
@@ -177,8 +178,8 @@ static void move_words(void* table, size_t bytes) {
     for (size_t i = 0; i < bytes / 8; i++) ((uint64_t*)table)[i] = moved(((uint64_t*)table)[i]);
 }
 
-// Each launch: kernel, threads; its values, each with whether it is a pointer; then what pointers lead to: name, kind,
-// address, bytes, before and after on Warp's cpu device.
+// Format of a launch: kernel, threads; its values, each with a pointer flag; then its memory regions: name, kind,
+// address, size, content before and after on Warp's cpu device.
 int main(int argc, char** argv) {
     file = fopen(argv[1], "rb");
     const int most = argc > 2 ? atoi(argv[2]) : 1 << 30;
@@ -196,7 +197,7 @@ int main(int argc, char** argv) {
         for (auto& region : regions) {
             int64_t bytes;
             take(region.name, 32); take(&region.kind, 4); take(&region.was, 8); take(&bytes, 8);
-            // As large as the tensor and not a byte more: the address sanitizer knows where it ends.
+            // Exactly as large as the tensor, so that the address sanitizer detects accesses beyond it.
             if (posix_memalign(&region.at, 16, bytes ? bytes : 1)) return 2;
             take(region.at, bytes);
             region.want.resize(bytes);
@@ -213,7 +214,7 @@ int main(int argc, char** argv) {
             if (entry.blocks) fill(values_now.data()); }
         if (!kernel_now) { fprintf(stderr, "no kernel %s\n", name); return 2; }
         bool whole = blocks <= most, met = true;
-        const int count_now = std::min(blocks, most);  // spread over the launch where they are not all
+        const int count_now = std::min(blocks, most);  // evenly spaced if not all blocks run
         for (int i = 0; i < count_now && met; i++) { block_now = (int64_t)i * blocks / count_now; met = run_block(); }
         printf("{\"kernel\": \"%s\", \"blocks\": %d, \"whole\": %s, \"met\": %s, \"differs\": {", name, blocks,
                whole ? "true" : "false", met ? "true" : "false");

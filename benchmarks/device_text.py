@@ -1,10 +1,10 @@
-"""Our kernels as a GPU compiles them (`__CUDA_ARCH__`), run on a CPU, plain and under sanitizers.
+"""Runs the project's kernels on a CPU in their GPU variant (`__CUDA_ARCH__`), plain and under sanitizers.
 
-What Warp's cpu device runs of the text is its other side: shuffles through memory, no votes, plain atomics. Here every
-launch of a few small scenes (the rasteriser's, on fibers), of SSIM and the loss, of Adam and of a field's planes is
-written down with its buffers before and after on that device, and `device_text.cpp` does it again with real votes and
-shuffles per warp, and atomics. What it cannot show: races between blocks, other streams, memory that was never written,
-the roundings of a GPU's own exp2 and division.
+Warp's cpu device runs the other variant: shuffles through memory, no votes, plain atomics. This tool records launches
+on that device, with their buffers before and after. The launches are those of a few small scenes (the rasteriser, on
+fibers), of SSIM and the loss, of Adam, and of a field's planes. `device_text.cpp` repeats them with real votes and
+shuffles per warp, and atomics. The tool cannot detect races between blocks, errors of stream order, reads of
+uninitialised memory, or the rounding of a GPU's exp2 and division.
 
     python -m benchmarks.device_text                the launches against Warp's cpu device
     python -m benchmarks.device_text --sanitize     once more under address and undefined, and under thread (minutes)
@@ -40,33 +40,33 @@ BUILDS = {
     "address,undefined": ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"],
     "thread": ["-O1", "-g", "-fsanitize=thread", "-DTHREADS"],
 }
-"""Name -> flags of the compiler."""
+"""Name -> compiler flags."""
 BACKWARD = ("raster_blend_backward", "raster_project_backward", "plane_gradients")
-"""Kernels whose sums are of another order on a GPU; all others agree with Warp's cpu device to the bit."""
+"""Kernels whose sums have another order on a GPU; all others agree with Warp's cpu device bit for bit."""
 
 SAME = {name + " = 1;": f"SAME({name});" for name in ("live", "many", "bad[0]")}
-"""Flags into which several threads of a block write the same 1, which CUDA allows and C++ does not: all that the thread
-sanitizer is kept from telling."""
+"""Flags to which several threads of a block write the same 1. CUDA allows that and C++ does not, so the thread
+sanitizer ignores exactly these writes."""
 
 
 def compiler() -> str | None:
-    """A C++ compiler of this machine."""
+    """Path of a C++ compiler on this machine, or None."""
     return shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 
 
 class Launches:
-    """Launches of our kernels on Warp's cpu device, with all that their pointers lead to before and after."""
+    """Recorder of kernel launches on Warp's cpu device, with all memory reachable by pointers before and after."""
 
     def __init__(self) -> None:
         self.records: list[bytes] = []
         self.bodies: dict[str, str] = {}
-        """Name of a kernel that was launched -> its function."""
+        """Name of a launched kernel -> its function's text."""
         self._known: dict[int, torch.Tensor] = {}
 
     @contextlib.contextmanager
     def noted(self) -> Iterator[None]:
-        """Notes every launch within. A pointer is identified by the tensor that it was taken from; those tensors stay
-        alive."""
+        """Context that records every launch. A pointer is identified by the tensor whose `data_ptr` returned it; these
+        tensors are kept alive."""
         call, ask, modules = cuda._Launcher.__call__, torch.Tensor.data_ptr, (ssim_cuda, adam, planes_cuda)
         launch_on = [module.launch_on for module in modules]
         notes = self
@@ -104,14 +104,14 @@ class Launches:
         try:
             yield
         finally:
-            del torch.Tensor.data_ptr  # its base's is found again
+            del torch.Tensor.data_ptr  # uncovers the base class's method
             cuda._Launcher.__call__ = call  # type: ignore[method-assign]
             for module, plain in zip(modules, launch_on, strict=True):
                 module.launch_on = plain  # type: ignore[attr-defined]
             self._known.clear()
 
     def _note(self, name: str, threads: int, values: list[tuple[bool, int, str]], launch: Callable[[], None]) -> None:
-        """Carries a launch out; its record. Values: (is it a pointer, bits, name)."""
+        """Runs a launch and appends its record. Values: (whether it is a pointer, bits, name)."""
         reached: dict[int, tuple[str, torch.Tensor]] = {}
         for points, value, label in values:
             if points and value:
@@ -128,7 +128,7 @@ class Launches:
         self.records.append(b"".join(parts))
 
     def _reach(self, address: int, label: str, reached: dict[int, tuple[str, torch.Tensor]]) -> None:
-        """The tensor at an address, and those that its own numbers lead to. KeyError if nobody asked for one."""
+        """Adds the tensor at an address, and those that its elements point to. KeyError for an unknown address."""
         if address in reached:
             return
         tensor = self._known[address]
@@ -142,13 +142,13 @@ class Launches:
         return tensor.dtype == torch.int64 and any(word in self._known for word in _flat(tensor).tolist())
 
     def write(self, folder: Path) -> None:
-        """launches.bin and kernels.inc, for `build` and `run`."""
+        """Writes launches.bin and kernels.inc, for `build` and `run`."""
         (folder / "launches.bin").write_bytes(struct.pack("<i", len(self.records)) + b"".join(self.records))
         (folder / "kernels.inc").write_text(_kernels(self.bodies), encoding="utf-8")
 
 
 def _flat(tensor: torch.Tensor) -> torch.Tensor:
-    """The numbers of a dense tensor as they lie in memory."""
+    """The elements of a dense tensor in memory order."""
     return tensor.detach().as_strided((tensor.numel(),), (1,))
 
 
@@ -157,12 +157,12 @@ def _bytes(tensor: torch.Tensor) -> bytes:
 
 
 def _bits(value: float) -> int:
-    """An int's, or a float's as float32."""
+    """Bits of an int as 64 bits, or of a float as float32."""
     return struct.unpack("<I", struct.pack("<f", value))[0] if isinstance(value, float) else value & (2**64 - 1)
 
 
 def _raster_function(whole: str, body: str) -> str:
-    """A kernel of the rasteriser: its arguments are a structure that `fill` makes once for a launch."""
+    """Function text of a rasteriser kernel, whose arguments are a structure filled once per launch by `fill`."""
     return _function(whole, f"Args& args = args_of_launch;\n{body}")
 
 
@@ -173,7 +173,7 @@ _TAKEN = {
 
 
 def _plain_function(whole: str, kernel: Any) -> str:
-    """A kernel whose arguments are numbers and pointers, and whose threads know nothing of each other."""
+    """Function text of a kernel whose arguments are numbers and pointers, and whose threads are independent."""
     held = [cell.cell_contents for cell in kernel.func.__closure__]
     (native,) = (each for each in held if hasattr(each, "native_snippet"))
     taken = "".join(f"const {_TAKEN[arg.type].format(arg.label, i)} " for i, arg in enumerate(kernel.adj.args))
@@ -183,14 +183,14 @@ def _plain_function(whole: str, kernel: Any) -> str:
 def _function(whole: str, body: str) -> str:
     for flag, named in SAME.items():
         body = body.replace(flag, named)
-    # Macros of a kernel's text end with it.
+    # Macros are local to a kernel's text.
     defined = {line.split()[1].split("(")[0] for line in body.splitlines() if line.startswith("#define")}
     text = f"static void {whole}(const uint64_t* values, int task) {{\n{body}\n}}\n"
     return text + "".join(f"#undef {macro}\n" for macro in sorted(defined))
 
 
 def _kernels(bodies: dict[str, str]) -> str:
-    """The rasteriser's parameter structure, and a function for each kernel that was launched."""
+    """The rasteriser's parameter structure, and a function for each launched kernel."""
     fields = "".join(f"uint64_t {name}; " for name in NAMES) + "".join(f"int {name}; " for name in source.SIZES)
     filled = "".join(f"args_of_launch.{name} = values[{i}]; " for i, name in enumerate([*NAMES, *source.SIZES]))
     floats = len(NAMES) + len(source.SIZES)
@@ -208,7 +208,7 @@ def _kernels(bodies: dict[str, str]) -> str:
 
 
 def build(folder: Path, which: str = "plain") -> Path:
-    """Compiles the launches' kernels; the program. RuntimeError with the first complaint if that fails."""
+    """Compiles the launched kernels and returns the program. RuntimeError with the first compiler error."""
     program = folder / f"device_text_{which.replace(',', '_')}"
     command = [compiler() or "c++", "-std=c++20", "-w", "-pthread", "-ffp-contract=off", *BUILDS[which]]
     command += [f"-I{folder}", str(Path(__file__).with_suffix(".cpp")), "-o", str(program)]
@@ -219,7 +219,7 @@ def build(folder: Path, which: str = "plain") -> Path:
 
 
 def run(program: Path, most: int = 1 << 30) -> tuple[list[dict[str, Any]], str]:
-    """(a row per launch, what a sanitizer complained of). most: blocks of each launch that are run."""
+    """(a row per launch, messages of the sanitizer). `most`: greatest number of blocks to run of each launch."""
     environ = {**os.environ, "ASAN_OPTIONS": "detect_stack_use_after_return=0", "TSAN_OPTIONS": "halt_on_error=0"}
     command = [str(program), str(program.parent / "launches.bin"), str(most)]
     done = subprocess.run(command, capture_output=True, text=True, env=environ)
@@ -229,7 +229,7 @@ def run(program: Path, most: int = 1 << 30) -> tuple[list[dict[str, Any]], str]:
 
 
 def judge(rows: list[dict[str, Any]], bound: float = 1e-5) -> list[str]:
-    """What is wrong with launches: barriers that not all reach, figures that are not those of Warp's cpu device."""
+    """Faults of launches: barriers that not all threads reach, and results that differ from Warp's cpu device."""
     wrong: list[str] = []
     for row in rows:
         if not row["met"]:
@@ -256,7 +256,7 @@ def _cloud(n: int, seed: int, degree: int, larger: float = 0.0) -> dict[str, tor
 
 
 def _drawn(cloud: dict[str, torch.Tensor], width: int, height: int, cameras: int = 1, **more: Any) -> tuple[int, int]:
-    """A frame and its gradients; how many hits it has, and how many its list holds."""
+    """Draws a frame and its gradients; returns (number of its hits, capacity of its hit list)."""
     g = torch.Generator().manual_seed(0)
     leaves = {name: value.clone().requires_grad_() for name, value in cloud.items()}
     viewmats = torch.eye(4).repeat(cameras, 1, 1)
@@ -275,7 +275,7 @@ def _drawn(cloud: dict[str, torch.Tensor], width: int, height: int, cameras: int
 
 
 def broken(n: int = 48) -> dict[str, torch.Tensor]:
-    """Gaussians whose numbers are none, or beyond all measure, among sound ones."""
+    """Gaussians with NaN, infinite or extreme parameters among valid ones."""
     cloud = _cloud(n, 9, 1)
     nan, inf = float("nan"), float("inf")
     cloud["means"][:3] = torch.tensor([[nan, 0, 3], [1e30, 0, 3], [0, 0, 1e-3]])
@@ -287,10 +287,10 @@ def broken(n: int = 48) -> dict[str, torch.Tensor]:
 
 
 def note_scenes(launches: Launches) -> list[tuple[int, int]]:
-    """Small frames and gradients that meet every branch: odd sizes, hits that outnumber their list, Gaussians over many
-    tiles, several cameras, tiles whose numbers take 32 bits, harmonics that lie unaligned, what is not finite.
+    """Draws small frames and gradients that reach every branch: odd sizes, more hits than the list holds, Gaussians
+    over many tiles, several cameras, 32-bit tile numbers, unaligned harmonics, non-finite values.
 
-    Returns the hits of each frame, and how many its list holds.
+    Returns (number of hits, capacity of the hit list) of each frame.
     """
     hits: list[tuple[int, int]] = []
 
@@ -304,8 +304,8 @@ def note_scenes(launches: Launches) -> list[tuple[int, int]]:
         with launches.noted():
             draw(_cloud(90, 1, 2), 50, 37, settings=RasterSettings(antialiased=True, absgrad=True), with_depth=True)
             draw(_cloud(20, 1, 1), 112, 80, with_top=True)
-            draw(_cloud(30, 2, 1, larger=2.5), 112, 80, with_top=True)  # more hits than the list of the last call
-            draw(_cloud(30, 2, 1, larger=2.5), 112, 80, with_top=True)  # listed now
+            draw(_cloud(30, 2, 1, larger=2.5), 112, 80, with_top=True)  # more hits than the list of the last call holds
+            draw(_cloud(30, 2, 1, larger=2.5), 112, 80, with_top=True)  # now the list holds them
             draw(_cloud(70, 3, 0), 40, 33, cameras=3)
             source.WIDE_FROM = 1
             draw(_cloud(50, 4, 3), 50, 20)
@@ -317,9 +317,9 @@ def note_scenes(launches: Launches) -> list[tuple[int, int]]:
 
 
 def note_others(launches: Launches) -> None:
-    """SSIM, the loss, Adam and a field's planes with their gradients: odd sizes, pixels that are ignored, rows out of
-    view, a step that is left out, points that are nowhere and beyond the rim, planes of one node, channels that are no
-    multiple of four."""
+    """Runs SSIM, the loss, Adam and a field's planes with their gradients, including edge cases: odd sizes, ignored
+    pixels, rows out of view, a skipped step, points that are NaN or outside the box, planes of one node, channel counts
+    not divisible by four."""
     g = torch.Generator().manual_seed(12)
     with launches.noted():
         for shape in ((11, 11, 1), (17, 23, 3)):

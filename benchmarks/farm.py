@@ -1,15 +1,15 @@
-"""What a farm's job costs and makes, against what was said and against one machine.
+"""Cost and results of a farm job, compared with its estimate and with one machine.
 
     python -m benchmarks.farm --output DIR [--openjd PYTHON] [--blender BLENDER] [--measure]
 
-Makes short clips of the bundled one, exports them as a job from import to bake, and runs it with `openjd run`: two at
-once, each on a core of its own, tasks shuffled, a session for every few tasks. Prints the estimate against what was
-measured: seconds of the processor of every process, engine included, and the clock. Then takes and bakes the same
-instants on one machine, with all its cores, and compares every frame, bit for bit.
+Makes short clips of the bundled one, exports them as a job from import to bake, and runs it with `openjd run`. Two
+hosts run at once, each on its own core, with shuffled tasks and a new session for every few tasks. Prints estimated and
+measured processor seconds of every process, including the engine, and elapsed time. Then freezes and bakes the same
+instants on one machine with all its cores, and compares every frame bit for bit.
 
-`--measure` first runs the job of another clip, of one instant in longer parts, and estimates by the rates of that;
-without it by those of the program. `--openjd` is a Python with openjd-cli (requirements/test.txt). Linux and macOS. The
-machine should do nothing else; the load is printed.
+`--measure` first runs the job of another clip, of one instant in longer parts, and estimates by its rates. Without it
+the program's rates are used. `--openjd` is a Python with openjd-cli (requirements/test.txt). Linux and macOS. Run it on
+an idle machine; the load is printed.
 """
 
 from __future__ import annotations
@@ -40,38 +40,38 @@ ROOT = Path(__file__).resolve().parents[1]
 CLIP = ROOT / "examples" / "sitting.mp4"
 CLIP_FRAMES = 74
 OTHER_FRAMES = 20
-"""Of the shot that rates are measured on: parts of 8 frames, and one of 4, tell apart what is fixed and what grows."""
+"""Frames of the shot that gives the rates. Its parts have 8 or 4 frames, to separate fixed cost and cost per frame."""
 TASKSET = ("taskset", "--cpu-list")
 
 
 @dataclass(frozen=True)
 class Host:
-    """What tasks find on every host."""
+    """Programs that tasks use on every host."""
 
     openjd: str
     """Python with openjd-cli."""
     blender: str
-    """Blender's program; empty: a bpy wheel."""
+    """Blender's program; empty to use a bpy wheel."""
 
 
 @dataclass
 class Job:
-    """A job that is being run."""
+    """A running job."""
 
     folder: Path
     host: Host
     session_tasks: int
     pending: dict[str, list[dict[str, str]]]
-    """Step -> its tasks that nobody has taken, shuffled."""
+    """Step -> its tasks not yet taken, shuffled."""
     waits: dict[str, str]
-    """Step -> the one before it."""
+    """Step -> the step that must end before it."""
     chance: np.random.Generator
     left: dict[str, int] = field(default_factory=dict[str, int])
-    """Step -> tasks that are not done."""
+    """Step -> number of unfinished tasks."""
     begun: int = 0
-    """Sessions."""
+    """Number of started sessions."""
     seconds: float = 0.0
-    """Of processors, in all sessions that have ended, with all that they started."""
+    """Processor seconds of all finished sessions, including their child processes."""
     failed: list[str] = field(default_factory=list[str])
     turn: threading.Condition = field(default_factory=threading.Condition)
 
@@ -79,7 +79,7 @@ class Job:
         self.left = {step: len(tasks) for step, tasks in self.pending.items()}
 
     def take(self) -> tuple[int, str, list[dict[str, str]]] | None:
-        """Number of a session, a step and some of its tasks; waits for one. None: nothing is left, or one failed."""
+        """Waits for (number of a session, step, some of its tasks). None if no tasks are left or a session failed."""
         with self.turn:
             while not self.failed and any(self.pending.values()):
                 ready = [
@@ -95,7 +95,7 @@ class Job:
         return None
 
     def work(self, core: int | None) -> None:
-        """One host: sessions, one after the other, on one core."""
+        """Runs one host: sessions one after another, on one core."""
         while taken := self.take():
             number, step, tasks = taken
             code, seconds = self.session(number, step, tasks, core)
@@ -107,7 +107,7 @@ class Job:
                 self.turn.notify_all()
 
     def session(self, number: int, step: str, tasks: list[dict[str, str]], core: int | None) -> tuple[int, float]:
-        """Exit code, and seconds of processors."""
+        """Runs a session; returns (exit code, processor seconds)."""
         values = read_json(self.folder / "parameters.json")
         values |= {"HostPython": sys.executable, "BackendPython": sys.executable, "Blender": self.host.blender}
         command = [self.host.openjd, "-P", "-m", "openjd", "run", str(self.folder / "template.json")]
@@ -120,17 +120,17 @@ class Job:
 
 
 def environ() -> dict[str, str]:
-    """Without what would change the environment of tasks."""
+    """This process's environment without variables that would change the tasks'."""
     return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "OMP_NUM_THREADS")}
 
 
 def pinned(core: int | None, command: list[str]) -> list[str]:
-    """A command on one core, where the system can do that: a task takes all cores that it may use."""
+    """A command pinned to one core where taskset exists, because a task uses all cores available to it."""
     return command if core is None or shutil.which("taskset") is None else [*TASKSET, str(core), *command]
 
 
 def clip_of(folder: Path, name: str, first: int, frames: int, shrink: int) -> str:
-    """Writes frames of the bundled clip as pictures, `shrink` times smaller; returns their pattern."""
+    """Writes frames of the bundled clip as pictures, `shrink` times smaller; returns their file pattern."""
     place = folder / name
     place.mkdir(parents=True)
     for number, frame in enumerate(open_source(str(CLIP)).frames(first, first + frames - 1), 1):
@@ -142,13 +142,13 @@ def clip_of(folder: Path, name: str, first: int, frames: int, shrink: int) -> st
 
 
 def exported(folder: Path, clips: Sequence[str], words: Sequence[str]) -> dict[str, Any]:
-    """Exports a job of clips; returns the estimate."""
+    """Exports a job of clips; returns its estimate."""
     shots = ["--shots-folder", str(folder / "shots")]
     return json.loads(backend("--json", "farm", "export", *clips, "--output", str(folder), *shots, "--bake", *words))
 
 
 def run(folder: Path, host: Host, session_tasks: int, at_once: int, seed: int) -> tuple[Job, float]:
-    """Runs an exported job; returns it, and how long it took by the clock."""
+    """Runs an exported job; returns (job, elapsed seconds)."""
     chance = np.random.default_rng(seed)
     pending: dict[str, list[dict[str, str]]] = {}
     waits: dict[str, str] = {}
@@ -174,7 +174,7 @@ def run(folder: Path, host: Host, session_tasks: int, at_once: int, seed: int) -
 
 
 def told(said: dict[str, Any], job: Job, clock: float, at_once: int) -> None:
-    """Prints the estimate against what was measured."""
+    """Prints the estimate and the measurement side by side."""
     took: dict[str, list[float]] = {}
     for shot in sorted((job.folder / "shots").glob(f"*{SHOT_SUFFIX}")):
         for record in records.read(shot):
@@ -192,7 +192,7 @@ def told(said: dict[str, Any], job: Job, clock: float, at_once: int) -> None:
 
 
 def alone(folder: Path, there: Path, host: Host) -> None:
-    """Takes and bakes all takes of a job again, from its trained shots, on this machine with all its cores."""
+    """Repeats all takes and bakes of a job from its trained shots, on this machine with all its cores."""
     for shot in sorted((folder / "shots").glob(f"*{SHOT_SUFFIX}")):
         copy = there / "shots" / shot.name
         shutil.copytree(shot, copy, ignore=shutil.ignore_patterns("takes", "farm", "developed", "jobs"))
@@ -204,7 +204,7 @@ def alone(folder: Path, there: Path, host: Host) -> None:
 
 
 def backend(*words: str) -> str:
-    """Runs a verb of the backend; returns what it said."""
+    """Runs a command of the backend; returns its output."""
     env = environ() | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "-P", "-m", "torch_backend", *words], cwd=ROOT, env=env, capture_output=True, text=True
@@ -215,7 +215,7 @@ def backend(*words: str) -> str:
 
 
 def baked(host: Host, words: Sequence[str]) -> None:
-    """Bakes a take whole, in the Blender of the hosts."""
+    """Bakes a whole take in the hosts' Blender."""
     entered = [
         str(ROOT / "splannequin.py"),
         "farm-host",
@@ -236,7 +236,7 @@ def baked(host: Host, words: Sequence[str]) -> None:
 
 
 def compared(ours: Path, theirs: Path) -> bool:
-    """Prints how many files of two folders are the same, by folder and kind; True if all are."""
+    """Prints how many files of two folders are identical, by folder and kind; True if all are."""
     same: dict[str, list[bool]] = {}
     different: list[str] = []
     for path in sorted(p for top in ("shots", "baked") for p in (theirs / top).rglob("*")):
@@ -260,7 +260,7 @@ def compared(ours: Path, theirs: Path) -> bool:
 
 
 def main() -> int:
-    """Runs what the module says; the exit status is 1 where a frame differs."""
+    """Runs the benchmark; returns 1 if a frame differs, else 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--output", type=Path, required=True, help="folder, which must not be there")
     parser.add_argument("--openjd", default=sys.executable, help="Python with openjd-cli")

@@ -3,11 +3,11 @@
     python -m benchmarks.fit_state SCENE ... --results DIR [--seeds 0 1] [--every K] [--cross]
 
 SCENE is a folder of benchmarks/synthetic; seeds 0 to 9 are for tuning. Its shot and an `auto` run for every training
-seed are made in DIR if they are not there. For every instant and pose with a truth the evidence is computed as a frozen
-frame computes it. Two losses are added. One is the mean squared error of a mix of the plate and of what fills it (the
-frame with that plate withheld) by the posterior, in units of the plate's own mean squared error. The other is the
-cross-entropy of the posterior with whether plate and truth differ. Then the bias alone is chosen by the PSNR of mixed
-frames. Prints the weights, and PSNR of frames mixed by them. `--cross` judges each scene by weights that were fitted on
+seed are made in DIR if missing. For every instant and pose with truth, the evidence is computed as for a frozen frame.
+The fit minimises the sum of two losses. The first is the mean squared error of a mixed frame, relative to the plate's.
+The posterior mixes the plate and its fill, which is the frame with that plate withheld. The second loss is the
+cross-entropy of the posterior with whether plate and truth differ. Afterwards the bias alone is chosen by the PSNR of
+mixed frames. Prints the weights and the PSNR of frames mixed by them. `--cross` judges each scene by weights fitted on
 the others.
 """
 
@@ -40,55 +40,55 @@ from torch_backend.train import load_run
 NAMES = [f.name for f in fields(StateWeights) if f.name != "bias"]
 """Names of the evidence, in the order of `Case.evidence`."""
 LABEL_WEIGHT = 0.1
-"""Weight of the cross-entropy beside the squared error."""
+"""Weight of the cross-entropy relative to the squared error."""
 DIFFERS = 0.03, 0.09
-"""Difference of plate and truth, display-referred, at which they begin to differ and surely do."""
+"""Display-referred differences of plate and truth at which the label `differs` leaves 0 and reaches 1."""
 SHIFTS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
-"""Added to the fitted bias, of which that is kept with which smoothed, mixed frames have the highest PSNR. The
-regression knows neither smoothing nor ramp, and its cross-entropy counts a missed pixel no more than a needless one."""
+"""Candidates added to the fitted bias; the highest PSNR of smoothed, mixed frames decides. The fit ignores smoothing
+and ramp, and its cross-entropy weighs missed and needlessly rejected pixels equally."""
 ALIKE = 0.02
-"""dB of PSNR by which two biases are equally good: the one that lets go of less is taken."""
+"""dB of PSNR within which two biases count as equally good; the one that rejects less is taken."""
 STEPS, RATE, DECAY = 150, 0.15, 1e-4
-"""Of Adam; and the weight of the squared weights, which are in standard deviations of the evidence."""
+"""Steps and learning rate of Adam, and weight decay; weights are per standard deviation of the evidence."""
 
 
 @dataclass
 class Case:
-    """All frames of one run, pictures [N, h, w, 3] display-referred, at the size of decisions."""
+    """All frames of one run. Pictures are [N, h, w, 3], display-referred, at the size of decisions."""
 
     name: str
     """Scene and training seed."""
     evidence: Tensor
-    """[N, h, w, E] in the order of NAMES."""
+    """[N, h, w, E] in the order of `NAMES`."""
     plate: Tensor
     """The plate of each pose."""
     filled: Tensor
-    """The frozen frame with that plate withheld."""
+    """The frozen frame with the plate of its pose withheld."""
     truth: Tensor
     """The scene at t*."""
     moving: Tensor
     """[N, h, w] bool: pixels that move."""
     unit: float
-    """Pixels of decisions to one of 640."""
+    """Pixels of decisions per pixel of a 640-pixel-wide frame."""
 
     def saving(self) -> Tensor:
-        """[N, h, w] squared error that letting go of the plate saves, over the plate's mean squared error."""
+        """[N, h, w] squared error saved by rejecting the plate, relative to the plate's mean squared error."""
         kept, gone = ((picture - self.truth).square().mean(-1) for picture in (self.plate, self.filled))
         return torch.stack([blurred(each, 1.0) for each in kept - gone]) / kept.mean()
 
     def differs(self) -> Tensor:
-        """[N, h, w] in 0..1: whether plate and truth differ."""
+        """[N, h, w] in 0..1: degree to which plate and truth differ."""
         off = torch.stack([blurred(each, 1.0).abs().amax(-1) for each in self.plate - self.truth])
         low, high = DIFFERS
         return ((off - low) / (high - low)).clamp(0.0, 1.0)
 
 
 def collect(truth: TruthScene, run: str, name: str, t_stars: Sequence[int], every: int) -> Case:
-    """The instants and every `every`-th pose of a scene, by one run."""
+    """The case of a scene and run: its instants and every `every`-th pose."""
     clip = DetailClip(truth.shot, run, load_run(truth.shot, run, torch.device("cpu")).width)
     rows: list[tuple[Tensor, ...]] = []
     for t_star in t_stars:
-        clip.frozen(t_star)  # developed here: rows are made without gradients
+        clip.frozen(t_star)  # develops outside `_row`, which computes no gradients
         for pose in [pose for pose in truth.poses(t_star, []) if pose != t_star][::every]:
             rows.append(_row(clip, truth, pose, t_star))
     found, plate, filled, target, moving = (torch.stack(column) for column in zip(*rows, strict=True))
@@ -114,7 +114,7 @@ def _row(clip: DetailClip, truth: TruthScene, pose: int, t_star: int) -> tuple[T
 
 
 def fit(cases: Sequence[Case]) -> StateWeights:
-    """The weights that fit all cases; each case weighs the same."""
+    """The weights fitted to all cases, weighted equally."""
     flat = [case.evidence.reshape(-1, len(NAMES)) for case in cases]
     every = torch.cat(flat)
     mean, deviation = every.mean(0), every.std(0).clamp_min(1e-3)
@@ -140,7 +140,7 @@ def fit(cases: Sequence[Case]) -> StateWeights:
 
 
 def judged(case: Case, weights: StateWeights) -> dict[str, float]:
-    """dB of frames mixed by weights, whole and moving; and of the plate and the fill alone."""
+    """{figure: value}: dB of the mix, of the plate alone and of the fill alone, whole and moving; share of the fill."""
     config = StateConfig(weights=weights)
     values = torch.tensor([getattr(weights, name) for name in NAMES])
     odds = case.evidence @ values + weights.bias

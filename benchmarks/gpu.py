@@ -1,16 +1,16 @@
-"""What there is to ask a card that is at hand for half an hour: `python -m benchmarks.gpu STAGE --results DIR`.
+"""Benchmarks for half an hour on a GPU: `python -m benchmarks.gpu STAGE --results DIR`.
 
-Stages, of at most 8 minutes each; docs/gpu.md says what each answers:
+Stages, of at most 8 minutes each; docs/gpu.md explains their figures:
   environment  the self-test, kernels compiled cold and warm, the tests that need a card
   sanitizer    compute-sanitizer's four tools over the tests of the rasteriser and of a field's planes
-  raster       W2, W3 and W4 against gsplat in one run, where a step's time goes, what a list that is too short costs,
-               what a field's planes take
-  training     a solved shot (--shot) on both devices, two seeds: PSNR, ms a step, how often the host waits
-  limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, views a second
+  raster       W2, W3 and W4 against gsplat in one run, a profile of a step, the cost of a hit list that is too short,
+               the cost of a field's planes
+  training     a solved shot (--shot) on both devices, two seeds: PSNR, ms per step, waits of the host
+  limits       memory of 4, 6 and 8 GB, resuming on either device, a freeze, views per second
 
-Each writes DIR/gpu-STAGE.json. A part that fails is a sentence there, and the others go on; so is a part for which no
-time was left. `--only PART ...` asks for some parts of a stage. `--dry-run` carries the same code out on the processor,
-at tiny sizes: its figures mean nothing.
+Each stage writes DIR/gpu-STAGE.json. A failed part, or one without enough time left, is reported in that file, and the
+other parts continue. `--only PART ...` selects parts of a stage. `--dry-run` runs the same code on the CPU at tiny
+sizes; its figures are meaningless.
 """
 
 import argparse
@@ -60,7 +60,7 @@ from torch_backend.train.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[1]
 SECONDS = 480.0
-"""Of a stage."""
+"""Time limit of a stage."""
 TESTS = (
     "tests/backend/raster/test_cuda.py",
     "tests/backend/deformation/test_planes.py",
@@ -74,12 +74,12 @@ PEER = "benchmarks.peers.gsplat"
 
 
 class Stage:
-    """A stage that runs: its parts, its clock, what it found."""
+    """A running stage: its parts, its time limit and its results."""
 
     def __init__(
         self, dry: bool, shot: Path | None, results: Path, seconds: float = SECONDS, only: Sequence[str] = ()
     ) -> None:
-        """`only`: names of parts; none: all."""
+        """`only`: names of the parts to run; empty for all."""
         self.dry, self.shot, self.results, self.only = dry, shot, results, only
         self.device = torch.device("cpu" if dry else "cuda")
         self.found: dict[str, Any] = {}
@@ -87,11 +87,11 @@ class Stage:
 
     @property
     def left(self) -> float:
-        """Seconds."""
+        """Seconds left."""
         return self.until - time.monotonic()
 
     def part(self, name: str, call: Callable[[], Any], needs: float = 0.0) -> None:
-        """Notes what a part found, or why it found nothing; needs: seconds without which it is not begun."""
+        """Records a part's result or failure. `needs`: seconds that must be left to start it."""
         if self.only and name not in self.only:
             return
         if self.left < needs and not self.dry:
@@ -100,14 +100,14 @@ class Stage:
         since = time.monotonic()
         try:
             result = call()
-        except Exception as error:  # the stage goes on: the card is not at hand for long
+        except Exception as error:  # later parts still run: the GPU is available for a short time only
             traceback.print_exc()
             result = {"failed": f"{type(error).__name__}: {error}".splitlines()[0]}
         self.found[name] = {"seconds": round(time.monotonic() - since, 2), **result}
         print(f"{name}: {json.dumps(self.found[name])[:400]}", flush=True)
 
     def child(self, command: list[str], most: float, **environ: str) -> dict[str, Any]:
-        """A process of its own: its exit code, seconds, and the end of what it said."""
+        """Runs a child process; returns its exit code, seconds, and the end of its output."""
         since = time.monotonic()
         paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
         whole = {**os.environ, "PYTHONPATH": paths, "PYTHONSAFEPATH": "1", **environ}
@@ -122,7 +122,7 @@ class Stage:
         return {"exit_code": ran.returncode, "seconds": round(time.monotonic() - since, 2), "said": output[-25:]}
 
     def scratch_shot(self) -> Shot:
-        """A copy of the shot, to write runs into. JobError without one."""
+        """A copy of the shot for training runs. JobError without a shot."""
         if self.shot is None:
             raise JobError("This part needs a solved shot.", "Name one with --shot.", 2)
         copy = self.results / "gpu-scratch.splannequin"
@@ -131,7 +131,7 @@ class Stage:
         return Shot.open(copy)
 
     def wait(self) -> None:
-        """Until the card has done what it was told."""
+        """Waits until the GPU is idle."""
         if self.device.type == "cuda":
             torch.cuda.synchronize()
 
@@ -207,7 +207,7 @@ def raster(stage: Stage) -> None:
 
 
 def _profile(stage: Stage, name: str) -> dict[str, Any]:
-    """The kernels that a frame and its gradient spend most on."""
+    """The 20 operations or kernels that take most of a frame and its gradient."""
     case = raster_bench._Case(
         room(*WORKLOADS[name]), raster_bench.Body("cpu" if stage.dry else "cuda", stage.device.type)
     )
@@ -227,8 +227,8 @@ def _profile(stage: Stage, name: str) -> dict[str, Any]:
 
 
 def _host(stage: Stage, run: Callable[[], Any], count: int) -> dict[str, Any]:
-    """What the host does in one of `count` runs: ms in all, without a profiler, and by Python's the functions it spends
-    most on, [calls, own us, us with what they call] (a profiler makes small functions look larger)."""
+    """Mean host time of `count` runs: ms in total, without a profiler, and the functions that take most, by cProfile,
+    each as [calls, own us, us including callees]. cProfile overstates small functions."""
     for _ in range(5):
         run()
     stage.wait()
@@ -259,13 +259,13 @@ def _host(stage: Stage, run: Callable[[], Any], count: int) -> dict[str, Any]:
 
 
 def _frames_host(stage: Stage, body: raster_bench.Body) -> dict[str, Any]:
-    """`_host` of a small frame and its gradient."""
+    """`_host` for a small frame and its gradient."""
     case = raster_bench._Case(room(*WORKLOADS["W0" if stage.dry else "W2"]), body)
     return _host(stage, case.image, 20 if stage.dry else 500)
 
 
 def _late_step(stage: Stage) -> dict[str, Any]:
-    """A step of `preview` past its half, the field there and the trial over: host and card, as `_host`, `_busy`."""
+    """Host and GPU figures (`_host`, `_busy`) of a late step of `preview`, with its field made and its trial over."""
     scene = load_scene(stage.scratch_shot())
     few, width = (600, 64) if stage.dry else (PRESETS["preview"]().densify.budget, PRESETS["preview"]().width)
     config = config_from_params(
@@ -283,19 +283,19 @@ def _late_step(stage: Stage) -> dict[str, Any]:
 
 
 def _ways(trainer: Trainer) -> dict[str, Recorder | None]:
-    """How a step is carried out."""
+    """Ways to run a step: launched kernel by kernel, or recorded as a CUDA graph."""
     ways: dict[str, Recorder | None] = {"launched": None}
     return ways if trainer.recorder is None else {**ways, "recorded": trainer.recorder}
 
 
 def _replays(trainer: Trainer) -> dict[str, Any]:
-    """How many steps were replayed, and why no more are."""
+    """Number of replayed steps, and why others were refused."""
     recorder = trainer.recorder
     return {} if recorder is None else {"replayed": recorder.replayed, "refused": recorder.refused}
 
 
 def _whole_runs(stage: Stage) -> dict[str, Any]:
-    """Whole runs of `preview`, two seeds, their steps recorded and launched in turn: seconds, dB held out."""
+    """Seconds and held-out dB of whole runs of `preview`, two seeds, with steps launched and with steps recorded."""
     scene = load_scene(stage.scratch_shot())
     few, width = (600, 64) if stage.dry else (PRESETS["preview"]().densify.budget, PRESETS["preview"]().width)
     train, test = split_frames(scene.solved, 8, 0)
@@ -323,8 +323,8 @@ def _whole_runs(stage: Stage) -> dict[str, Any]:
 
 
 def _short_list(stage: Stage, name: str) -> dict[str, Any]:
-    """A frame whose list holds all its hits, and one whose list holds a tenth of them."""
-    size = (60, 24, 17) if stage.dry else WORKLOADS[name]  # on fibers in a dry run
+    """ms of a frame whose list holds all its hits, and of one whose list holds a tenth of them."""
+    size = (60, 24, 17) if stage.dry else WORKLOADS[name]  # a dry run uses fibers
     case = raster_bench._Case(room(*size), raster_bench.Body("cuda", stage.device.type))
     times: dict[str, Any] = {}
     most, step = hit_lists.HITS_MAX, hit_lists.HITS_STEP
@@ -344,9 +344,9 @@ def _short_list(stage: Stage, name: str) -> dict[str, Any]:
 
 
 def _planes(stage: Stage) -> dict[str, Any]:
-    """Samples, penalty and gradients of a field's planes, ms: by our kernels, and by torch's operators.
+    """ms for samples, penalty and gradients of a field's planes, by the project's kernels and by torch's operators.
 
-    Of 100,000 points at one instant, as in a step, which add to two rows of the time planes.
+    Uses 100,000 points at one instant, as in a step, so that gradients go to two rows of the time planes.
     """
     g, count = torch.Generator().manual_seed(0), 300 if stage.dry else 100_000
     field = HexPlane(HexPlaneConfig(time_nodes=40), torch.tensor([[-1.0] * 3, [1.0] * 3]), g).to(stage.device)
@@ -376,7 +376,7 @@ def _planes(stage: Stage) -> dict[str, Any]:
 def training(stage: Stage) -> None:
     torch.set_num_threads(default_threads())
     devices = ("cpu",) if stage.dry else ("cuda", "cpu")
-    for device in devices:  # the card first: the processor may take longer than the stage has
+    for device in devices:  # the GPU first: the CPU may need longer than the stage's limit
         for preset in ("preview", "final"):
             for seed in (0,) if stage.dry else (0, 1):
                 name = f"{preset}-{device}-{seed}"
@@ -389,11 +389,11 @@ def training(stage: Stage) -> None:
 
 
 def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any]:
-    """A run: PSNR on frames held out, and ms a step between its measurements."""
+    """Trains a run; returns its held-out PSNR, and ms per step between its measurements."""
     steps = 20 if stage.dry else {"preview": 0, "final": 3000}[preset]
     report, name = Warnings(), f"gpu-{preset}-{device}-{seed}"
     shot, known = stage.scratch_shot(), PRESETS[preset]()
-    # The processor's numbers on either device: a card's own are others.
+    # Both devices use the CPU's preset sizes, because a GPU has other defaults.
     few = 400 if stage.dry else known.densify.budget
     width = 64 if stage.dry else known.width or load_scene(shot).width
     params = TrainParams(
@@ -415,7 +415,7 @@ def _trained(stage: Stage, preset: str, device: str, seed: int) -> dict[str, Any
 def _trainer(
     stage: Stage, iterations: int, most: int, width: int = 0, method: str = "auto", stretched: tuple[int, int] = (0, 0)
 ) -> Trainer:
-    """A run of `final` that nothing is saved of; its frames stretched to a width and height, if those are given."""
+    """An unsaved run of `final`. `stretched`: (width, height) to which its frames are resized, or zeros."""
     scene = load_scene(stage.scratch_shot())
     config = config_from_params(
         TrainParams(preset="final", iterations=iterations, max_gaussians=most, method=method, width=width)
@@ -436,7 +436,7 @@ def _step(trainer: Trainer) -> None:
 
 
 def _enlarged(trainer: Trainer, many: int) -> None:
-    """`many` Gaussians of those a run has: each split into smaller ones about its place, all of them open."""
+    """Grows a run to `many` Gaussians by splitting each into smaller ones around its position; all are open."""
     gaussians = trainer.model.gaussians
     few, device = len(gaussians), gaussians.open.device
     rows = torch.arange(many, device=device) % few
@@ -450,15 +450,15 @@ def _enlarged(trainer: Trainer, many: int) -> None:
 
 
 def _full_hd(stage: Stage) -> dict[str, Any]:
-    """A step of `final` with 1,000,000 Gaussians on frames stretched to 1920 x 1080: ms while nothing, a tenth and all
-    of them may move, and what of it the card was busy, by how many kernels."""
+    """A step of `final` with 1,000,000 Gaussians on frames stretched to 1920 x 1080, while none, a tenth and all of
+    them may move: ms, and the GPU's busy time and number of kernels."""
     many, size, count = (2000, (64, 36), 2) if stage.dry else (1_000_000, (1920, 1080), 30)
     trainer = _trainer(stage, 300, 2000 if stage.dry else 100_000, 64 if stage.dry else 0, "hexplane", size)
     schedule_events(trainer)
     figures: dict[str, Any] = {"gaussians": many, "width": size[0], "height": size[1], "frames": len(trainer.times)}
     for name, share in (("static", 0.0), ("tenth", 0.1), ("all", 1.0)):
         if name == "tenth":
-            trainer.iteration = 101  # a third: the field is made
+            trainer.iteration = 101  # past a third of the run the field exists
             schedule_events(trainer)
         if len(trainer.model.gaussians) != many:
             _enlarged(trainer, many)
@@ -482,7 +482,7 @@ def _full_hd(stage: Stage) -> dict[str, Any]:
 
 
 def _busy(stage: Stage, trainer: Trainer) -> dict[str, Any]:
-    """Of three steps, by torch's profiler: ms that the card was busy in each, how many kernels, the ten longest."""
+    """Per step, over three profiled steps: busy ms of the GPU, number of kernels, the ten longest kernels."""
     if stage.device.type != "cuda":
         return {}
     kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
@@ -490,7 +490,7 @@ def _busy(stage: Stage, trainer: Trainer) -> dict[str, Any]:
         for _ in range(3):
             trainer.step()
         stage.wait()
-    # A range that torch notes about its optimisers' steps would count their kernels twice.
+    # torch annotates a range around optimizer steps, which would count their kernels twice.
     kernels = [
         row
         for row in seen.key_averages()
@@ -503,13 +503,13 @@ def _busy(stage: Stage, trainer: Trainer) -> dict[str, Any]:
 
 
 def _waits(stage: Stage) -> dict[str, Any]:
-    """Places where the host waited for the card, by torch's own count, in steps that are no tenth."""
+    """Code lines where the host waits for the GPU, by torch's sync debug mode, without every tenth step."""
     trainer = _trainer(stage, 400, 600 if stage.dry else 100_000, 64 if stage.dry else 640, "hexplane")
     places: dict[str, int] = {}
     steps = 0
     while trainer.iteration < (140 if stage.dry else 300):
         schedule_events(trainer)
-        look = trainer.iteration >= 135 and trainer.iteration % 10 != 0  # the field is there from a third on
+        look = trainer.iteration >= 135 and trainer.iteration % 10 != 0  # the field exists after a third of the run
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always")
             if look and stage.device.type == "cuda":
@@ -538,13 +538,13 @@ def limits(stage: Stage) -> None:
 
 
 def _memory(stage: Stage, gb: int) -> dict[str, Any]:
-    """A step of a run as large as the plan for such a card allows: what it took, beside what was reckoned with."""
+    """Measured and planned memory of a step, for a run of the size that the plan allows on a GPU of `gb` GB."""
     scene = load_scene(stage.scratch_shot())
     config = config_from_params(TrainParams(preset="final", method="hexplane", max_gaussians=1_000_000))
     size = training_size(scene, config.width)
     plan = plan_memory(config, size, len(scene.solved), 0, gb * 10**9 - 900_000_000)
     trainer = _trainer(stage, 60, 2000, 64 if stage.dry else 0, "hexplane")
-    trainer.iteration = 21  # a third: the field is made
+    trainer.iteration = 21  # past a third of the run the field exists
     schedule_events(trainer)
     trainer.model.pieces = 500 if stage.dry else plan.pieces
     _enlarged(trainer, 2000 if stage.dry else plan.gaussians)
@@ -572,7 +572,7 @@ def _memory(stage: Stage, gb: int) -> dict[str, Any]:
 
 
 def _resumed(stage: Stage) -> dict[str, Any]:
-    """A run saved before a round of growth, and gone on with on each device."""
+    """Saves a run before a growth round, and resumes it on each device."""
     most, width = (1200, 64) if stage.dry else (60_000, 640)
     trainer = _trainer(stage, 600, most, width)
     growth = trainer.config.densify
@@ -596,7 +596,7 @@ def _resumed(stage: Stage) -> dict[str, Any]:
 
 
 def _run_of(stage: Stage) -> str:
-    """A run of the scratch shot, trained if there is none: the stage `training` leaves some."""
+    """Name of a run of the scratch shot, trained if missing; the stage `training` leaves some."""
     shot = stage.scratch_shot()
     name = f"gpu-preview-{stage.device.type}-0"
     if not (shot.run(name) / METRICS_FILE).is_file():
@@ -605,7 +605,7 @@ def _run_of(stage: Stage) -> str:
 
 
 def _frozen(stage: Stage) -> dict[str, Any]:
-    """Frames of a take a second, as they are delivered."""
+    """Number of frames of a take, and seconds per delivered frame."""
     shot, name = stage.scratch_shot(), _run_of(stage)
     first = load_scene(shot).frames[0]
     last = first + (0 if stage.dry else 9)
@@ -617,7 +617,7 @@ def _frozen(stage: Stage) -> dict[str, Any]:
 
 
 def _live(stage: Stage) -> dict[str, Any]:
-    """Views a second that a session draws, 320 x 180, without the pipe to Blender."""
+    """Views per second drawn by a live session at 320 x 180, without the pipe to Blender."""
     shot = stage.scratch_shot()
     session = LiveSession(shot, _run_of(stage), stage.device.type)
     cameras = CameraPath.load(shot.cameras).frames

@@ -1,4 +1,4 @@
-"""How many views a second a live session draws: `python -m benchmarks.live_rate SHOT [--run main]`, 320 x 180."""
+"""Views per second of a live session at 320 x 180: `python -m benchmarks.live_rate SHOT [--run main]`."""
 
 import argparse
 import os
@@ -16,7 +16,7 @@ SIZE = (320, 180)
 
 
 def main() -> None:
-    """Asks for one view after the other: t* through all trained frames, then t* held and all poses."""
+    """Requests views one after another: t* over all trained frames, then all poses at a fixed t*."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("shot")
     parser.add_argument("--run", default="main")

@@ -1,11 +1,11 @@
-"""Cameras of a matchmove file against our own solve: `python -m benchmarks.matchmove SCENE ... --results DIR`.
+"""Cameras of a matchmove file against the product's solve: `python -m benchmarks.matchmove SCENE ... --results DIR`.
 
-SCENE is a folder of benchmarks/synthetic. Its true camera is written by Blender as Alembic and as USD. The clip is then
-solved three times by the product's own command lines: by our solve, and with the cameras of either file, which
-Blender's importer reads. Each solve trains one run per seed, with every 8th frame held out. The table has the residual
-in pixels, also over the keypoints that our solve triangulates too (it adjusts its cameras to its keypoints, and keeps
-fewer), how far the cameras are from the true ones after the best similarity, and the PSNR of the held-out frames.
-Finished solves and runs are not computed again, so that seeds can be added.
+SCENE is a folder of benchmarks/synthetic. Blender writes its true camera as Alembic and as USD. The product's command
+lines then solve the clip three times: without a camera file, and with the cameras of each file, read by Blender's
+importer. Each solve trains one run per seed, with every 8th frame held out. The table has the residual in pixels, the
+distance of the cameras from the true ones after the best similarity, and the PSNR of the held-out frames. The residual
+is also given over the keypoints that the product's solve triangulates: it adjusts cameras to them and keeps fewer.
+Finished solves and runs are not repeated, so seeds can be added later.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from torch_backend.contract import RunFolder, read_json
 from torch_backend.shot import SHOT_SUFFIX, Shot, write_json
 
 SOURCES = {"solve": "our solve", "abc": "Alembic", "usdc": "USD"}
-"""Where the cameras come from: ending of the file -> name in the table."""
+"""Source of the cameras (file ending) -> name in the table."""
 HEADINGS = (
     "| scene | cameras | residual, px | points | same keypoints, px: mean and median (our solve) | focal length, px "
     "| off the true positions, mm | rotations, degrees | held out, dB |"
@@ -39,7 +39,7 @@ HEADINGS = (
 
 
 def camera_file(scene: SyntheticScene, folder: Path, ending: str, bpy: Path) -> Path:
-    """The true camera of a scene as FOLDER/camera.ENDING, written if it is not there."""
+    """FOLDER/camera.ENDING with the true camera of a scene, written if missing."""
     file = folder / f"camera.{ending}"
     if not file.exists():
         source = folder / "camera.json"
@@ -63,7 +63,7 @@ def solved(scene: SyntheticScene, folder: Path, source: str, bpy: Path) -> Shot:
 
 
 def compared(shot: Shot, ours: Shot) -> str:
-    """Mean and median residual over the keypoints that both solves triangulate, those of our solve in brackets."""
+    """Mean and median residual over the keypoints triangulated by both solves; those of `ours` in brackets."""
     printed = _run([sys.executable, "-P", "-m", "benchmarks.synthetic.residuals", shot.colmap, ours.colmap])
     one, other = ({(name, x, y): error for name, x, y, error in rows} for rows in json.loads(printed))
     both = sorted(one.keys() & other.keys())
@@ -72,7 +72,7 @@ def compared(shot: Shot, ours: Shot) -> str:
 
 
 def row_of(scene: SyntheticScene, folder: Path, source: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Figures of one source of cameras: the solve, and the held-out PSNR of a training for each seed."""
+    """Figures of one source of cameras: the solve, and the held-out PSNR of one training per seed."""
     shot = solved(scene, folder, source, find_bpy(args.bpy))
     solve, alike = read_json(shot.solve / "solve.json"), similarity_to_exact(scene, shot)
     row: dict[str, Any] = {
@@ -94,12 +94,12 @@ def row_of(scene: SyntheticScene, folder: Path, source: str, args: argparse.Name
 
 
 def _backend(*words: Any) -> None:
-    """Runs a verb of the backend."""
+    """Runs a command of the backend."""
     _run([sys.executable, "-P", "-m", "torch_backend", *words])
 
 
 def _run(words: Sequence[Any]) -> str:
-    """Runs a child process; returns what it printed. RuntimeError with its last line if it fails."""
+    """Runs a child process; returns its output. RuntimeError with its last line if it fails."""
     env = child_environ(SPLANNEQUIN_BACKEND_PYTHON=sys.executable)
     done = subprocess.run([str(word) for word in words], env=env, capture_output=True)
     if done.returncode:
@@ -109,7 +109,7 @@ def _run(words: Sequence[Any]) -> str:
 
 @in_words
 def main(argv: Sequence[str] | None = None) -> None:
-    """Prints a row per scene and source of cameras."""
+    """Prints a row for each scene and source of cameras."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--results", type=Path, required=True)

@@ -1,17 +1,18 @@
 """Mattes from one lasso against rendered truth: `python -m benchmarks.mattes SCENE ... --results DIR`.
 
-SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot with exact
-cameras, an `auto` run and a take for each instant are made in DIR if they are missing. Truth are the pixels whose
-centre shows a person, by rays through the scene's triangles.
+SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 for tuning, 100 to 109 for reporting). Its shot with exact
+cameras, an `auto` run and a take for each instant are made in DIR if missing. Truth is the set of pixels whose centre
+shows a person, found by rays through the scene's triangles.
 
-Each person is lassoed once per instant, at the frame that shows the largest share of them (`--lasso-at t-star`: at
-that of the instant, which may show a sliver). The lasso is the outline of the truth there, a corner every `--corner`
-pixels, each moved by up to `--sloppy` pixels in any direction; a person whom something parts has a polygon for each
-part of a twentieth or more. Judged are all other frames of the take (every `--every`-th of the clip, t* among them)
-that show at least `LEAST` pixels of the person: intersection over union of truth and the matte, cut at half. Seconds
-are those of the job up to its first matte, loading of the run included, and of each further frame with all its mattes.
+Each person is lassoed once per instant, at the frame that shows the largest share of them. With `--lasso-at t-star` it
+is the instant's frame, which may show only a sliver. The lasso is the outline of the truth in that frame, with a corner
+every `--corner` pixels. Each corner is moved by up to `--sloppy` pixels in any direction. If an occluder splits a
+person, each part with at least a twentieth of the pixels gets a polygon. All other frames of the take that show at
+least `LEAST` pixels of the person are judged (every `--every`-th of the clip, including t*). The figure is the
+intersection over union of truth and the matte, thresholded at 0.5. Seconds are given up to the job's first matte,
+including loading the run, and per further frame with all its mattes.
 
-DIR gets mattes-NAME.json.
+Writes mattes-NAME.json to DIR.
 """
 
 from __future__ import annotations
@@ -47,15 +48,15 @@ from torch_backend.freeze.take.folder import frames_of
 from torch_backend.shot import Shot, write_json
 
 LEAST = 200
-"""Pixels of a person below which a pose says little: half a pixel of outline is a tenth of it."""
+"""Least pixels of a person for a judged pose; with fewer, half a pixel of outline is a tenth of the person."""
 WIDE = 120
-"""Width of the pictures, in pixels, on which silhouettes are counted."""
+"""Width in pixels of the pictures on which silhouettes are counted."""
 PERSON = "person"
-"""What the names of movers that are people begin with."""
+"""Prefix of the names of movers that are people."""
 
 
 def person_masks(scene: SyntheticScene, t_star: int, poses: Sequence[int]) -> dict[str, dict[int, NDArray[np.bool_]]]:
-    """Person -> pose -> [H, W]: the pixels that show them while time stands still at frame `t_star`."""
+    """Person -> pose -> [H, W] mask of the pixels that show the person while time is frozen at frame `t_star`."""
     geometry, faces = Geometry.load(scene.root), faces_of_people(scene.root)
     standing = geometry.at(scene.frames.index(t_star))
     found: dict[str, dict[int, NDArray[np.bool_]]] = {name: {} for name in faces}
@@ -69,9 +70,9 @@ def person_masks(scene: SyntheticScene, t_star: int, poses: Sequence[int]) -> di
 
 
 def best_poses(scene: SyntheticScene, t_star: int, masks: dict[str, dict[int, NDArray[np.bool_]]]) -> dict[str, int]:
-    """Person -> the pose that shows most of them: of those with the largest share seen, to a twentieth, the nearest.
+    """Person -> the pose that shows the largest share of them, rounded to a twentieth; ties go to the most pixels.
 
-    The share is that of their silhouette, as nothing hid it and as the frame went on for its size on all sides.
+    The share is relative to the full silhouette: unoccluded, and in a frame three times as wide and high.
     """
     geometry, small = Geometry.load(scene.root), WIDE / scene.width
     standing, K = geometry.at(scene.frames.index(t_star)), scene.K * [[small], [small], [1.0]]
@@ -92,7 +93,7 @@ def best_poses(scene: SyntheticScene, t_star: int, masks: dict[str, dict[int, ND
 
 
 def faces_of_people(folder: Path) -> dict[str, tuple[int, int]]:
-    """Person -> the first of their triangles in `Geometry.triangles`, and the one after the last."""
+    """Person -> (first triangle, one past the last) in `Geometry.triangles`."""
     plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
     with np.load(folder / "geometry" / "static.npz", allow_pickle=False) as data:
         at = len(data["triangles"])
@@ -109,9 +110,9 @@ def faces_of_people(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def lassos(mask: NDArray[np.bool_], corner: float, sloppy: float, seed: int) -> list[list[list[float]]]:
-    """Polygons, corners [x, y] in pixels, that somebody draws around a mask [H, W], up to `sloppy` pixels off.
+    """Hand-drawn polygons around a mask [H, W], corners [x, y] in pixels, each up to `sloppy` pixels from the outline.
 
-    One for each part of a twentieth of the mask or more, with a corner every `corner` pixels.
+    Each part with at least a twentieth of the mask gets one polygon, with a corner every `corner` pixels.
     """
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     large = [outline for outline in outlines if cv2.contourArea(outline) >= 0.05 * mask.sum()]
@@ -119,7 +120,7 @@ def lassos(mask: NDArray[np.bool_], corner: float, sloppy: float, seed: int) -> 
 
 
 def _drawn(outline: NDArray[np.float64], corner: float, sloppy: float, seed: int) -> list[list[float]]:
-    """A closed outline [P, 2] as somebody draws it."""
+    """A closed outline [P, 2] as drawn by hand."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
     at = np.arange(0.0, length[-1], corner)
     corners = np.stack([np.interp(at, length, outline[:, axis]) for axis in (0, 1)], axis=1)
@@ -129,12 +130,12 @@ def _drawn(outline: NDArray[np.float64], corner: float, sloppy: float, seed: int
 
 
 def overlap(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
-    """Intersection over union of two masks; 1 where both are empty."""
+    """Intersection over union of two masks; 1 if both are empty."""
     return float((found & truth).sum() / max(1, (found | truth).sum())) if (found | truth).any() else 1.0
 
 
 class Watch(Log):
-    """A reporter that notes when frames with mattes were done."""
+    """A reporter that records when each frame with mattes is finished."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -145,28 +146,28 @@ class Watch(Log):
             self.at.append(time.perf_counter())
 
     def metric(self, stage: str, values: Any) -> None:
-        """Nothing: figures are the benchmark's own."""
+        """Does nothing: the benchmark computes its own figures."""
 
 
 @dataclass
 class MatteTake:
-    """A take of an instant with a matte of each person whom its lassoed frame shows."""
+    """A take of an instant with a matte of each person visible in that person's lassoed frame."""
 
     folder: TakeFolder
     masks: dict[str, dict[int, NDArray[np.bool_]]]
-    """Truth, as of `person_masks`."""
+    """Truth, as returned by `person_masks`."""
     lassoed: dict[str, int]
-    """Person -> the pose at which they were lassoed."""
+    """Person -> the lassoed pose."""
     seconds: dict[str, float]
     """{first, others}: until the first frame with mattes, and per further frame."""
 
     def matte(self, name: str, pose: int) -> NDArray[np.bool_]:
-        """[H, W]: a person's matte, cut at half."""
+        """[H, W] a person's matte, thresholded at 0.5."""
         return read_matte(matte_file(self.folder, name, pose, "exr"), (0, 0)) > 0.5
 
 
 def make(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> MatteTake:
-    """Freezes an instant if its take is missing, and makes the mattes of its people anew."""
+    """Freezes an instant if its take is missing, and always makes its people's mattes again."""
     take = f"mattes{t_star}"
     freeze_shot(shot, FreezeParams(run=run, take=take, t_star=t_star, step=args.every, only_missing=True), Log())
     folder = TakeFolder(shot.take(take))
@@ -178,7 +179,7 @@ def make(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argpars
         for seed, name in enumerate(masks)
         for polygon in lassos(masks[name][at[name]], args.corner, args.sloppy, 100 * seed)
     ]
-    shutil.rmtree(folder.mattes, ignore_errors=True)  # kept ones would take no time
+    shutil.rmtree(folder.mattes, ignore_errors=True)  # existing mattes would be skipped and take no time
     path = args.results.absolute() / f"lassos-{shot.root.stem}-{t_star}.json"
     write_json(path, {"mattes": rows})
     watch = Watch()
@@ -191,7 +192,7 @@ def make(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argpars
 
 
 def judge(shot: Shot, scene: SyntheticScene, run: str, t_star: int, args: argparse.Namespace) -> list[dict[str, Any]]:
-    """One row per person and pose that is judged: {t_star, person, pose, pixels, iou, first, others}."""
+    """One row per person and judged pose: {t_star, person, pose, pixels, iou, first, others}."""
     made = make(shot, scene, run, t_star, args)
     found: list[dict[str, Any]] = []
     for name, of in made.masks.items():
@@ -224,7 +225,7 @@ def _cells(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def matte_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of every benchmark that lassoes people in synthetic scenes."""
+    """Adds the arguments of every benchmark that lassoes people in synthetic scenes."""
     scene_arguments(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the training")
     parser.add_argument("--corner", type=float, default=8.0, help="pixels of outline between two corners of a lasso")

@@ -1,15 +1,16 @@
-"""The model alone, against plates that it was not trained on: `python -m benchmarks.model SHOT --results DIR`.
+"""The model alone against plates held out of training: `python -m benchmarks.model SHOT --results DIR`.
 
-Trains `--method` on a solved shot, of which nothing is written, and judges at the training size, in dB, means over the
-held-out frames: S (still pixels: the motion matte says still, and no mover is within 8 px of 640), moving pixels and
-the whole, each frame at its own time; and frozen still pixels, F: time stands still at each `--t-star`, seen from the
-held-out frames at least a quarter of the clip away, where neither the matte of that frame nor that of t* has a mover.
-With `--develop` both instants are developed as a freeze does it, whatever the method; F, the best 90 % and the gradient
-energy of those frames are judged before and after, at the training size and at `LARGE` pixels. `--held N`: moving
-pixels of N held-out frames as time standing still at that very frame shows them, whose plate neither training nor
-developing has seen. Tune with `--phase` other than 0. Seconds are of the processor; one thread. `--set` changes any
-number of the configuration, `--set gate.start=0.4 densify.budget=50000`, `--develop-set` any of `DevelopConfig`.
-`--again` judges the training that an earlier call of the same `--name` left in DIR.
+Trains `--method` on a solved shot, which stays unchanged. Figures are in dB at the training size, means over the
+held-out frames. Each frame at its own time gives S, moving and whole. S covers the pixels that the motion matte calls
+still, with no mover within 8 px at a width of 640. F covers still pixels of frames frozen at each instant. These are
+seen from the held-out frames at least a quarter of the clip away. A pixel with a mover in that frame's matte or in the
+matte of t* is excluded. The instants are `--t-star` and one half a clip away. With `--develop` both are developed as
+a freeze does, for any method. Then F, the best 90 % and the gradient energy of those frames are judged before and
+after, at the training size and at `LARGE` pixels. `--held N` judges moving pixels of N held-out frames, with time
+frozen at that frame; neither training nor development has used its plate. Tune with `--phase` other than 0. Seconds are
+CPU time of one thread. `--set` changes any number of the configuration, for example `--set gate.start=0.4
+densify.budget=50000`; `--develop-set` any of `DevelopConfig`. `--again` judges the training left in DIR by an earlier
+call with the same `--name`.
 """
 
 from __future__ import annotations
@@ -59,16 +60,16 @@ from torch_backend.train.resume import restore_run
 from torch_backend.train.trainer import Trainer
 
 FIGURES = ("still", "moving", "whole", "frozen", "gradient")
-"""S, M, whole and F in dB; gradient energy of the render at its own time over the plate's."""
+"""PSNR in dB of S, moving, whole and F; gradient energy of the render at its own time, relative to the plate's."""
 LARGE = 640
-"""Width at which frozen frames are judged too, at most: that of the working frames."""
+"""Greatest width of the second size at which frozen frames are judged; equals the width of the working frames."""
 OF_FROZEN = ("frozen", "best_90", "gradient")
-"""Of a frozen frame at another pose: F and the best 90 % of its pixels in dB; gradient energy over the plate's."""
+"""Figures of a frozen frame at another pose: F and its best 90 % in dB; gradient energy relative to the plate's."""
 _MARGIN = 8 / 640
 
 
 def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
-    """The configuration with `a.b=value` applied; ValueError for what is not there."""
+    """The configuration with `a.b=value` applied. ValueError or AttributeError for an unknown field."""
     for change in changes:
         path, _, value = change.partition("=")
         *parts, name = path.split(".")
@@ -82,7 +83,7 @@ def changed(config: TrainConfig, changes: Iterable[str]) -> TrainConfig:
 
 
 class Judge:
-    """Held-out frames of a shot at a size, and what of them moves."""
+    """Held-out frames of a shot at one size, and their moving regions."""
 
     def __init__(self, shot: Shot, trainer: Trainer, test: list[int], width: int) -> None:
         self.shot, self.trainer, self.scene, self.test = shot, trainer, trainer.scene, test
@@ -93,11 +94,11 @@ class Judge:
         self.ignored = load_ignored(masks_of(shot), self.scene, test, self.width, self.height)
 
     def judged(self, index: int, where: Tensor) -> Tensor:
-        """Of the pixels `where`, bool [H, W], those that the shot's mask does not say are no part of the scene."""
+        """The pixels of `where`, bool [H, W], without those masked as no part of the scene."""
         return where if index not in self.ignored else where & ~self.ignored[index]
 
     def matte(self, index: int) -> Tensor:
-        """[H, W] in 0..1. ValueError without one."""
+        """[H, W] motion matte of a frame in 0..1. ValueError if the shot has none."""
         found = load_motion(self.shot, self.scene.frames[index])
         if found is None:
             raise ValueError("the shot has no motion mattes: solve it anew")
@@ -105,11 +106,11 @@ class Judge:
         return F.interpolate(matte, (self.height, self.width), mode="nearest-exact")[0, 0]
 
     def still(self, matte: Tensor, mover: Tensor | None = None) -> Tensor:
-        """Pixels that stand still, bool [H, W]."""
+        """bool [H, W] still pixels."""
         return still_pixels(matte, mover, max(1, round(_MARGIN * self.width)))
 
     def at_own_time(self) -> list[dict[str, Any]]:
-        """S, moving, whole and gradient energy, a row per held-out frame; at the training size."""
+        """S, moving, whole and gradient energy, one row per held-out frame, at its own time."""
         rows = []
         for index, plate in self.images.items():
             shown, matte = self.trainer.render_frame(index), self.matte(index)
@@ -123,13 +124,13 @@ class Judge:
         return rows
 
     def seen(self, frozen: FrozenGaussians, index: int) -> FrozenImage:
-        """A frozen scene from the camera of a frame."""
+        """A frozen scene rendered from a frame's camera."""
         t, at = self.trainer, float(self.scene.times[index])
         view = t.viewmats[index], self.Ks[index]
         return render_frozen(frozen, *view, self.width, self.height, t.model.exposure, at)
 
     def frozen(self, frozen: FrozenGaussians, t_star: int) -> list[dict[str, Any]]:
-        """`OF_FROZEN` with time at the delivered frame of index `t_star`, a row per held-out frame far enough away."""
+        """`OF_FROZEN` at the instant of frame index `t_star`, one row per held-out frame that is far enough away."""
         views, matte_t_star, rows = self.trainer.viewmats, self.matte(t_star), []
         for index, plate in self.images.items():
             if abs(index - t_star) < len(self.scene.frames) / 4:
@@ -149,18 +150,18 @@ class Judge:
         return rows
 
     def moving_at(self, frozen: FrozenGaussians, index: int) -> float | None:
-        """PSNR of what moves in a held-out frame, of the scene frozen at it, from its own pose."""
+        """PSNR of the moving pixels of a held-out frame, for the scene frozen at this frame and seen from its pose."""
         moving = self.judged(index, self.matte(index) > 0.75)
         return _psnr(over_grey(self.seen(frozen, index)), self.images[index], moving)
 
 
 def masks_of(shot: Shot) -> Masks:
-    """What is ignored of a shot's frames."""
+    """Reader of the ignored regions of a shot's frames."""
     return functools.partial(load_mask, shot, IGNORE)
 
 
 def over_grey(image: FrozenImage) -> Tensor:
-    """[H, W, 3] as previews show it."""
+    """[H, W, 3] over grey, as in previews."""
     return image.color + 0.5 * (1.0 - image.alpha[..., None])
 
 
@@ -170,18 +171,18 @@ def _psnr(image: Tensor, plate: Tensor, where: Tensor) -> float | None:
 
 
 def mean(rows: Sequence[dict[str, Any]], name: str) -> float | None:
-    """Of a figure over the rows that have it."""
+    """Mean of a figure over the rows where it is not None."""
     values = [row[name] for row in rows if row.get(name) is not None]
     return statistics.fmean(values) if values else None
 
 
 def nearest_trained(trainer: Trainer, frame: int) -> int:
-    """Index of the trained frame nearest to a frame's number."""
+    """Index of the training frame nearest to a frame number."""
     return min(trainer.train_ids, key=lambda i: abs(trainer.scene.frames[i] - frame))
 
 
 def configured(args: argparse.Namespace, shot: Shot) -> TrainConfig:
-    """The configuration that is requested, or that of the trained run that is."""
+    """The requested configuration, or that of the requested trained run."""
     if args.run:
         return config_from_json(read_meta(shot.run(args.run) / CHECKPOINT_FILE)["config"])
     params = TrainParams(method=args.method, seed=args.seed, iterations=args.iterations, width=args.width, holdout=8)
@@ -191,7 +192,7 @@ def configured(args: argparse.Namespace, shot: Shot) -> TrainConfig:
 
 
 def trained(args: argparse.Namespace, shot: Shot, config: TrainConfig) -> tuple[Trainer, list[int], float]:
-    """(trainer at its end, indices of the frames held out, CPU seconds of the training)."""
+    """(trainer after training, indices of held-out frames, CPU seconds of the training)."""
     scene = load_scene(shot)
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
@@ -210,7 +211,7 @@ def trained(args: argparse.Namespace, shot: Shot, config: TrainConfig) -> tuple[
 
 
 class Freezer:
-    """Instants of a training, as the field has them and as a freeze develops them."""
+    """Instants of a training, before and after development."""
 
     def __init__(self, args: argparse.Namespace, shot: Shot, trainer: Trainer) -> None:
         t, self.shot, self.trainer = trainer, shot, trainer
@@ -222,11 +223,11 @@ class Freezer:
         self.seconds = 0.0
 
     def field(self, index: int) -> FrozenGaussians:
-        """The instant of a frame as it was trained."""
+        """The trained instant of a frame, before development."""
         return freeze_at(self.trainer.model, float(self.trainer.scene.times[index]), self.trainer.seconds)
 
     def developed(self, index: int) -> FrozenGaussians:
-        """The instant of a frame, developed: with what its plate alone shows, if that was trained on."""
+        """The developed instant of a frame. A held-out frame gets the repairs without training on its plate."""
         scene, since = self.trainer.scene, time.process_time()
         frame, frozen = scene.frames[index], self.field(index)
         if frame in self.run.train_frames:
@@ -239,13 +240,13 @@ class Freezer:
 
 
 def spread(indices: Sequence[int], count: int) -> list[int]:
-    """At most so many of them, evenly."""
+    """At most `count` of the indices, evenly spaced."""
     step = max(1.0, len(indices) / max(1, count))
     return [indices[int((n + 0.5) * step)] for n in range(min(count, len(indices)))]
 
 
 def judged(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge], t_stars: list[int]) -> dict[str, Any]:
-    """Rows of the frozen frames by size, before and after developing: {"field": {"small": [...], ...}, ...}."""
+    """Rows of the frozen frames by size, before and after development: {"field": {"small": [...], ...}, ...}."""
     rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for kind in ("field", "developed") if args.develop else ("field",):
         rows[kind] = {size: [] for size in judges}
@@ -257,7 +258,7 @@ def judged(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge],
 
 
 def held(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge], test: list[int]) -> list[dict[str, Any]]:
-    """What moves at instants that nobody has seen, dB: a row per held-out frame in which enough does."""
+    """dB of moving pixels at instants held out of training, one row per held-out frame with moving pixels."""
     rows = []
     for index in spread([i for i in test if bool((judges["small"].matte(i) > 0.75).any())], args.held):
         row: dict[str, Any] = {"frame": freezer.trainer.scene.frames[index]}
@@ -269,7 +270,7 @@ def held(args: argparse.Namespace, freezer: Freezer, judges: dict[str, Judge], t
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
-    """Trains and judges once."""
+    """Trains and judges one configuration."""
     shot = Shot.open(args.shot)
     config = configured(args, shot)
     trainer, test, seconds = trained(args, shot, config)

@@ -1,14 +1,14 @@
 """Motion mattes against rendered truth: `python -m benchmarks.movers SCENE ... --results DIR`.
 
-SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot with exact (or
-solved) cameras and its mattes are made in DIR if they are not there. Printed are, over all frames of the clip:
+SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 for tuning, 100 to 109 for reporting). Its shot with exact (or
+solved) cameras and its mattes are made in DIR if missing. Prints, over all frames of the clip:
 
-precision     share of the marked pixels that move, or lie within `--margin` pixels of one that does
-moving, ...   recall: share of the truth's pixels that are marked, of all that moves and of the thing of a hard scene
-worst         recall of the thing in the tenth of the frames where it is least, of frames that show `LEAST` pixels of it
+precision     share of the marked pixels that move, or are within `--margin` pixels of a moving pixel
+moving, ...   recall: share of the true pixels that are marked, for all movers and for the small mover of a hard scene
+worst         recall of that mover in its worst tenth of the frames, of frames that show at least `LEAST` pixels of it
 
-Truth calls a pixel moving if its surface point is ever more than half a pixel elsewhere: people who sway are included.
-DIR gets movers-NAME.json with one row per frame.
+A pixel is truly moving if its surface point is ever more than half a pixel elsewhere, so swaying people are included.
+Writes movers-NAME.json with one row per frame to DIR.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from torch_backend.shot import write_json
 MOVERS = ("moving", *(name for name in THINGS if name not in ("glass", "mirror", "wall")))
 """Regions of truth that mattes should mark."""
 LEAST = 50
-"""Pixels of a thing below which a frame says nothing about its recall."""
+"""Least pixels of a thing for a frame to count in its worst recall."""
 
 
 def frame_row(matte: NDArray[np.uint8], regions: Mapping[str, NDArray[np.bool_]], margin: int) -> dict[str, Any]:
-    """Pixel counts of one frame: `marked`, `right` of them, and `found`: [marked, all] of each mover.
+    """Pixel counts of one frame: `marked`, how many of them are `right`, and `found`: [marked, all] of each mover.
 
     Args:
-        matte: [H, W] as `load_motion` returns it.
-        regions: name -> [H, W]; `moving` has to be there.
-        margin: pixels around what moves that may be marked, too.
+        matte: [H, W] as returned by `load_motion`.
+        regions: name -> [H, W] mask; `moving` is required.
+        margin: pixels around moving pixels that may also be marked.
     """
     block = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
     near = cv2.dilate(regions["moving"].astype(np.uint8), block) > 0
@@ -51,7 +51,7 @@ def frame_row(matte: NDArray[np.uint8], regions: Mapping[str, NDArray[np.bool_]]
 
 
 def judge(truth: TruthScene, margin: int) -> list[dict[str, Any]]:
-    """One row per frame that has a matte, see `frame_row`."""
+    """One row per frame with a matte, see `frame_row`."""
     rows: list[dict[str, Any]] = []
     for frame in (camera.frame for camera in load_cameras(truth.shot).frames):
         matte = load_motion(truth.shot, frame)
@@ -64,7 +64,7 @@ def judge(truth: TruthScene, margin: int) -> list[dict[str, Any]]:
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """Precision, recall of each mover, and that of the thing in its worst frames; None where nothing is marked."""
+    """Precision, recall of each mover, and recall of the thing in its worst frames; precision is None without marks."""
     marked, right = (sum(each[name] for each in rows) for name in ("marked", "right"))
     found: dict[str, float | None] = {"precision": right / marked if marked else None}
     for name in MOVERS:
@@ -80,7 +80,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
 
 
 def text(found: Mapping[str, float | None]) -> str:
-    """One line."""
+    """The figures as one line."""
     return ", ".join(f"{name} {'–' if value is None else f'{value:.3f}'}" for name, value in found.items())
 
 

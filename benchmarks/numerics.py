@@ -2,7 +2,7 @@
 
     python -m benchmarks.numerics [--out docs/numerics.md] [--cases CASE ...] [--bodies BODY ...]
 
-Errors are those of `raster_errors.py`, cases those of `raster_cases.py`.
+`raster_errors.py` defines the errors, `raster_cases.py` the cases.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 
 BARS = {"W0": (0.0, 1e-4), "W1": (100.0, 4e-4)}
-"""Workload: least PSNR in dB over all pixels, largest relative L2 gradient error of any input."""
+"""Workload -> (least PSNR in dB over all pixels, largest relative L2 gradient error of any input)."""
 _NOTES = """\
 - **Flips.** Alpha below 1/255 is dropped, so a pixel within rounding of the cut moves by up to 4e-3 with the last bit
   of an input. No body is wrong there: such pixels are left out of errors and gradients, and their share is bounded.
@@ -54,23 +54,23 @@ def _cell(value: float) -> str:
 
 
 def _errors(e: Errors) -> str:
-    """PSNR and the worst gradient's error as a cell of the table of cases."""
+    """PSNR and largest gradient error as a cell of the table of cases."""
     decibels = "exact" if math.isinf(e.psnr) else f"{e.psnr:.0f}"
     finite = all(bool(torch.isfinite(g).all()) for g in e.grads.values())
     return f"{decibels}, {_cell(e.gradient) if finite else 'NOT FINITE'}"
 
 
 _CLOSE = (120.0, 1e-5)
-"""Least PSNR in dB and largest error of a gradient with which no body's row of a case is worth reading."""
+"""A case is left out of the table if all bodies have at least this PSNR in dB and at most this gradient error."""
 
 
 def _cases(bodies: list[str], names: list[str]) -> list[str]:
-    """The table of cases that some body is not close to the oracle in: errors of each body, and what tests assert."""
+    """Table of the cases in which some body exceeds `_CLOSE`: errors of each body, and the bounds that tests assert."""
     lines = ["| case | " + " | ".join(bodies) + " | asserted |", "|---" * (len(bodies) + 2) + "|"]
     for name in names:
         case = CASES[name]
         errors = [compare(size(name, body), body) for body in bodies]
-        if all(e.psnr >= _CLOSE[0] and e.gradient <= _CLOSE[1] for e in errors):  # False of NaN
+        if all(e.psnr >= _CLOSE[0] and e.gradient <= _CLOSE[1] for e in errors):  # NaN compares as False
             continue
         gradient = "finite" if case.gradient is None else _cell(case.gradient)
         plain = f" (reference32: {_cell(case.plain)})" if case.plain else ""
@@ -85,7 +85,7 @@ def _cases(bodies: list[str], names: list[str]) -> list[str]:
 
 
 def _generated(cases: int) -> str:
-    """Run the property tests; their count of generated cases, and pytest's verdict."""
+    """Runs the property tests; returns their number of generated cases and pytest's verdict."""
     command = [sys.executable, "-P", "-m", "pytest", "-q", "tests/backend/raster/test_properties.py"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **({"SPLANNEQUIN_CASES": str(cases)} if cases else {})}
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -109,7 +109,7 @@ def _machine() -> str:
 
 
 def _workloads(bodies: list[str]) -> list[str]:
-    """The rooms of benchmarks/workload.py: errors over all pixels and per input, against the bars."""
+    """Table of the rooms of benchmarks/workload.py: errors over all pixels and per input, with `BARS`."""
     lines = [
         "| workload, body | flips | dB, all pixels | dB | " + " | ".join(i for i in INPUTS if i != "sh") + " | bars |",
         "|---" * (len(INPUTS) + 4) + "|",
@@ -118,7 +118,7 @@ def _workloads(bodies: list[str]) -> list[str]:
         scene = workload(name)
         for body in bodies:
             if body == "cuda" and name != "W0":
-                continue  # on fibers it would take minutes
+                continue  # minutes on fibers
             e = compare(scene, body)
             held = e.psnr_all >= least and e.gradient <= most
             bounds = (f">= {least:.0f} dB, " if least else "") + f"<= {_cell(most)}"
@@ -131,7 +131,7 @@ def _workloads(bodies: list[str]) -> list[str]:
 
 
 def report(bodies: list[str], names: list[str], cases: int) -> str:
-    """The whole of docs/numerics.md."""
+    """The whole text of docs/numerics.md."""
     text = [
         "# Numerics of the rasteriser",
         "",

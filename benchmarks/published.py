@@ -1,23 +1,23 @@
-"""Our frozen frames beside those that somebody else published of the same clip. `python -m benchmarks.published ...`
+"""Compares frozen frames of the product with published ones of the same clip: `python -m benchmarks.published ...`.
 
-The authors of the Splannequin paper show, on the page of their user study, clips of the Mannequin Challenge, and each
-frozen at one instant by several methods: one frozen frame per frame of the clip, seen by that frame's camera. A shot
-imported from the same clip has a camera for the same frames, so a take of it at the same instant can be held beside
-them. Their videos are not ours to distribute: docs/benchmarks.md says where they are.
+The page of the Splannequin paper's user study shows clips of the Mannequin Challenge. Each clip is frozen at one
+instant by several methods: one frozen frame per frame of the clip, seen from that frame's camera. A shot imported from
+the same clip has cameras for the same frames, so its take at the same instant is comparable. These videos may not be
+distributed with the product: docs/benchmarks.md says where they are.
 
     python -m benchmarks.published SHOT TAKE CLIP VIDEO [VIDEO ...] [--half right] [--results FILE]
 
-SHOT is solved from CLIP, TAKE is a take of it, every VIDEO has a frame for each of CLIP's (with --half, one half of its
-width does). For the take's frames, for the take, its splats alone, and each video, the mean of
+SHOT is solved from CLIP, TAKE is a take of it. Every VIDEO has a frame for each of CLIP's; with --half, in one half of
+its width. Prints means over the take's frames, for the take, its Gaussians alone, and each video:
 
-* whole, best 90 %: PSNR in dB against the clip's own frame. A frozen frame should be that frame wherever nothing moves;
-  the worst tenth of the pixels is left to what does. The take is compared as it was solved, without its lens, a video
-  as it is: each with what its method saw.
-* gradient: mean length of the gradient over that of the clip's frame. 1 is as sharp as the plate.
+* whole, best 90 %: PSNR in dB against the clip's own frame. A frozen frame should equal that frame wherever nothing
+  moves; the best 90 % leaves the worst tenth of the pixels to movers. The take is compared without lens distortion, as
+  solved; a video is compared unchanged. Each method is thus compared with its own footage.
+* gradient: mean gradient magnitude relative to the clip's frame; 1 is as sharp as the plate.
 
-A method that handed the clip back would be perfect here: whether what moves stands as it stood at the instant has to be
-looked at. (The share of pixels that move against the cameras was tried for that: in every eighth frame the flow's noise
-hides it.)
+A method that returns the clip unchanged would score perfectly. Check by eye whether movers stand as they did at the
+instant. (The share of pixels that move against the cameras does not show it: flow noise hides it in every eighth
+frame.)
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ from torch_backend.shot import Shot, write_json
 from torch_backend.torch_types import from_numpy
 
 Picture = NDArray[np.uint8]
-"""[H, W, 3]."""
+"""[H, W, 3] picture."""
 FIGURES = ("whole", "best_90", "gradient")
 
 
 def video_frames(path: Path, wanted: Sequence[int], size: tuple[int, int], half: str = "") -> Iterator[Picture]:
-    """Frames of a video by their place in it, ascending, each at `size` (width, height)."""
+    """Yields frames of a video by ascending index, each at `size` (width, height). JobError if one is missing."""
     with av.open(str(path)) as video:
         left = list(wanted)
         for place, frame in enumerate(video.decode(video=0)):
@@ -65,14 +65,14 @@ def video_frames(path: Path, wanted: Sequence[int], size: tuple[int, int], half:
 
 
 def fitted(pixels: Picture, size: tuple[int, int]) -> Picture:
-    """A picture at another size."""
+    """A picture resized to (width, height)."""
     if pixels.shape[1::-1] == size:
         return pixels
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def compared(picture: Picture, plate: Picture) -> dict[str, float]:
-    """`FIGURES` of a frozen frame beside the plate of its pose."""
+    """`FIGURES` of a frozen frame against the plate of its pose."""
     one, other = (from_numpy(p).float() / 255.0 for p in (picture, plate))
     return {
         "whole": psnr_of(float((one - other).double().square().mean())),
@@ -82,7 +82,7 @@ def compared(picture: Picture, plate: Picture) -> dict[str, float]:
 
 
 def judged(shot: Shot, take: str, clip: Path, videos: Sequence[Path], half: str) -> dict[str, dict[str, float]]:
-    """Name -> mean of `FIGURES` over the take's frames: of the take, of its splats alone, and of each video."""
+    """Name -> mean of `FIGURES` over the take's frames, for the take, its Gaussians alone, and each video."""
     files = sorted(path for path in (shot.takes / take).glob("*.exr") if path.stem.isdigit())
     frames = [int(path.stem) for path in files]
     if not frames:
@@ -119,7 +119,7 @@ def judged(shot: Shot, take: str, clip: Path, videos: Sequence[Path], half: str)
 
 @in_words
 def main(argv: Sequence[str] | None = None) -> None:
-    """Prints a row for the take, its splats and each video."""
+    """Prints a row for the take, its Gaussians alone and each video."""
     parser = argparse.ArgumentParser(description="Our frozen frames beside published ones of the same clip.")
     parser.add_argument("shot", type=Path)
     parser.add_argument("take")

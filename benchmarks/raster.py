@@ -1,10 +1,10 @@
-"""Times the rasteriser on four seeded workloads: `python -m benchmarks.raster [W0 W1 ...] [--json FILE]`.
+"""Times the rasteriser on seeded workloads: `python -m benchmarks.raster [W0 W1 ...] [--json FILE]`.
 
 Rivals: `--reference` (the torch oracle in float32) and `--peer MODULE` (see `benchmarks/peers`). Errors are measured by
 `benchmarks/numerics.py`.
 
-The workloads are those of `benchmarks/workload.py`. Bodies are run in turn, round by round, so that whatever else the
-machine does falls on all of them alike.
+The workloads are those of `benchmarks/workload.py`. Bodies run alternately, round by round, so that other load on the
+machine affects all of them alike.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from benchmarks.workload import WORKLOADS, Workload, room
 from torch_backend.raster import RasterSettings, rasterize
 
 SLOW_MS = 1000.0
-"""A body whose first frame takes longer is given SLOW_ROUNDS rounds at most."""
+"""A body whose first two frames both take longer than this, in ms, gets at most `SLOW_ROUNDS` rounds."""
 SLOW_ROUNDS = 5
 
 
@@ -44,11 +44,11 @@ class Body:
     device: str = "cpu"
     threads: int = 1
     degree: int | None = None
-    """Of the harmonics; None for plain colours."""
+    """Degree of the spherical harmonics; None for plain colours."""
     peer: str = ""
     """Import path of the peer's module."""
     graph: bool = False
-    """A frame and its gradient are one CUDA graph, as a training step's are (`train.recorder`)."""
+    """True to capture a frame and its gradient as one CUDA graph, like a training step (`train.recorder`)."""
 
     def prepare(self, work: Workload) -> Prepared:
         if self.backend == "peer":
@@ -99,7 +99,7 @@ def _peer(module: str) -> Peer:
 
 
 class _Case:
-    """One workload held by one body."""
+    """One workload on one body."""
 
     def __init__(self, work: Workload, body: Body):
         self.body, self.prepared = body, body.prepare(work)
@@ -107,7 +107,7 @@ class _Case:
         self._graph = self._captured() if body.graph else None
 
     def _captured(self) -> torch.cuda.CUDAGraph:
-        """A frame and its gradient; the last of three plain ones before it has learnt how long the list is."""
+        """Graph of a frame and its gradient. Three plain runs first size the hit list."""
         for _ in range(3):
             self.image()
         torch.cuda.synchronize()
@@ -117,7 +117,7 @@ class _Case:
         return graph
 
     def image(self) -> torch.Tensor:
-        """Forward and backward, untimed; gradients are in the leaves afterwards."""
+        """Runs forward and backward, untimed, and returns the image; the leaves then hold the gradients."""
         for leaf in self.prepared.leaves.values():
             leaf.grad = None
         image = self.prepared.forward()
@@ -125,7 +125,7 @@ class _Case:
         return image.detach()
 
     def run(self) -> tuple[float, float]:
-        """Milliseconds of (forward, forward and backward); a graph has no time for its first half alone."""
+        """Milliseconds of (forward, forward and backward); a graph returns its total for both."""
         if self._graph is not None:
             torch.cuda.synchronize()
             events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
@@ -154,13 +154,13 @@ class _Case:
 
 
 def _figures(values: list[float]) -> dict[str, float]:
-    """Median, and the quartiles around it."""
+    """Median, quartiles, minimum and number of values."""
     low, middle, high = (float(v) for v in np.percentile(values, [25, 50, 75]))
     return {"median": middle, "low": low, "high": high, "min": min(values), "rounds": len(values)}
 
 
 def interleaved(work: Workload, bodies: dict[str, Body], rounds: int) -> dict[str, list[tuple[float, float]]]:
-    """Milliseconds (forward, forward and backward) per body and round: one body after the other, round by round."""
+    """Milliseconds (forward, forward and backward) per body and round; the bodies alternate in each round."""
     cases = {label: _Case(work, body) for label, body in bodies.items()}
     slow = {label for label, case in cases.items() if case.run()[1] > SLOW_MS}  # the first frame compiles and warms up
     slow = {label for label in slow if cases[label].run()[1] > SLOW_MS}
@@ -173,7 +173,7 @@ def interleaved(work: Workload, bodies: dict[str, Body], rounds: int) -> dict[st
 
 
 def measure(size: tuple[int, int, int], bodies: dict[str, Body], rivals: list[str], rounds: int) -> dict[str, Any]:
-    """Figures of all bodies on `room(*size)`, and how many times each rival's time each of our bodies takes less."""
+    """Figures of all bodies on `room(*size)`, and ratios of each rival's time to each of our bodies' times."""
     times = interleaved(room(*size), bodies, rounds)
     result: dict[str, Any] = {"gaussians": size[0], "width": size[1], "height": size[2], "bodies": {}, "ratios": {}}
     for label, pairs in times.items():
@@ -182,7 +182,7 @@ def measure(size: tuple[int, int, int], bodies: dict[str, Body], rivals: list[st
     for rival in rivals:
         for label in bodies:
             if label not in rivals and bodies[label].degree is None:
-                pairs = list(zip(times[rival], times[label], strict=False))  # the same round for both
+                pairs = list(zip(times[rival], times[label], strict=False))  # pairs times of the same round
                 result["ratios"][f"{rival} / {label}"] = {
                     name: _figures([theirs[i] / ours[i] for theirs, ours in pairs])
                     for i, name in enumerate(("forward", "forward_backward"))
@@ -191,7 +191,7 @@ def measure(size: tuple[int, int, int], bodies: dict[str, Body], rivals: list[st
 
 
 def machine(device: str) -> dict[str, Any]:
-    """What the figures were measured on, and when."""
+    """The machine, software versions and date of the figures."""
     model = platform.processor()
     if pathlib.Path("/proc/cpuinfo").exists():
         lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()

@@ -1,4 +1,4 @@
-"""The hard cases of the rasteriser: scenes, and the bounds that tests/backend/raster/test_hard_cases.py asserts."""
+"""Hard cases of the rasteriser: scenes, and the bounds asserted by tests/backend/raster/test_hard_cases.py."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from torch_backend.raster import RasterSettings
 
 @dataclass(frozen=True)
 class Case:
-    """One hard case: a scene, and how far a float32 body may be from the oracle on it."""
+    """One hard case: a scene, and the allowed errors of a float32 body against the oracle."""
 
     build: Callable[[bool], Scene]
-    """Makes the scene; True asks for a small one (CPU fibers are slow)."""
+    """Builds the scene; with True, a small one for slow CPU fibers."""
     psnr: float = 100.0
-    """Least PSNR in dB at pixels without flips, at a peak of 1 or the brightest channel."""
+    """Least PSNR in dB at pixels without flips, relative to a peak of 1 or the brightest channel if greater."""
     gradient: float | None = 5e-4
-    """Largest relative L2 gradient error of any input at pixels without flips; None: ill-posed, only finite."""
+    """Largest relative L2 gradient error of any input at pixels without flips; None requires finite values only."""
     flips: float = 0.02
     """Largest share of pixels with flips."""
     note: str = ""
-    """Why a bound is wider than the others."""
+    """Reason for a wider bound."""
     plain: float | None = None
-    """The bound on gradients for plain torch in float32 (body reference32), where it is wider."""
+    """Wider bound on gradients for plain torch in float32 (body reference32), or None."""
 
 
 def _poisoned(small: bool) -> Scene:
@@ -61,7 +61,7 @@ def _scales(
 
 
 def _near_plane(small: bool) -> Scene:
-    """Behind the camera, behind the plane, on it, just beyond, and Gaussians that reach through it."""
+    """Gaussians behind the camera, behind, on and just beyond the near plane, and some that extend through it."""
     scene = cloud(30, 24, 18, seed=11, settings=RasterSettings(threads=2, near=0.25))
     scene.tensors["viewmats"] = torch.eye(4, dtype=torch.float64)[None]
     z = torch.tensor([-5, -0.25, -1e-8, 0, 1e-38, 1e-8, 0.2499, 0.25, 0.25 + 2**-20, 0.2501, 0.26, 0.3])
@@ -72,7 +72,7 @@ def _near_plane(small: bool) -> Scene:
 
 
 def _frustum_edge(small: bool) -> Scene:
-    """Long Gaussians far off to the side and near: without the clamp their footprint explodes."""
+    """Long Gaussians near the camera and far to the side, whose footprint explodes without the clamp."""
     scene = cloud(60 if small else 200, 32, 24, seed=6)
     scene.Ks = camera(32, 24, 24.0, 9.0, 14.0)
     scene.tensors["means"] *= torch.tensor([4.0, 4.0, 0.4])
@@ -94,7 +94,7 @@ def _needles(antialiased: bool) -> Callable[[bool], Scene]:
 
 
 def _edge_on(small: bool) -> Scene:
-    """Discs seen exactly from the side, points and lines: the projected covariance is singular before the blur."""
+    """Discs seen edge-on, points and lines, whose projected covariance is singular before the blur."""
     scene = cloud(24, 24, 18, seed=9)
     scene.tensors["viewmats"] = torch.eye(4, dtype=torch.float64)[None]
     scene.tensors["quats"] = torch.tensor([1.0, 0, 0, 0]).double().repeat(24, 1)
@@ -105,7 +105,7 @@ def _edge_on(small: bool) -> Scene:
 
 
 def _quaternions(small: bool) -> Scene:
-    """Zero, shorter than the cut, and of any length that float32 holds."""
+    """Quaternions of length zero, shorter than the cut, and up to the greatest lengths of float32."""
     scene = cloud(30, 24, 18, seed=12)
     lengths = torch.tensor([0, 1e-38, 1e-7, 1e-5, 1e-3, 1e8, 1e15, 1e25, 1e37]).double()
     unit = scene.tensors["quats"][:9] / scene.tensors["quats"][:9].norm(dim=-1, keepdim=True)
@@ -143,7 +143,7 @@ def _crowd(small: bool) -> Scene:
 
 
 def _giant(small: bool) -> Scene:
-    """One Gaussian over all pixels, two more inside it."""
+    """One Gaussian that covers all pixels, and two inside it."""
     size = (40, 36) if small else (300, 200)
     scene = stack(single(*size, focal=float(size[0]), scale=4.0), 3)
     scene.tensors["log_scales"] += torch.tensor([0.3, 0.0, -0.3])
@@ -179,7 +179,7 @@ def _black_harmonics(small: bool) -> Scene:
 
 
 def scaled_world(factor: float) -> Callable[[bool], Scene]:
-    """World, near plane and camera positions times `factor`."""
+    """Builder of a scene with world, near plane and camera positions scaled by `factor`."""
 
     def build(small: bool) -> Scene:
         scene = cloud(60, 32, 24, seed=14, settings=RasterSettings(threads=2, near=0.01 * factor))
@@ -192,7 +192,7 @@ def scaled_world(factor: float) -> Callable[[bool], Scene]:
 
 
 def _far_from_the_origin(small: bool) -> Scene:
-    """World and camera 1000 units off: float32 holds positions there to 3e-5 of a unit, 4e-4 px."""
+    """World and camera 1400 units from the origin, where float32 resolves positions to 3e-5 units, or 4e-4 px."""
     scene = cloud(60, 32, 24, seed=15)
     away = torch.tensor([1000.0, -500.0, 800.0]).double()
     scene.tensors["means"] += away
@@ -248,7 +248,7 @@ CASES: dict[str, Case] = {
     "the same, antialiased": Case(_scales(-20.0, -50.0, -math.inf, antialiased=True)),
     "behind, on, just beyond, through the near plane": Case(_near_plane, gradient=5e-3),
     "elongated at and beyond the frustum's edge": Case(_frustum_edge),
-    # Expanding the conic in float32, or det = xx yy - xy^2, would lose three digits.
+    # Expanding the conic in float32, or computing det = xx yy - xy^2, would lose three digits.
     "needles 1 : 1000": Case(_needles(False), gradient=2e-3),
     "needles 1 : 1000, antialiased": Case(_needles(True), gradient=5e-3),
     "points, lines, discs from the side": Case(_edge_on),
@@ -291,5 +291,5 @@ CASES: dict[str, Case] = {
 
 
 def size(case: str, body: str) -> Scene:
-    """The scene of a case, at the size for a body."""
+    """The scene of a case, small for the body `cuda`."""
     return CASES[case].build(body == "cuda")

@@ -1,8 +1,8 @@
-"""Scenes of the rasteriser, and how far a body is from the float64 oracle on one.
+"""Scenes for the rasteriser, and errors of a body against the float64 oracle.
 
-Inputs are rounded to float32 before the oracle sees them, so that an error is a body's own. A Gaussian whose alpha at a
-pixel lies within rounding of 1/255 is drawn by one body and skipped by another ("flip"); images and gradients are
-compared at the pixels where no such thing happened, and the share of the others is stated.
+Inputs are rounded to float32 before the oracle uses them, so that all errors come from the body. If a Gaussian's alpha
+at a pixel is within rounding of 1/255, one body may draw it and another skip it (a "flip"). Images and gradients are
+compared at pixels without flips; the share of the other pixels is reported.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch_backend.raster import RasterOutput, RasterSettings, rasterize
 INPUTS = ("means", "quats", "log_scales", "opacity_logits", "colors", "sh", "viewmats", "background")
 PER_GAUSSIAN = ("means", "quats", "log_scales", "opacity_logits", "colors", "sh")
 SAME_SIDE = 3e-4
-"""Pixels whose alphas differ by less are on the same side of the alpha cut: a flip moves alpha by T / 255."""
+"""Pixels whose alphas differ by less than this are on the same side of the alpha cut; a flip moves alpha by T / 255."""
 
 BODIES: dict[str, tuple[str, torch.dtype, str]] = {
     "cpu": ("cpu", torch.float32, "cpu"),
@@ -39,7 +39,7 @@ if importlib.util.find_spec("torch_backend.raster.cuda"):
 
 @dataclass
 class Scene:
-    """Arguments of one `rasterize` call as float64 tensors, and how to run them."""
+    """Arguments of one `rasterize` call as float64 tensors, with its options."""
 
     tensors: dict[str, Tensor]
     Ks: Tensor
@@ -51,7 +51,7 @@ class Scene:
         return {name: value.to(device, dtype).clone().requires_grad_() for name, value in self.tensors.items()}
 
     def rounded(self) -> Scene:
-        """The same with every input a float32 number."""
+        """The scene with every input rounded to float32."""
         tensors = {name: value.float().double() for name, value in self.tensors.items()}
         return Scene(tensors, self.Ks.float().double(), self.width, self.height, self.options)
 
@@ -69,7 +69,7 @@ class Scene:
         )
 
     def gradients(self, body: str, where: Any = 1.0, **options: Any) -> tuple[RasterOutput, dict[str, Tensor]]:
-        """Output, and the gradients of a fixed random cotangent of all differentiable images, at pixels `where`."""
+        """(output, gradients of a fixed random weighting of all differentiable images, at pixels `where`)."""
         _, dtype, device = BODIES[body]
         leaves = self.leaves(dtype, device)
         out = self.run(body, leaves, **options)
@@ -88,57 +88,57 @@ def scalar(out: RasterOutput, where: Any = 1.0) -> Tensor:
     loss = (out.colors * weights(out.colors) * where[..., None]).sum()
     loss = loss + (out.alphas * weights(out.alphas) * where).sum()
     if out.depth_expected is not None:
-        # Where alpha is near 0 the ratio is ill-conditioned and its cut-off flips: not a place to compare.
+        # Where alpha is near 0 the ratio is ill-conditioned and its cut-off flips, so it is not compared.
         depth = torch.where(out.alphas > 0.2, out.depth_expected, torch.zeros_like(out.alphas))
         loss = loss + (depth * weights(depth) * where).sum()
     return loss
 
 
 def relative(value: Tensor, truth: Tensor) -> float:
-    """|value - truth| / |truth|, L2."""
+    """|value - truth| / |truth| in the L2 norm."""
     value, truth = value.detach().cpu().double(), truth.detach().cpu().double()
     return float((value - truth).norm() / truth.norm().clamp_min(1e-300))
 
 
 def assert_gradients(grads: dict[str, Tensor], truth: dict[str, Tensor], bound: float) -> None:
-    """AssertionError unless all are finite and within a relative error of `bound` of the truth."""
+    """AssertionError unless all gradients are finite and within a relative error of `bound`."""
     assert all(torch.isfinite(grad).all() for grad in grads.values())
     errors = {name: relative(grads[name], value) for name, value in truth.items()}
     assert max(errors.values()) <= bound, errors
 
 
 def on_host(out: RasterOutput) -> RasterOutput:
-    """The same images on the CPU."""
+    """The images copied to the CPU."""
     held: dict[str, Any] = {one.name: getattr(out, one.name) for one in dataclasses.fields(out)}
     moved: dict[str, Any] = {name: None if value is None else value.cpu() for name, value in held.items()}
     return RasterOutput(**moved)
 
 
 def _decibels(error: Tensor) -> float:
-    """PSNR of errors at a peak of 1; infinite where there are none."""
+    """PSNR in dB of errors at a peak of 1; infinite without errors."""
     return float(-10 * torch.log10(error.square().mean())) if error.numel() else math.inf
 
 
 def psnr(value: Tensor, truth: Tensor) -> float:
-    """dB for a peak of 1; infinite where equal."""
+    """PSNR in dB at a peak of 1; infinite for equal images."""
     return _decibels(value.detach().cpu().double() - truth.detach().cpu().double())
 
 
 @dataclass
 class Errors:
-    """One body against the oracle on one scene."""
+    """Errors of one body against the oracle on one scene."""
 
     flips: float
     """Share of pixels on different sides of the alpha cut."""
     image: float
-    """Largest |colour error| at the others, in units of the brightest channel of the oracle's image (1 at least)."""
+    """Largest |colour error| at pixels without flips, relative to the oracle's brightest channel (at least 1)."""
     psnr: float
-    """dB at the same pixels, for a peak of that unit."""
+    """PSNR in dB at pixels without flips, with this brightness as the peak."""
     psnr_all: float
-    """The same over all pixels, flips included."""
+    """The same PSNR over all pixels, including flips."""
     gradients: dict[str, float]
-    """Relative L2 error per input of the gradients at pixels without flips; 0 where both are 0. For the background:
-    relative to 1 % at least of its gradient in an empty scene, since 1 - alpha is all that float32 knows of T."""
+    """Relative L2 error of each input's gradient at pixels without flips; 0 where both are 0. The background's error is
+    relative to at least 1 % of its gradient in an empty scene, because float32 knows T only as 1 - alpha."""
     out: RasterOutput
     grads: dict[str, Tensor]
     oracle: RasterOutput
@@ -151,7 +151,7 @@ class Errors:
 
 
 def compare(scene: Scene, body: str, **options: Any) -> Errors:
-    """Run `scene`, its inputs rounded to float32, on a body and on the oracle."""
+    """Runs `scene`, with inputs rounded to float32, on a body and on the oracle, and compares them."""
     scene = scene.rounded()
     options = {"with_contributions": True} | options
     ran: list[tuple[RasterOutput, dict[str, Tensor]]] = []
@@ -172,7 +172,7 @@ def compare(scene: Scene, body: str, **options: Any) -> Errors:
     clean = error[same]
     gradients = {}
     for name, value in oracle_grads.items():
-        floor = 1e-6  # what the oracle has as rounding of zero has no relative error
+        floor = 1e-6  # below this the oracle's value is only rounding of zero
         if name == "background":
             empty = torch.zeros_like(oracle.colors).requires_grad_()
             blank = dataclasses.replace(oracle, colors=empty, alphas=oracle.alphas.detach(), depth_expected=None)
@@ -194,7 +194,7 @@ def compare(scene: Scene, body: str, **options: Any) -> Errors:
 
 
 def camera(width: int, height: int, focal: float, cx: float | None = None, cy: float | None = None) -> Tensor:
-    """K [1, 3, 3]; the principal point is the centre unless given."""
+    """K [1, 3, 3]; the principal point defaults to the centre."""
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
     return torch.tensor([[[focal, 0, cx], [0, focal, cy], [0, 0, 1]]], dtype=torch.float64)
 
@@ -202,7 +202,7 @@ def camera(width: int, height: int, focal: float, cx: float | None = None, cy: f
 def cloud(
     n: int, width: int, height: int, seed: int = 0, channels: int = 3, degree: int | None = None, **options: Any
 ) -> Scene:
-    """Random Gaussians before a camera that is turned a little; harmonics instead of colours if degree is given."""
+    """Random Gaussians before a slightly rotated camera, with harmonics instead of colours if `degree` is given."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -239,7 +239,7 @@ def single(
     scale: float = 0.2,
     logit: float = 2.0,
 ) -> Scene:
-    """One grey-red Gaussian before a camera at the origin."""
+    """One reddish Gaussian before a camera at the origin."""
     values = {
         "means": [mean],
         "quats": [quat],
@@ -254,7 +254,7 @@ def single(
 
 
 def workload(name: str) -> Scene:
-    """One of the benchmark's rooms."""
+    """The room of a benchmark workload."""
     count, width, height = WORKLOADS[name]
     work = room(count, width, height)
     opacity = torch.tensor(work.opacities).double()
@@ -269,7 +269,7 @@ def workload(name: str) -> Scene:
 
 
 def stack(scene: Scene, n: int) -> Scene:
-    """`n` copies of a scene's one Gaussian."""
+    """`n` copies of the only Gaussian of a scene."""
     for name in PER_GAUSSIAN:
         if name in scene.tensors:
             value = scene.tensors[name]

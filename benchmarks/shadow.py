@@ -1,4 +1,4 @@
-"""The shadow of a ball on a surface, by rays: what a shadow catcher shows of it, and how alike two of them are."""
+"""Shadow of a ball on a surface by ray casting, as seen by a shadow catcher, and the similarity of two shadows."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from benchmarks.synthetic.rays import RayScene
 from benchmarks.synthetic.regions import View
 
 RADIUS = 0.15
-"""Metres: that of the ball."""
+"""Radius of the ball in metres."""
 TO_LAMP = np.array([0.8, -0.5, 1.2])
-"""Metres from the ball to the middle of the lamp: about 1.5, so that it hangs below ceilings."""
+"""Offset from the ball to the lamp's centre in metres, about 1.5 long to stay below ceilings."""
 LAMP = 0.1
-"""Metres: radius of the lamp, a level disc. It gives the shadow an edge a few pixels wide."""
+"""Radius of the lamp, a horizontal disc, in metres. It gives the shadow an edge a few pixels wide."""
 SAMPLES = 32
-"""Points of the lamp that light is sampled at."""
+"""Number of sampled points of the lamp."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,28 +27,28 @@ class Set:
     """A ball and a lamp, in metres."""
 
     ball: NDArray[np.float64]
-    """[3] the middle of the ball."""
+    """[3] centre of the ball."""
     lamps: NDArray[np.float64]
-    """[SAMPLES, 3] points of the lamp."""
+    """[SAMPLES, 3] sampled points of the lamp."""
 
     @classmethod
     def on(cls, place: NDArray[np.float64]) -> Set:
-        """A ball that rests on a place [3], z up."""
+        """A ball resting on a point [3], z up, with its lamp."""
         n = np.arange(SAMPLES) + 0.5
-        away, turn = LAMP * np.sqrt(n / SAMPLES), n * np.pi * (3.0 - np.sqrt(5.0))  # a sunflower's seeds: even
+        away, turn = LAMP * np.sqrt(n / SAMPLES), n * np.pi * (3.0 - np.sqrt(5.0))  # sunflower spiral for even spacing
         disc = np.stack([away * np.cos(turn), away * np.sin(turn), np.zeros(SAMPLES)], axis=1)
         ball = place + np.array([0.0, 0.0, RADIUS])
         return cls(ball, ball + TO_LAMP + disc)
 
     def stops(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[...] whether the ball lies between points [..., 3] and points [..., 3]."""
+        """bool [...]: whether the ball blocks the segment between points `begin` and `end`, each [..., 3]."""
         along, off = end - begin, self.ball - begin
         share = np.clip((off * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-20), 0.0, 1.0)
         return np.asarray(np.linalg.norm(share[..., None] * along - off, axis=-1) < RADIUS)
 
 
 def places_of(truth: RayScene, view: View) -> list[NDArray[np.float64]]:
-    """Points of a surface on which a ball can rest: seen at a quarter, half and three quarters of a row low down."""
+    """Surface points for a resting ball, seen at a quarter, half and three quarters of a low pixel row."""
     at = [(int(share * view.width), int(0.8 * view.height)) for share in (0.25, 0.5, 0.75)]
     rays = view.rays().reshape(view.height, view.width, 3)
     found = [(ray, truth.cast(view.eye[None], ray[None]).distance[0]) for ray in (rays[y, x] for x, y in at)]
@@ -56,9 +56,9 @@ def places_of(truth: RayScene, view: View) -> list[NDArray[np.float64]]:
 
 
 def shadow(surface: RayScene, view: View, of: Set) -> NDArray[np.float32]:
-    """[H, W] in 0..1: what the ball leaves of the lamp's light on the surface that each pixel shows.
+    """[H, W] in 0..1: share of the lamp's light that passes the ball, at the surface point of each pixel.
 
-    1 where nothing is shown, or where the surface itself keeps all light away: a shadow catcher shows nothing there.
+    1 where no surface is visible or the surface itself blocks all light, because a shadow catcher is empty there.
     """
     rays = view.rays()
     distance = surface.cast(np.broadcast_to(view.eye, rays.shape), rays).distance.astype(np.float64)
@@ -74,9 +74,9 @@ def shadow(surface: RayScene, view: View, of: Set) -> NDArray[np.float32]:
 
 
 def likeness(surface: RayScene, truth: RayScene, view: View, of: Set) -> float | None:
-    """Mean SSIM of the shadows on a surface and on the true one, where either is and the ball does not hide it.
+    """Mean SSIM of the shadows on a surface and on the true one, over pixels in either shadow not hidden by the ball.
 
-    None if neither shows any.
+    None if neither has a shadow.
     """
     pair = np.stack([shadow(one, view, of) for one in (surface, truth)])
     rays = view.rays()

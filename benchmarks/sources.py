@@ -1,6 +1,6 @@
 """Scenes for the benchmark: folders of truth, real clips, and the synthetic scenes of benchmarks/synthetic.
 
-`python -m benchmarks.sources` is `python -m benchmarks.synthetic` that ends when its parent does.
+`python -m benchmarks.sources` runs `python -m benchmarks.synthetic` and ends when its parent ends.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ ROOT = Path(__file__).resolve().parents[1]
 def load_source(source: str, results: Path) -> TruthScene:
     """The scene of `truth:FOLDER`, `shot:FOLDER`, `exact:FOLDER` or `solved:FOLDER`. ValueError for anything else.
 
-    The last two are scenes of benchmarks/synthetic with their cameras exact, or solved by COLMAP: the shot to train on
-    is made in RESULTS/shots if it is not there.
+    The last two are scenes of benchmarks/synthetic with exact cameras or with cameras solved by COLMAP. Their shot to
+    train on is made in RESULTS/shots if missing.
     """
     kind, _, folder = source.partition(":")
     if kind == "truth":
         scene = TruthFolder(folder)
-        # All runs of a scene train with its motion mattes: otherwise it depends on which of them was judged first.
-        # Without readable footage there are none, and plate detail is not judged either (`evaluate_run`).
+        # Find motion mattes now, so that all runs of a scene train with them, in any order of judging.
+        # Unreadable footage has no mattes, and plate detail is not judged either (`evaluate_run`).
         with locked(scene.shot.root / "bench" / "motion.lock"), contextlib.suppress(JobError):
             find_motion(scene.shot, Log())
         return scene
@@ -56,7 +56,7 @@ def load_source(source: str, results: Path) -> TruthScene:
 
 
 class SyntheticTruth:
-    """A scene of benchmarks/synthetic, as `TruthScene` asks for it."""
+    """A scene of benchmarks/synthetic with the interface `TruthScene`."""
 
     kind = "synthetic"
     judged = "whole"
@@ -68,7 +68,7 @@ class SyntheticTruth:
         self.name = f"{self.scene.size} {self.scene.name}"
         place = shots / f"{self.scene.size}-{self.scene.name}-{cameras}{SHOT_SUFFIX}"
         self.shot = (exact_shot if cameras == "exact" else solved_shot)(self.scene, place, Log())
-        # Exact cameras come without; the motion mattes drive the training.
+        # Training uses motion mattes, which a shot with exact cameras lacks.
         find_motion(self.shot, Log())
         self._pixels = SolvedPixels(self.shot)
         self.t_stars, self._poses = list(self.scene.t_stars), list(self.scene.poses)
@@ -78,15 +78,15 @@ class SyntheticTruth:
         self.key = content_key(made, read_json(self.shot.solve / "cameras.json"))
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
-        """All poses that have a truth and a camera."""
+        """All poses with truth and a camera."""
         return [pose for pose in self._poses if pose in self.scene.world_to_camera]
 
     def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
-        """The rendered truth, through the undistortion that the clip's frames went through."""
+        """The rendered truth, undistorted like the clip's frames."""
         return self._resampled(self.scene.truth(t_star, pose), width, height)
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """By truth: seen at t* or not, moving or static, and a hard scene's things; of the nearest pixel."""
+        """Regions by truth (seen at t* or not, moving or static) and a hard scene's things, by nearest pixel."""
         regions = self._pixels.regions(self.scene.regions(t_star, pose))
         seen, moving = (_nearest(mask, width, height) for mask in (regions.seen, regions.moving))
         things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
@@ -94,18 +94,18 @@ class SyntheticTruth:
 
     @property
     def metres_per_unit(self) -> float:
-        """Metres per solve unit of the shot: 1 with exact cameras."""
+        """Metres per solve unit of the shot; 1 with exact cameras."""
         return 1.0 if self.cameras == "exact" else similarity_to_exact(self.scene, self.shot).scale
 
     def depth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
-        """[height, width] metres along the camera's axis, to a millimetre, inf for sky; of the nearest pixel."""
+        """[height, width] depth in metres along the camera's axis, to a millimetre, inf for sky; by nearest pixel."""
         depth = self._pixels.regions(self.scene.regions(t_star, pose)).depth
         return torch.nn.functional.interpolate(
             torch.from_numpy(depth)[None, None], (height, width), mode="nearest-exact"
         )[0, 0]
 
     def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """{thing: what was rendered without it, or with it in its other state}, as `truth` is."""
+        """{thing: render without it, or with it in its other state}, resampled like `truth`."""
         pixels, info = self.scene.behind(t_star, pose), self.scene.info
         names = [each["thing"] for each in info.get("held", [])] + ([info["thing"]] if "thing" in info else [])
         return {} if pixels is None else dict.fromkeys(names, self._resampled(pixels, width, height))
@@ -117,7 +117,7 @@ class SyntheticTruth:
         return image[0].permute(1, 2, 0).clamp(0.0, 1.0)
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """Moving or static in the clip's own frame and a hard scene's things, by truth; of the nearest pixel."""
+        """`moving` and `static` in the clip's own frame and a hard scene's things, by truth; by nearest pixel."""
         regions = self._pixels.regions(self.scene.frame_regions(frame))
         moving = _nearest(regions.moving, width, height)
         things = {name: _nearest(mask, width, height) for name, mask in regions.things.items()}
@@ -125,7 +125,7 @@ class SyntheticTruth:
 
 
 def load_synthetic(folder: Path, results: Path, cameras: str = "exact") -> SyntheticTruth:
-    """The scene of benchmarks/synthetic in a folder; ValueError for any other."""
+    """The scene of benchmarks/synthetic in a folder. ValueError for any other kind of scene."""
     truth = load_source(f"{cameras}:{folder.absolute()}", results.absolute())
     if not isinstance(truth, SyntheticTruth):
         raise ValueError(f"{folder}: this is only known of scenes of benchmarks/synthetic")
@@ -133,7 +133,7 @@ def load_synthetic(folder: Path, results: Path, cameras: str = "exact") -> Synth
 
 
 def in_words(main: Callable[[Sequence[str] | None], None]) -> Callable[..., int]:
-    """A command line as a function that returns an exit code: what goes wrong is one sentence."""
+    """Wraps a command line to return an exit code and to print errors as one sentence."""
 
     @functools.wraps(main)
     def run(argv: Sequence[str] | None = None) -> int:
@@ -149,7 +149,7 @@ def in_words(main: Callable[[Sequence[str] | None], None]) -> Callable[..., int]
 
 
 def _nearest(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
-    """A mask at another size."""
+    """A mask resized by nearest pixel."""
     values = torch.from_numpy(mask.astype(np.float32))[None, None]
     return torch.nn.functional.interpolate(values, (height, width), mode="nearest-exact")[0, 0] > 0.5
 
@@ -162,11 +162,11 @@ def make_scenes(
     bpy: str | None = None,
     kinds: Sequence[str] = ("plain",),
 ) -> list[str]:
-    """Sources of the synthetic scenes of a size, rendered first where they are not there (a child process).
+    """Sources of the synthetic scenes of a size. Missing scenes are rendered in a child process.
 
-    `kinds`: of `synthetic.sizes.KINDS`; of those that break an assumption of the method the first seed alone. `bpy` is
-    a Python with Blender's module, found beside the repository if it is not given. RuntimeError with the child's own
-    last words if a scene cannot be made.
+    `kinds`: names from `synthetic.sizes.KINDS`. If any of them is in `LIMITS`, only the first seed is used. `bpy`: a
+    Python with Blender's module; None finds one near the repository. RuntimeError with the child's last line if a
+    scene cannot be made.
     """
     seeds = list(TUNING_SEEDS if tuning else REPORT_SEEDS)[: 1 if {*kinds} & {*LIMITS} else SIZES[size].scenes]
     command = [sys.executable, "-P", "-m", "benchmarks.sources", "--size", size, "--out", str(folder)]
@@ -181,18 +181,18 @@ def make_scenes(
 
 
 def last_words(errors: str) -> str:
-    """The last line that a failed child wrote, but for what image libraries say of themselves as Python ends."""
+    """The last line written by a failed child, without messages of image libraries at exit."""
     lines = [line for line in errors.strip().splitlines() if "nanobind" not in line and not line.startswith(" - ")]
     return lines[-1] if lines else "no output"
 
 
 def child_environ(**extra: str) -> dict[str, str]:
-    """Environment of a child of the benchmark: this checkout on its path, and not the folder that it stands in."""
+    """Environment of a child of the benchmark, with this checkout on its path and without the working directory."""
     return {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1", "PYTHONUNBUFFERED": "1", **extra}
 
 
 def end_with_parent() -> None:
-    """Ends this process as SIGTERM does once its standard input closes: its parent, which holds it open, is gone."""
+    """Ends this process by SIGTERM when its standard input closes, which means that its parent has ended."""
 
     def watch() -> None:
         with contextlib.suppress(OSError):
@@ -204,7 +204,7 @@ def end_with_parent() -> None:
 
 
 class Warnings(Reporter):
-    """A reporter that keeps the warnings."""
+    """A reporter that collects warnings."""
 
     def __init__(self) -> None:
         self.warnings: list[str] = []
@@ -214,7 +214,7 @@ class Warnings(Reporter):
 
 
 class Log(Reporter):
-    """A reporter that says one line per stage."""
+    """A reporter that prints one line per stage."""
 
     def __init__(self) -> None:
         self._stage = ""

@@ -1,12 +1,12 @@
-"""Stability over whole runs: many seeds of every host on one tiny scene, in seconds each.
+"""Stability over whole runs: many seeds of every host on one tiny scene, seconds each.
 
     taskset -c 0 python -m benchmarks.stability SHOT [--seeds 20] [--results FILE]
 
-SHOT is a solved shot folder or a scene of benchmarks/synthetic (its exact cameras are used, the shot is made beside
-FILE). Nothing is written into a shot. Every run is one of the product's own (its loop, schedules, growth and gate) with
-the numbers in `CHANGES`; FILE keeps each finished run, so an interrupted benchmark goes on where it was. The table
-gives held-out PSNR at the frames' own times, how many steps were left out because they were not finite, how many
-warnings of repairs there were, and how many runs ended more than 3 dB under the median of their row.
+SHOT is a solved shot folder, which stays unchanged, or a scene of benchmarks/synthetic, whose shot with exact cameras
+is made in FILE's folder. Every run uses the product's loop, schedules, growth and gate with the numbers in `CHANGES`.
+FILE keeps each finished run, so an interrupted benchmark continues where it stopped. The table gives held-out PSNR at
+the frames' own times, and numbers of steps skipped as non-finite, of repair warnings, and of diverged runs, which ended
+more than 3 dB below the median of their row.
 """
 
 import argparse
@@ -41,12 +41,12 @@ from torch_backend.train.pictures import training_size
 from torch_backend.train.trainer import Trainer
 
 METHODS = ("hexplane", "mlp", "control_points", "auto")
-"""The hosts with all Gaussians moving, and our default: hexplane behind the gate. All with `support`."""
+"""The hosts with all Gaussians moving, and the default `auto`: hexplane with the gate. All use `support`."""
 CHANGES = {"iterations": 160, "max_gaussians": 1500, "width": 96, "holdout": 3}
-"""What a run here has other than preset `preview`, besides growth every 20 steps: four rounds before it ends."""
+"""Changes to preset `preview`, in addition to growth every 20 steps, which makes four rounds."""
 _EVERY = 20
 DIVERGED_DB = 3.0
-"""A run this much under the median of its row counts as diverged."""
+"""A run this many dB below the median of its row counts as diverged."""
 
 
 @dataclasses.dataclass
@@ -54,27 +54,27 @@ class Outcome:
     """One run."""
 
     method: str
-    """As `--method`."""
+    """Value of `--method`."""
     seed: int
-    """Of every random draw."""
+    """Seed of every random draw."""
     psnr_db: float | None
-    """Mean over the held-out frames at their own times; None if the run ended early."""
+    """Mean PSNR over the held-out frames at their own times; None if the run ended early."""
     skipped_steps: int
-    """Steps that changed nothing because they were not finite."""
+    """Number of steps skipped because they were not finite."""
     warnings: list[str]
-    """What the run warned of."""
+    """Warnings of the run."""
     finite: bool
-    """Whether every parameter is, at the end."""
+    """True if every parameter is finite at the end."""
     gaussians: int
-    """At the end."""
+    """Number of Gaussians at the end."""
     moving_share: float
-    """Share of them that the field moves."""
+    """Share of the Gaussians that the field moves."""
     seconds: float
-    """Of training."""
+    """Seconds of training."""
 
 
 class Watched(Trainer):
-    """A trainer on the CPU that counts the steps left out."""
+    """A trainer on the CPU that counts skipped steps."""
 
     skipped_steps = 0
 
@@ -85,14 +85,14 @@ class Watched(Trainer):
 
 
 def configuration(method: str, seed: int, **changes: Any) -> TrainConfig:
-    """The numbers of a run; `changes` go before `CHANGES`."""
+    """The configuration of a run; `changes` override `CHANGES`."""
     config = config_from_params(TrainParams(method=method, seed=seed, **{**CHANGES, **changes}))
     config.densify.every = _EVERY
     return config
 
 
 def train_once(scene: Scene, config: TrainConfig) -> Outcome:
-    """A whole run; a run that ends in a JobError has no PSNR, and its words among the warnings."""
+    """A whole run. After a JobError the PSNR is None, and the warnings include the error."""
     width, height = training_size(scene, config.width)
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     images = load_images(scene, train + test, width, height)
@@ -121,7 +121,7 @@ def train_once(scene: Scene, config: TrainConfig) -> Outcome:
 
 
 def table(outcomes: Sequence[Outcome]) -> list[str]:
-    """One row per method, Markdown."""
+    """Markdown table with a row per method."""
     lines = [
         "| method | runs | PSNR, dB: mean | std | min | max | diverged | not finite | steps left out | warnings | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|",

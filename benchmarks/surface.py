@@ -1,16 +1,16 @@
-"""Distance of a take's surface to the truth: `python -m benchmarks.surface SCENE ... --results DIR`.
+"""Distance of a take's surface from the truth: `python -m benchmarks.surface SCENE ... --results DIR`.
 
-SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 to tune on, 100 to 109 to report on). Its shot and an `auto` run
-for each training seed are made in DIR if they are missing; each instant is frozen (every `--every`-th frame), and its
-surface is made as *Add Frozen Surface* makes it. Only exact cameras: solve units are metres.
+SCENE is a folder of benchmarks/synthetic (seeds 0 to 9 for tuning, 100 to 109 for reporting). Its shot and an `auto`
+run for each training seed are made in DIR if missing. Each instant is frozen (every `--every`-th frame) and its surface
+made as by *Add Frozen Surface*. Requires exact cameras, whose solve unit is a metre.
 
-Judged is the distance from the nearest point of the true surface, as a share of that point's depth in the plate nearest
-to it. A vertex counts if two of the clip's plates see that point: what no plate saw is guessed, not measured. The room
-and people (what moves in the clip) are judged apart, and so are the points of the frames' own depth: they tell what
-fusing adds. So is what the surface shows at their pixels: vertices are spread by area, pixels are not.
+The figure is the distance to the nearest point of the true surface, relative to that point's depth in the nearest plate
+that sees it. A vertex counts only if two of the clip's plates see the true point; other points are guessed, not
+measured. The room and people (movers of the clip) are judged separately. The same figures of the frames' depth points
+show what fusion adds. The surface is also judged at the frames' pixels, because vertices are distributed by area.
 
-A ball is stood on the true surface at three places, under a lamp, and its shadow on the surface is compared with that
-on the truth from the first, middle and last pose: SSIM within the shadows. DIR gets surface-NAME.json.
+A ball is placed on the true surface at three points, under a lamp. From the first, middle and last pose, its shadow on
+the surface is compared with the one on the truth: SSIM within the shadows. Writes surface-NAME.json to DIR.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ from torch_backend.freeze.take.folder import frames_of
 from torch_backend.shot import write_json
 
 BEYOND = 0.01
-"""Relative distance that was wanted in the median."""
+"""Target for the median relative distance."""
 THINNED = 7
-"""Of the pixels of frames, one in so many is judged."""
+"""Stride of the judged pixels of frames."""
 PLATES = 2
-"""Number of plates that have to see a point of the true surface."""
+"""Least number of plates that must see a point of the true surface."""
 
 
 def off_truth(places: NDArray[np.float64], truth: RayScene, views: Sequence[View]) -> NDArray[np.float64]:
-    """[V] distance from the true surface, as a share of its depth; inf where fewer than `PLATES` views see that.
+    """[V] distance from the true surface, relative to its depth; inf if fewer than `PLATES` views see the true point.
 
     Args:
         places: [V, 3] in metres.
@@ -67,7 +67,7 @@ def off_truth(places: NDArray[np.float64], truth: RayScene, views: Sequence[View
 
 
 def figures(off: NDArray[np.float64]) -> dict[str, float]:
-    """Points, and of those that plates see: their share, median and ninth tenth of their distance, share `BEYOND`."""
+    """Number of points, share seen by plates; of these, median and 90th percentile of distance, share `BEYOND`."""
     seen = off[np.isfinite(off)]
     row = {"points": float(len(off)), "seen": len(seen) / max(len(off), 1)}
     if len(seen):
@@ -77,9 +77,9 @@ def figures(off: NDArray[np.float64]) -> dict[str, float]:
 
 
 def judge(truth: SyntheticTruth, run: str, t_star: int, every: int) -> dict[str, dict[str, float]]:
-    """Part -> `figures`: room and people of the surface, of it at the frames' pixels, and of the frames themselves.
+    """{part: `figures`} for room and people: of the surface, of the surface at frames' pixels, of the frames' depth.
 
-    And "shadow" -> number of pictures of it, mean and worst likeness.
+    "shadow" has the number of its pictures, and mean and worst likeness.
     """
     shot, scene, take = truth.shot, truth.scene, f"surface-{run}-{t_star}"
     folder = TakeFolder(shot.take(take))
@@ -108,7 +108,7 @@ def judge(truth: SyntheticTruth, run: str, t_star: int, every: int) -> dict[str,
 
 
 def points_of(folder: TakeFolder) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """(points [P, 3] that a take's frames show by their depth, from where [P, 3], which move): every `THINNED`-th."""
+    """(points [P, 3] from a take's depth, their eyes [P, 3], bool [P] movers), of every `THINNED`-th pixel."""
     points: list[NDArray[np.float64]] = []
     eyes: list[NDArray[np.float64]] = []
     moves: list[NDArray[np.bool_]] = []

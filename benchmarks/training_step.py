@@ -1,11 +1,11 @@
 """Breakdown of one training step before and after the gate opens: `python -m benchmarks.training_step SHOT`.
 
-SHOT is a solved shot folder; nothing is written into it. One run of the preset trains with the tuning split (every 8th
-frame held out, four frames off) and the shot's motion mattes; `--steps` steps are timed at each share of the run in
-`--at`. Parts are means over these steps, in ms; a part inside another is taken off the outer one, and what no part
-covers is listed as the rest.
-Parts of the backward pass are told apart by the moment at which the gradients of the images and of the Gaussians
-arrive: autograd works through the graph in the reverse order of its making.
+SHOT is a solved shot folder, which stays unchanged. One run of the preset trains with the tuning split (every 8th frame
+held out, four frames later) and the shot's motion mattes. `--steps` steps are timed at each share of the run in `--at`.
+Parts are means over these steps, in ms. The time of an inner part is subtracted from the outer one, and time outside of
+all parts is listed as the rest.
+Autograd traverses the graph in reverse order of construction. So the parts of the backward pass are separated by the
+times at which the gradients of the images and of the Gaussians arrive.
 """
 
 import argparse
@@ -41,14 +41,14 @@ from torch_backend.train.trainer import Trainer
 
 
 class _Silent(Reporter):
-    """A reporter of warnings alone."""
+    """A reporter that only prints warnings."""
 
     def warning(self, message: str, hint: str = "") -> None:
         print(f"note: {message} {hint}")
 
 
 class Parts:
-    """Milliseconds per part of the step at hand; a part inside another is taken off the outer one."""
+    """Milliseconds per part of the current step, with the time of inner parts subtracted from outer ones."""
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = defaultdict(float)
@@ -56,7 +56,7 @@ class Parts:
         self.mark = 0.0
 
     def timed(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """`call`, with its time noted under `name`."""
+        """Wraps `call` to add its time to `name`."""
 
         def run(*args: Any, **kwargs: Any) -> Any:
             since = time.perf_counter()
@@ -71,14 +71,14 @@ class Parts:
         return run
 
     def lap(self, name: str) -> None:
-        """Notes the time since the last mark under `name`, and marks again: for the stretches of one backward pass."""
+        """Adds the time since the last mark to `name`, and sets the mark again, for sections of one backward pass."""
         now = time.perf_counter()
         self.spent[name] += 1e3 * (now - self.mark)
         self.mark = now
 
 
 def watch(trainer: Trainer, parts: Parts) -> None:
-    """Puts timers round what a step calls. Call it anew when the trainer has made its field."""
+    """Wraps the functions called by a step in timers. Call it again when the trainer has made its field."""
     module: Any = trainer_module
     model, patched = trainer.model, set(vars(trainer).get("_timed", ()))
 
@@ -108,7 +108,7 @@ def watch(trainer: Trainer, parts: Parts) -> None:
         patch(model.field, "regularisation", "field's penalties, forward")
     if (id(module), "render") not in patched:
         render = parts.timed("rasterise, forward", module.render)
-        hooks: list[Any] = []  # a parameter that nothing moves is the same tensor in the next step
+        hooks: list[Any] = []  # removed after each step, because an unmoved parameter stays the same tensor
 
         def watched(state: dict[str, torch.Tensor], *args: Any, **options: Any) -> Any:
             out = render(state, *args, **options)
@@ -165,7 +165,7 @@ def main() -> None:
     shot = Shot.open(args.shot)
     config = config_from_params(TrainParams(preset=args.preset, iterations=args.iterations, holdout=8))
     config.holdout_phase = 4
-    if args.threads:  # the backend takes all cores that it may use
+    if args.threads:  # the backend uses all cores available to the process
         if not hasattr(os, "sched_setaffinity"):
             parser.error("--threads: this system does not let a program leave cores alone")
         os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[: args.threads]))
@@ -179,7 +179,7 @@ def main() -> None:
     images = load_images(scene, train, width, height)
     trainer = Trainer(scene, images, train, config, _Silent(), movers=movers, ignored=ignored)
     parts, results = Parts(), {}
-    with torch_threads(3 * width * height):  # as `Trainer.run`
+    with torch_threads(3 * width * height):  # as in `Trainer.run`
         for share in args.at:
             while trainer.progress < share:
                 events.schedule_events(trainer)

@@ -1,14 +1,14 @@
-"""How many numbers is the freeze tuned by? `python -m benchmarks.tuned_numbers [--list]`.
+"""Counts the numbers by which the freeze is tuned: `python -m benchmarks.tuned_numbers [--list]`.
 
 Counts the numbers of `views`, `instant` and `composite` in torch_backend/freeze: those of fields and constants (each
-one of a tuple), and those written in the code. A number counts as tuned unless it is one of these:
+element of a tuple), and literals in the code. A number counts as tuned unless it is one of these:
 
-- trivial: 0, 1, 2, 3, 4 and one half in the code, which are dimensions, centres of pixels, windows and even odds;
-- a guard, but for fields: at most 1e-3, or from 1e4 on, which keeps a quotient or a logarithm finite;
-- in `UNTUNED`: a resource (bytes, rows, what is kept), a format (steps of a file, transfer functions, versions), a
-  unit, or mathematics that somebody proved.
+- trivial: 0, 1, 2, 3, 4 and one half in the code, used for dimensions, pixel centres, windows and even odds;
+- a guard, except in fields: at most 1e-3 or at least 1e4, which keeps a quotient or a logarithm finite;
+- in `UNTUNED`: a resource (bytes, rows, cache sizes), a format (steps of a file, transfer functions, versions), a unit,
+  or a proven mathematical constant.
 
-What a number costs halved and doubled is measured by the variants `sweep-frame` and `sweep-scene` of benchmarks.ablate.
+The variants `sweep-frame` and `sweep-scene` of benchmarks.ablate measure the effect of halving and doubling a number.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from pathlib import Path
 
 ROOMS = ("views", "instant", "composite")
 TRIVIAL = {0.0, 0.5, 1.0, 2.0, 3.0, 4.0}
-"""Of numbers in the code; a field or a constant counts whatever its value, unless it is 0."""
+"""Values ignored in code. Fields and constants count with any value except 0."""
 GUARDS = 1e-3, 1e4
-"""Numbers of code and constants up to the first and from the second on are guards."""
+"""Numbers of code and constants up to the first or from the second value on are guards."""
 UNTUNED = {
     "views/reproject.py:_REACH": "mathematics",
     "views/scene_flow.py:_KEPT": "resource",
@@ -79,7 +79,7 @@ UNTUNED = {
     "composite/warp.py:_ROWS": "resource",
     "composite/warp.py:read_warp": "format",
 }
-"""`file:name` of a constant, a field or a function -> why its numbers are not tuned. What says so wrongly is a bug."""
+"""`file:name` of a constant, field or function -> why its numbers are not tuned. A wrong entry is a bug."""
 
 
 @dataclass(frozen=True)
@@ -91,15 +91,15 @@ class Number:
     line: int
     """Line number."""
     name: str
-    """The field, constant or function that it belongs to."""
+    """The field, constant or function of the number."""
     value: float
-    """What it is."""
+    """Value of the number."""
     kind: str
-    """`tuned`, `guard`, or as in `UNTUNED`."""
+    """`tuned`, `guard`, or a value of `UNTUNED`."""
 
 
 def numbers_of(file: str, text: str) -> Iterator[Number]:
-    """The numbers of a module, `file` being its path below torch_backend/freeze, that are not trivial."""
+    """Yields the non-trivial numbers of a module; `file` is its path below torch_backend/freeze."""
     for name, node, is_named in _places(ast.parse(text)):
         for each in ast.walk(node):
             if not isinstance(each, ast.Constant) or isinstance(each.value, bool):
@@ -117,7 +117,7 @@ def numbers_of(file: str, text: str) -> Iterator[Number]:
 
 
 def _places(tree: ast.Module) -> Iterator[tuple[str, ast.AST, bool]]:
-    """(name, what to look through, True for a field or a constant) of every part of a module."""
+    """Yields (name, syntax tree to search, True for a field or a constant) of every part of a module."""
     for node in tree.body:
         if isinstance(node, ast.ClassDef):
             for part in node.body:
@@ -134,12 +134,12 @@ def _places(tree: ast.Module) -> Iterator[tuple[str, ast.AST, bool]]:
 
 
 def _is_plain(value: ast.expr) -> bool:
-    """True for a number, or a tuple or product of numbers: not for what is indexed or called."""
+    """True for a number, or a tuple or product of numbers, without calls, subscripts or names."""
     return not any(isinstance(each, ast.Call | ast.Subscript | ast.Name) for each in ast.walk(value))
 
 
 def numbers(freeze: Path) -> list[Number]:
-    """All that count or are excused."""
+    """All non-trivial numbers of the freeze."""
     files = [path for room in ROOMS for path in sorted((freeze / room).glob("*.py"))]
     return [
         each

@@ -1,17 +1,18 @@
-"""One picture of two instants against its rendered truth: `python -m benchmarks.two_instants SCENE ... --results DIR`.
+"""Picture of two combined instants against its rendered truth: `python -m benchmarks.two_instants SCENE ...`.
 
-SCENE and DIR are as for `benchmarks.mattes`, which makes the takes and the mattes. For each ordered pair of instants
-(base, instant) and each person whom both lassoed frames show, `combine` lets the person stand as at `instant` in the
-take of `base`. The truth of that picture is rendered from the scene with this one person at `instant`; that needs a
-Python with bpy (`--bpy`, else the one that set-up made).
+The full call is `python -m benchmarks.two_instants SCENE ... --results DIR`. SCENE and DIR are as for
+`benchmarks.mattes`, which makes the takes and the mattes. For each ordered pair of instants (base, instant) and each
+person visible in both lassoed frames, `combine` inserts the person as at `instant` into the take of `base`. The truth
+is rendered from the scene with this one person at `instant`; this needs a Python with bpy (`--bpy`, or the one made by
+set-up).
 
-What is lost by combining is the PSNR of the two takes by themselves less that of the combined picture. A pixel belongs
-to the take whose instant shows the surfaces of the combined scene there, by `SAMPLES` squared rays: to the base where
-it does, else to the instant. Its error by itself is that take's against the truth of that take's instant. In the
-remaining pixels neither instant shows the surface (the person stands in front of somebody who moved, or was hidden at
-`instant`): they are judged in the combined picture alone, as *unknown*. Poses that have a truth count.
+The loss of combining is the PSNR of the two separate takes minus that of the combined picture. Each pixel is assigned
+to a take by `SAMPLES` squared rays: to the base if its instant shows the surfaces of the combined scene, else to the
+instant if that does. The separate error of a pixel is that take's error against the truth of that take's instant. The
+remaining pixels show a surface visible at neither instant: the person stands in front of somebody who moved, or was
+hidden at `instant`. They are judged in the combined picture only, as *unknown*. Only poses with truth count.
 
-DIR gets two-instants-NAME.json, and a picture of each frame (truth, combined, base, instant) in DIR/two-instants.
+Writes two-instants-NAME.json to DIR, and a picture of each frame (truth, combined, base, instant) to DIR/two-instants.
 """
 
 from __future__ import annotations
@@ -48,17 +49,17 @@ from torch_backend.freeze.take.folder import frames_of
 from torch_backend.shot import Shot, write_json
 
 SAMPLES = 3
-"""Rays a side by which a pixel is judged: an edge that only one instant shows makes it that instant's."""
+"""Rays per side of a pixel. A pixel belongs to an instant only if all of its rays agree with that instant."""
 SAME_METRES = 1e-3
-"""Two hits of one ray closer than this are one surface: people who hold still sway by more between two instants."""
+"""Two hits of one ray closer than this in metres are one surface; people sway by more between two instants."""
 BASE, INSTANT, UNKNOWN = range(3)
-"""Whose instant shows a pixel of the combined scene."""
+"""Owner of a pixel of the combined scene."""
 
 Mask = NDArray[np.bool_]
 
 
 def owners(scene: SyntheticScene, person: str, base: int, instant: int, pose: int) -> NDArray[np.uint8]:
-    """[H, W] of `BASE`, `INSTANT`, `UNKNOWN`: whose truth shows what the combined scene shows at a pose."""
+    """[H, W] of `BASE`, `INSTANT`, `UNKNOWN`: the take whose truth equals the combined scene at a pose."""
     geometry, index = Geometry.load(scene.root), scene.frames.index
     first, last = faces_of_people(scene.root)[person]
     mixed = geometry.at(index(base))
@@ -77,13 +78,13 @@ def owners(scene: SyntheticScene, person: str, base: int, instant: int, pose: in
 
 
 def _same(one: Hits, other: Hits) -> Mask:
-    """[R] whether rays met the same surface, or nothing, in two scenes."""
+    """[R] whether rays hit the same surface, or nothing, in two scenes."""
     near = np.abs(np.where(one.face < 0, 0.0, one.distance) - np.where(other.face < 0, 0.0, other.distance))
     return (one.face == other.face) & (near < SAME_METRES)
 
 
 def rendered(scene: SyntheticScene, person: str, base: int, instant: int, args: argparse.Namespace) -> Path:
-    """Folder of the pictures NNNNNN.png of `base` with one person at `instant`, rendered if they are missing."""
+    """Folder of the pictures NNNNNN.png of `base` with one person at `instant`; missing pictures are rendered."""
     folder = args.results.absolute() / "two-instants" / f"{scene.name}-{person}-{base}-{instant}"
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("geometry", "textures", "meter.json"):
@@ -100,7 +101,7 @@ def rendered(scene: SyntheticScene, person: str, base: int, instant: int, args: 
 
 
 def picture_of(folder: TakeFolder, pose: int) -> NDArray[np.uint8]:
-    """[H, W, 3] sRGB of a take's frame."""
+    """[H, W, 3] sRGB picture of a take's frame."""
     return linear_to_srgb8(np.clip(read_frozen_exr(folder.frame(pose)).rgba[..., :3], 0.0, 1.0))
 
 
@@ -108,7 +109,7 @@ def judge(
     shot: Shot, scene: SyntheticScene, person: str, takes: dict[int, TakeFolder], pair: tuple[int, int],
     args: argparse.Namespace,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """One row per pose: {person, base, instant, pose, regions: {name: [pixels, squared error combined, apart]}}."""
+    """One row per pose: {person, base, instant, pose, regions: {name: [pixels, squared error combined, separate]}}."""
     base, instant = pair
     name = f"two{base}-{instant}-{person}"
     things = f"{person}={takes[instant].root.name}"
@@ -137,7 +138,7 @@ def _squares(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.flo
 
 
 def figures(rows: Sequence[dict[str, Any]], region: str) -> tuple[float, float] | None:
-    """PSNR (combined, two takes by themselves) of a region, pixels of all poses together; None if it is empty."""
+    """PSNR (combined, separate takes) of a region over the pixels of all poses; None if it is empty."""
     pixels, error, apart = np.sum([row["regions"][region] for row in rows], axis=0)
     return (psnr_of(error / pixels), psnr_of(apart / pixels)) if pixels else None
 

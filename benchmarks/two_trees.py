@@ -1,11 +1,11 @@
-"""Frozen frames of two states of this repository, on the same trained clips, judged by the same measures.
+"""Compares frozen frames of two states of this repository, on the same trained clips, by the same measures.
 
-    python -m benchmarks.two_trees plan PLAN --clip SHOT ...          # which instants and frames: drawn by a seed
+    python -m benchmarks.two_trees plan PLAN --clip SHOT ...          # instants and frames, drawn by a seed
     PYTHONPATH=TREE python TREE/.../two_trees.py draw PLAN DIR        # in each tree, with this very file
     python -m benchmarks.two_trees judge PLAN DIR DIR
 
-`draw` needs no more of a tree than `benchmarks.detail_clip`, so it goes back to 2026-11-23. Depth, and with it where
-two neighbouring frames lie over one another, is each tree's own; motion mattes are those of the shot.
+`draw` only needs `benchmarks.detail_clip` from a tree, so it works with trees since 2026-11-23. Depth, and so the
+correspondence of two neighbouring frames, is each tree's own; motion mattes are the shot's.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import torch
 
 INSTANTS, PAIRS, SEED, WIDTH = 6, 2, 62, 640
 SHOWN = ("still", "flicker", "moving_p50", "excess")
-"""Columns of `ablate`: dB of still pixels; of 255; pixels of 640 that neighbours move at the median; flow left."""
+"""Compared figures of `ablate`: dB of still pixels; flicker of 255; median residual flow in px at 640; its excess."""
 
 
 def plan(clips: list[Path]) -> dict[str, dict[str, list[tuple[int, int]]]]:
-    """Shot -> instant -> pairs of neighbouring frames."""
+    """{shot: {instant: pairs of neighbouring frames}}."""
     from benchmarks.ablate.cases import clip_case, pairs_of
 
     found: dict[str, dict[str, list[tuple[int, int]]]] = {}
@@ -37,7 +37,7 @@ def plan(clips: list[Path]) -> dict[str, dict[str, list[tuple[int, int]]]]:
 
 
 def draw(planned: dict[str, Any], folder: Path) -> None:
-    """Makes the frames that are not in the folder yet."""
+    """Renders the frames missing in the folder."""
     from benchmarks.detail_clip import DetailClip
     from torch_backend.shot import Shot
 
@@ -55,7 +55,7 @@ def draw(planned: dict[str, Any], folder: Path) -> None:
 
 
 def judge(planned: dict[str, Any], folders: list[Path]) -> list[str]:
-    """Figures of each clip and tree, and the difference of the trees over all instants."""
+    """Lines with the figures of each clip and tree, and the difference of the trees over all instants."""
     from benchmarks.ablate.measures import judge_pair, summary
     from benchmarks.detail_clip import DetailClip
     from benchmarks.detail_figures import Flow
@@ -101,7 +101,7 @@ def _file(folder: Path, shot: str, t_star: str, frame: int) -> Path:
 
 
 def _read(path: Path) -> Any:
-    """A frame as `DetailClip.view` returns it, as far as it is judged."""
+    """A stored frame with the judged fields of `DetailClip.view`."""
     with np.load(path) as stored:
         picture, depth, motion = (
             torch.from_numpy(stored[n].astype(np.float32)) for n in ("picture", "depth", "motion")

@@ -1,7 +1,8 @@
 """Seeded scenes for the rasteriser's benchmarks.
 
-A workload is a furnished room seen from inside: points on walls, boxes and spheres with the noise of a solve, scales
-from the distance to the neighbours, flat along the normal, 3 % large Gaussians in the background, mixed opacities.
+A workload is a furnished room seen from inside. Its points are on walls, boxes and spheres, with the noise of a solve.
+Scales follow the distance to neighbours and are flat along the normal. It has 3 % large background Gaussians and mixed
+opacities.
 """
 
 from dataclasses import dataclass
@@ -18,12 +19,12 @@ WORKLOADS = {
     "W3": (200_000, 640, 360),
     "W4": (1_000_000, 1920, 1080),
 }
-"""Gaussians, width, height."""
+"""Name -> (number of Gaussians, width, height)."""
 
 
 @dataclass
 class Workload:
-    """Float32 arrays of one scene: linear scales, opacities in (0, 1), colors [N, 3]; g [H, W, 3]: d loss / d image."""
+    """Float32 arrays of a scene: linear scales, opacities in (0, 1), colors [N, 3]; g [H, W, 3] is d loss / d image."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -58,7 +59,7 @@ _SPHERES = [((0.7, 0.55, 2.4), 0.25, 8.0), ((-1.5, 0.0, 3.4), 0.35, 8.0), ((-0.3
 
 
 def _rectangles() -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
-    """Walls and the faces of the boxes."""
+    """Walls and box faces as (corner, edge u, edge v, density)."""
     faces = [(np.array(o, float), np.array(u, float), np.array(v, float), d) for o, u, v, d in _WALLS]
     for centre, size, density in _BOXES:
         edges = np.diag(size)
@@ -70,7 +71,7 @@ def _rectangles() -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
 
 
 def _surface_points(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals [count, 3] on the room's surfaces, as many on each as its area times its density asks."""
+    """Points and normals [count, 3] on the room's surfaces, distributed by area times density."""
     faces = _rectangles()
     share = np.array(
         [float(np.linalg.norm(np.cross(u, v))) * d for _, u, v, d in faces]
@@ -94,7 +95,7 @@ def _surface_points(count: int, rng: np.random.Generator) -> tuple[np.ndarray, n
 
 
 def _facing(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Quaternions [N, 4] wxyz that turn z to the normals, spun at random."""
+    """Quaternions [N, 4] wxyz that rotate z to the normals, with random spin."""
     z = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     x = rng.normal(size=z.shape)
     x -= (x * z).sum(1, keepdims=True) * z
@@ -103,7 +104,7 @@ def _facing(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _camera(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """K and viewmat of a camera near the back wall, 58 degrees wide, turned a little."""
+    """K and viewmat of a slightly rotated camera near the back wall, with a horizontal angle of 58 degrees."""
     focal, turn, position = 0.9 * width, 0.08, np.array([0.15, -0.1, 0.25])
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     viewmat = np.eye(4)
@@ -113,7 +114,7 @@ def _camera(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def room(count: int, width: int, height: int, seed: int = 1234) -> Workload:
-    """The workload of `count` Gaussians; the order of the random draws is part of the recipe."""
+    """The workload of `count` Gaussians. Keep the order of the random draws, which determines the scene."""
     rng = np.random.default_rng(seed)
     large = int(0.03 * count)
     n = count - large

@@ -1,1 +1,1 @@
-"""Ablation of the freeze: any rule or term by itself off, named combinations, one table. See `__main__.py`."""
+"""Ablation of the freeze: each rule or term switched off alone or in named combinations. See `__main__.py`."""

@@ -1,14 +1,15 @@
-"""What each rule of the freeze is worth: `python -m benchmarks.ablate SCENE ... --clip SHOT ... --results DIR`.
+"""Measures the worth of each rule of the freeze: `python -m benchmarks.ablate SCENE ... --clip SHOT ... --results DIR`.
 
-Every rule and term of the freeze is switched off by itself, and in named combinations (`switches.py`). SCENE is a
-folder of benchmarks/synthetic, SHOT a trained clip. Against truth: dB of delivered and developed frames by region, and
-recall of things. On clips, at instants drawn by a seed that nothing was tuned at: dB of still pixels, flow left and
-flicker between neighbouring frozen frames, CPU seconds. Each variant at each instant is one JSON file in
-DIR/ablate/CODE, so that an interrupted run goes on where it was. `--table` prints the tables of what is there.
+Every rule and term of the freeze is switched off alone and in named combinations (`switches.py`). SCENE is a folder of
+benchmarks/synthetic; SHOT is a trained clip. Scenes are judged against truth: dB of delivered and developed frames by
+region, and recall of things. Clips are judged at instants drawn by a seed, except those used for tuning. Their figures
+are dB of still pixels, residual flow and flicker between neighbouring frozen frames, and CPU seconds. Each variant at
+each instant is one JSON file in DIR/ablate/CODE, so an interrupted run continues where it stopped. `--table` only
+prints the tables of existing records.
 
-Flicker is the mean absolute difference of two neighbouring frozen frames, the second brought to the first by frozen
-depth and cameras, over the pixels that both see, of 255. The spread in the table is the standard deviation over
-instants, scenes and seeds.
+Flicker is the mean absolute difference of two neighbouring frozen frames, on a scale of 0..255. The second frame is
+warped to the first by frozen depth and cameras; only pixels visible in both count. The spread in the table is the
+standard deviation over instants, scenes and seeds.
 """
 
 from __future__ import annotations
@@ -33,18 +34,18 @@ from benchmarks.sources import in_words
 
 ROOT = Path(__file__).resolve().parents[2]
 SHOWN_BY_CASE = ("today", "null", "P")
-"""Variants whose figures are told for each case."""
+"""Variants whose figures are printed for each case."""
 
 
 class Ablation:
-    """One run of the bench."""
+    """One run of the ablation."""
 
     def __init__(self, store: Store, kept: Path, args: argparse.Namespace) -> None:
         self.store, self.kept, self.args = store, kept, args
         self.ends = time.monotonic() + args.seconds if args.seconds else float("inf")
 
     def run(self, cases: Sequence[Case]) -> None:
-        """Measures what has no record yet: the first instant of every case, then the second, until time is up."""
+        """Measures every variant without a record, until time is up: first instants of all cases, then second ones."""
         most = self.args.instants or max(len(case.t_stars) for case in cases)
         for n in range(most):
             for case in cases:
@@ -81,8 +82,7 @@ class Ablation:
             self.store.save(case.name, t_star, name, row | facts)
 
     def _judged(self, case: Case, t_star: int, key: str, off: frozenset[str]) -> Row | None:
-        """The figures of another variant that is the same scene with the same rules of frames off; None: there is
-        none."""
+        """Figures of a recorded variant with the same scene and frame rules; None if there is none."""
         place = self.store.path(case.name, t_star, "today").parent
         for record in Store(place.parent).records() if place.is_dir() else ():
             if (record["t_star"], record["scene"], record["frame_rules"]) == (t_star, key, sorted(off)):
@@ -91,7 +91,7 @@ class Ablation:
 
 
 def _by_scene(todo: dict[str, frozenset[str]]) -> Iterator[tuple[frozenset[str], dict[str, frozenset[str]]]]:
-    """(rules of the scene that are off, variants that share them)."""
+    """Yields (scene rules that are off, variants that share them)."""
     groups: dict[frozenset[str], dict[str, frozenset[str]]] = {}
     for name, off in todo.items():
         groups.setdefault(off - of_frames(off), {})[name] = off
@@ -99,7 +99,7 @@ def _by_scene(todo: dict[str, frozenset[str]]) -> Iterator[tuple[frozenset[str],
 
 
 def tables(store: Store) -> list[str]:
-    """All tables of what was measured."""
+    """Lines of all tables of the records."""
     records = store.records()
     lines = [f"Records of the freeze {store.folder.name}: {len(records)}."]
     for title, columns in (("Against truth", TRUTH), ("On clips", CLIPS), ("Masks painted by hand", MASKS)):

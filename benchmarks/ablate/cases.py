@@ -1,4 +1,4 @@
-"""What the ablation is run on: synthetic scenes with truth, and clips, each with the instants it is judged at."""
+"""Cases of the ablation: synthetic scenes with truth, and clips, each with the instants at which it is judged."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from torch_backend.shot import Shot
 from torch_backend.train import load_run
 
 TUNED_AT = {"sitting": (8, 36, 63)}
-"""Clip -> instants that today's rules were tuned at, which are never drawn."""
+"""Clip -> instants used to tune today's rules; they are never drawn."""
 INSTANTS = 6
-"""Instants of a clip that are drawn."""
+"""Number of instants drawn for a clip."""
 ITERATIONS, GAUSSIANS = 1500, 10_000
-"""How runs of scenes are trained, as `benchmarks.detail_truth` does by default."""
+"""Training steps and most Gaussians of runs of scenes, the defaults of `benchmarks.detail_truth`."""
 
 
 @dataclass
@@ -32,19 +32,19 @@ class Case:
     """One trained scene or clip."""
 
     name: str
-    """As in the table and in names of files."""
+    """Name in the table and in file names."""
     clip: DetailClip
     """Its run, plates and cameras."""
     t_stars: list[int]
     """Frame numbers of its instants, in the order in which they are judged."""
     truth: TruthScene | None
-    """Rendered truth; None: a clip."""
+    """Rendered truth; None for a clip."""
 
 
 def scene_case(folder: Path, seed: int, results: Path, lent: Path | None = None) -> Case:
-    """A synthetic scene with a run of a training seed, in `results`, made there if it is not.
+    """A synthetic scene with a run of a training seed in `results`, trained if missing.
 
-    `lent`: results of `benchmarks.detail_truth` whose shot is copied if it has the run and `results` has not.
+    `lent`: results of `benchmarks.detail_truth` to copy the shot from, or None. The shot is copied once per seed.
     """
     source = f"exact:{folder.absolute()}"
     name = f"{folder.parent.name}-{folder.name}"
@@ -60,26 +60,26 @@ def scene_case(folder: Path, seed: int, results: Path, lent: Path | None = None)
 
 
 def clip_case(path: Path, run: str, seed: int) -> Case:
-    """A trained clip with instants drawn by a seed from the frames that it was trained on."""
+    """A trained clip with instants drawn by a seed from its training frames."""
     clip = DetailClip(Shot.open(path), run, FLOW_WIDTH)
     name = path.name.removesuffix(".splannequin")
     return Case(name, clip, drawn(name, clip.run.train_frames, seed), None)
 
 
 def drawn(name: str, trained_frames: list[int], seed: int) -> list[int]:
-    """`INSTANTS` frame numbers of a clip, drawn by a seed; none that anything was tuned at."""
+    """`INSTANTS` frame numbers of a clip, drawn by a seed, without those used for tuning (`TUNED_AT`)."""
     free = [frame for frame in trained_frames if frame not in TUNED_AT.get(name, ())]
     return [free[n] for n in _sample(len(free), INSTANTS, name, seed)]
 
 
 def pairs_of(case: Case, t_star: int, count: int, seed: int) -> list[tuple[int, int]]:
-    """`count` pairs of neighbouring frames that an instant of a clip is judged at, drawn by a seed; never t* itself."""
+    """`count` pairs of neighbouring frames at which a clip's instant is judged, drawn by a seed, without t* itself."""
     frames = case.clip.frames
     free = [pair for pair in itertools.pairwise(frames) if t_star not in pair]
     return sorted(free[n] for n in _sample(len(free), count, f"{case.name} {t_star}", seed))
 
 
 def _sample(count: int, most: int, name: str, seed: int) -> list[int]:
-    """Up to `most` of the numbers below `count`, in the order in which they are drawn."""
+    """Up to `most` of the numbers below `count`, in random order."""
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     return [int(n) for n in rng.permutation(count)[:most]]

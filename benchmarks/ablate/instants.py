@@ -1,4 +1,4 @@
-"""Instants of one t*, made with rules off. Steps that several variants share are made once."""
+"""Makes the instants of one t* with rules off. Steps that several variants share run once."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ class Instant:
     frozen: FrozenGaussians
     """The scene."""
     key: str
-    """Identifies its content: variants that have it alike are the same scene."""
+    """Hash of the content: variants with equal keys have the same scene."""
     seconds: dict[str, float]
     """CPU seconds of each step that made it."""
 
 
 class Instants:
-    """Makes the instants of one t* of a clip. Results of steps are kept by what went into them."""
+    """Makes the instants of one t* of a clip. Caches the result of each step under a hash of its inputs."""
 
     def __init__(self, clip: DetailClip, t_star: int, folder: Path | None = None) -> None:
-        """`folder`: where developed scenes are kept for a later process; None: nowhere."""
+        """`folder`: where developed scenes are kept for later processes; None keeps them in memory only."""
         self.clip, self.t_star, self.folder = clip, t_star, folder
         self._kept: dict[str, tuple[Any, float]] = {}
 
@@ -53,10 +53,10 @@ class Instants:
 
     @contextlib.contextmanager
     def _sharing(self, off: frozenset[str], seconds: dict[str, float]) -> Iterator[None]:
-        """While this lasts, steps that are asked again with the same input answer with what they made before."""
+        """Context in which a step called again with the same input returns its cached result."""
         with contextlib.ExitStack() as stack:
             for stage in STAGES:
-                # A step that is off as a whole is replaced over this, and costs nothing.
+                # A step that is off as a whole is replaced on top of this wrapper, and costs nothing.
                 stack.enter_context(replaced(MAKER, stage, self._shared(stage, off, seconds)))
             yield
 
@@ -79,7 +79,7 @@ class Instants:
         return wrap
 
     def _made(self, stage: str, key: str, make: Callable[[], Any]) -> tuple[Any, float]:
-        """(what a step makes, its CPU seconds): from the folder if it lies there."""
+        """(result of a step, its CPU seconds), read from the folder if it is there."""
         path = None if self.folder is None or stage != "develop" else self.folder / f"{key}.safetensors"
         if path is not None and path.is_file():
             return _load(path)
@@ -92,7 +92,7 @@ class Instants:
 
 
 def _save(path: Path, frozen: FrozenGaussians, seconds: float) -> None:
-    """Keeps a developed scene, what it descends from, and the CPU seconds it took."""
+    """Saves a developed scene, the scene it descends from, and the CPU seconds it took."""
     assert frozen.descent is not None
     scenes = {"now": frozen, "before": frozen.descent}
     tensors = {f"{name}.{key}": value.clone() for name, scene in scenes.items() for key, value in scene.state.items()}
@@ -115,9 +115,9 @@ def _load(path: Path) -> tuple[FrozenGaussians, float]:
 
 
 def digest(value: Any) -> str:
-    """Identifies tensors, arrays, numbers, words and collections and dataclasses of them by content.
+    """Hash of the content of tensors, arrays, numbers, strings, and of collections and dataclasses of them.
 
-    Functions, and objects that belong to the clip, count for nothing: they are the same for all variants of a t*.
+    Functions and objects that belong to the clip are ignored: they are the same for all variants of a t*.
     """
     found = hashlib.sha256()
     _feed(found, value)

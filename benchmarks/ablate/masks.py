@@ -1,4 +1,4 @@
-"""What a variant lets go of the frame's own plate, against masks painted by hand (`benchmarks.other_state`)."""
+"""Compares the pixels that a variant rejects of a frame's own plate with hand-painted masks (`other_state`)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from torch_backend.lens.plate_lens import load_plate_lenses
 
 
 def variants() -> dict[str, frozenset[str]]:
-    """Name -> rules of frames that are off: combinations, and each rule that decides about the own plate."""
+    """Name -> frame rules that are off: combinations, and each rule that decides whether the own plate is used."""
     named = {name: off for name, off in COMBINATIONS.items() if off == of_frames(off)}
     return named | {f"no {rule.name}": frozenset({rule.name}) for rule in STATE if rule.name in RULES}
 
 
 def judge_masks(case: Case, store: Store) -> None:
-    """Measures every variant at the painted pairs of a clip, on today's scene. Nothing if nobody painted it."""
+    """Measures every variant at the painted pairs of a clip, on today's scene. A clip without masks is skipped."""
     name = Path(case.clip.shot.info().source).stem
     if name not in CLIPS:
         return
@@ -44,7 +44,7 @@ def judge_masks(case: Case, store: Store) -> None:
 def _judged(
     maker: FrameMaker, masks: Painted, pairs: list[Pair], todo: Mapping[str, frozenset[str]]
 ) -> dict[str, Row]:  # fmt: skip
-    """{variant: figures} of an instant."""
+    """{variant: figures} at one instant."""
     clip, rows = maker.clip, {name: list[Row]() for name in todo}
     lenses = load_plate_lenses(clip.shot)
     scale = np.array([masks.width / clip.width, masks.height / clip.height], np.float32)
@@ -62,6 +62,6 @@ def _judged(
 
 
 def _mean(frames: list[Row], ratio: str) -> float | None:
-    """Mean of a ratio over the frames that have it."""
+    """Mean of a ratio over the frames where it is not None; None without such a frame."""
     known = [frame[ratio] for frame in frames if frame[ratio] is not None]
     return statistics.fmean(known) if known else None

@@ -1,4 +1,4 @@
-"""What is measured of one variant at one instant: against truth, or on a clip."""
+"""Figures of one variant at one instant, against truth or on a clip."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from torch_backend.freeze.composite.compositor import CompositeFrame, Compositor
 from torch_backend.freeze.frozen import FrozenImage, OutputFrame
 
 DECISIONS = (("composite.compositor", "primary_matte"),)
-"""Functions that decide from which plate a pixel comes: their CPU seconds are those of the decision."""
+"""Functions that choose the plate of each pixel; their CPU seconds are the cost of the decision."""
 Row = dict[str, Any]
 
 
 class FrameMaker:
-    """Frozen frames of one instant, with rules of frames off. Plates are examined once for all variants."""
+    """Frozen frames of one instant, with frame rules off. Plates are examined once for all variants."""
 
     def __init__(self, clip: DetailClip, t_star: int, instant: Instant) -> None:
         self.clip, self.t_star, self.instant = clip, t_star, instant
@@ -36,14 +36,14 @@ class FrameMaker:
         self._images: dict[int, FrozenImage] = {}
 
     def image(self, frame: int) -> FrozenImage:
-        """The splats alone."""
+        """The render of the Gaussians, without plate detail."""
         if frame not in self._images:
             self._images[frame] = self.clip.splats(frame, self.t_star, self.instant.frozen)
-            self.make(frame, frozenset())  # what it computes of plates is no variant's cost
+            self.make(frame, frozenset())  # computes the results cached per plate, so that no variant pays for them
         return self._images[frame]
 
     def _maker(self, off: frozenset[str]) -> Compositor:
-        """A compositor with rules `off`. What it has of plates serves until how plates are examined changes."""
+        """A compositor with rules `off`. The cache of plates is kept until a rule that affects it changes."""
         config = detail_config(off)
         views = {name for name in off if any(each.module.startswith("views.") for each in RULES[name].switches)}
         key = config.source_views, views
@@ -53,7 +53,7 @@ class FrameMaker:
         return self._compositor[1]
 
     def make(self, frame: int, off: frozenset[str]) -> tuple[CompositeFrame, float, float]:
-        """(the frame with rules `off`, CPU seconds of its decisions, CPU seconds of all of it but the splats)."""
+        """(frame with rules `off`, CPU seconds of its decisions, CPU seconds without the Gaussians' render)."""
         clip, image = self.clip, self.image(frame)
         output = OutputFrame(frame, *clip.camera(frame), float(self.t_star), float(frame))
         spent, compositor = [0.0], self._maker(off)
@@ -65,7 +65,7 @@ class FrameMaker:
 
 @contextmanager
 def timed(spent: list[float]) -> Iterator[None]:
-    """While this lasts CPU seconds of `DECISIONS` are added to the one number of `spent`."""
+    """Context that adds CPU seconds of `DECISIONS` to `spent[0]`."""
 
     def clock(step: Callable[..., Any]) -> Callable[..., Any]:
         def timed_step(*args: Any) -> Any:
@@ -92,14 +92,14 @@ def judge(
     case: Case, maker: FrameMaker, variants: Mapping[str, frozenset[str]], poses: Sequence[int],
     pairs: Sequence[tuple[int, int]],
 ) -> dict[str, Row]:  # fmt: skip
-    """{variant: figures}, of rules of frames that are off, at `poses` of a scene with truth or `pairs` of a clip."""
+    """{variant: figures} with frame rules off, at `poses` of a scene with truth or at `pairs` of a clip."""
     if case.truth is not None:
         return _judge_truth(case.truth, maker, variants, poses)
     return _judge_clip(maker, variants, pairs)
 
 
 def poses_of(truth: TruthScene, t_star: int, every: int) -> list[int]:
-    """Frame numbers of every `every`-th pose that has a truth; never t* itself, whose plate is the truth."""
+    """Frame numbers of every `every`-th pose with truth, without t* itself, whose plate is the truth."""
     return [pose for pose in truth.poses(t_star, []) if pose != t_star][every // 2 :: every]
 
 
@@ -136,7 +136,7 @@ def _judge_clip(
         laid: tuple[Pair, Tensor] | None = None
         for name, off in variants.items():
             a, b = (maker.make(frame, off) for frame in (first, second))
-            if laid is None:  # depth, and with it where things lie, is the same with any rule of frames off
+            if laid is None:  # frame rules change neither depth nor the correspondence that follows from it
                 laid = _laid(maker, (first, second), (a[0], b[0]))
             pair, still = laid
             row = judge_pair(flow, pair, still, shown(a[0]), shown(b[0]), maker.clip.plate(first))
@@ -148,7 +148,7 @@ def _judge_clip(
 def _laid(
     maker: FrameMaker, frames: tuple[int, int], made: tuple[CompositeFrame, CompositeFrame]
 ) -> tuple[Pair, Tensor]:
-    """(two neighbouring frames laid over one another, bool [H, W] still pixels of the first)."""
+    """(correspondence of two neighbouring frames, bool [H, W] still pixels of the first)."""
     clip, t_star, both = maker.clip, maker.t_star, list[Shown]()
     still: Tensor | None = None
     for frame, detailed in zip(frames, made, strict=True):
@@ -162,7 +162,7 @@ def _laid(
 
 
 def judge_pair(flow: Flow, pair: Pair, still: Tensor, one: Tensor, two: Tensor, plate: Tensor) -> Row:
-    """Figures of two neighbouring frozen frames: error of still pixels, flow left in pixels, flicker of 255."""
+    """Figures of two neighbouring frozen frames: error of still pixels, residual flow in pixels, flicker of 255."""
     error = (one - plate).double().square().mean(-1)[still]
     left, judged = unexplained_flow(flow, one, two, pair.places, pair.both), textured(one)
     stands = pair.moving | pair.still
@@ -180,7 +180,7 @@ def judge_pair(flow: Flow, pair: Pair, still: Tensor, one: Tensor, two: Tensor, 
 
 
 def summary(row: Row) -> dict[str, float | None]:
-    """{figure: mean over the frames of one variant at one instant}; None where no frame has it."""
+    """{figure: mean over the frames of one variant at one instant}; None for a figure that no frame has."""
     frames, found = row["frames"], dict[str, float | None]()
     for what in ("delivered", "developed"):
         for region in ("whole", "never_seen", "moving", "static"):

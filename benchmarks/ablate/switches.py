@@ -1,8 +1,8 @@
-"""The freeze's steps and terms, each with what stands in its place when it is off.
+"""The freeze's steps and terms, each with its neutral replacement when it is switched off.
 
-A step is switched off in this process alone: a name of a module gets a neutral replacement. A term of a frame is a
-number of `CompositeConfig`, a dot apart for a number within (`state.weights.change`), and gets a neutral value. This is
-the only file of the bench that knows the freeze's insides.
+A step is switched off in this process only: a neutral function replaces a name of a module. A term of a frame is a
+number of `CompositeConfig` that gets a neutral value; dots lead to nested numbers (`state.weights.change`). This is the
+only file of the bench that depends on the freeze's internals.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from torch_backend.freeze.instant.develop import DevelopConfig
 from torch_backend.freeze.instant.static_baseline import StaticBaselineConfig
 
 FRAME = "frame"
-"""Stage of the rules that decide each frame; all other stages make the instant."""
+"""Stage of the rules that affect each frame; all other stages make the instant."""
 STAGES = ("apply_static_baseline", "with_missing", "develop")
-"""Names in `torch_backend.freeze.instant.repairs` of the steps that make an instant, in their order."""
+"""Names of the steps that make an instant in `torch_backend.freeze.instant.repairs`, in their order."""
 MAKER = "instant.repairs"
 
 
@@ -37,11 +37,11 @@ class Switch:
     module: str
     """Module of `torch_backend.freeze`."""
     name: str
-    """Name in it, with a dot for a method of a class."""
+    """Name in the module, with a dot for a method of a class."""
     neutral: Callable[..., Any]
-    """What stands there instead."""
+    """The replacement."""
     of_original: bool = False
-    """True if `neutral` is called with what stands there, and returns what stands there instead."""
+    """True if `neutral` takes the original and returns the replacement."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +53,18 @@ class Rule:
     off: str
     """What happens when it is off."""
     stage: str = FRAME
-    """Step that it acts in: one of `STAGES`, or `FRAME`."""
+    """Step in which it acts: one of `STAGES`, or `FRAME`."""
     switches: tuple[Switch, ...] = ()
-    """Names that are replaced."""
+    """Names to replace."""
     numbers: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """Fields of `CompositeConfig`, with dots for fields within, and their neutral values."""
+    """Fields of `CompositeConfig`, with dots for nested fields, and their neutral values."""
 
 
 # ---------------------------------------------------------------------------------------------- neutral replacements
 
 
 def _none(*_: Any, **__: Any) -> None:
-    """Nothing was found."""
+    """None: no finding."""
 
 
 def _third(*args: Any, **_: Any) -> Any:
@@ -73,7 +73,7 @@ def _third(*args: Any, **_: Any) -> Any:
 
 
 def _developed_as_is(*args: Any, **_: Any) -> FrozenGaussians:
-    """The scene without a training step; its descent says that it has its layer already."""
+    """The scene without a training step, as its own descent, so that its residual Gaussians count as present."""
     return dataclasses.replace(args[2], descent=args[2])
 
 
@@ -87,7 +87,7 @@ def _freeze(module: str) -> Any:
 
 
 def _baseline(**numbers: Any) -> tuple[Switch, ...]:
-    """The static baseline with other numbers. Its repair is replaced, because that has its configuration by default."""
+    """Switches that preset the configuration of the static baseline's class with other numbers."""
     config = dataclasses.replace(StaticBaselineConfig(), **numbers)
     return (Switch(MAKER, "StaticBaseline", partial(partial, config=config), of_original=True),)
 
@@ -137,7 +137,7 @@ STATE = (
     _number("smoothing", "log-odds as they are", state__smoothing=0.0),
     _number("softness", "hard borders", state__softness=0.01),
 )
-"""Terms that decide what is let go of."""
+"""Terms that decide which pixels of the own plate are rejected."""
 _FILL = (
     Rule(
         "agreed", "plates of other times need not agree with t*",
@@ -156,7 +156,7 @@ _FILL = (
 
 
 def _scaled(value: Any, factor: float) -> Any:
-    """A number, or each of a tuple, times a factor; whole numbers stay whole."""
+    """A number, or each number of a tuple, times a factor; integers stay integers."""
     if isinstance(value, tuple):
         return tuple(_scaled(each, factor) for each in value)
     return round(value * factor) if isinstance(value, int) else value * factor
@@ -169,7 +169,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _numbers(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """(path, value) of every number of a configuration, those within it too."""
+    """Yields (path, value) of every number of a configuration, including nested ones."""
     for each in dataclasses.fields(config):
         value, at = getattr(config, each.name), f"{path}{each.name}"
         if dataclasses.is_dataclass(value):
@@ -179,7 +179,7 @@ def _numbers(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _swept() -> Iterator[Rule]:
-    """Every number halved and doubled: those of frames, those of the instant, and constants of modules."""
+    """Yields one rule per number, halved and doubled: numbers of frames, of the instant, and constants of modules."""
     for word, factor in SWEEP.items():
         for path, value in _numbers(CompositeConfig()):
             yield Rule(f"{word} {path}", f"times {factor}", numbers={path: _scaled(value, factor)})
@@ -201,15 +201,15 @@ def _changed(path: str, value: Any, config_for: Callable[..., Any]) -> Callable[
 
 
 SWEEP = {"half": 0.5, "twice": 2.0}
-"""Word -> by what every number is multiplied, one at a time: groups `sweep-scene` and `sweep-frame`."""
+"""Word -> factor that multiplies every number, one number at a time (groups `sweep-scene` and `sweep-frame`)."""
 NOT_SWEPT = ("seed",)
-"""Fields that are no amounts."""
+"""Fields that are not amounts."""
 CONSTANTS = (
     ("views.source_views", "DOUBT", FRAME),
     ("views.decisions", "MARGIN", FRAME),
     ("views.working_plates", "SEEN", STAGES[2]),
 )
-"""(module, name, stage) of constants that are swept, too."""
+"""(module, name, stage) of the constants that are swept."""
 
 RULES = {rule.name: rule for rule in (*_SCENE, *STATE, *_FILL, *_swept())}
 """Name -> rule."""
@@ -219,12 +219,12 @@ COMBINATIONS = {
     "mattes alone": frozenset(("scene flow", "change", "gain", "contradiction")),
     "motion alone": frozenset(("change", "gain", "contradiction")),
 }
-"""Name -> rules that are off. `motion alone`: mattes and the model's travel tell the state."""
+"""Name -> rules that are off. In `motion alone`, mattes and the model's scene flow decide the state."""
 
 
 def variants(groups: tuple[str, ...]) -> dict[str, frozenset[str]]:
-    """Name -> rules that are off, of `today` and of `groups`: combinations, scene, frame, sweep-scene, sweep-frame,
-    or a variant's own name. Those that sweep halve and double every number."""
+    """Name -> rules that are off, for `today` and for `groups`: combinations, scene, frame, sweep-scene, sweep-frame,
+    or a variant's own name. The sweep groups halve and double every number. ValueError for an unknown group."""
     swept = {name: frozenset({name}) for name in RULES if name.split()[0] in SWEEP}
     every = {**COMBINATIONS, **{f"no {name}": frozenset({name}) for name in RULES if name not in swept}, **swept}
     found = {"today": every["today"]}
@@ -244,17 +244,17 @@ def variants(groups: tuple[str, ...]) -> dict[str, frozenset[str]]:
 
 
 def of_frames(off: frozenset[str]) -> frozenset[str]:
-    """Of rules those that decide frames."""
+    """The rules that affect frames."""
     return frozenset(name for name in off if RULES[name].stage == FRAME)
 
 
 def of_stage(off: frozenset[str], stage: str) -> frozenset[str]:
-    """Of rules those that act in a stage."""
+    """The rules that act in a stage."""
     return frozenset(name for name in off if RULES[name].stage == stage)
 
 
 def detail_config(off: frozenset[str]) -> CompositeConfig:
-    """The configuration of plate detail with the numbers of rules neutral."""
+    """The compositing configuration with the numbers of rules `off` set to neutral values."""
     config = CompositeConfig()
     for name in sorted(off):
         for path, value in RULES[name].numbers.items():
@@ -270,7 +270,7 @@ def _with(config: Any, path: list[str], value: Any) -> Any:
 
 @contextlib.contextmanager
 def switched_off(off: frozenset[str]) -> Iterator[None]:
-    """While this lasts the names of rules are replaced. KeyError for a rule that there is not."""
+    """Context in which the names of rules are replaced. KeyError for an unknown rule."""
     switches = [switch for name in sorted(off) for switch in RULES[name].switches]
     with contextlib.ExitStack() as stack:
         for switch in switches:
@@ -284,7 +284,7 @@ def _instead(switch: Switch, original: Callable[..., Any]) -> Callable[..., Any]
 
 @contextlib.contextmanager
 def replaced(module: str, name: str, by: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Iterator[None]:
-    """While this lasts a name of a module of the freeze is what `by` makes of it. AttributeError if it is not there."""
+    """Context in which `by(original)` replaces a name of a freeze module. AttributeError for an unknown name."""
     holder = _freeze(module)
     *classes, name = name.split(".")
     for each in classes:

@@ -1,4 +1,4 @@
-"""Records of the ablation, and the one table of what each rule is worth."""
+"""Records of the ablation, and the table of the worth of each rule."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from torch_backend.contract import read_json
 from torch_backend.shot import content_key, write_json
 
 RECORD_VERSION = 1
-"""Rises when records made before are not to be used any more."""
+"""Increase to invalidate older records."""
 TRUTH = {
     "delivered whole": "whole", "delivered never_seen": "never seen", "delivered moving": "moving",
     "delivered static": "static", "recall": "recall", "over splats": "moving, delivered less developed",
 }  # fmt: skip
-"""Figure of a record -> its column, against truth; dB, but for recall."""
+"""Figure of a record -> its column, against truth; in dB except recall."""
 CLIPS = {
     "still": "still, dB", "excess": "flow left p99, moving less still, px", "moving_p50": "p50 moving, px",
     "moving_p99": "p99 moving, px", "flicker": "flicker, /255", "decision_s": "decision, CPU s a frame",
     "instant_s": "instant, CPU s",
 }  # fmt: skip
-"""The same, of clips."""
+"""Figure of a record -> its column, on clips."""
 MASKS = {"iou": "IoU of masks", "extra_share": "share of the unchanged that is let go"}
-"""The same, of hand-painted masks."""
+"""Figure of a record -> its column, against hand-painted masks."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Store:
     """Folder of the records of one version of the code."""
 
     def path(self, case: str, t_star: int, variant: str) -> Path:
-        """Where a record lies."""
+        """File of a record."""
         words = [re.sub(r"[^\w+-]+", "-", word).strip("-") for word in (case, f"t{t_star:06d}", variant)]
         return self.folder / words[0] / words[1] / f"{words[2]}.json"
 
@@ -48,26 +48,26 @@ class Store:
         return self.path(case, t_star, variant).is_file()
 
     def save(self, case: str, t_star: int, variant: str, row: dict[str, Any]) -> None:
-        """Writes a record whole."""
+        """Writes a record atomically."""
         facts = {"version": RECORD_VERSION, "case": case, "t_star": t_star, "variant": variant}
         path = self.path(case, t_star, variant)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, facts | row)
 
     def records(self) -> list[dict[str, Any]]:
-        """All of them."""
+        """All records."""
         return [read_json(path) for path in sorted(self.folder.rglob("t*/*.json"))]
 
 
 def code_version(root: Path) -> str:
-    """Identifies the text of the freeze and of this bench."""
+    """Hash of the source text of the freeze and of this bench."""
     files = [*sorted((root / "torch_backend" / "freeze").rglob("*.py"))]
     files += [root / "benchmarks" / "ablate" / f"{name}.py" for name in ("switches", "measures", "instants")]
     return content_key(RECORD_VERSION, [path.read_text(encoding="utf-8") for path in files])[:12]
 
 
 def figures(record: dict[str, Any]) -> dict[str, float | None]:
-    """Figures of a record by the names of `TRUTH`, `CLIPS` and `MASKS`."""
+    """Figures of a record under the names of `TRUTH`, `CLIPS` and `MASKS`."""
     found = summary(record)
     moving, splats = found["delivered moving"], found["developed moving"]
     found["over splats"] = None if moving is None or splats is None else moving - splats
@@ -77,9 +77,9 @@ def figures(record: dict[str, Any]) -> dict[str, float | None]:
 
 
 def table(records: Iterable[dict[str, Any]], columns: dict[str, str]) -> list[str]:
-    """Markdown: a row for each variant, its mean difference to `today` over instants, and their standard deviation.
+    """Markdown rows, one per variant: mean difference to `today` over instants, and its standard deviation.
 
-    An instant counts where both were measured. "Fires" counts the instants at which any figure but seconds differs.
+    Only instants with records of both count. "Fires" counts the instants at which any figure except seconds differs.
     """
     by_variant: dict[str, dict[tuple[str, int], dict[str, float | None]]] = {}
     for record in records:
@@ -103,11 +103,11 @@ SWEPT = {
     "delivered whole": "whole", "delivered moving": "moving", "delivered static": "static", "still": "still of clips",
     "excess": "flow left",
 }  # fmt: skip
-"""Figure of a record -> what a sweep tells of it; dB, but for flow in pixels."""
+"""Figure of a record -> its heading in the sweep table; in dB except flow, in pixels."""
 
 
 def sweep_table(records: Iterable[dict[str, Any]]) -> list[str]:
-    """Markdown: a row for each number, what it changes halved and doubled, means over instants; [] without a sweep."""
+    """Markdown rows, one per number: mean change over instants when halved and doubled; [] without a sweep."""
     found: dict[tuple[str, str], dict[str, list[float]]] = {}
     by_place: dict[tuple[str, int], dict[str, dict[str, float | None]]] = {}
     for record in records:
@@ -128,7 +128,7 @@ def sweep_table(records: Iterable[dict[str, Any]]) -> list[str]:
 
 
 def case_table(records: Iterable[dict[str, Any]], columns: dict[str, str], variants: Sequence[str]) -> list[str]:
-    """Markdown: figures of some variants by case, means over its instants."""
+    """Markdown rows: figures of some variants by case, means over its instants."""
     rows: dict[tuple[str, str], list[dict[str, float | None]]] = {}
     for record in records:
         if record["variant"] in variants:
@@ -153,7 +153,7 @@ def _differs(a: dict[str, float | None], b: dict[str, float | None]) -> bool:
 
 
 def _cell(values: Sequence[float | None], signed: bool) -> str:
-    """Mean and standard deviation of what is known."""
+    """Mean and standard deviation of the values that are not None."""
     known = [value for value in values if value is not None]
     if not known:
         return "–"

@@ -1,7 +1,7 @@
-"""Hand-painted masks of real plates: which pixels of plate m show another state of the scene than plate t*.
+"""Hand-painted masks of real plates: pixels of plate m that show another state of the scene than plate t*.
 
-The masks are polygons in `sitting.json`, `kitchen.json` and `hall.json` beside this file; each says how it was painted.
-`score` compares them with what a frozen frame lets go of its own plate.
+The masks are polygons in `sitting.json`, `kitchen.json` and `hall.json` in this folder; each file says how they were
+painted. `score` compares them with the pixels that a frozen frame rejects of its own plate.
 """
 
 from .masks import OTHER, SAME, UNSCORED, Painted, Pair, Polygon, load_masks, plate_labels

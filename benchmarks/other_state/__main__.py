@@ -1,12 +1,12 @@
-"""What frozen frames let go of their own plates, against masks painted by hand.
+"""Compares the pixels that frozen frames reject of their own plates with hand-painted masks.
 
     python -m benchmarks.other_state SHOT ... --results DIR
 
-SHOT is a trained shot folder of `sitting`, `kitchen` or `hall` (shared/footage); nothing is written into it. For every
-painted pair of t* and frame: IoU, precision and recall of the pixels that the delivered frame lets go of, and of those
-that motion mattes alone would let go of; then the share of unchanged pixels that is let go of. DIR gets
-other-state-NAME.json and, with `--pictures`, a picture of each pair. They show the footage: those of `kitchen` and
-`hall` may not enter the repository.
+SHOT is a trained shot folder of `sitting`, `kitchen` or `hall` (shared/footage), which stays unchanged. Every painted
+pair of t* and frame gives IoU, precision and recall of the pixels rejected by the delivered frame, and of those that
+motion mattes alone would reject. A further figure is the share of unchanged pixels that is rejected. Writes
+other-state-NAME.json to DIR and, with `--pictures`, a picture of each pair. The pictures show the footage: those of
+`kitchen` and `hall` must not enter the repository.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from .masks import CLIPS, OTHER, SAME, Labels, Painted, load_masks, sha256_of
 from .scores import LET_GO, METHODS, Row, judged, mean_counts, pooled_counts
 
 FIGURES = ("iou", "precision", "recall", "extra_share")
-"""In the table, in this order."""
+"""Figures in the order of the table."""
 
 
 def masks_of(clip: DetailClip, name: str | None) -> Painted:
-    """The masks of a shot's footage. ValueError if it has none or its video is another one than was painted."""
+    """The masks of a shot's footage. ValueError without masks, or if the painted video was a different one."""
     source = Path(clip.shot.info().source)
     masks = load_masks(name or source.stem)
     if source.is_file() and sha256_of(source) != masks.sha256:
@@ -45,7 +45,7 @@ def masks_of(clip: DetailClip, name: str | None) -> Painted:
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Means over frames and figures of all pixels together, by METHODS."""
+    """Means over frames, and figures of all pixels pooled, by `METHODS`."""
     return {
         name: {
             "mean": mean_counts([row.counts[name] for row in rows]),
@@ -56,7 +56,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def table(name: str, rows: Sequence[Row], summed: dict[str, Any]) -> list[str]:
-    """Markdown, a row per pair, then the means."""
+    """Markdown table: a row per pair, then the means."""
     lines = [
         f"| {name} | " + " | ".join(f"{method}: IoU | precision | recall | extra" for method in METHODS) + " |",
         "|---|" + "---:|" * (len(FIGURES) * len(METHODS)),
@@ -74,9 +74,9 @@ def _cells(figures: dict[str, float | None]) -> str:
 
 
 def picture(clip: DetailClip, row: Row, view: View, labels: Labels) -> list[torch.Tensor]:
-    """Plate t*, the plate with its labels and what was let go of, the frozen frame: each [H, W, 3].
+    """Plate t*, the plate tinted by its labels and rejected pixels, the frozen frame: each [H, W, 3].
 
-    Green: rightly let go of. Red: kept, though another state. Blue: let go of, though the same. Grey: not scored.
+    Green: rightly rejected. Red: kept, though another state. Blue: rejected, though the same. Grey: not scored.
     """
     plate, label = clip.plate(row.frame), torch.from_numpy(labels)
     is_let_go = view.detailed.matte < LET_GO
@@ -93,7 +93,7 @@ def picture(clip: DetailClip, row: Row, view: View, labels: Labels) -> list[torc
 
 
 def run(clip: DetailClip, masks: Painted, pictures: Path | None) -> list[Row]:
-    """All rows of a clip; prints each as it is there."""
+    """All rows of a clip; prints each row once it is computed."""
     rows: list[Row] = []
     for row, view, labels in judged(clip, masks):
         rows.append(row)

@@ -16,7 +16,7 @@ from torch_backend.contract import read_json
 CLIPS = ("sitting", "kitchen", "hall")
 """Clips of shared/footage that have masks."""
 SAME, OTHER, UNSCORED = 0, 1, 2
-"""Labels of a pixel: plate t* would show the same there, it would show another state, nobody can tell."""
+"""Labels of a pixel: plate t* shows the same, another state, or it cannot be decided."""
 
 Labels = NDArray[np.uint8]
 
@@ -28,7 +28,7 @@ class Polygon:
     points: NDArray[np.float64]
     """[N, 2] corners x, y in pixels of the source frame, pixel centres at +0.5."""
     shows: str
-    """What the frame shows there."""
+    """Content of the frame in the polygon."""
     label: int
     """OTHER, or UNSCORED where the polygon is uncertain."""
 
@@ -40,11 +40,11 @@ class Pair:
     t_star: int
     """Frame number of the frozen instant, counted from 1."""
     frame: int
-    """Frame number of the plate that was painted."""
+    """Frame number of the painted plate."""
     border_px: int
-    """Pixels on either side of an edge between labels that are not scored: 2 for a sharp frame, 4 for a blurred one."""
+    """Unscored pixels on either side of an edge between labels: 2 for a sharp frame, 4 for a blurred one."""
     polygons: tuple[Polygon, ...]
-    """Painted in this order; a later one replaces what lies below it."""
+    """Polygons in painting order; a later one replaces earlier ones."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,11 @@ class Painted:
     clip: str
     """Name of the video, without its ending."""
     sha256: str
-    """Digest of the video file that was painted."""
+    """Digest of the painted video file."""
     width: int
-    """Pixels of a source frame."""
+    """Width of a source frame in pixels."""
     height: int
-    """Pixels of a source frame."""
+    """Height of a source frame in pixels."""
     pairs: tuple[Pair, ...]
     """Ascending in t* and frame."""
 
@@ -74,12 +74,12 @@ class Painted:
 
 
 def fill_polygon(labels: Labels, points: NDArray[np.float64], label: int) -> None:
-    """Set the pixels whose centres lie inside a polygon, by the even-odd rule.
+    """Sets the pixels whose centres lie inside a polygon, by the even-odd rule.
 
     Args:
         labels: [H, W], changed in place.
-        points: [N, 2] corners x, y in pixels; the last joins the first.
-        label: The value to set.
+        points: [N, 2] corners x, y in pixels; the polygon is closed automatically.
+        label: Label of these pixels.
     """
     height, width = labels.shape
     low = np.clip(np.floor(points.min(0)).astype(int), 0, (width, height))
@@ -97,10 +97,10 @@ def plate_labels(labels: Labels, where: NDArray[np.float32]) -> Labels:
 
     Args:
         labels: [H, W] labels of the source frame.
-        where: [h, w, 2] place x, y in the source frame of each pixel of the plate, pixel centres at +0.5.
+        where: [h, w, 2] position x, y in the source frame of each pixel of the plate, pixel centres at +0.5.
 
     Returns:
-        [h, w] labels; UNSCORED where the plate looks past the source frame.
+        [h, w] labels; UNSCORED for pixels outside the source frame.
     """
     height, width = labels.shape
     x, y = np.floor(where[..., 0]).astype(int), np.floor(where[..., 1]).astype(int)
@@ -110,11 +110,11 @@ def plate_labels(labels: Labels, where: NDArray[np.float32]) -> Labels:
 
 
 def load_masks(clip: str, folder: Path | None = None) -> Painted:
-    """The masks of a clip, from the JSON of its name. ValueError if there is none.
+    """The masks of a clip, from the JSON file of its name. ValueError without that file.
 
     Args:
         clip: One of CLIPS.
-        folder: Where the JSON lies; None: beside this module.
+        folder: Folder of the JSON file; None for this module's folder.
     """
     path = (folder or Path(__file__).parent) / f"{clip}.json"
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""Scores of what a frozen frame lets go of its own plate, against the painted masks."""
+"""Scores of the pixels that a frozen frame rejects of its own plate, against the painted masks."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from torch_backend.lens.plate_lens import load_plate_lenses
 from .masks import OTHER, SAME, Labels, Painted, plate_labels
 
 LET_GO = 0.5
-"""A pixel's own plate is let go of where its matte is below this: more than half of the pixel comes from elsewhere."""
+"""A pixel's own plate is rejected if its matte is below this: more than half of the pixel comes from elsewhere."""
 METHODS = ("delivered", "mattes")
-"""What the delivered frame lets go of; what motion mattes alone would let go of: the plate's own matte, and that of
-plate t* carried to the plate by the frozen depth."""
+"""Pixels rejected by the delivered frame, and pixels that motion mattes alone would reject: movers of the plate's own
+matte, and of the matte of plate t* warped to the plate by the frozen depth."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Counts:
     """Scored pixels of one frame or of several."""
 
     both: int
-    """Let go of, and painted as another state."""
+    """Rejected, and painted as another state."""
     extra: int
-    """Let go of, although plate t* would show the same."""
+    """Rejected, although the same at t*."""
     missed: int
     """Kept, although painted as another state."""
     right: int
@@ -39,26 +39,26 @@ class Counts:
 
     @property
     def iou(self) -> float | None:
-        """Intersection over union; None if nothing is painted: `extra_share` judges such a frame."""
+        """Intersection over union; None if nothing is painted (see `extra_share` for such a frame)."""
         return _ratio(self.both, self.both + self.extra + self.missed) if self.both + self.missed else None
 
     @property
     def precision(self) -> float | None:
-        """Share of what was let go of that is painted; None if nothing was let go of or nothing is painted."""
+        """Share of the rejected pixels that is painted; None if nothing is rejected or nothing is painted."""
         return _ratio(self.both, self.both + self.extra) if self.both + self.missed else None
 
     @property
     def recall(self) -> float | None:
-        """Share of what is painted that was let go of; None if nothing is painted."""
+        """Share of the painted pixels that is rejected; None if nothing is painted."""
         return _ratio(self.both, self.both + self.missed)
 
     @property
     def extra_share(self) -> float | None:
-        """Share of the pixels that are the same at t* that was let go of all the same."""
+        """Share of the pixels unchanged at t* that is wrongly rejected; None without such pixels."""
         return _ratio(self.extra, self.extra + self.right)
 
     def figures(self) -> dict[str, float | int | None]:
-        """All of it for a JSON."""
+        """All ratios and counts, for JSON."""
         ratios = {"iou": self.iou, "precision": self.precision, "recall": self.recall, "extra_share": self.extra_share}
         return {**ratios, **vars(self)}
 
@@ -72,10 +72,10 @@ class Row:
     frame: int
     """Frame number of the plate."""
     counts: dict[str, Counts]
-    """By METHODS."""
+    """Counts by `METHODS`."""
 
     def figures(self) -> dict[str, Any]:
-        """All of it for a JSON."""
+        """All values of the row, for JSON."""
         named = {name: counts.figures() for name, counts in self.counts.items()}
         return {"t_star": self.t_star, "frame": self.frame, **named}
 
@@ -85,7 +85,7 @@ def _ratio(part: int, whole: int) -> float | None:
 
 
 def count(is_let_go: NDArray[np.bool_], labels: Labels) -> Counts:
-    """Counts of one frame, both [H, W]."""
+    """Counts of one frame, from rejected pixels and labels, both [H, W]."""
     is_other, is_same = labels == OTHER, labels == SAME
     return Counts(
         int((is_let_go & is_other).sum()), int((is_let_go & is_same).sum()),
@@ -94,13 +94,13 @@ def count(is_let_go: NDArray[np.bool_], labels: Labels) -> Counts:
 
 
 def pooled_counts(counts: Iterable[Counts]) -> Counts:
-    """The sum over frames: large regions weigh more."""
+    """Sum over frames, so that large regions weigh more."""
     rows = [(c.both, c.extra, c.missed, c.right) for c in counts]
     return Counts(*(sum(column) for column in zip(*rows, strict=True))) if rows else Counts(0, 0, 0, 0)
 
 
 def mean_counts(counts: Sequence[Counts]) -> dict[str, float | None]:
-    """{figure: mean over the frames that have one}; each frame weighs the same."""
+    """{figure: mean over the frames where it is not None}; frames weigh equally."""
     means: dict[str, float | None] = {}
     for name in ("iou", "precision", "recall", "extra_share"):
         values = [value for c in counts if (value := getattr(c, name)) is not None]
@@ -109,16 +109,16 @@ def mean_counts(counts: Sequence[Counts]) -> dict[str, float | None]:
 
 
 def score(clip: DetailClip, masks: Painted) -> list[Row]:
-    """The scores of a trained shot's frozen frames, a row for every painted pair.
+    """Scores of a trained shot's frozen frames, one row per painted pair.
 
-    Frames are rendered as a take renders them; instants are developed if the clip develops.
+    Frames are rendered as in a take; instants are developed if the clip develops them.
     """
     return [row for row, _, _ in judged(clip, masks)]
 
 
 def judged(clip: DetailClip, masks: Painted) -> Iterable[tuple[Row, View, Labels]]:
-    """(scores, frozen frame, labels [H, W] of its plate) of every painted pair, one after the other."""
-    # A shot with cameras of truth has no record of a solve: its frames never went through a lens.
+    """Yields (scores, frozen frame, labels [H, W] of its plate) of every painted pair."""
+    # A shot with exact cameras has no solve record, and its frames have no lens distortion.
     lenses = load_plate_lenses(clip.shot) if clip.shot.solve_record.is_file() else {}
     scale = np.array([masks.width / clip.width, masks.height / clip.height], np.float32)
     straight = np.stack(np.meshgrid(np.arange(clip.width) + 0.5, np.arange(clip.height) + 0.5), -1).astype(np.float32)
@@ -136,9 +136,9 @@ def judged(clip: DetailClip, masks: Painted) -> Iterable[tuple[Row, View, Labels
 
 
 def _let_go(clip: DetailClip, t_star: int, frame: int, view: View) -> tuple[Tensor, Tensor]:
-    """Bool [H, W] by METHODS."""
+    """bool [H, W] rejected pixels of each of `METHODS`."""
     detailed = view.detailed
-    # On the clip's own poses the frame's own plate leads. If another one did, nothing of the own plate would be kept.
+    # At the clip's own poses the own plate is the primary source. Otherwise no pixel of the own plate is kept.
     delivered = (detailed.matte < LET_GO) | (detailed.primary != frame)
     own, frozen = clip.mattes(frame, t_star, view)
     return delivered, torch.maximum(own, frozen) > MOVER_MATTE

@@ -1,6 +1,6 @@
-"""What a rival must offer to be timed: `python -m benchmarks.raster --peer MODULE`, MODULE being a Python import path.
+"""Interface of a rival renderer for `python -m benchmarks.raster --peer MODULE`; MODULE is a Python import path.
 
-Such a module has a `NAME`, and two functions with the signatures of `Peer`. `gsplat.py` beside this file is an example.
+Such a module has a `NAME` and two functions with the signatures of `Peer`. `gsplat.py` in this folder is an example.
 """
 
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from benchmarks.workload import Workload
 
 @dataclass(frozen=True)
 class Prepared:
-    """One workload, ready to be rendered again and again."""
+    """One workload, ready for repeated rendering."""
 
     forward: Callable[[], Tensor]
-    """Renders, and returns the image [H, W, 3], float32, black background, with its graph."""
+    """Renders and returns the image [H, W, 3], float32, black background, with its autograd graph."""
     leaves: dict[str, Tensor]
-    """By the names of `rasterize`: the tensors that get gradients, as the peer is parametrised."""
+    """Tensors that get gradients, in the peer's parametrisation, by the names of `rasterize`."""
 
 
 class Peer(Protocol):
@@ -28,9 +28,9 @@ class Peer(Protocol):
     NAME: str
 
     def missing(self, device: str) -> str | None:
-        """One sentence that says what is missing to run on `device` ('cpu' or 'cuda'); None if all is there."""
+        """A sentence that names what is missing to run on `device` ('cpu' or 'cuda'); None if nothing is."""
         ...
 
     def prepare(self, work: Workload, device: str) -> Prepared:
-        """Put the workload on the device. Torch's number of threads is set already."""
+        """Puts the workload on the device. Torch's number of threads is already set."""
         ...

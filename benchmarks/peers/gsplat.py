@@ -1,4 +1,4 @@
-"""gsplat (Apache-2.0, installed by whoever compares: `pip install gsplat`) as a peer, by its public call."""
+"""gsplat (Apache-2.0) as a peer, through its public function. Install it with `pip install gsplat`."""
 
 import importlib
 import importlib.util

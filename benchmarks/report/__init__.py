@@ -1,1 +1,1 @@
-"""Folders of runs and ground truth into figures: metrics, tables, plots, one page. Reads folders only."""
+"""Turns folders of runs and ground truth into figures: metrics, tables, plots, one page. Folders are only read."""

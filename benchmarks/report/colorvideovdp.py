@@ -1,7 +1,7 @@
 """ColorVideoVDP (Mantiuk et al. 2024) of frame sequences, from the package cvvdp.
 
-The package imports torchvision for one Gaussian blur, and a model hub for a learnt variant that is not used here;
-beside a CPU torch neither is to be had. So its `__init__` is passed over, and the blur is lent while it is imported.
+The package imports torchvision for one Gaussian blur, and a model hub for a learnt variant that is not used. Neither is
+installed with a CPU-only torch. So this module skips the package's `__init__` and substitutes the blur during import.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from torch import Tensor
 from torch.nn import functional as F
 
 DISPLAY = "standard_4k"
-"""The package's default display: 30 inch, 3840x2160, 200 cd/m2, seen from 0.75 m."""
+"""The package's default display: 30 inch, 3840x2160, 200 cd/m2, viewed from 0.75 m."""
 
 
 def available() -> bool:
-    """True if the package and what it imports are installed."""
+    """True if the package and its imports are installed."""
     return all(importlib.util.find_spec(name) for name in ("pycvvdp", "tqdm", "ffmpeg", "imageio", "scipy"))
 
 
 @torch.no_grad()
 def sequence_jod(frames: Tensor, truth: Tensor, fps: float) -> float | None:
-    """Quality of a sequence in just-objectionable-differences: 10 is no difference, less is worse. None if absent.
+    """Quality of a sequence in just-objectionable differences (10 is identical); None without the package.
 
     Args:
         frames, truth: [F, H, W, 3] display-referred in [0, 1]; one frame is judged as a still picture.
-        fps: frames per second at which they are shown.
+        fps: frames per second of the sequence.
     """
     if not available():
         return None

@@ -1,4 +1,4 @@
-"""A trained run against a scene with truth: freezes at every t*, sees it from every pose, scores, keeps pictures."""
+"""Evaluates a trained run against a scene with truth: freezes it at every t*, scores every pose, saves pictures."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ from .things import matte_on_panes, opened_on, recall_of
 from .truth import PANES, TruthScene
 
 KEPT = 6
-"""Pictures kept of every run, the same frames for all runs of a scene."""
+"""Number of pictures saved for every run, of the same frames for all runs of a scene."""
 WORST = 4
-"""Pictures kept of a run's worst frames."""
+"""Number of pictures saved of a run's worst frames."""
 
 
 @dataclass
 class Frozen:
-    """A run frozen at one instant, ready to be seen."""
+    """A run frozen at one instant, ready to render."""
 
     run: LoadedRun
     scene: Scene
     t_star: int
     gaussians: FrozenGaussians
     compositor: Compositor | None = None
-    """What makes plate detail; None: splats are all there is."""
+    """Compositor of plate detail; None for Gaussians alone."""
     developed: FrozenGaussians | None = None
-    """The instant developed; None: what is made of plates is made on `gaussians`, as splats alone are."""
+    """The developed instant; None to composite on `gaussians`."""
 
     def view(self, pose: int, shown: str = SPLATS) -> Tensor:
-        """[H, W, 3] in [0, 1] from the pose of frame `pose`, exposed as that frame is, before grey."""
+        """[H, W, 3] in [0, 1] over grey, from the pose of frame `pose` and with its exposure."""
         viewmat, K = self._camera(pose)
         gaussians = self.gaussians if shown == SPLATS or self.developed is None else self.developed
         image = self._splats(pose, gaussians)
@@ -65,7 +65,7 @@ class Frozen:
         return (color + (1.0 - alpha[..., None]) * 0.5).clamp(0.0, 1.0)
 
     def motion(self, pose: int) -> Tensor:
-        """[H, W] in [0, 1] from the pose of frame `pose`: how much of what is seen the model moves in the clip."""
+        """[H, W] in [0, 1] from the pose of frame `pose`: share of each pixel that the model moves in the clip."""
         return self._splats(pose, self.gaussians).motion
 
     def _camera(self, pose: int) -> tuple[Tensor, Tensor]:
@@ -79,7 +79,7 @@ class Frozen:
 
 
 def plate_detail(shot: Shot, run: LoadedRun, scene: Scene, report: Reporter) -> Compositor:
-    """What makes plate detail at the run's size. Motion mattes are found in the shot if it has none.
+    """Compositor of plate detail at the run's size. Computes the shot's motion mattes if missing.
 
     JobError if the footage cannot be read.
     """
@@ -95,12 +95,12 @@ def evaluate_run(
     Args:
         truth: the scene; its shot holds the run.
         run_name: folder in the shot's runs/.
-        query: how Gaussians are asked at t*: nearest or plain.
-        results: folder of the records; pictures go into `PICTURES` there.
-        run_id: names this run's pictures.
-        device: what renders.
+        query: time query of Gaussians at t*: nearest or plain.
+        results: folder of the records; pictures go to its `PICTURES`.
+        run_id: name of this run's pictures.
+        device: device for rendering.
 
-    JobError if there is no such run; `Cancelled` if a stop was requested.
+    JobError without such a run; `Cancelled` if a stop was requested.
     """
     run, scene = load_run(truth.shot, run_name, device), load_scene(truth.shot)
     held_out = held_out_frames(run, scene)
@@ -121,7 +121,7 @@ def evaluate_run(
     }
     shown = {name: _shown(truth, frozen, held_out, name, report) for name in kinds}
     for name, of in shown.items():
-        if name != WITHHELD:  # as fast as what is delivered, and not to be looked at
+        if name != WITHHELD:  # its speed equals that of DELIVERED, and its pictures are not shown
             of.frozen_fps = _fps(next(iter(frozen.values())), scene, name)
             _Keeper(truth, frozen, (run.width, run.height), results, run_id, name).keep(of)
     plates = _Keeper(truth, frozen, (run.width, run.height), results, run_id).plates(shown[SPLATS].two_instants)
@@ -146,9 +146,9 @@ def evaluate_run(
 def _shown(
     truth: TruthScene, frozen: Mapping[int, Frozen], held_out: Sequence[int], shown: str, report: Reporter
 ) -> Detailed:
-    """Every pose of every instant made in one way, against the truth.
+    """Scores every pose of every instant in one variant of the frame against the truth.
 
-    What is delivered at the pose of t* itself is plate t*, which is the truth itself: no row, lest it lift the means.
+    The delivered frame at the pose of t* is plate t*, which is the truth. It gets no row, as it would raise the means.
     """
     rows: list[FrameScore] = []
     jod: dict[str, float | None] = {}
@@ -169,7 +169,7 @@ def _shown(
 
 
 def held_out_frames(run: LoadedRun, scene: Scene) -> list[int]:
-    """Frame numbers that the run did not train on."""
+    """Frame numbers held out of the run's training."""
     _, test = split_frames(scene.solved, run.config.holdout, run.config.holdout_phase)
     return [scene.frames[i] for i in test]
 
@@ -178,23 +178,23 @@ def freeze_run(
     run: LoadedRun, scene: Scene, t_star: int, query: str, compositor: Compositor | None = None,
     developed: FrozenGaussians | None = None,
 ) -> Frozen:  # fmt: skip
-    """The run frozen at frame `t_star`; `compositor` as `plate_detail` gives it, None for splats alone; `developed` as
-    `develop_run` does, None: as the run has it."""
+    """The run frozen at frame `t_star`. `compositor`: from `plate_detail`, or None for Gaussians alone. `developed`:
+    from `develop_run`, or None for the undeveloped run."""
     frozen = freeze_at(run.model, scene.time_of_frame(t_star), span_of(scene, run), query)
     return Frozen(run, scene, t_star, frozen, compositor, developed)
 
 
 def develop_run(shot: Shot, run: LoadedRun, scene: Scene, t_star: int, query: str, report: Reporter) -> FrozenGaussians:
-    """The scene that a take of frame `t_star` is rendered from, kept with the run: developed, if it was trained on.
+    """The scene from which a take of frame `t_star` is rendered, developed if the run trained on that frame.
 
-    Motion mattes must have been found, as `plate_detail` does.
+    The scene is saved with the run. The shot needs motion mattes, which `plate_detail` computes.
     """
     return Instants(shot, run, scene, query, [float(t_star)]).at(float(t_star), report)
 
 
 @torch.no_grad()
 def _of_frame(truth: TruthScene, run: LoadedRun, scene: Scene, frame: int) -> HeldOut:
-    """A held-out frame of the clip as the run shows it at its own time, against the plate."""
+    """Scores a held-out frame of the clip, rendered by the run at its own time, against its plate."""
     index, time_of = scene.frames.index(frame), scene.time_of_frame(frame)
     model, size = run.model, (run.width, run.height)
     where = (scene.viewmats[index].to(model.device), scene.camera_at(*size)[index].to(model.device))
@@ -209,9 +209,9 @@ def _of_frame(truth: TruthScene, run: LoadedRun, scene: Scene, frame: int) -> He
 
 
 def last_third_step_ms(path: Path, iterations: int) -> float | None:
-    """Mean wall milliseconds of a step over the last third of a run, from its metrics.jsonl; None if that has too few.
+    """Mean wall milliseconds per step over the last third of a run, from its metrics.jsonl; None with too few lines.
 
-    An interrupted run measures again what it repeats: the later line counts.
+    An interrupted run repeats some measurements; then the later line counts.
     """
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     seconds = {row["iteration"]: row["seconds"] for row in map(json.loads, lines)}
@@ -243,10 +243,10 @@ def _score(
 
 
 def _fps(frozen: Frozen, scene: Scene, shown: str) -> float:
-    """Frames per second of one frozen instant along the clip's poses, after one for warming up.
+    """Frames per second of one frozen instant along the clip's poses, after one warm-up frame.
 
-    At most 40 poses, with plate detail 8. Of each the fastest of three rounds counts, which other work on the machine
-    lengthens least.
+    Uses at most 40 poses, or 8 with plate detail. Each pose counts with the fastest of three rounds, which other load
+    on the machine affects least.
     """
     most = min(40 if shown == SPLATS else 8, len(scene.frames))
     poses = [scene.frames[int(i)] for i in np.linspace(0, len(scene.frames) - 1, most)]
@@ -263,7 +263,7 @@ def _fps(frozen: Frozen, scene: Scene, shown: str) -> float:
 
 
 class _Keeper:
-    """Writes the pictures that the report shows."""
+    """Writes the pictures for the report."""
 
     def __init__(
         self,
@@ -280,18 +280,18 @@ class _Keeper:
         self._common = f"{PICTURES}/{truth.key}-{size[0]}"
 
     def keep(self, of: Detailed) -> None:
-        """The pictures of its rows."""
+        """Sets the pictures of `of` for its rows."""
         of.pictures, of.two_instants = self.pictures(of.rows), self.two_instants(of.rows)
 
     def pictures(self, rows: list[FrameScore]) -> list[Picture]:
-        """The shown and the worst frames, worst first."""
+        """Pictures of evenly spaced frames and of the worst frames, worst first."""
         ranked = sorted(rows, key=lambda row: _rank(self._truth, row))
         spread = evenly_spaced(len(rows), KEPT)
         picked = {(row.t_star, row.pose): row for row in [*ranked[:WORST], *(rows[i] for i in spread)]}
         return [self._picture(row) for row in ranked if (row.t_star, row.pose) in picked]
 
     def two_instants(self, rows: list[FrameScore]) -> list[Picture]:
-        """One pose at the instants farthest apart that share one."""
+        """Pictures of one pose at two instants, the farthest apart among instants that share a pose."""
         by_pose: dict[int, list[FrameScore]] = {}
         for row in rows:
             by_pose.setdefault(row.pose, []).append(row)
@@ -307,7 +307,7 @@ class _Keeper:
         return [self._picture(row) for row in ([shared[0], shared[-1]] if len(shared) > 1 else [])]
 
     def plates(self, pair: Sequence[Picture]) -> dict[str, str]:
-        """The plates of the instants of those pictures."""
+        """Frame number -> plate of the instants of these pictures."""
         return {str(picture.t_star): self._plate(picture.t_star) for picture in pair}
 
     def _picture(self, row: FrameScore) -> Picture:
@@ -329,7 +329,7 @@ class _Keeper:
 
 
 def _rank(truth: TruthScene, row: FrameScore) -> float:
-    """PSNR in dB that ranks frames; over the whole frame where the judged region is empty."""
+    """PSNR in dB for ranking frames: of the judged region, or of the whole frame if that region is empty."""
     value = row.value("psnr_db", truth.judged)
     whole = row.value("psnr_db")
     assert whole is not None  # the whole frame is never empty

@@ -1,4 +1,4 @@
-"""Rows of the report's tables of hard scenes: glass and mirrors, and whether small movers are there."""
+"""Table rows of the report for hard scenes: glass and mirrors, and recall of small movers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RECALLED = ("swinging", "arm")
 
 
 def pane_rows(settings: Sequence[Setting]) -> list[list[str]]:
-    """Per setting that saw panes: dB on them and on the wall beside, the difference, what was taken for motion."""
+    """Row per setting with panes: dB on them and on the nearby wall, the difference, and false motion on them."""
     rows: list[list[str]] = []
     for s in settings:
         if s.summary("psnr_db", "wall") is None:
@@ -57,7 +57,7 @@ THING_NOTE = (
 
 
 def thing_rows(settings: Sequence[Setting]) -> list[list[str]]:
-    """Per setting that saw a small mover or hair: recall over all poses and of the worst, dB."""
+    """Row per setting with a small mover or hair: recall over all poses and in the worst one, and dB."""
     rows: list[list[str]] = []
     for s in settings:
         counts = {name: _counts(s.runs, name) for name in RECALLED}
@@ -70,12 +70,12 @@ def thing_rows(settings: Sequence[Setting]) -> list[list[str]]:
 
 
 def _counts(runs: Sequence[RunRecord], name: str) -> list[tuple[int, int]]:
-    """[(pixels that show it, pixels that should)] by frame."""
+    """[(pixels that show the thing, pixels that should)] by frame."""
     return [tuple(row.recalled[name]) for run in runs for row in run.rows if name in row.recalled]
 
 
 def _recall(counts: Sequence[tuple[int, int]]) -> list[str]:
-    """Over all frames, and of the worst frame of those with enough pixels."""
+    """Recall over all frames, and in the worst frame of those with enough pixels."""
     return [NONE if share is None else f"{share:.2f}" for share in overall(counts)]
 
 
@@ -85,7 +85,7 @@ def _decibels(setting: Setting, region: str) -> str:
 
 
 def _less_than_wall(setting: Setting, pane: str) -> str:
-    """Mean over frames that show both: dB of the pane less those of the wall."""
+    """Mean difference in dB of the pane and the wall, over frames that show both."""
     return _signed(_mean(setting, lambda row: _difference(row.value("psnr_db", "wall"), row.value("psnr_db", pane))))
 
 
@@ -99,7 +99,7 @@ def _mean(setting: Setting, read: Callable[[FrameScore], float | None]) -> float
 
 
 def _of_matte(runs: Sequence[RunRecord], pane: str) -> str:
-    """Moving, and unknown in brackets."""
+    """Share of the pane that the matte calls moving, and in brackets unknown."""
     found = [run.matte[pane] for run in runs if pane in run.matte]
     if not found:
         return NONE

@@ -1,11 +1,11 @@
-"""How far a picture is from the truth: PSNR, SSIM, ST-LPIPS, FLIP over regions, and what many such figures say.
+"""Distances of a picture from the truth (PSNR, SSIM, ST-LPIPS, FLIP) over regions, and statistics of many figures.
 
-Pictures are display-referred sRGB in [0, 1], [H, W, 3]. Every metric is a map over pixels first, so that a region (what
-was never seen at t*, what moves) is judged by its own pixels; a window or a receptive field still looks a little beyond
-the region's border. A metric whose package is absent is None, and `missing_metrics` says so: never a made-up figure.
+Pictures are display-referred sRGB in [0, 1], [H, W, 3]. Every metric is first a map over pixels, so that a region (such
+as points unseen at t*, or movers) is judged by its own pixels. Windows and receptive fields still reach slightly beyond
+the region's border. A metric without its package is None, and `missing_metrics` reports it.
 """
 
-# Packages of requirements/bench.txt may be absent; each use says what to do then.
+# Packages of requirements/bench.txt may be absent; each use handles that case.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from torch_backend.torch_types import from_numpy
 from . import colorvideovdp, stlpips
 
 METRICS = {"psnr_db": True, "ssim": True, "st_lpips": False, "flip": False}
-"""Metric of a picture -> whether more is better."""
+"""Metric of a picture -> True if higher is better."""
 WHOLE = "whole"
-"""The region of all pixels; always there."""
+"""The region of all pixels, in every score."""
 LEAST_SHARE = 0.002
-"""A region below this share of the picture is taken for empty: the PSNR of a dozen pixels is noise."""
+"""A region below this share of the picture counts as empty, because the PSNR of a dozen pixels is noise."""
 WINDOW, SIGMA = 11, 1.5
-"""SSIM's Gaussian window in pixels (Wang et al. 2004); a smaller picture has a smaller window."""
+"""SSIM's Gaussian window in pixels (Wang et al. 2004); a smaller picture gets a smaller window."""
 _MSE_FLOOR = 1e-12
-"""Identical pictures are 120 dB apart, not infinitely many: JSON knows no infinity."""
+"""Lower limit of the error. It makes identical pictures 120 dB apart, because JSON has no infinity."""
 
 
 def missing_metrics() -> dict[str, str]:
-    """Metrics that cannot be had here, each with the sentence that the report prints."""
+    """Unavailable metrics, each with the sentence printed in the report."""
     sentences: dict[str, str] = {}
     if stlpips.weights_path() is None:
         sentences["st_lpips"] = "ST-LPIPS was not measured: stlpips-pytorch is not installed (requirements/bench.txt)."
@@ -56,12 +56,12 @@ def score(
     """Scores a picture against the truth, over the whole and over regions.
 
     Args:
-        image, truth: [H, W, 3] float, display-referred; clamped to [0, 1] as a display does.
+        image, truth: [H, W, 3] float, display-referred; clamped to [0, 1] like on a display.
         regions: name -> bool [H, W].
 
     Returns:
-        {region: {"pixels": int, metric: float | None}}, `WHOLE` among them. A metric is None where its package is
-        absent, where the picture is too small for it, or where the region is (nearly) empty.
+        {region: {"pixels": int, metric: float | None}}, including `WHOLE`. A metric is None without its package, if the
+        picture is too small for it, or if the region is (nearly) empty.
     """
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image and truth should be [H, W, 3] alike, got {tuple(image.shape)}, {tuple(truth.shape)}")
@@ -78,7 +78,7 @@ def psnr_by_region(image: Tensor, truth: Tensor, regions: Mapping[str, Tensor]) 
 
 
 def error_maps(image: Tensor, truth: Tensor) -> dict[str, Tensor | None]:
-    """Maps [H, W] of two pictures [H, W, 3] by metric (psnr_db: the squared error); None where it is not to be had."""
+    """{metric: map [H, W]} of two pictures [H, W, 3] (psnr_db: the squared error); None for an unavailable metric."""
     image, truth = image.float().clamp(0.0, 1.0), truth.float().clamp(0.0, 1.0)
     return {
         "psnr_db": (image - truth).double().square().mean(2),
@@ -89,7 +89,7 @@ def error_maps(image: Tensor, truth: Tensor) -> dict[str, Tensor | None]:
 
 
 def _over(maps: Mapping[str, Tensor | None], mask: Tensor) -> dict[str, float | int | None]:
-    """Each map's figure over a mask [H, W]."""
+    """The figure of each map over a mask [H, W]."""
     count = int(mask.sum())
     row: dict[str, float | int | None] = {"pixels": count}
     enough = count >= max(1, LEAST_SHARE * mask.numel())
@@ -100,12 +100,12 @@ def _over(maps: Mapping[str, Tensor | None], mask: Tensor) -> dict[str, float | 
 
 
 def psnr_of(mse: float) -> float:
-    """Decibels of a mean squared error of values in [0, 1]; at most 120."""
+    """PSNR in dB of a mean squared error of values in [0, 1]; at most 120."""
     return -10.0 * math.log10(max(mse, _MSE_FLOOR))
 
 
 def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
-    """SSIM at every pixel, mean over channels: [H, W] from [H, W, C]; data_range 1, borders renormalised.
+    """SSIM of every pixel, mean over channels: [H, W] from [H, W, C]; data_range 1, windows renormalised at borders.
 
     The window is `WINDOW` wide, or the largest odd width that fits the shorter side.
     """
@@ -125,7 +125,7 @@ def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def _blur_matrix(size: int, width: int) -> Tensor:
-    """[size, size] float64: rows are Gaussian windows cut at the border, each summing to 1."""
+    """[size, size] float64 matrix whose rows are Gaussian windows, clipped at the border, each summing to 1."""
     at = torch.arange(size, dtype=torch.float64)
     distance = at[:, None] - at[None, :]
     weights = torch.exp(-0.5 * (distance / SIGMA).square()) * (distance.abs() <= width // 2)
@@ -133,7 +133,7 @@ def _blur_matrix(size: int, width: int) -> Tensor:
 
 
 def flip_map(image: Tensor, truth: Tensor) -> Tensor | None:
-    """LDR-FLIP at every pixel [H, W], at the package's viewing distance (67 pixels per degree); None if absent."""
+    """[H, W] LDR-FLIP at the package's viewing distance (67 pixels per degree); None without the package."""
     if importlib.util.find_spec("flip_evaluator") is None:
         return None
     flip_evaluator: Any = importlib.import_module("flip_evaluator")
@@ -144,20 +144,20 @@ def flip_map(image: Tensor, truth: Tensor) -> Tensor | None:
 
 
 def best_share_psnr(image: Tensor, truth: Tensor, share: float = 0.9) -> float:
-    """PSNR in dB over the best `share` of the pixels: what is left when the worst errors are somebody's motion."""
+    """PSNR in dB over the best `share` of the pixels, which excludes the worst errors, usually due to movers."""
     errors = (image.clamp(0.0, 1.0) - truth.clamp(0.0, 1.0)).double().square().mean(2).flatten()
     return psnr_of(float(errors.sort().values[: max(1, math.floor(share * len(errors)))].mean()))
 
 
 def gradient_energy(image: Tensor, mask: Tensor | None = None) -> float:
-    """Mean squared gradient (forward differences) of Rec. 709 luma over pixels [H, W]: how sharp a picture is."""
+    """Mean squared gradient (forward differences) of Rec. 709 luma over pixels [H, W], a measure of sharpness."""
     luma = image.clamp(0.0, 1.0).double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
     energy = F.pad(luma[:, 1:] - luma[:, :-1], (0, 1)).square() + F.pad(luma[1:] - luma[:-1], (0, 0, 0, 1)).square()
     return float(energy.mean() if mask is None else energy[mask].mean())
 
 
 def gradient_magnitude(image: Tensor, mask: Tensor | None = None) -> float:
-    """Mean length of the gradient (forward differences) of Rec. 709 luma over pixels [H, W]: grain counts as detail."""
+    """Mean gradient magnitude (forward differences) of Rec. 709 luma over pixels [H, W]; grain counts as detail."""
     luma = image.clamp(0.0, 1.0).double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
     x, y = F.pad(luma[:, 1:] - luma[:, :-1], (0, 1)), F.pad(luma[1:] - luma[:-1], (0, 0, 0, 1))
     length = (x.square() + y.square()).sqrt()
@@ -169,22 +169,22 @@ def gradient_magnitude(image: Tensor, mask: Tensor | None = None) -> float:
 
 @dataclass
 class Summary:
-    """The paper's row of a table: the mean, and the mean of the worst shares of the frames."""
+    """A table row as in the paper: the mean, and means of the worst shares of the frames."""
 
     count: int
-    """Frames."""
+    """Number of frames."""
     mean: float
-    """Of all frames."""
+    """Mean of all frames."""
     bottom_75: float
-    """Of the worst 75 % of the frames (rounded up to whole frames), and so on."""
+    """Mean of the worst 75 % of the frames, rounded up to whole frames; likewise the next two."""
     bottom_50: float
     bottom_25: float
     worst: float
-    """The worst frame."""
+    """Value of the worst frame."""
 
 
 def summarise(values: Sequence[float | None], more_is_better: bool = True) -> Summary | None:
-    """The summary of the values that are there; None if none is."""
+    """Summary of the values that are not None; None without such values."""
     known = sorted((v for v in values if v is not None), reverse=not more_is_better)
     if not known:
         return None
@@ -196,38 +196,38 @@ def summarise(values: Sequence[float | None], more_is_better: bool = True) -> Su
 
 
 Key = tuple[str, str, int, int, int]
-"""(scene, cameras, seed, t*, pose): where two methods are compared."""
+"""(scene, cameras, seed, t*, pose) at which two methods are compared."""
 
 _UNITS = (("runs", 3), ("freezes", 4), ("frames", 5))
-"""Independent units of a comparison, and how many leading parts of `Key` name one."""
+"""Candidate units of independence, each with the number of leading parts of `Key` that identify it."""
 _LEAST_UNITS = 4
 
 
 @dataclass
 class Paired:
-    """Method a against method b on the frames that both have."""
+    """Comparison of method a with method b on the frames that both have."""
 
     mean: float
     """Mean difference a - b over frames."""
     se: float | None
     """Standard error of that mean, from the spread over independent units; None with fewer than two."""
     unit: str
-    """What was taken as independent: runs (scene and seed), freezes (and t*) or frames."""
+    """Unit taken as independent: runs (scene, cameras and seed), freezes (also t*) or frames."""
     units: int
-    """How many of them."""
+    """Number of these units."""
     frames: int
-    """Frames compared."""
+    """Number of compared frames."""
     frame_se: float | None
-    """The standard error if every frame were independent, which frames of one run are not: too small."""
+    """Standard error if all frames were independent. It is too small, because frames of one run are correlated."""
     verdict: str
-    """win: the difference is to a's favour by more than twice `se`; loss; undecided, as with fewer than four units."""
+    """win or loss if a is better or worse by more than twice `se` and there are at least four units; else undecided."""
 
 
 def paired(a: Mapping[Key, float | None], b: Mapping[Key, float | None], more_is_better: bool = True) -> Paired | None:
     """Compares two methods frame by frame. None if no frame has both.
 
-    Frames of one run fail together, so the error is taken over runs where at least four are at hand, else over
-    freezes, else over frames: units' means, weighted by their frames.
+    Frames of one run fail together. So the error is computed over runs if there are at least four, else over freezes if
+    at least four, else over frames. Means of units are weighted by their number of frames.
     """
     differences = {k: float(x) - float(y) for k, x in a.items() if x is not None and (y := b.get(k)) is not None}
     if not differences:
@@ -249,7 +249,7 @@ def paired(a: Mapping[Key, float | None], b: Mapping[Key, float | None], more_is
 
 
 def _clustered_error(values: np.ndarray, which: np.ndarray) -> float | None:
-    """Standard error of the mean of `values` [V] whose errors are shared within clusters `which` [V] of 0..G-1."""
+    """Standard error of the mean of `values` [V], with errors correlated within clusters `which` [V] of 0..G-1."""
     count = int(which.max()) + 1
     if count < 2:
         return None
@@ -258,9 +258,9 @@ def _clustered_error(values: np.ndarray, which: np.ndarray) -> float | None:
 
 
 def pareto_front(cost: Sequence[float], gain: Sequence[float]) -> list[int]:
-    """Indices of the points that no other beats: less or equal cost and more or equal gain, one of them strictly.
+    """Indices of the undominated points, ordered by cost.
 
-    Ordered by cost.
+    A point dominates another with less or equal cost and more or equal gain, one of them strictly.
     """
     front: list[int] = []
     for i in sorted(range(len(cost)), key=lambda i: (cost[i], -gain[i])):

@@ -23,7 +23,7 @@ COSTS: dict[str, tuple[str, Callable[[RunRecord], float | None]]] = {
     "frame_ms": ("rendering a frozen frame, milliseconds", lambda run: run.frozen_fps and 1000.0 / run.frozen_fps),
     "megabytes": ("model, megabytes", lambda run: run.model_bytes / 1e6),
 }
-"""File stem -> axis, figure of a run; less is better in all of them."""
+"""File stem -> (axis label, figure of a run); less is better for all."""
 _INK, _GRID, _GROUND = "#1d1d1f", "#d5d5da", "white"
 _COLOURS = {
     "hexplane": "#2f7ed8",
@@ -60,7 +60,7 @@ def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str) -
     axes.set_xscale("log")
     _limits(axes, [p[1] for p in points])
     named = [p for p in points if p[0].host == "auto" or p[0].variant != "default"]
-    # Colour and marker say which host; the names of six published ones would cover one another.
+    # Colour and marker already identify the host; labels of the six published ones would overlap.
     texts = [p[0].variant if p[0].variant == "reference" else p[0].label for p in named]
     points_of = [(p[1], p[2], text, _COLOURS.get(p[0].host, _INK)) for p, text in zip(named, texts, strict=True)]
     _labels(axes, points_of)
@@ -75,7 +75,7 @@ def cost_plot(path: Path, settings: Sequence[Setting], cost: str, region: str) -
 
 
 def _limits(axes: Any, prices: Sequence[float]) -> None:
-    """Room beside the points, and plain numbers on a logarithmic axis."""
+    """Sets axis limits with room at the sides of the points, and plain numbers on a logarithmic axis."""
     ticker: Any = importlib.import_module("matplotlib.ticker")
 
     low, high = min(prices), max(prices)
@@ -90,7 +90,7 @@ def _plain(value: float, position: int) -> str:
 
 
 def _legend(figure: Any, settings: Sequence[Setting]) -> None:
-    """Colours of the hosts and markers of the supervisions, under the plot."""
+    """Draws a legend of host colours and supervision markers below the plot."""
     Line2D: Any = importlib.import_module("matplotlib.lines").Line2D
 
     plain = {"color": "none", "markersize": 7}
@@ -105,7 +105,7 @@ def _legend(figure: Any, settings: Sequence[Setting]) -> None:
 
 
 def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
-    """Names to the right of points, pushed apart where they would lie on one another; (x, y, name, colour)."""
+    """Draws names to the right of points, moved apart where they overlap; named: (x, y, name, colour)."""
     withStroke: Any = importlib.import_module("matplotlib.patheffects").withStroke
 
     low, high = axes.get_ylim()
@@ -126,7 +126,7 @@ def _labels(axes: Any, named: Sequence[tuple[float, float, str, str]]) -> None:
 
 
 def strip(path: Path, results: Path, record: RunRecord, title: str, most: int = 6) -> Path | None:
-    """Truth above, ours below, worst frame first; None if the run kept no pictures."""
+    """Strip of frames with truth above and ours below, worst first; None if the run saved no pictures."""
     shown = record.pictures[:most]
     if not shown:
         return None
@@ -136,7 +136,7 @@ def strip(path: Path, results: Path, record: RunRecord, title: str, most: int = 
 
 
 def methods_strip(path: Path, results: Path, runs: Sequence[tuple[str, RunRecord]], title: str) -> Path | None:
-    """One frame as every method freezes it, truth first: the frame that all kept on which they differ most."""
+    """One frame as frozen by every method, after the truth: the common frame with the greatest spread in PSNR."""
     if not runs:
         return None
     kept = [{(p.t_star, p.pose): p for p in run.pictures} for _, run in runs]
@@ -158,7 +158,7 @@ def methods_strip(path: Path, results: Path, runs: Sequence[tuple[str, RunRecord
 
 
 def two_instants(path: Path, results: Path, record: RunRecord, title: str) -> Path | None:
-    """One pose at two instants, the truth beside, and the plates of the instants; None if the run has no such pair."""
+    """One pose at two instants with the truth and the plates of the instants; None if the run has no such pair."""
     pair: list[Picture] = record.two_instants
     if len(pair) != 2:
         return None
@@ -168,7 +168,7 @@ def two_instants(path: Path, results: Path, record: RunRecord, title: str) -> Pa
         "ours": [p.ours for p in pair],
         "truth": [p.truth for p in pair],
     }
-    if record.kind == "real":  # both are the plate at the pose
+    if record.kind == "real":  # the truth of both is the plate at the pose
         rows.pop("truth")
     return _grid(path, results, rows, heads, title)
 
@@ -181,7 +181,7 @@ def _grid(
     title: str,
     named: bool = True,
 ) -> Path:
-    """Pictures in rows with a name before each row and a head over each column (or over each picture)."""
+    """Pictures in rows, with a name before each row and a heading over each column or each picture."""
     plt = _pyplot()
     pictures = {name: [read_png(results / p) for p in paths] for name, paths in rows.items()}
     first = next(iter(pictures.values()))[0]
@@ -222,7 +222,7 @@ def _grid(
 
 
 def _pyplot() -> Any:
-    """matplotlib.pyplot without a window."""
+    """matplotlib.pyplot without windows."""
     importlib.import_module("matplotlib").use("Agg")
     return importlib.import_module("matplotlib.pyplot")
 

@@ -1,5 +1,5 @@
-"""The truth in a real clip: where nothing moves, the plate at pose n shows what the frozen shot must show at pose n,
-whatever t* is. Where nothing moves, the motion matte of the solve says (`motion/mattes.py`).
+"""Truth in a real clip: where nothing moves, the frozen shot at pose n must equal the plate at pose n, for any t*.
+The motion matte of the solve defines where nothing moves (`motion/mattes.py`).
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from torch_backend.shot import Shot
 from torch_backend.torch_types import from_numpy
 
 MARGIN = 8.0
-"""A still pixel this near to a mover, in pixels of a picture 640 wide, is no truth: outlines of movers are soft, and so
-are their mattes."""
+"""Distance to a mover, in pixels of a 640-pixel-wide picture, within which still pixels do not count as truth. Outlines
+of movers are soft, and so are their mattes."""
 
 
 def ensure_motion(shot: Shot) -> None:
-    """Finds the motion matte of a shot solved before there was one. JobError if the shot is not solved."""
+    """Computes the motion mattes of a shot solved by a version without them. JobError if the shot is not solved."""
     find_motion(shot, _Mute())
 
 
 def motion_shares(shot: Shot, frame: int, width: int, height: int) -> dict[str, Tensor]:
     """Shares of each pixel of a [height, width] picture: `rigid`, `still` and `moving`, float32 in [0, 1].
 
-    Rigid is what stands still and is far from all that moves; what is not known is neither still nor moving.
-    ValueError if the frame has no matte.
+    Rigid pixels are still and far from movers; unknown pixels are neither still nor moving. ValueError if the frame has
+    no matte.
     """
     labels = load_motion(shot, frame)
     if labels is None:
@@ -42,7 +42,7 @@ def motion_shares(shot: Shot, frame: int, width: int, height: int) -> dict[str, 
 
 
 def near(mask: NDArray[np.bool_], distance: float) -> NDArray[np.bool_]:
-    """The pixels that are at most `distance` pixels from one of the mask [H, W], and those of it."""
+    """Mask [H, W] dilated by a Euclidean distance in pixels."""
     import cv2
 
     if not mask.any():
@@ -55,9 +55,9 @@ def _resized(mask: NDArray[np.bool_], width: int, height: int) -> Tensor:
 
 
 def far_from(poses: Sequence[int], t_star: int, frames: int) -> list[int]:
-    """The poses that test a freeze at t*: more than a quarter of the clip's `frames` away (frame numbers alike)."""
+    """The poses that test a freeze at t*: more than a quarter of the clip's `frames` away, in frame numbers."""
     return [pose for pose in poses if abs(pose - t_star) > frames / 4]
 
 
 class _Mute(Reporter):
-    """A reporter to whom nobody listens."""
+    """A reporter without output."""

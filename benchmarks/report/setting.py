@@ -1,4 +1,4 @@
-"""All runs of one way of training and freezing, and their means: a row of the report's tables."""
+"""All runs of one way of training and freezing, with their means: a row of the report's tables."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from .metrics import METRICS, WHOLE, Key, Paired, Summary, paired, summarise
 from .records import FrameScore, RunRecord
 
 NONE = "–"
-"""Cell of a table in which there is nothing."""
+"""Text of an empty table cell."""
 
 
 @dataclass
 class Setting:
-    """All runs of one way of doing it, on one kind of scene."""
+    """All runs of one way of training and freezing, on one kind of scene."""
 
     label: str
     host: str
@@ -25,41 +25,41 @@ class Setting:
     variant: str
     cameras: str
     shown: str
-    """What its frames show: splats, withheld or delivered."""
+    """Variant of its frames: splats, developed, withheld or delivered."""
     runs: list[RunRecord]
 
     def summary(self, metric: str, region: str = WHOLE) -> Summary | None:
-        """Over all frames of all runs."""
+        """Summary of a metric over all frames of all runs."""
         return self.of_frames(lambda row: row.value(metric, region), METRICS[metric])
 
     def of_frames(self, read: Callable[[FrameScore], float | None], more_is_better: bool = True) -> Summary | None:
-        """Any figure of a frame, over all runs."""
+        """Summary of a figure of a frame over all runs."""
         return summarise([v for run in self.runs for v in run.per_frame(read)], more_is_better)
 
     def of_runs(self, read: Callable[[RunRecord], float | None]) -> float | None:
-        """Mean of any figure of a run; None if any run lacks it."""
+        """Mean of a figure of a run; None if any run lacks it."""
         values = [read(run) for run in self.runs]
         known = [v for v in values if v is not None]
         return float(np.mean(known)) if known and len(known) == len(values) else None
 
     def jod(self) -> float | None:
-        """Mean over instants of all runs."""
+        """Mean ColorVideoVDP over the instants of all runs; None without any."""
         values = [v for run in self.runs for v in run.jod.values() if v is not None]
         return float(np.mean(values)) if values else None
 
     def of_heldout(self, region: str) -> float | None:
-        """Mean PSNR in dB over a region of the clip's held-out frames of all runs; None if none has it."""
+        """Mean PSNR in dB over a region of the clip's held-out frames of all runs; None if no frame has the region."""
         values = [v for run in self.runs for v in run.heldout_values(region).values() if v is not None]
         return float(np.mean(values)) if values else None
 
     def against(self, other: Setting, metric: str, region: str = WHOLE) -> Paired | None:
-        """Frame by frame against another setting; `jod` instant by instant."""
+        """Comparison with another setting, frame by frame, or for `jod` instant by instant."""
         if metric == "jod":
             return self._against(other, RunRecord.jod_values)
         return self._against(other, lambda run: run.values(metric, region), METRICS[metric])
 
     def against_heldout(self, other: Setting, region: str) -> Paired | None:
-        """PSNR on the clip's held-out frames, frame by frame against another setting."""
+        """Comparison of PSNR on the clip's held-out frames with another setting, frame by frame."""
         return self._against(other, lambda run: run.heldout_values(region))
 
     def _against(
@@ -69,7 +69,7 @@ class Setting:
         return paired(mine, theirs, more_is_better)
 
     def ratio(self, other: Setting, read: Callable[[RunRecord], float | None]) -> float | None:
-        """Geometric mean over scenes and seeds of a cost here over the same there; None if no run of both has it."""
+        """Geometric mean, over scenes and seeds, of a cost relative to another setting's; None without common runs."""
         of_place = {run.place: read(run) for run in other.runs}
         pairs = [(read(run), of_place.get(run.place)) for run in self.runs]
         logs = [float(np.log(a / b)) for a, b in pairs if a and b]

@@ -1,8 +1,8 @@
 """ST-LPIPS, the shift-tolerant learnt distance of pictures (Ghildyal and Liu, ECCV 2022), on AlexNet.
 
-The package stlpips-pytorch brings the weights; its code does not import beside a CPU torch, and none of it is used: the
-network below is written from the layers' shapes and the paper's description. AlexNet's strides are replaced by blurred
-subsampling: a binomial 3x3 filter, stride 2, borders reflected by 2 pixels.
+The package stlpips-pytorch supplies the weights. Its code cannot be imported with a CPU-only torch and is not used.
+This network is written from the layers' shapes and the paper's description. Blurred subsampling replaces AlexNet's
+strides: a binomial 3x3 filter, stride 2, borders reflected by 2 pixels.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from torch.nn import functional as F
 
 _PACKAGE, _WEIGHTS = "stlpips-pytorch", "weights/vST0.0/alex_shift_tolerant.pth"
 _LEAST_SIDE = 32
-"""Below this the last layers have too few pixels to be reflected."""
+"""Least side in pixels, below which the last layers are too small for reflected borders."""
 
 
 def weights_path() -> Path | None:
-    """The package's weight file; None if it is not installed."""
+    """The package's weight file; None without the package."""
     try:
         files = importlib.metadata.files(_PACKAGE) or []
     except importlib.metadata.PackageNotFoundError:
@@ -37,8 +37,9 @@ def _weights(path: Path) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def distance_map(image: Tensor, truth: Tensor) -> Tensor | None:
-    """Distance at every pixel [H, W] of two pictures [H, W, 3] in [0, 1]; its mean is the published distance up to the
-    layers' upsampling. None if the weights are absent or a side is below 32 pixels.
+    """[H, W] distance map of two pictures [H, W, 3] in [0, 1]; None without weights or if a side is below 32 pixels.
+
+    Its mean is the published distance, except for the layers' upsampling.
     """
     path = weights_path()
     if path is None or min(image.shape[:2]) < _LEAST_SIDE:
@@ -53,7 +54,7 @@ def distance_map(image: Tensor, truth: Tensor) -> Tensor | None:
 
 
 def _features(image: Tensor, w: dict[str, Tensor]) -> list[Tensor]:
-    """The five layers of a picture [H, W, 3], each [1, C, h, w] and of unit length along C."""
+    """The five layers of a picture [H, W, 3], each [1, C, h, w] and normalised to unit length along C."""
     x = (image.permute(2, 0, 1)[None] * 2.0 - 1.0 - w["scaling_layer.shift"]) / w["scaling_layer.scale"]
     layers = [F.relu(_halve(_convolve(x, w, "slice1.0", 2), w["net.slice1.1.filt"]))]
     for name, halved in (("slice2.5", "slice2.4"), ("slice3.9", "slice3.8"), ("slice4.11", ""), ("slice5.13", "")):
@@ -67,5 +68,5 @@ def _convolve(x: Tensor, w: dict[str, Tensor], name: str, padding: int) -> Tenso
 
 
 def _halve(x: Tensor, taps: Tensor) -> Tensor:
-    """Blurs by `taps` [C, 1, 3, 3] and takes every second pixel."""
+    """Blurs by `taps` [C, 1, 3, 3] and keeps every second pixel."""
     return F.conv2d(F.pad(x, (2, 2, 2, 2), mode="reflect"), taps, stride=2, groups=x.shape[1])

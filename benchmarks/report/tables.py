@@ -1,4 +1,4 @@
-"""Records into tables: means as the paper gives them, regions, costs, paired comparisons, ablations."""
+"""Turns records into tables: means as in the paper, regions, costs, paired comparisons, ablations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HOST_NAMES = {
     "auto": "auto (ours)",
     "static": "static 3DGS",
 }
-"""TrainConfig.method -> what it is called."""
+"""TrainConfig.method -> displayed name."""
 METRIC_NAMES = {"psnr_db": "PSNR, dB", "ssim": "SSIM", "st_lpips": "ST-LPIPS", "flip": "FLIP", "jod": "JOD"}
 REGION_NAMES = {
     WHOLE: "whole frame",
@@ -30,9 +30,9 @@ REGION_NAMES = {
     RIGID: "what never moves",
 }
 SHOWN_NAMES = {DEVELOPED: "developed", WITHHELD: "plate detail, plate withheld", DELIVERED: "plate detail"}
-"""What frames show, besides splats -> what is added to a method's name."""
+"""Variant of a frame, except Gaussians alone -> suffix of the method's name."""
 QUERIES = {"plain": "at t*", "nearest": "nearest seen"}
-"""How Gaussians are asked -> in a table."""
+"""Time query of the Gaussians -> text in a table."""
 QUERY_NOTE = (
     "Hosts without anchors and with the paper's are frozen at t* itself, as published; with support every Gaussian is "
     "asked at the time nearest to t* at which it was seen."
@@ -49,20 +49,20 @@ _DIGITS = {"psnr_db": 2, "ssim": 4, "st_lpips": 4, "flip": 4, "jod": 2}
 
 @dataclass
 class Table:
-    """A table of text, for Markdown and for report.json."""
+    """A table of text cells, for Markdown and for report.json."""
 
     title: str
     header: list[str]
     rows: list[list[str]]
     note: str = ""
     best: int | None = None
-    """The row that is printed bold."""
+    """Index of the bold row, or None."""
 
 
 def settings_of(records: Sequence[RunRecord], kind: str) -> list[Setting]:
-    """The records of synthetic or real scenes by setting, hosts in the order of `HOST_NAMES`.
+    """The records of synthetic or real scenes grouped by setting, with hosts in the order of `HOST_NAMES`.
 
-    What was judged developed and with plate detail too is a setting of its own, after that of splats alone.
+    Each variant in `detailed` is a separate setting, after the one of Gaussians alone.
     """
     alone = [r for r in records if r.kind == kind]
     chosen = [shown for r in alone for shown in (r, *(r.as_shown(name) for name in r.detailed))]
@@ -101,7 +101,7 @@ def _label(host: str, supervision: str, variant: str) -> str:
 
 
 def all_tables(records: Sequence[RunRecord]) -> list[Table]:
-    """Every table that the records have figures for."""
+    """All tables for which the records have figures."""
     synthetic, real = settings_of(records, "synthetic"), settings_of(records, "real")
     main = [s for s in synthetic if s.variant in ("default", "reference")]
     tables: list[Table] = []
@@ -215,8 +215,8 @@ def _costs(settings: Sequence[Setting]) -> Table:
 
 
 def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
-    """(a, b) to be told apart: every host with anchors against without, ours against hosts and against static,
-    developed instants and plate detail against splats alone."""
+    """Compared pairs (a, b): hosts with and without anchors; ours and each other host, including static; developed
+    instants or plate detail, and Gaussians alone."""
     pairs: list[tuple[Setting, Setting]] = []
     for group in _places(settings):
         at = {(s.variant, s.host, s.supervision): s for s in group if s.shown == SPLATS}
@@ -236,11 +236,11 @@ def comparisons(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
 
 
 GATELESS = ("default", "hexplane")
-"""(variant, host) of what `auto` is without its gate: all Gaussians move."""
+"""(variant, host) that equals `auto` without its gate, with all Gaussians moving."""
 
 
 def _places(settings: Sequence[Setting]) -> list[list[Setting]]:
-    """Settings that can be told apart: those of the same cameras and preset."""
+    """Groups of comparable settings: those with the same cameras and preset."""
     by_place: dict[tuple[str, str], list[Setting]] = {}
     for s in settings:
         by_place.setdefault((s.cameras, s.preset), []).append(s)
@@ -248,7 +248,7 @@ def _places(settings: Sequence[Setting]) -> list[list[Setting]]:
 
 
 def _who_wins(settings: Sequence[Setting]) -> Table:
-    """The claims one by one: mean paired difference, its standard error, and what it cost."""
+    """Table of all comparisons: mean paired difference, its standard error, and relative cost."""
     header = ["a against b", "where", "cost a / b", "PSNR a - b, dB", "standard error", "n", "frames", "verdict"]
     rows: list[list[str]] = []
 
@@ -358,17 +358,17 @@ def _real_extra(settings: Sequence[Setting]) -> Table:
 
 
 def number(value: float | None, metric: str) -> str:
-    """A figure of a metric with its digits."""
+    """A figure formatted with the digits of its metric."""
     return plain(value, _DIGITS[metric])
 
 
 def plain(value: float | None, digits: int) -> str:
-    """A number, or a dash for one that was not measured."""
+    """A formatted number, or a dash for None."""
     return NONE if value is None else f"{value:.{digits}f}"
 
 
 def pace(run: RunRecord) -> str:
-    """Threads and runs at once while it trained: "1 × 2"."""
+    """Threads and number of runs at once during training, like "1 × 2"."""
     return NONE if run.threads is None or run.jobs is None else f"{run.threads} × {run.jobs}"
 
 
@@ -378,12 +378,12 @@ def _best(values: Sequence[float | None]) -> int | None:
 
 
 def to_be_seen(setting: Setting) -> bool:
-    """Whether a setting belongs into a picture of all methods: each with splats alone, ours as it is delivered too."""
+    """True for settings in pictures of all methods: all with Gaussians alone, and ours also as delivered."""
     return setting.shown == SPLATS or (setting.shown == DELIVERED and setting.host == "auto")
 
 
 def markdown(table: Table) -> str:
-    """The table in Markdown, title and note included."""
+    """The table in Markdown, with title and note."""
     lines = [f"### {table.title}", "", "| " + " | ".join(table.header) + " |"]
     lines += ["|" + "|".join("---" if i == 0 else "---:" for i in range(len(table.header))) + "|"]
     for i, row in enumerate(table.rows):

@@ -1,5 +1,5 @@
-"""What hard scenes are judged by, beside the error of a region: whether a small mover is there at all, and whether
-glass and mirrors, which change with the view, were taken for what changes with time.
+"""Additional figures of hard scenes: recall of a small mover, and false motion on glass and mirrors, which change with
+the view but not with time.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from .truth import TruthScene
 
 RECALL_DISTANCE = 0.15
-"""A pixel shows the thing if its colour is at most this far from the truth: root mean square over the channels, of
-display-referred values in [0, 1]. PSNR of such a pixel is 16.5 dB: soft, displaced by a fraction of it, but there."""
+"""Greatest distance of a pixel's colour from the truth with which it shows the thing: root mean square over channels of
+display-referred values in [0, 1]. It equals a PSNR of 16.5 dB: the thing may be soft or slightly displaced."""
 RECALL_APART = 0.1
-"""Thing and background less far apart than this, in the same measure, cannot be told from each other: such pixels do
-not count."""
+"""Distance of thing and background, in the same measure, below which they are too similar; such pixels do not
+count."""
 LEAST_PIXELS = 6
-"""A pose in which fewer pixels should show the thing says nothing by itself: it counts in the sum only."""
+"""Least pixels of the thing for a pose to be the worst one; with fewer it only counts in the sum."""
 OPENED = 0.5
-"""A pixel of a frozen frame was taken for something that moves if its motion matte is above this."""
+"""Motion matte above which a pixel of a frozen frame was treated as moving."""
 
 
 def recalled(image: Tensor, truth: Tensor, behind: Tensor, mask: Tensor) -> tuple[int, int]:
     """(pixels that show the thing, pixels that should) of a frozen frame.
 
-    A pixel shows it if its colour is within `RECALL_DISTANCE` of the truth, and nearer to that than to what is behind.
+    A pixel shows it if its colour is within `RECALL_DISTANCE` of the truth, and closer to the truth than to `behind`.
 
     Args:
         image, truth, behind: [H, W, 3] display-referred in [0, 1]; `behind` is the truth without the thing.
@@ -43,21 +43,21 @@ def recalled(image: Tensor, truth: Tensor, behind: Tensor, mask: Tensor) -> tupl
 
 
 def _distance(a: Tensor, b: Tensor) -> Tensor:
-    """[H, W] root mean square over channels."""
+    """[H, W] root mean square difference over channels."""
     return (a.float().clamp(0.0, 1.0) - b.float().clamp(0.0, 1.0)).square().mean(2).sqrt()
 
 
 def recall_of(
     behind: Mapping[str, Tensor], image: Tensor, truth: Tensor, regions: Mapping[str, Tensor]
 ) -> dict[str, list[int]]:
-    """{thing: [pixels that show it, pixels that should]} of a frozen frame, for every thing that has a `behind`."""
+    """{thing: [pixels that show it, pixels that should]} of a frozen frame, for every thing in `behind`."""
     return {name: list(recalled(image, truth, b, regions[name])) for name, b in behind.items() if name in regions}
 
 
 def overall(counts: Sequence[tuple[int, int]]) -> tuple[float | None, float | None]:
-    """Shares of what `recalled` counted in several frames: of all their pixels, and of the worst frame's.
+    """(share over all pixels, share in the worst frame) of the counts of `recalled` in several frames.
 
-    None where there is nothing to count; frames of fewer than `LEAST_PIXELS` are no worst one.
+    None without counted pixels. Frames with fewer than `LEAST_PIXELS` cannot be the worst one.
     """
     should = sum(of for _, of in counts)
     each = [found / of for found, of in counts if of >= LEAST_PIXELS]
@@ -65,7 +65,7 @@ def overall(counts: Sequence[tuple[int, int]]) -> tuple[float | None, float | No
 
 
 def opened_on(motion: Tensor, regions: Mapping[str, Tensor]) -> dict[str, float]:
-    """{pane: share of it that a freeze's motion matte [H, W] calls moving}, for panes that are in the picture."""
+    """{pane: share of it that a freeze's motion matte [H, W] calls moving}, for visible panes."""
     return {n: float((motion[regions[n]] > OPENED).float().mean()) for n in PANES if n in regions and regions[n].any()}
 
 

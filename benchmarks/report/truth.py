@@ -1,10 +1,10 @@
-"""Scenes that a freeze can be judged on: rendered truth in a folder, or a real clip where nothing moves.
+"""Scenes with a truth for freezes: rendered truth in a folder, or a real clip where nothing moves.
 
-A folder of truth (written by benchmarks/synthetic, or by whoever has some):
+Layout of a folder of truth, written by benchmarks/synthetic or another source:
 
     truth.json                     version, name, cameras, shot, fps, t_stars, poses, regions
     truth/<t*>_<pose>.png          the scene frozen at frame t*, seen from the pose of frame `pose`
-    regions/<t*>_<pose>_<name>.png white where the region is, one per name in `regions`
+    regions/<t*>_<pose>_<name>.png white inside the region, one per name in `regions`
 
 `shot` is the solved shot folder to train on, relative to truth.json; frame numbers are those of its clip.
 """
@@ -26,22 +26,22 @@ from .real import ensure_motion, far_from, motion_shares
 
 TRUTH_VERSION = 1
 REGIONS = ("seen", "never_seen", "moving", "static")
-"""By truth: visible in the clip's frame at t*; not; on something that moves in the clip; on nothing that does."""
+"""Regions by truth: visible in the clip's frame at t*, or not; on a mover of the clip, or not."""
 PANES = ("glass", "mirror")
-"""Of a hard scene: pixels of a window's pane and of a mirror in which nothing moves, by truth."""
+"""Panes of a hard scene: pixels of a window's pane and of a mirror in which nothing moves, by truth."""
 HELD = "held"
-"""Optional: pixels in which the plate of the pose shows another state than t*, although nothing moves there within half
+"""Optional region: pixels where the plate of the pose shows another state than t*, although they are still within half
 a second of that plate."""
 HELD_THINGS = ("raised", "turned", "resting", "leaving", "set_down")
-"""An arm that is raised once; a head that turns unseen; a hand that leaves a table; a person who leaves; a box."""
+"""An arm raised once; a head that turns unseen; a hand that leaves a table; a person who leaves; a box put down."""
 THINGS = (*PANES, "wall", "swinging", "arm", "hair", *HELD_THINGS, HELD)
-"""Besides: the still wall around panes; something that swings on a thread; an arm that gestures; loose hair."""
+"""Names of all things of hard scenes, including the still wall near panes, a swinging object, a gesturing arm, hair."""
 RIGID = "rigid"
 """The region of a real clip in which the plate is the truth."""
 
 
 class TruthScene(Protocol):
-    """What a scene is asked for."""
+    """Interface of a scene with truth."""
 
     name: str
     kind: str
@@ -51,46 +51,46 @@ class TruthScene(Protocol):
     shot: Shot
     """The solved shot to train on."""
     key: str
-    """Identifies shot and truth by content."""
+    """Hash of the content of shot and truth."""
     fps: float
-    """Poses per second, when the poses of an instant are shown as a sequence; 0 if they are none."""
+    """Poses per second when the poses of an instant are shown as a sequence; 0 if they do not form one."""
     t_stars: list[int]
     """Frame numbers of the instants."""
     judged: str
     """Region whose PSNR ranks frames."""
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
-        """Frame numbers of the poses that test a freeze at t*, given the frames that were kept out of training."""
+        """Frame numbers of the poses that test a freeze at t*, given the held-out frames."""
         ...
 
     def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
-        """[height, width, 3] display-referred in [0, 1]."""
+        """[height, width, 3] truth, display-referred in [0, 1]."""
         ...
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """name -> bool [height, width]; in hard scenes some of `THINGS` too."""
+        """{name: bool [height, width]}; in hard scenes also some of `THINGS`."""
         ...
 
     def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """thing -> [height, width, 3], the truth without it, right where the thing is; {} if that is not known."""
+        """{thing: [height, width, 3] truth without it, valid inside the thing}; {} if unknown."""
         ...
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """`moving`, `static` and what there is of `THINGS`, bool [height, width], of the clip's own frame.
+        """`moving`, `static` and the available `THINGS`, bool [height, width], of the clip's own frame.
 
-        {} if that is not known.
+        {} if unknown.
         """
         ...
 
 
 class TruthFolder:
-    """A folder of truth, see the module."""
+    """A folder of truth, laid out as described in this module."""
 
     kind = "synthetic"
     judged = "whole"
 
     def __init__(self, folder: str | Path) -> None:
-        """FileNotFoundError or ValueError if the folder is none."""
+        """FileNotFoundError or ValueError for an invalid folder."""
         self.folder = Path(folder).absolute()
         facts = read_json(self.folder / "truth.json")
         check_version(facts, str(self.folder / "truth.json"), TRUTH_VERSION)
@@ -105,29 +105,29 @@ class TruthFolder:
         self.key = content_key(facts, read_json(self.shot.cameras))
 
     def poses(self, t_star: int, held_out: Sequence[int]) -> list[int]:
-        """All poses that have a truth."""
+        """All poses with truth."""
         return list(self._poses)
 
     def truth(self, t_star: int, pose: int, width: int, height: int) -> Tensor:
-        """The rendered truth, as `TruthScene` says."""
+        """The rendered truth, see `TruthScene`."""
         return read_image(self.folder / "truth" / f"{t_star:06d}_{pose:06d}.png", width, height)
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """The regions by truth; a pixel belongs to one if more than half of it does."""
+        """The regions by truth; a pixel belongs to a region that covers more than half of it."""
         named = {name: self.folder / "regions" / f"{t_star:06d}_{pose:06d}_{name}.png" for name in self._regions}
         return {name: read_image(path, width, height).mean(2) > 0.5 for name, path in named.items()}
 
     def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """Nothing: the folder holds none."""
+        """{}: the folder has no such pictures."""
         return {}
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """Nothing: the folder holds none."""
+        """{}: the folder has no such regions."""
         return {}
 
 
 class RealScene:
-    """A real clip: the plate is the truth on the pixels that stand still through the clip, far from what moves."""
+    """A real clip whose plates are the truth at pixels that are still and far from movers."""
 
     kind = "real"
     cameras = "solved"
@@ -136,8 +136,8 @@ class RealScene:
 
     def __init__(self, shot: Shot, instants: int = 8) -> None:
         """Args:
-            shot: a solved shot; it gets its motion matte here if it has none.
-            instants: how many t*, evenly spread over the solved frames.
+            shot: a solved shot; its motion mattes are computed if missing.
+            instants: number of t*, evenly spaced over the solved frames.
 
         JobError if the shot is not solved.
         """  # fmt: skip
@@ -157,14 +157,14 @@ class RealScene:
         return read_image(self.shot.plate(pose), width, height)
 
     def regions(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """The rigid pixels of the plate; one counts if nearly all of it is."""
+        """The rigid pixels of the plate; more than 95 % of a pixel must be rigid."""
         return {RIGID: motion_shares(self.shot, pose, width, height)["rigid"] > 0.95}
 
     def behind(self, t_star: int, pose: int, width: int, height: int) -> dict[str, Tensor]:
-        """Nothing: nobody has seen it."""
+        """{}: unknown for a real clip."""
         return {}
 
     def frame_regions(self, frame: int, width: int, height: int) -> dict[str, Tensor]:
-        """Static: nearly all of the pixel stands still; moving: nearly all of it moves. What is unknown is neither."""
+        """`static` and `moving` pixels: more than 95 % of the pixel is still, or moves. Unknown pixels are neither."""
         shares = motion_shares(self.shot, frame, width, height)
         return {"moving": shares["moving"] > 0.95, "static": shares["still"] > 0.95}

@@ -1,4 +1,4 @@
-"""The report's folder from a folder of records: report.json, report.md, plots and strips."""
+"""Writes the report's folder from a folder of records: report.json, report.md, plots and strips."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ TITLE = "Frozen time: speed against error"
 def write_report(
     results: Path, folder: Path, run_ids: Sequence[str] | None = None, missing: Sequence[str] = (), command: str = ""
 ) -> Path:
-    """Writes the report of the records in `results` (those of `run_ids`, if given) and returns its Markdown file.
+    """Writes the report of the records in `results`, or of those of `run_ids`, and returns its Markdown file.
 
     Args:
-        folder: made if it is not there; files of an older report are replaced.
-        said: sentences about what is missing, besides the metrics that the records lack.
-        command: what to type to repeat it all.
+        folder: made if missing; files of an older report are replaced.
+        missing: sentences about missing parts, in addition to the metrics that the records lack.
+        command: command that repeats the benchmark.
 
-    ValueError if there is no record, or a damaged one. Without matplotlib there are no pictures, and a sentence.
+    ValueError without records, or for a damaged one. Without matplotlib a sentence replaces the plots.
     """
     records = load_records(results, run_ids)
     if not records:
@@ -53,7 +53,7 @@ def write_report(
 
 
 def _facts(records: Sequence[RunRecord], command: str) -> list[str]:
-    """Lines of Markdown, with HTML in it: runs, machines, dates, command."""
+    """Lines of Markdown with HTML: runs, machines, dates, command."""
     machines = sorted({f"{r.machine['processor']}, {r.machine['cores']} cores" for r in records if r.machine})
     dates = sorted(r.finished for r in records if r.finished)
     scenes = sorted({f"{r.scene} ({r.kind}, {r.cameras} cameras)" for r in records})
@@ -78,7 +78,7 @@ def _plots(records: Sequence[RunRecord], folder: Path) -> list[tuple[str, Path]]
 
 
 def _figures(settings: Sequence[Setting], results: Path, folder: Path) -> list[tuple[str, Path]]:
-    """Per scene: every method on one frame, our worst frames, one pose at two instants."""
+    """Figures per scene: every method on one frame, our worst frames, one pose at two instants."""
     figures: list[tuple[str, Path]] = []
     scenes = dict.fromkeys((run.scene, run.cameras) for s in settings for run in s.runs)
     for scene, cameras in scenes:

@@ -1,4 +1,4 @@
-"""Synthetic scenes with truth: people who hold still and drift, seen by a handheld camera (docs/synthetic.md)."""
+"""Synthetic scenes with truth: people who hold still and sway, filmed by a handheld camera (docs/synthetic.md)."""
 
 from .folder import Regions, SyntheticScene
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def arguments(argv: list[str] | None) -> argparse.Namespace:
-    """The command line."""
+    """The parsed command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.synthetic", description=__doc__)
     parser.add_argument("--size", choices=list(SIZES), default="quick")
     parser.add_argument(
@@ -38,7 +38,7 @@ def arguments(argv: list[str] | None) -> argparse.Namespace:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """0 if every scene is there; 1 with one sentence on standard error otherwise."""
+    """Makes the scenes; returns 0, or 1 with one sentence on standard error if a scene cannot be made."""
     options = arguments(argv)
     size = SIZES[options.size]
     seeds = options.seeds or list(REPORT_SEEDS)[: size.scenes]

@@ -1,6 +1,6 @@
-"""A handheld camera: walks forward, pans, goes and returns, or orbits; or one that turns on a tripod.
+"""Camera paths: a handheld camera that walks forward, pans, goes and returns, or orbits; or one that turns on a tripod.
 
-World in metres, z up; axes OpenCV.
+World in metres, z up; camera axes as in OpenCV.
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ import numpy as np
 from .noise import Array, stream, wander
 
 FOCAL_PER_WIDTH = 0.85
-"""Focal length over image width: 61 degrees across, as a phone's main camera."""
+"""Focal length relative to image width: a horizontal angle of 61 degrees, like a phone's main camera."""
 
 PIVOT_METRES = 0.05
-"""How far a lens stands before the axis that a tripod's head turns about."""
+"""Distance of the lens in front of the rotation axis of a tripod's head."""
 
 
 @dataclass(frozen=True)
 class CameraMove:
-    """The path of one scene, as a function of time."""
+    """The camera path of one scene as a function of time."""
 
     move: str
-    """One of sizes.CAMERA_MOVES, or tripod: it turns about a pivot and nobody's hand is on it."""
+    """One of sizes.CAMERA_MOVES, or tripod: it turns about a pivot without a hand's tremble."""
     seed: int
     duration: float
-    """Seconds of the clip: the path is walked once in this time."""
+    """Seconds of the clip, in which the path is walked once."""
 
     def eyes_and_targets(self, seconds: Array) -> tuple[Array, Array]:
-        """([T, 3] where it is, [T, 3] where it looks), before the hand trembles."""
+        """([T, 3] positions, [T, 3] targets of the view), before the hand's tremble."""
         rng = stream(self.seed, "camera path")
         u = np.clip(seconds / self.duration, -0.2, 1.2)
         height = rng.uniform(1.45, 1.65)
@@ -63,7 +63,7 @@ class CameraMove:
         return eyes, np.column_stack([target, np.full_like(u, height - rng.uniform(0.25, 0.5))])
 
     def world_to_camera(self, seconds: Array) -> Array:
-        """[T, 4, 4] with the tremble of the hand: centimetres and half degrees, at walking pace and faster."""
+        """[T, 4, 4] including the hand's tremble: centimetres and half degrees, at walking pace and faster."""
         eyes, targets = self.eyes_and_targets(seconds)
         if self.move == "tripod":
             return np.array([_look_at(e, t, np.zeros(3)) for e, t in zip(eyes, targets, strict=True)])
@@ -74,7 +74,7 @@ class CameraMove:
 
 
 def _look_at(eye: Array, target: Array, tremble: Array) -> Array:
-    """[4, 4] world-to-camera from `eye` to `target`, then turned by small angles about the camera's own axes."""
+    """[4, 4] world-to-camera from `eye` to `target`, then rotated by small angles about the camera's axes."""
     z = target - eye
     z /= np.linalg.norm(z)
     x = np.cross(z, [0.0, 0.0, 1.0])
@@ -93,6 +93,6 @@ def _look_at(eye: Array, target: Array, tremble: Array) -> Array:
 
 
 def intrinsics(width: int, height: int) -> Array:
-    """[3, 3] in pixels, pixel centres at +0.5: square pixels, the principal point in the middle."""
+    """[3, 3] in pixels, pixel centres at +0.5: square pixels, principal point at the centre."""
     focal = FOCAL_PER_WIDTH * width
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])

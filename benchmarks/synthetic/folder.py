@@ -1,11 +1,11 @@
-"""Reads a finished scene. numpy and the product's PNG reader; nothing that renders.
+"""Reads a finished scene with numpy and the product's PNG reader, without rendering.
 
-scene.json               format version, cameras, instants, how it was made
+scene.json               format version, cameras, instants, generator settings
 frames/NNNNNN.png        the clip: 8-bit sRGB, frame n at time n, numbered from 1
 masks/NNNNNN.npz         depth_mm, moving: of the clip's frame
 truth/<t*>/NNNNNN.png    the scene frozen at t*, from the camera of frame NNNNNN
 truth/<t*>/NNNNNN.npz    depth_mm, seen, moving: of that picture
-truth/<t*>/behind/NNNNNN.png   in scenes of some kinds: what stands behind the thing that the scene is about
+truth/<t*>/behind/NNNNNN.png   in scenes of some kinds: the background behind the scene's thing
 
 Masks and truth of a hard scene also hold thing_<name>, see regions.py.
 """
@@ -28,21 +28,21 @@ from .sizes import FORMAT_VERSION, THING
 
 @dataclass(frozen=True)
 class Regions:
-    """What is known of the pixels of one picture of the truth."""
+    """Depth and masks of one picture of the truth."""
 
     depth: NDArray[np.float32]
     """[H, W] metres along the camera's axis, to a millimetre; inf for sky."""
     moving: NDArray[np.bool_]
-    """[H, W] the surface point is at some frame of the clip elsewhere in this view, by more than `moving_px`."""
+    """[H, W] the surface point moves in this view by more than `moving_px` at some frame of the clip."""
     seen: NDArray[np.bool_]
     """[H, W] the surface point is visible in the clip's own frame t*."""
     things: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    """name -> [H, W]: what a hard scene is about: glass, mirror and the wall beside them, swinging, arm, hair, what is
-    held, and the region held."""
+    """{name: [H, W]} things of a hard scene: glass, mirror and the nearby wall, swinging, arm, hair, the held things,
+    and the region held."""
 
     @classmethod
     def of(cls, data: Mapping[str, NDArray]) -> Regions:
-        """From the arrays of a scene's .npz file; of a frame of the clip, which has no `seen`, all of it is."""
+        """Regions from the arrays of an .npz file. Clip frames have no `seen`; all their pixels count as seen."""
         moving = data["moving"]
         things = {name.removeprefix(THING): data[name] for name in data if name.startswith(THING)}
         seen = data["seen"] if "seen" in data else np.ones_like(moving)
@@ -51,13 +51,13 @@ class Regions:
 
 @dataclass(frozen=True)
 class SyntheticScene:
-    """A clip with exact cameras, and the truth at some instants. Frames are known by their numbers, from 1."""
+    """A clip with exact cameras, and the truth at some instants. Frame numbers start at 1."""
 
     root: Path
     name: str
     seed: int
     kind: str
-    """plain, or one of the limits."""
+    """plain, or one of the other kinds in `sizes.KINDS`."""
     size: str
     width: int
     height: int
@@ -69,15 +69,15 @@ class SyntheticScene:
     world_to_camera: dict[int, NDArray[np.float64]]
     """{frame: [4, 4]}, OpenCV axes, metres."""
     t_stars: list[int]
-    """Instants that have a truth."""
+    """Instants with truth."""
     poses: list[int]
-    """Frames at whose camera each truth was rendered."""
+    """Frames whose cameras render each truth."""
     info: dict[str, Any]
-    """All of scene.json."""
+    """All content of scene.json."""
 
     @classmethod
     def load(cls, path: str | Path) -> SyntheticScene:
-        """A finished scene. FileNotFoundError if it is not (yet) one, ValueError if it is from a newer version."""
+        """A finished scene. FileNotFoundError if it is not finished, ValueError for another format version."""
         root = Path(path)
         record = root / "scene.json"
         if not record.is_file():
@@ -104,11 +104,11 @@ class SyntheticScene:
         )
 
     def frame_path(self, frame: int) -> Path:
-        """Picture of a frame of the clip."""
+        """Path of the picture of a clip frame."""
         return self.root / "frames" / f"{frame:06d}.png"
 
     def truth_path(self, t_star: int, pose: int) -> Path:
-        """Picture of the scene frozen at `t_star` from the camera of frame `pose`."""
+        """Path of the picture of the scene frozen at `t_star`, from the camera of frame `pose`."""
         return self.root / "truth" / f"{t_star:06d}" / f"{pose:06d}.png"
 
     def frame(self, frame: int) -> NDArray[np.uint8]:
@@ -130,21 +130,21 @@ class SyntheticScene:
             return Regions.of(data)
 
     def behind(self, t_star: int, pose: int) -> NDArray[np.uint8] | None:
-        """[H, W, 3] uint8 sRGB: the truth without the thing that the scene is about, or with all that is held in its
-        other state; black away from it.
+        """[H, W, 3] uint8 sRGB truth without the scene's thing, or with all held things in their other state; black
+        away from it.
 
-        None if the kind has none, or that view does not show it.
+        None if the kind has none, or if the view does not show it.
         """
         path = self.truth_path(t_star, pose)
         path = path.parent / "behind" / path.name
         return read_png(path) if path.is_file() else None
 
     def frame_depth(self, frame: int) -> NDArray[np.float32]:
-        """[H, W] metres, inf for sky, of a frame of the clip."""
+        """[H, W] depth of a clip frame in metres, inf for sky."""
         return self.frame_regions(frame).depth
 
     def frame_moving(self, frame: int) -> NDArray[np.bool_]:
-        """[H, W] what moves in a frame of the clip: see Regions.moving."""
+        """[H, W] moving pixels of a clip frame, see Regions.moving."""
         return self.frame_regions(frame).moving
 
     def centres(self) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
-"""One scene from its seed: geometry of every frame, textures, cameras, and the list of pictures to render.
+"""Makes one scene from its seed: geometry of every frame, textures, cameras, and the list of pictures to render.
 
-Written into the scene's folder: geometry/static.npz, geometry/<name>.npz and <name>.npy (vertices [T, V, 3] of
-everything that moves), textures/*.png, and plan.json, last: what render_bpy.py reads.
+Writes to the scene's folder: geometry/static.npz, geometry/<name>.npz and <name>.npy (vertices [T, V, 3] of every
+mover), textures/*.png, and finally plan.json, the input of render_bpy.py.
 """
 
 from __future__ import annotations
@@ -37,52 +37,53 @@ SHUTTER_SECONDS = 0.06
 """Time between the first and the last row of a frame in `rolling-shutter`."""
 SHUTTER_BANDS = 9
 BEHIND_MARGIN = 6
-"""Pixels around a thing that are rendered without it."""
+"""Margin in pixels around a thing that is rendered without it."""
 SHUTTER_FRAMES, SUBFRAMES, SUBFRAME_OVERSIZE = 0.5, 3, 2
-"""Of `held`: how long the shutter is open, in frame intervals (a 180 degree shutter); how many pictures are averaged
-over it, in steps of 0.8 px at `quick`, where the camera moves by 2.5 px meanwhile; and the largest `oversize` that they
-are rendered at, because each of them samples the pixels again."""
+"""For `held`: shutter time in frame intervals (a 180 degree shutter), number of pictures averaged over it, and greatest
+`oversize` of these pictures. The camera moves by 2.5 px during the shutter at `quick`, so pictures are 0.8 px apart.
+Each picture samples the pixels anew, which allows a smaller `oversize`."""
 WALK_METRES = 3.2
-"""How far the one in `walker` goes, against the camera: one who goes along with it looks like one who stands nearer."""
+"""Length in metres of the walk in `walker`. It goes against the camera's motion; with it, the walker would look
+nearer."""
 
 
 @dataclass
 class Mover:
-    """Something that changes from frame to frame."""
+    """An object whose vertices change from frame to frame."""
 
     name: str
     vertices: NDArray[np.float32]
-    """[T, V, 3] world, metres."""
+    """[T, V, 3] world coordinates in metres."""
     mesh: Mesh
-    """Its triangles; the mesh's own vertices are those of the first frame."""
+    """Its triangles; the mesh's vertices are those of the first frame."""
     texture: str
     """File in textures/."""
     in_view: bool = True
-    """False: only its shadow is seen."""
+    """False if only its shadow is visible."""
 
 
 def frame_number(index: int) -> int:
-    """Frames are numbered from 1."""
+    """Frame number of an index; numbers start at 1."""
     return index + 1
 
 
 def frame_name(index: int) -> str:
-    """File of a frame."""
+    """File name of a frame."""
     return f"{frame_number(index):06d}.png"
 
 
 def frame_seconds(size: Size) -> Array:
-    """[T] seconds of the clip's frames."""
+    """[T] times of the clip's frames in seconds."""
     return np.arange(size.frames) / size.fps
 
 
 def camera_of(seed: int, size: Size, kind: str = "plain") -> CameraMove:
-    """The camera's path through the clip."""
+    """The camera path of the clip."""
     return CameraMove(camera_move_of(seed, kind), seed, (size.frames - 1) / size.fps)
 
 
 def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bodies: Bodies) -> None:
-    """Everything that rendering needs, plan.json last."""
+    """Writes everything needed for rendering, with plan.json last."""
     seconds = frame_seconds(size)
     camera = camera_of(seed, size, kind)
     path = camera.eyes_and_targets(np.linspace(0.0, camera.duration, 60))[0][:, :2]
@@ -143,7 +144,7 @@ def write_geometry(folder: Path, seed: int, kind: str, size: Size, key: str, bod
 def _write_held(
     folder: Path, plan: dict[str, Any], size: Size, camera: CameraMove, scene: Held, movers: list[Mover]
 ) -> None:
-    """geometry/held.npz, and in the plan: what is held, its other state behind it, and motion blur."""
+    """Writes geometry/held.npz; adds held things, pictures of their other state, and motion blur to the plan."""
     things = [thing for part in scene.parts for thing in part.things]
     with atomic_path(folder / "geometry" / "held.npz") as partial:
         np.savez(partial, allow_pickle=False, **{thing.name: thing.faces for thing in things})
@@ -158,7 +159,7 @@ def _write_held(
     plan["jobs"] = _with_behind(plan["jobs"], size, [(by_name[thing.mover], thing.faces) for thing in things])
     for job in plan["jobs"]:
         if "box" in job:
-            # Only compared with by colour, so that one moment is enough.
+            # These pictures are only compared by colour, so one moment is enough.
             job["shutter"] = job["shutter"][SUBFRAMES // 2 : SUBFRAMES // 2 + 1]
             job["elsewhen"] = {
                 name: float(np.clip(part.other_time(job["bands"][0]["time"] / size.fps) * size.fps, 0, size.frames - 1))
@@ -168,7 +169,7 @@ def _write_held(
 
 
 def _shutter(job: dict[str, Any], size: Size, camera: CameraMove) -> list[dict[str, Any]]:
-    """Moments over which a picture is averaged. Frozen scenes have the blur of the camera, none of their own."""
+    """Moments over which a picture is averaged. Frozen scenes get the camera's blur, but no motion blur of movers."""
     offsets = SHUTTER_FRAMES * ((np.arange(SUBFRAMES) + 0.5) / SUBFRAMES - 0.5)
     pose = int(Path(job["out"]).stem) - 1
     views = camera.world_to_camera((pose + offsets) / size.fps)
@@ -189,7 +190,7 @@ def _plan(
     thing: Thing | None,
     place: Place,
 ) -> dict[str, Any]:
-    """What render_bpy.py reads."""
+    """The content of plan.json, read by render_bpy.py."""
     plan: dict[str, Any] = {
         "key": key,
         "seed": seed,
@@ -208,7 +209,7 @@ def _plan(
         "people": [{"name": p.name, "pose": p.pose, "phenotype": p.phenotype, "place": p.place} for p in people],
         "jobs": _jobs(seed, kind, size, camera),
     }
-    # Scenes without these have the same plan, to the byte, as before there were any.
+    # Written only if present, so that plans of other scenes stay identical byte for byte.
     if place.panes:
         plan["panes"] = [pane.to_json() for pane in place.panes]
         plan["reflects"] = {GLASS: GLASS_INDEX, MIRROR: MIRROR_SHARE}
@@ -237,7 +238,7 @@ def _write_mesh(path: Path, mesh: Mesh) -> None:
 
 
 def _people(seed: int, kind: str, path: Array, camera: CameraMove, staging: Staging) -> list[Person]:
-    """Two to five people in view and out of the camera's way."""
+    """Two to five people (plain) or three, in view and away from the camera's path."""
     from .people import POSES, Person
 
     rng = stream(seed, "people")
@@ -287,7 +288,7 @@ def _people(seed: int, kind: str, path: Array, camera: CameraMove, staging: Stag
 
 
 def _walk(person: Person, seconds: Array, duration: float) -> NDArray[np.float32]:
-    """[T, 1, 3] metres: from where somebody stands to as far on the other side of the middle, in one clip."""
+    """[T, 1, 3] offset in metres of a walk to the mirrored position on the other side of the centre, in one clip."""
     begin, end = _ends(person)
     offset = np.zeros((len(seconds), 1, 3), np.float32)
     offset[:, 0, 0] = (end - begin) * seconds / duration
@@ -295,12 +296,12 @@ def _walk(person: Person, seconds: Array, duration: float) -> NDArray[np.float32
 
 
 def _ends(person: Person) -> tuple[float, float]:
-    """x in metres where one who walks begins and ends."""
+    """(first, last) x in metres of a walking person."""
     return person.place[0], person.place[0] - float(np.copysign(WALK_METRES, person.place[0]))
 
 
 def _thrown_ball(folder: Path, seed: int, seconds: Array) -> Mover:
-    """A ball that bounces across the scene, 3 m/s and more."""
+    """A ball that bounces across the scene at 3 m/s or more."""
     rng = stream(seed, "ball")
     write_png(folder / "textures" / "ball.png", TEXTURES["fabric"].draw(rng, 512))
     builder = Builder([0.4])
@@ -317,7 +318,7 @@ def _thrown_ball(folder: Path, seed: int, seconds: Array) -> Mover:
 
 
 def _shadow_board(folder: Path, place: Place, seconds: Array, duration: float) -> Mover:
-    """A board that passes between a strong lamp and the scene, itself out of view."""
+    """A board, out of view, that moves between a strong lamp and the scene."""
     write_png(folder / "textures" / "board.png", np.full((8, 8, 3), 60, np.uint8))
     lamp = np.array([1.2, -3.8, 5.2])
     aim = np.array([0.0, 0.8, 0.6]) - lamp
@@ -340,12 +341,12 @@ def _shadow_board(folder: Path, place: Place, seconds: Array, duration: float) -
 
 
 def exposure_stops(kind: str, share: float) -> float:
-    """Stops added at `share` in [0, 1] of the clip."""
+    """Exposure offset in stops at `share` in [0, 1] of the clip."""
     return EXPOSURE_RAMP_STOPS * (share - 0.5) if kind == "exposure-ramp" else 0.0
 
 
 def _jobs(seed: int, kind: str, size: Size, camera: CameraMove) -> list[dict[str, Any]]:
-    """The clip's frames, and after each instant's frame the truth of that instant."""
+    """The clip's frames, each instant's frame followed by the truth of that instant."""
     seconds = frame_seconds(size)
     views = camera.world_to_camera(seconds)
     instants, poses = set(size.t_star_indices()), size.pose_indices()
@@ -363,7 +364,7 @@ def _jobs(seed: int, kind: str, size: Size, camera: CameraMove) -> list[dict[str
 def _with_behind(
     jobs: list[dict[str, Any]], size: Size, things: Sequence[tuple[Mover, NDArray[np.bool_]]]
 ) -> list[dict[str, Any]]:
-    """After each truth that shows one of the scene's things, what stands behind them: only the pixels around them."""
+    """Inserts, after each truth that shows a thing, a picture of the background behind the things, cropped to them."""
     K, found = intrinsics(size.width, size.height), []
     for job in jobs:
         found.append(job)
@@ -386,7 +387,7 @@ def _with_behind(
 
 
 def _box_of(points: NDArray[np.float32], view: Array, K: Array, size: Size) -> Array | None:
-    """[4] left, top, right, bottom of points [P, 3] in a picture, with a margin; None if it does not show them."""
+    """[4] left, top, right, bottom of points [P, 3] in a picture, with a margin; None if none of it is visible."""
     local = points @ view[:3, :3].T + view[:3, 3]
     pixels = (local[:, :2] / np.maximum(local[:, 2:], 0.05) * K[[0, 1], [0, 1]] + K[:2, 2])[local[:, 2] > 0.05]
     if len(pixels) == 0:
@@ -398,7 +399,7 @@ def _box_of(points: NDArray[np.float32], view: Array, K: Array, size: Size) -> A
 
 
 def _job(out: str, seed: int, kind: str, size: Size, time: int, pose: int, views: Array) -> dict[str, Any]:
-    """One picture: the scene of frame `time` from the camera of frame `pose`. The same pair has the same noise."""
+    """One picture: the scene of frame `time` from the camera of frame `pose`. Equal pairs have equal noise."""
     band = {"rows": [0, size.height], "time": float(time), "world_to_camera": views[pose].tolist()}
     stops = exposure_stops(kind, time / (size.frames - 1))
     noise = int(stream(seed, "cycles", time, pose).integers(1 << 31))
@@ -406,7 +407,7 @@ def _job(out: str, seed: int, kind: str, size: Size, time: int, pose: int, views
 
 
 def _bands(size: Size, camera: CameraMove, index: int) -> list[dict[str, Any]]:
-    """Strips of rows, each at its own time around the frame's, in frames; the middle row is on time."""
+    """Strips of rows, each with its own time around the frame's, in frames; the middle row is on time."""
     edges = np.linspace(0, size.height, min(SHUTTER_BANDS, size.height) + 1).round().astype(int)
     bands = []
     for low, high in itertools.pairwise(edges):

@@ -1,4 +1,4 @@
-"""Triangles with texture coordinates: the shapes that rooms and furniture are built of. Metres, z up."""
+"""Textured triangle shapes for rooms and furniture. Metres, z up."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def turn(yaw: float) -> Array:
 
 
 class Builder:
-    """Gathers faces of one mesh. `scale` of a material is the metres of its picture; 0 stretches it over a face."""
+    """Collects the faces of one mesh. A material's scale is its picture's size in metres; 0 stretches it over a
+    face."""
 
     def __init__(self, scales: list[float]) -> None:
         self.scales = scales
@@ -40,14 +41,14 @@ class Builder:
         self.materials: list[int] = []
 
     def rect(self, origin: ArrayLike, along: ArrayLike, up: ArrayLike, material: int) -> None:
-        """A rectangle from `origin` along two vectors (metres), facing along x up."""
+        """Adds a rectangle from `origin` along two vectors (metres), facing their cross product `along` × `up`."""
         o, a, b = (np.asarray(v, np.float64) for v in (origin, along, up))
         self._quad(np.array([o, o + a, o + a + b, o + b]), float(np.linalg.norm(a)), float(np.linalg.norm(b)), material)
 
     def box(
         self, centre: ArrayLike, size: ArrayLike, material: int, yaw: float = 0.0, front: int | None = None
     ) -> None:
-        """A box with its middle at `centre`; the side towards local -y may have its own material."""
+        """Adds a box centred at `centre`; the side towards local -y may have another material."""
         centre, half = np.asarray(centre, np.float64), np.asarray(size, np.float64) / 2
         rotation = turn(yaw)
         for axis in range(3):
@@ -66,7 +67,7 @@ class Builder:
                 self.rect(centre + rotation @ corner, rotation @ along, rotation @ up, used)
 
     def cylinder(self, base: ArrayLike, radius: float, height: float, material: int, sides: int = 28) -> None:
-        """An upright column without a bottom; `base` is the middle of its foot."""
+        """Adds an upright column without a bottom; `base` is the centre of its foot."""
         base = np.asarray(base, np.float64)
         angles = np.linspace(0.0, 2 * np.pi, sides + 1)
         ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(sides + 1)], 1) * radius
@@ -80,7 +81,7 @@ class Builder:
             self._quad(np.array([base + up, low + up, high + up, base + up]), radius, length, material)
 
     def ball(self, centre: ArrayLike, radii: ArrayLike, material: int, sides: int = 20, rings: int = 12) -> None:
-        """An ellipsoid."""
+        """Adds an ellipsoid."""
         centre, radii = np.asarray(centre, np.float64), np.asarray(radii, np.float64)
         phi, theta = np.linspace(0, 2 * np.pi, sides + 1), np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
 
@@ -109,14 +110,14 @@ class Builder:
         uv = (np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]) + start) / over
         for order in ([0, 1, 2], [0, 2, 3]):
             triangle = corners[order]
-            # The poles of balls and the lids of columns have quads of no area on one side.
+            # At the poles of balls and on the lids of columns, half of a quad has no area.
             if np.linalg.norm(np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])) > 1e-9:
                 self.corners.append(triangle)
                 self.uvs.append(uv[order])
                 self.materials.append(material)
 
     def mesh(self) -> Mesh:
-        """Everything added so far."""
+        """The mesh of all added faces."""
         count = len(self.materials)
         return Mesh(
             np.asarray(self.corners, np.float32).reshape(-1, 3),

@@ -1,8 +1,8 @@
-"""What the hard scenes have that others have not: where it stands, how it moves, and which triangles are it.
+"""Things of the hard scenes: their position, motion and triangles.
 
-`glass`: a window with a pane and a mirror in the wall ahead. `swinging`: an apple of 2 % of the picture's width on a
-thread. `arm`: somebody stands still and one arm waves (even seeds) or points (odd). `hair`: loose strands on a head
-that stands before a bright window. Metres, z up.
+`glass`: a window with a pane and a mirror in the wall ahead. `swinging`: an apple on a thread, with 2 % of the
+picture's width. `arm`: a person stands still and one arm waves (even seeds) or points (odd). `hair`: loose strands on a
+head in front of a bright window. Metres, z up.
 """
 
 from __future__ import annotations
@@ -27,58 +27,58 @@ if TYPE_CHECKING:
     from .people import Bodies, Body
 
 APPLE_SHARE = 0.02
-"""Width of the apple over that of the picture, from the middle of the camera's path."""
+"""Width of the apple relative to the picture's, from the middle of the camera's path."""
 APPLE_HEIGHT, THREAD_TOP, THREAD_RADIUS = 1.35, 3.1, 0.0015
-"""Metres: of the apple above the floor, of the thread's upper end (in or above every ceiling), and half its width."""
+"""Metres: apple's height above the floor, height of the thread's upper end (at or above every ceiling), its radius."""
 SWING_METRES = (0.25, 0.05)
-"""How far it swings to the side and in depth."""
+"""Amplitude of the swing to the side and in depth, in metres."""
 GRAVITY = 9.81
 BRIGHT_WINDOW, BRIGHT_SKY = 3.4, 3.5
-"""Width in metres of the window behind the hair, and strength of the sky there (other rooms: 1.6): near white, yet
-mostly not clipped, for else a strand would have to cover most of a pixel to be seen."""
+"""Width in metres of the window behind the hair, and strength of its sky (other rooms: 1.6). The sky is near white but
+mostly not clipped; otherwise only a strand that covers most of a pixel would be visible."""
 EVENING_SKY = 0.5
-"""Strength of the sky behind glass: as bright as the room, so that a reflection is seen."""
+"""Strength of the sky behind glass. The sky is as bright as the room, so that reflections are visible."""
 STRANDS, STRAND_STEPS, STRAND_SIDES = 800, 6, 3
 STRAND_METRES, STRAND_RADIUS = (0.1, 0.3), 0.0008
-"""Shortest and longest, and half the width at the root: a wisp, a tenth of a pixel wide at `quick`."""
+"""Shortest and longest strand, and its radius at the root in metres: a tenth of a pixel wide at `quick`."""
 _HEAD_HEIGHT, _BACK_WALL = 1.6, 3.8
-"""About where heads and the wall ahead are."""
+"""Approximate height of heads, and y of the wall ahead, in metres."""
 
 
 @dataclass
 class Staging:
-    """What a hard scene needs of its place before anything else stands there."""
+    """Requirements of a hard scene on its place, fixed before furniture and other people are placed."""
 
     ahead: WallAhead | None = None
     first: tuple[float, float] | None = None
-    """Where the first person stands: the one whom the scene is about."""
+    """Position of the first person, whose arm or hair is the scene's thing."""
     apple: tuple[float, float] | None = None
-    """x, y below which the apple hangs."""
+    """x, y of the hanging apple."""
     clear: list[Keepout] = field(default_factory=list)
-    """Where nobody and nothing may hide it."""
+    """Areas kept free of people and furniture, which would hide the thing."""
 
 
 @dataclass
 class Thing:
-    """What a hard scene is about, as triangles of one mover."""
+    """The thing of a hard scene, as triangles of one mover."""
 
     name: str
-    """swinging, arm or hair: the name of its mask."""
+    """Name of its mask: swinging, arm or hair."""
     mover: str
     faces: NDArray[np.bool_]
-    """[F] which triangles of the mover are in the mask."""
+    """[F] triangles of the mover in the mask."""
     gone: NDArray[np.bool_]
-    """[F] which are taken away to see what stands behind it; none: no such pictures are made."""
+    """[F] triangles removed for pictures of the background; if all are False, no such pictures are made."""
 
 
 def share_in_view(views: Array, point: Array) -> float:
-    """Share of world-to-camera poses [C, 4, 4] in which a point lies well inside the width of the picture."""
+    """Share of world-to-camera poses [C, 4, 4] in which a point is well inside the width of the picture."""
     local = views[:, :3, :3] @ point + views[:, :3, 3]
     return float(((local[:, 2] > 0.5) & (np.abs(local[:, 0]) * FOCAL_PER_WIDTH < 0.42 * local[:, 2])).mean())
 
 
 def stage(kind: str, seed: int, path: Array, views: Array) -> Staging:
-    """Where the things of a hard scene are. `path` [P, 2] x, y of the camera, `views` [C, 4, 4] world-to-camera."""
+    """Places the things of a hard scene. `path` [P, 2]: x, y of the camera; `views` [C, 4, 4]: world-to-camera."""
     side = float(stream(seed, "staging").choice([-1.0, 1.0]))
     if kind == "glass":
         ahead = WallAhead(0.95 * side, mirror_x=-1.15 * side, glazed=True, garden=True, sky_strength=EVENING_SKY)
@@ -98,7 +98,7 @@ def stage(kind: str, seed: int, path: Array, views: Array) -> Staging:
 
 
 def _in_view(path: Array, views: Array, better: Callable[[float, float], float], away: float) -> tuple[float, float]:
-    """x, y that most views show, at least `away` metres from the camera's path, and near it."""
+    """x, y that most views show, at least `away` metres from the camera's path but close to it."""
     best, found = -np.inf, (0.0, 1.0)
     for x in np.arange(-1.5, 1.55, 0.1):
         for y in np.arange(-1.0, 2.65, 0.1):
@@ -112,14 +112,14 @@ def _in_view(path: Array, views: Array, better: Callable[[float, float], float],
 
 
 def _before_window(path: Array, x: float, y: float, width: float) -> float:
-    """Share of the path's eyes that see a head at x, y before the window in the wall ahead."""
+    """Share of the path's camera positions that see a head at x, y in front of the window in the wall ahead."""
     reach = (_BACK_WALL - path[:, 1]) / np.maximum(y - path[:, 1], 0.1)
     behind = path[:, 0] + (x - path[:, 0]) * reach
     return float((np.abs(behind) < width / 2 - 0.25).mean())
 
 
 def _line_of_sight(path: Array, target: tuple[float, float], at: tuple[int, ...] = (12, 30, 48)) -> list[Keepout]:
-    """Discs between some points of the path and a target, 0.5 m short of both."""
+    """Discs between some points of the path and a target, ending 0.5 m before both."""
     discs = []
     for eye in path[list(at)]:
         away = np.asarray(target) - eye
@@ -135,7 +135,7 @@ def _line_of_sight(path: Array, target: tuple[float, float], at: tuple[int, ...]
 def apple(
     folder: Path, seed: int, seconds: Array, place: tuple[float, float], path: Array
 ) -> tuple[Array, Mesh, Thing]:
-    """(vertices [T, V, 3], mesh, thing) of an apple that swings on its thread; textures/apple.png is written."""
+    """(vertices [T, V, 3], mesh, thing) of an apple swinging on its thread; writes textures/apple.png."""
     rng = stream(seed, "apple")
     write_png(folder / "textures" / "apple.png", _apple_skin(rng))
     diameter = APPLE_SHARE / FOCAL_PER_WIDTH * float(np.hypot(*(path[len(path) // 2] - place)))
@@ -147,7 +147,7 @@ def apple(
     builder.cylinder([0.0, 0.0, -length + 0.8 * radius], THREAD_RADIUS, length - 0.8 * radius, 0, 5)
     mesh = builder.mesh()
     faces = np.arange(len(mesh.triangles)) < of_apple
-    mesh.uv[~faces] = 0.02  # the texture's dark corner: the stalk, and the thread
+    mesh.uv[~faces] = 0.02  # the texture's dark corner, for the thread
     turn, phase = 2 * np.pi * seconds / (2 * np.pi * np.sqrt(length / GRAVITY)), rng.uniform(0.0, 2 * np.pi, 2)
     sideways, deep = (m / length * np.sin(turn + p) for m, p in zip(SWING_METRES, phase, strict=True))
     turns = _turns((2, 0), sideways) @ _turns((1, 2), deep)
@@ -166,7 +166,7 @@ def _turns(axes: tuple[int, int], angles: Array) -> Array:
 
 
 def _apple_skin(rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Red with a yellow cheek, and a dark corner."""
+    """Texture of an apple: red with a yellow cheek, and a dark corner."""
     cheek = np.clip(2.5 * (fractal(rng, 128, 1.8) - 0.65), 0.0, 1.0)[..., None]
     skin = hsv(0.0, 0.85, 0.75) * (1 - cheek) + hsv(0.13, 0.7, 0.85) * cheek
     skin = skin * (0.85 + 0.3 * fractal(rng, 128, 0.8))[..., None]
@@ -175,13 +175,13 @@ def _apple_skin(rng: np.random.Generator) -> NDArray[np.uint8]:
 
 
 def arm_of(bodies: Bodies, name: str) -> Thing:
-    """The right arm of a person: triangles that mostly follow its bones."""
+    """A person's right arm: triangles that mostly follow its bones."""
     faces = bodies.influence["right_arm"][bodies.triangles].mean(axis=1) > 0.5
     return Thing("arm", name, faces, faces)
 
 
 def hair_of(folder: Path, bodies: Bodies, body: Body, seed: int, seconds: Array) -> tuple[Array, Mesh, Thing]:
-    """(vertices [T, V, 3], mesh, thing) of loose strands on a head, which they follow; textures/hair.png is written."""
+    """(vertices [T, V, 3], mesh, thing) of loose strands that follow a head; writes textures/hair.png."""
     rng = stream(seed, "hair")
     tone = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.7), rng.uniform(0.15, 0.55))
     write_png(folder / "textures" / "hair.png", np.tile(np.round(255 * tone).astype(np.uint8), (8, 8, 1)))
@@ -207,7 +207,7 @@ def hair_of(folder: Path, bodies: Bodies, body: Body, seed: int, seconds: Array)
 
 
 def _roots(bodies: Bodies, start: Array, head: NDArray[np.bool_], rng: np.random.Generator) -> tuple[Array, Array]:
-    """([N, 3] points on the scalp, [N, 3] unit directions in which hair leaves it)."""
+    """([N, 3] points on the scalp, [N, 3] unit directions of hair at these points)."""
     scalp = bodies.triangles[(bodies.regions["hair"][bodies.triangles] > 0.5).all(axis=1)]
     a, b, c = (start[scalp[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -219,7 +219,7 @@ def _roots(bodies: Bodies, start: Array, head: NDArray[np.bool_], rng: np.random
 
 
 def _spines(roots: Array, out: Array, rng: np.random.Generator) -> Array:
-    """[N, S + 1, 3] strands: away from the scalp, then down, each with a will of its own."""
+    """[N, S + 1, 3] points of strands: away from the scalp, then down, with random variation."""
     length = rng.uniform(*STRAND_METRES, len(roots))[:, None] / STRAND_STEPS
     heading, at = out.copy(), roots - 0.004 * out
     points = [at]
@@ -233,7 +233,7 @@ def _spines(roots: Array, out: Array, rng: np.random.Generator) -> Array:
 
 
 def _tubes(strands: int) -> NDArray[np.int32]:
-    """[F, 3] triangles of the strands' sides; vertices are numbered by strand, ring and side."""
+    """[F, 3] triangles of the strands' sides; vertices are ordered by strand, ring and side."""
     side = np.arange(STRAND_SIDES)
     quads = []
     for step in range(STRAND_STEPS):
@@ -246,7 +246,7 @@ def _tubes(strands: int) -> NDArray[np.int32]:
 
 
 def _rigid(source: Array, target: Array) -> tuple[Array, Array]:
-    """(rotation [3, 3], translation [3]) that takes points [P, 3] to others with the least error (Kabsch 1976)."""
+    """(rotation [3, 3], translation [3]) that maps points [P, 3] to others with the least error (Kabsch 1976)."""
     a, b = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((target - b).T @ (source - a))
     rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt

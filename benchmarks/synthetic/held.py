@@ -1,8 +1,8 @@
-"""Kind `held`: what stands still for seconds in one state, changes within a second, and stands still in another.
+"""Kind `held`: things that are still for seconds in one state, change within a second, and are still in another.
 
-Optical flow between neighbouring frames calls it still in both states. Each scene has three people, and each of them
-plays one of five roles (`ROLES`), chosen by the seed (`CAST`). Every change happens between two instants t*, so that
-nothing changes at an instant. Metres, z up; times in seconds of the clip.
+Optical flow between neighbouring frames finds no motion in either state. Each scene has three people, each with one of
+five roles (`ROLES`), chosen by the seed (`CAST`). Every change is between two instants t*, so that nothing changes at
+an instant. Metres, z up; times in seconds of the clip.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 RAISED, TURNED, RESTING, LEAVING, SET_DOWN = "raised", "turned", "resting", "leaving", "set_down"
 ROLES = (RAISED, TURNED, RESTING, LEAVING, SET_DOWN)
-"""An arm that is raised once and kept up (before a panel of its own colour in even seeds); a head that turns while a
-column hides it from the camera; a hand that rests on a table and leaves it; a person who walks into a cubicle and stays
-there; a box that is held and then set down."""
+"""raised: an arm is raised once and stays up (with even seeds before a panel of its colours). turned: a head turns
+while a column hides it from the camera. resting: a hand rests on a table and leaves it. leaving: a person walks into a
+cubicle and stays. set_down: a box is held and then set down."""
 CAST = (
     (RAISED, RESTING, LEAVING),
     (RAISED, RESTING, SET_DOWN),
@@ -44,26 +44,26 @@ CAST = (
     (RAISED, LEAVING, SET_DOWN),
     (RAISED, RESTING, LEAVING),
 )
-"""Roles by `seed % 10`. A head turns only where the camera goes aside and returns or orbits (`seed % 4` of 2 or 3): one
-that walks forward or pans does not pass a column and still see both states."""
+"""Roles by `seed % 10`. `turned` needs a camera that goes and returns or orbits (`seed % 4` of 2 or 3): one that walks
+forward or pans cannot pass a column and see both states."""
 CHANGE_SECONDS = {RAISED: 0.6, TURNED: 0.6, RESTING: 0.6, LEAVING: 1.2, SET_DOWN: 1.0}
-"""How long a change takes: an arm moves as people move it without haste, a walk of 1.5 m at 1.3 m/s."""
+"""Duration of each change in seconds: an unhurried arm movement; a walk of 1.5 m at 1.3 m/s."""
 REST_SECONDS = 0.5
-"""Least time between a change and an instant, where the clip leaves that much."""
+"""Least seconds between a change and an instant, if the clip is long enough."""
 RESTLESS = 0.2
-"""Factor on the drift of these people: 95 % of their vertices stay within 3 cm while a state lasts (0.3: 4 cm)."""
+"""Factor on these people's sway: 95 % of their vertices stay within 3 cm during a state (4 cm with 0.3)."""
 SPOTS, GOOD_SPOTS, LAYOUTS = 400, 150, 20
-"""Random places that are tried for a role, how many of the best are kept, and random layouts of those that are improved
-place by place: the one with the best view of every role is taken."""
+"""Number of random places tried for a role, number of the best ones kept, and number of random layouts of these.
+Layouts are improved place by place; the one with the best view of every role is used."""
 COLUMN_SHARE = 0.45
-"""Where the column stands on the line from the head to the camera: nearer to the camera it hides more than the head."""
+"""Position of the column on the line from head to camera. A column nearer to the camera hides more than the head."""
 HEAD_RADIUS, ARM_RADIUS = 0.13, 0.4
-"""Metres around the middle of a head, and of anything else that is held, that should be in sight."""
+"""Radius in metres, around a head and around other held things, that should be visible."""
 COLUMN_HEIGHT = 2.1
 PANEL_SIZE, PANEL_BEHIND = (1.9, 0.06, 2.3), 0.5
-"""Metres: width, depth and height of the panel of the arm's own colour, and how far behind the person it stands."""
+"""Width, depth and height in metres of the panel in the arm's colours, and its distance behind the person."""
 CUBICLE, WALK_METRES = 1.0, 1.5
-"""Side of the cubicle, and how far its middle is from where the one who leaves stood."""
+"""Side of the cubicle in metres, and distance of its centre from the starting point of the leaving person."""
 CUBICLE_HEIGHT = 2.2
 BOX_SIZE = (0.2, 0.2, 0.24)
 
@@ -90,44 +90,44 @@ _LEGS_DOWN: Pose = dict.fromkeys(_STRIDE, (0, 0, 0))
 
 @dataclass
 class Part:
-    """One role of a scene and who plays it."""
+    """One role of a scene and the person who has it."""
 
     role: str
     person: Person
     begin: float
     """Seconds at which the change begins."""
     end: float
-    """Seconds at which it is over."""
+    """Seconds at which the change ends."""
     things: list[Thing] = field(default_factory=list)
-    """What is held, as triangles of a mover; filled by `perform`."""
+    """The held thing, as triangles of a mover; set by `perform`."""
     movers: list[str] = field(default_factory=list)
-    """Everything that the change moves; filled by `perform`."""
+    """Names of all movers changed by the role; set by `perform`."""
 
     def other_time(self, seconds: float) -> float:
-        """A time at which the other state stands still, seen from the state at `seconds`."""
+        """A time in the other state, for a state at `seconds`."""
         return self.end + 0.25 if seconds < 0.5 * (self.begin + self.end) else self.begin - 0.25
 
     def to_json(self) -> dict[str, object]:
-        """As it stands in plan.json."""
+        """The role's entry in plan.json."""
         return {"name": self.role, "movers": self.movers, "begin": self.begin, "end": self.end}
 
 
 @dataclass
 class Held:
-    """The roles of one scene, and where its furniture stands."""
+    """The roles of one scene, and the positions of its furniture."""
 
     parts: list[Part]
     clear: list[Keepout]
-    """Ground that people, props and the lines of sight to them need."""
+    """Ground kept free for people, props and lines of sight."""
     columns: list[tuple[float, float, float]]
-    """x, y and radius of what hides a head while it turns."""
+    """x, y and radius of the columns that hide a head while it turns."""
 
     def part_of(self, person: Person) -> Part:
-        """The role that a person plays."""
+        """The role of a person."""
         return next(part for part in self.parts if part.person is person)
 
     def furnish(self, furnisher: Furnisher) -> None:
-        """Puts up columns and cubicles."""
+        """Adds columns and cubicles."""
         for x, y, radius in self.columns:
             furnisher.build.cylinder([x, y, 0.0], radius, COLUMN_HEIGHT, furnisher.material("bricks"))
         for part in self.parts:
@@ -138,9 +138,10 @@ class Held:
 
 
 def change_times(size: Size, role: str, rng: np.random.Generator) -> tuple[float, float]:
-    """(begin, end) in seconds of a change: in the middle between two instants, or nearly there.
+    """(begin, end) of a change in seconds, at or near the middle between two instants.
 
-    A clip with a single instant changes before it; one whose instants leave no room (`paper`) in its middle third.
+    With a single instant the change is before it. If no gap between instants is long enough (`paper`), the change is in
+    the middle third of the clip.
     """
     length, duration = CHANGE_SECONDS[role], (size.frames - 1) / size.fps
     instants = [index / size.fps for index in size.t_star_indices()]
@@ -158,21 +159,21 @@ def change_times(size: Size, role: str, rng: np.random.Generator) -> tuple[float
 
 @dataclass
 class _Spot:
-    """Where a role is played, in one layout that is tried."""
+    """Place of a role in one candidate layout."""
 
     place: Array
-    """[2] metres."""
+    """[2] position in metres."""
     middle: Array
-    """[2] the middle of what is held, in its two states."""
+    """[2] mean position of the held thing in its two states."""
     heading: float
     solid: list[Array]
-    """Discs (x, y, radius) that hide what is behind them: the person and the props."""
+    """Discs (x, y, radius) of the person and the props, which block views."""
     column: Array | None = None
-    """The one of them that may hide its own person."""
+    """The disc that may hide its own person, or None."""
 
 
 def cast(seed: int, size: Size, camera: CameraMove) -> Held:
-    """Who plays what, where and when."""
+    """Assigns roles, places and times."""
     rng = stream(seed, "held")
     roles = CAST[seed % 10]
     times = [change_times(size, role, rng) for role in roles]
@@ -200,12 +201,12 @@ def cast(seed: int, size: Size, camera: CameraMove) -> Held:
 def _spot(
     role: str, time: tuple[float, float], seed: int, camera: CameraMove, eyes: Array, rng: np.random.Generator
 ) -> _Spot | None:
-    """A random place for a role with its props; None if it is in the camera's way or leaves the place."""
+    """A random place for a role with its props; None if it blocks the camera or exceeds the room."""
     place = np.array([rng.uniform(-2.3, 2.3), rng.uniform(-1.4, 2.2)])
     away = eyes[len(eyes) // 2] - place
     away = away / np.linalg.norm(away)
     facing = float(np.arctan2(away[0], -away[1]))
-    # The body looks along (sin, -cos) of its heading; turned to its left, the right arm is nearer to the camera.
+    # The body faces (sin, -cos) of its heading. If it is turned to its left, the right arm is nearer to the camera.
     turned = {RAISED: 0.0, TURNED: 0.0, RESTING: 40.0, SET_DOWN: 55.0}
     solid, column = [np.array([*place, 0.3])], None
     if role == LEAVING:
@@ -233,7 +234,7 @@ def _spot(
 
 
 def _column(place: Array, middle: float, camera: CameraMove) -> Array:
-    """[3] x, y, radius of a column that hides a head from 0.4 s before the middle of its turn until 0.4 s after."""
+    """[3] x, y, radius of a column that hides a head from 0.4 s before to 0.4 s after the middle of its turn."""
     views = camera.world_to_camera(middle + np.linspace(-0.4, 0.4, 9))
     eyes = _eyes(views)
     at = place + COLUMN_SHARE * (eyes[4] - place)
@@ -243,13 +244,13 @@ def _column(place: Array, middle: float, camera: CameraMove) -> Array:
 
 
 def _walks_to(place: tuple[float, float], heading: float) -> tuple[float, float]:
-    """x, y of the middle of the cubicle."""
+    """x, y of the centre of the cubicle."""
     return place[0] + WALK_METRES * float(np.sin(heading)), place[1] - WALK_METRES * float(np.cos(heading))
 
 
 @dataclass
 class _Sight:
-    """From where a spot is seen, in T views."""
+    """Visibility of a spot in T views."""
 
     spot: _Spot
     lines: Array
@@ -257,13 +258,13 @@ class _Sight:
     length: Array
     """[T] metres to the camera."""
     in_view: NDArray[np.bool_]
-    """[T] whether the picture shows it, and its own column does not hide it."""
+    """[T] whether the spot is in the picture and not hidden by its own column."""
     states: tuple[NDArray[np.bool_], NDArray[np.bool_]]
-    """[T] which views are before the change, and which after it."""
+    """[T] masks of the views before and after the change."""
 
     @classmethod
     def of(cls, spot: _Spot, time: tuple[float, float], seconds: Array, views: Array) -> _Sight:
-        """The sight of a spot whose change takes `time`, in views [T] at seconds [T]."""
+        """The visibility of a spot whose change takes `time`, in views [T] at seconds [T]."""
         away = _eyes(views) - spot.middle
         length = np.linalg.norm(away, axis=1)
         point = np.array([*spot.middle, 1.2])
@@ -274,7 +275,7 @@ class _Sight:
         return sight
 
     def _is_open(self, discs: list[Array]) -> NDArray[np.bool_]:
-        """[T] whether none of the discs (x, y, radius) stands before it."""
+        """[T] whether no disc (x, y, radius) hides the spot."""
         is_open, width = np.ones(len(self.length), bool), HEAD_RADIUS if self.spot.column is not None else ARM_RADIUS
         for x, y, radius in discs:
             to = np.array([x, y]) - self.spot.middle
@@ -283,13 +284,13 @@ class _Sight:
         return is_open
 
     def shown(self, others: list[_Sight]) -> float:
-        """In what share of the views of the rarer state it is seen past other spots; less where it is far away."""
+        """Share of the views that see the spot past other spots, in the less visible state; reduced with distance."""
         shown = self.in_view & self._is_open([disc for other in others for disc in other.spot.solid])
         return float(min(shown[state].mean() for state in self.states)) - 0.04 * float(self.length.mean())
 
 
 def _layout(choices: list[list[_Sight]], rng: np.random.Generator) -> list[_Sight]:
-    """One spot per role: the best of some random layouts, each improved role by role. ValueError if none fits."""
+    """One spot per role: the best of several random layouts, each improved role by role. ValueError if none fits."""
     best, found = -np.inf, None
     for _ in range(LAYOUTS):
         layout = [sights[int(rng.integers(len(sights)))] for sights in choices]
@@ -304,7 +305,7 @@ def _layout(choices: list[list[_Sight]], rng: np.random.Generator) -> list[_Sigh
 
 
 def _worth(layout: list[_Sight]) -> float:
-    """How well a layout shows its roles, the worst first; -inf if two of them touch."""
+    """Score of a layout's visibility, mainly of the least visible role; -inf if two spots overlap."""
     for a, b in itertools.combinations(layout, 2):
         for one, other in itertools.product(a.spot.solid, b.spot.solid):
             if np.hypot(*(one[:2] - other[:2])) < one[2] + other[2] + 0.15:
@@ -314,12 +315,12 @@ def _worth(layout: list[_Sight]) -> float:
 
 
 def _eyes(views: Array) -> Array:
-    """[T, 2] x, y of the cameras [T, 4, 4]."""
+    """[T, 2] x, y positions of the cameras [T, 4, 4]."""
     return -np.einsum("tji,tj->ti", views[:, :3, :3], views[:, :3, 3])[:, :2]
 
 
 def _person(seed: int, number: int, role: str, spot: _Spot, time: tuple[float, float]) -> Person:
-    """An adult who holds still but for the change of the role."""
+    """An adult who holds still except for the change of the role."""
     from .people import Person
 
     rng = stream(seed, "held", role)
@@ -337,7 +338,7 @@ def _person(seed: int, number: int, role: str, spot: _Spot, time: tuple[float, f
 
 
 def _changes(role: str, time: tuple[float, float], rng: np.random.Generator) -> tuple[tuple[float, float, Pose], ...]:
-    """(begin, end, pose after it) in seconds; what a role begins with is reached before the clip does."""
+    """(begin, end, pose after it) in seconds; the initial pose is reached before the clip begins."""
     before, (begin, end) = (-2.0, -1.0), time
     half = 0.5 * (begin + end)
     if role == RAISED:
@@ -359,15 +360,15 @@ def _changes(role: str, time: tuple[float, float], rng: np.random.Generator) -> 
 
 
 Extra = tuple[str, Array, Mesh]
-"""Name, vertices [T, V, 3] and mesh of something that stands beside a person; its picture is textures/<name>.png."""
+"""Name, vertices [T, V, 3] and mesh of a mover beside a person; its picture is textures/<name>.png."""
 
 
 def perform(
     folder: Path, part: Part, bodies: Bodies, body: Body, furnisher: Furnisher, seed: int, seconds: Array
 ) -> list[Extra]:
-    """Moves the body and puts up the props of a role, and says which triangles are the held thing.
+    """Moves the body, adds the props of a role, and sets the triangles of the held thing.
 
-    `seconds` [T]; `body.vertices` is changed in place for who walks. Pictures of extras are written.
+    `seconds` [T]; for a walking person `body.vertices` changes in place. Writes the pictures of extras.
     """
     name, role = part.person.name, part.role
     part.movers = [name]
@@ -396,33 +397,33 @@ def perform(
 
 
 def _index(seconds: Array, at: float) -> int:
-    """Frame nearest to a time."""
+    """Index of the frame nearest to a time."""
     return int(np.abs(seconds - at).argmin())
 
 
 def _faces(influence: Array, body: Body) -> NDArray[np.bool_]:
-    """[F] triangles that mostly follow some bones."""
+    """[F] triangles that mostly follow the given bones."""
     return influence[body.triangles].mean(axis=1) > 0.5
 
 
 def _table(furnisher: Furnisher, person: Person, above: Array, height: float) -> None:
-    """A small round table whose top is at `height` below points [P, 3], mostly on their side away from the person."""
+    """Adds a round table with its top at `height` below points [P, 3], offset away from the person."""
     ahead = np.array([np.sin(person.heading), -np.cos(person.heading)])
     x, y = above[:, :2].mean(axis=0) + 0.08 * ahead
     wood = furnisher.material("planks")
     furnisher.build.cylinder([x, y, 0.0], 0.18, 0.03, wood)
     furnisher.build.cylinder([x, y, 0.03], 0.03, height - 0.06, wood, 12)
     furnisher.build.cylinder([x, y, height - 0.03], 0.22, 0.03, wood)
-    # The underside: a cylinder has none.
+    # The underside, which a cylinder lacks.
     furnisher.build.cylinder([x, y, height - 0.03], 0.22, 0.0, wood)
 
 
 def _panel(folder: Path, part: Part, body: Body, faces: NDArray[np.bool_], seed: int, seconds: Array) -> Extra:
-    """A panel behind the arm, in the arm's own colours in patches of its own size."""
+    """A panel behind the arm, with the arm's colours in patches of the arm's size."""
     rng = stream(seed, "held", "panel")
     a, b, c = (body.vertices[0, body.triangles[faces, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    # By area: a hand has as many triangles as the rest of the arm.
+    # Sample by area, because a hand has as many triangles as the rest of the arm.
     uv = body.uv[faces].mean(axis=1)[rng.choice(len(area), 4096, p=area / area.sum())]
     size = len(body.texture)
     row, column = (np.clip((v * size).astype(int), 0, size - 1) for v in (1.0 - uv[:, 1], uv[:, 0]))

@@ -1,4 +1,4 @@
-"""Makes whole scenes: geometry here, pictures in a bpy process, regions here. Each step goes on where it was."""
+"""Makes whole scenes: geometry, then pictures in a bpy process, then regions. Every step can be resumed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .people import Bodies
 
 GENERATOR_VERSION = 1
-"""Raised when the same seed would give another scene: a folder of another version is refused."""
+"""Increase when the same seed gives another scene; folders of other versions are refused."""
 ROOT = Path(__file__).resolve().parents[2]
 RENDERER = Path(__file__).with_name("render_bpy.py")
 USUAL_BPY = ".venv-bpy-5.0"
@@ -43,11 +43,11 @@ Say = Callable[[str], None]
 
 
 class BpyMissingError(RuntimeError):
-    """There is no Python with bpy; the message says what to do."""
+    """No Python with bpy was found; the message says what to do."""
 
 
 def default_folder() -> Path:
-    """Where scenes are kept unless told otherwise: the user's cache, outside of the repository."""
+    """Default folder of scenes: in the user's cache, outside the repository."""
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
     elif sys.platform == "darwin":
@@ -58,8 +58,8 @@ def default_folder() -> Path:
 
 
 def find_bpy(given: str | Path | None) -> Path:
-    """The Python of a bpy wheel's environment: `given` may be that Python or its environment's folder."""
-    home = Path(os.environ.get("SPLANNEQUIN_HOME") or ROOT).expanduser()  # where set-up puts environments
+    """The Python of an environment with a bpy wheel. `given`: that Python, its environment's folder, or None."""
+    home = Path(os.environ.get("SPLANNEQUIN_HOME") or ROOT).expanduser()  # where set-up makes environments
     places = [Path(given)] if given else [home / USUAL_BPY, *sorted(home.glob(".venv-bpy-*"), reverse=True)]
     for place in places:
         for python in (place, place / "bin" / "python", place / "Scripts" / "python.exe"):
@@ -71,15 +71,15 @@ def find_bpy(given: str | Path | None) -> Path:
 
 
 def scene_name(seed: int, kind: str) -> str:
-    """Folder of a scene within its size."""
+    """Folder name of a scene within the folder of its size."""
     return f"seed-{seed:03d}" if kind == "plain" else f"{kind}-{seed:03d}"
 
 
 def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: Callable[[], Bodies], say: Say) -> Path:
-    """The folder of a finished scene under `out`/<size>/: made, completed, or left alone if it is finished.
+    """The folder of a finished scene in `out`/<size>/, made or completed if necessary.
 
     `bodies` is called only if geometry is missing. ValueError if the folder holds another version's scene, RuntimeError
-    with the renderer's last lines if it dies.
+    with the renderer's last lines if it fails.
     """
     folder = out / size.name / scene_name(seed, kind)
     key = content_key(FORMAT_VERSION, GENERATOR_VERSION, size, seed, kind)
@@ -111,7 +111,7 @@ def make_scene(out: Path, size: Size, seed: int, kind: str, bpy: Path, bodies: C
 
 
 def render_pictures(folder: Path, bpy: Path, say: Say) -> None:
-    """Runs the renderer as a child that ends when this process does."""
+    """Runs the renderer as a child process that ends when this process ends."""
     log = folder / "render.log"
     last: list[str] = []
     eta = _Eta(say, "pictures")
@@ -147,7 +147,7 @@ def render_pictures(folder: Path, bpy: Path, say: Say) -> None:
 
 
 class _Eta:
-    """Progress in words, at most every few seconds, with an estimate from the pace so far."""
+    """Prints progress every few seconds, with the remaining time estimated from the mean pace."""
 
     def __init__(self, say: Say, what: str, every: float = 5.0) -> None:
         self.say, self.what, self.every = say, what, every
@@ -162,7 +162,7 @@ class _Eta:
 
 
 def write_record(folder: Path, size: Size, seed: int, kind: str, key: str, seconds: dict[str, float]) -> None:
-    """scene.json, which says that the scene is whole."""
+    """Writes scene.json, which marks the scene as complete."""
     meter = json.loads((folder / "meter.json").read_text(encoding="utf-8"))
     plan: dict[str, Any] = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
     cameras = [
@@ -213,7 +213,7 @@ def write_record(folder: Path, size: Size, seed: int, kind: str, key: str, secon
 
 
 def _limits(kind: str) -> dict[str, Any]:
-    """What a limit scene does, in numbers."""
+    """Figures of a limit or hard scene for scene.json."""
     if kind == "exposure-ramp":
         return {"exposure_stops_over_clip": EXPOSURE_RAMP_STOPS, "truth": "with the exposure of frame t*"}
     if kind == "rolling-shutter":

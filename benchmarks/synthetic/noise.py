@@ -1,4 +1,4 @@
-"""Seeded noise: over time for motion, over images and space for textures. Each use has its own stream of the seed."""
+"""Seeded noise over time for motion, and over images and space for textures. Each use has its own random stream."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 def stream(seed: int, *name: str | int) -> np.random.Generator:
-    """The random stream of one part of one scene: another part that draws more does not change this one."""
+    """The random stream of one part of one scene, independent of the number of draws in other parts."""
     return np.random.default_rng([seed, *(zlib.crc32(str(part).encode()) for part in name)])
 
 
@@ -24,7 +24,7 @@ def wander(rng: np.random.Generator, seconds: Array, period: float, width: int =
 
 
 def bumps(rng: np.random.Generator, seconds: Array, every: float, width: float) -> Array:
-    """[T] quick events between 0 and 1, `every` seconds on average, each about `width` seconds long."""
+    """[T] short events between 0 and 1, `every` seconds apart on average, each about `width` seconds long."""
     start, end = -2.0 * every, 3600.0
     gaps = rng.uniform(0.6, 1.4, 512) * every
     centres = start + np.cumsum(gaps)
@@ -34,7 +34,7 @@ def bumps(rng: np.random.Generator, seconds: Array, every: float, width: float) 
 
 
 def smooth_step(seconds: Array, begin: float, end: float) -> Array:
-    """[T] from 0 at `begin` to 1 at `end`, with no speed at either."""
+    """[T] smooth step from 0 at `begin` to 1 at `end`, with zero slope at both."""
     share = np.clip((seconds - begin) / (end - begin), 0.0, 1.0)
     return share * share * (3.0 - 2.0 * share)
 
@@ -53,7 +53,7 @@ def fractal(
 
 
 def solid(seed: int, points: Array, scale: float) -> Array:
-    """[P] value noise in [0, 1] in space: random values on a lattice of pitch `scale`, smoothly interpolated."""
+    """[P] spatial value noise in [0, 1]: random values on a lattice of pitch `scale`, smoothly interpolated."""
     at = points / scale
     cell = np.floor(at).astype(np.int64)
     f = at - cell
@@ -67,7 +67,7 @@ def solid(seed: int, points: Array, scale: float) -> Array:
 
 
 def _hash(cell: NDArray[np.int64], seed: int) -> Array:
-    """[P] in [0, 1) from integer cells [P, 3]: multiply and xorshift on 64 bits."""
+    """[P] hash in [0, 1) of integer cells [P, 3], by 64-bit multiply and xorshift."""
     keys = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
     x = (cell.astype(np.uint64) * keys).sum(axis=1, dtype=np.uint64) + np.uint64(
         seed * 0xD6E8FEB86659FD93 & 0xFFFFFFFFFFFFFFFF

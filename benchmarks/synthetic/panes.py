@@ -1,7 +1,7 @@
-"""Flat panes: window glass, and mirrors. Where a ray meets one, and what it shows there by reflection.
+"""Flat panes of window glass and mirrors: ray intersection and reflection.
 
-A pane is no part of the scene's triangles: the world behind it is rendered without it, its reflection by itself, and
-the two are mixed by how much it reflects (render_bpy.py). World in metres.
+Panes are not among the scene's triangles. render_bpy.py renders the world behind a pane without it, and the reflection
+separately, and mixes both by the pane's reflectance. World in metres.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from .noise import Array
 
 GLASS, MIRROR = "glass", "mirror"
 GLASS_INDEX = 2.333
-"""Index of refraction whose one surface reflects 16 % straight on: what the four surfaces of double glazing do."""
+"""Index of refraction of one surface that reflects 16 % at normal incidence, like four surfaces of double glazing."""
 MIRROR_SHARE = 0.95
-"""Of the light, that a mirror gives back."""
+"""Share of the light reflected by a mirror."""
 
 
 @dataclass(frozen=True)
 class Pane:
-    """A rectangle that reflects to the side along x up."""
+    """A rectangle that reflects on the side of the cross product `along` × `up`."""
 
     kind: str
     """GLASS or MIRROR."""
     origin: Array
     """[3] one corner."""
     along: Array
-    """[3] one side."""
+    """[3] one side, as a vector."""
     up: Array
-    """[3] the other, square to it."""
+    """[3] the other side, perpendicular to `along`."""
 
     @classmethod
     def of(cls, kind: str, origin: ArrayLike, along: ArrayLike, up: ArrayLike) -> Pane:
-        """From anything that numpy reads."""
+        """A pane from anything that numpy can convert."""
         return cls(kind, *(np.asarray(v, np.float64) for v in (origin, along, up)))
 
     @classmethod
@@ -45,17 +45,17 @@ class Pane:
         return cls.of(data["kind"], data["origin"], data["along"], data["up"])
 
     def to_json(self) -> dict[str, Any]:
-        """As it stands in plan.json."""
+        """The pane's entry in plan.json."""
         return {"kind": self.kind, **{name: getattr(self, name).tolist() for name in ("origin", "along", "up")}}
 
     @property
     def normal(self) -> Array:
-        """[3] unit, towards the side that reflects."""
+        """[3] unit normal of the reflecting side."""
         normal = np.cross(self.along, self.up)
         return normal / np.linalg.norm(normal)
 
     def within(self, points: Array, margin: float = 0.0) -> NDArray[np.bool_]:
-        """[...] whether points [..., 3], seen along the normal, lie in the rectangle widened by `margin` metres."""
+        """bool [...]: points [..., 3] that project along the normal into the rectangle widened by `margin` metres."""
         inside = np.ones(points.shape[:-1], bool)
         for side in (self.along, self.up):
             length = np.linalg.norm(side)
@@ -64,11 +64,11 @@ class Pane:
         return inside
 
     def above(self, points: Array) -> Array:
-        """[...] metres by which points [..., 3] stand before the pane's plane."""
+        """[...] signed distance in metres of points [..., 3] in front of the pane's plane."""
         return (points - self.origin) @ self.normal
 
     def distance_to(self, eye: Array, rays: Array) -> Array:
-        """[R] lengths of the rays [R, 3] from `eye` [3] at which they meet the side that reflects; inf where not."""
+        """[R] lengths at which rays [R, 3] from `eye` [3] hit the reflecting side; inf without a hit."""
         toward = rays @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.where(toward < 0, -self.above(eye) / toward, np.inf)
@@ -77,9 +77,9 @@ class Pane:
         return np.where(hit, distance, np.inf)
 
     def mirrored(self, points: Array) -> Array:
-        """[..., 3] where the images of points [..., 3] stand."""
+        """[..., 3] mirror images of points [..., 3]."""
         return points - 2.0 * self.above(points)[..., None] * self.normal
 
     def turned_back(self, rays: Array) -> Array:
-        """[..., 3] directions after the reflection."""
+        """[..., 3] reflected directions."""
         return rays - 2.0 * (rays @ self.normal)[..., None] * self.normal

@@ -1,11 +1,11 @@
-"""People who hold still and cannot quite: bodies from `anny`, posed, clothed by procedural textures, drifting.
+"""People who hold still with slight drift: bodies from `anny`, posed, with procedural textures as clothes.
 
-`anny` (PyPI, code Apache-2.0, MakeHuman data CC0) gives bare bodies from child to elder. Clothes are regions of the
-skin pushed outwards by some millimetres and painted; hair is a cap of the same kind. Body frame: x to the left hand,
--y ahead, z up, metres. Angles are degrees about these axes.
+`anny` (PyPI, code Apache-2.0, MakeHuman data CC0) gives unclothed bodies from child to elder. Clothes are regions of
+the skin displaced outwards by some millimetres and painted; hair is a cap made in the same way. Body frame: x to the
+left hand, -y ahead, z up, metres. Angles are degrees about these axes.
 """
 
-# Packages of requirements/bench.txt may be absent; each use says what to do then.
+# Packages of requirements/bench.txt may be absent; each use handles that case.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from .textures import Picture, colour, halved, hsv
 
 TEXTURE_SIZE = 1024
 WAIST, KNEE = -0.06, -0.42
-"""Heights on the rest body, whose origin lies in its pelvis, in metres."""
+"""Heights in metres on the rest body, whose origin is in its pelvis."""
 SKIN, SHIRT, TROUSERS, SHOES, HAIR, EYES = range(6)
 FACE = ("eyeBlinkLeft", "eyeBlinkRight", "jawOpen", "mouthSmileLeft", "mouthSmileRight")
 BLINK_SECONDS, FLIP_SECONDS = 0.3, 0.35
 WAVE_HERTZ, POINT_HERTZ = 0.45, 0.3
-"""How often a gesture is made."""
+"""Frequencies of the gestures."""
 
 Pose = dict[str, tuple[float, float, float]]
 
 
 def _both(pose: Pose) -> Pose:
-    """The pose of the left limbs, mirrored to the right ones too."""
+    """A pose of the left limbs, completed with the mirrored right limbs."""
     mirrored = {k.removesuffix(".L") + ".R": (x, -y, -z) for k, (x, y, z) in pose.items()}
     return {**pose, **mirrored}
 
@@ -80,7 +80,7 @@ SEATED = ("sit", "sit_talk")
 
 @dataclass(frozen=True)
 class Person:
-    """Who stands where, and how they move."""
+    """Position, pose and motion of a person."""
 
     name: str
     phenotype: dict[str, float]
@@ -88,27 +88,27 @@ class Person:
     place: tuple[float, float]
     """x, y on the floor in metres."""
     heading: float
-    """Radians about z; 0 looks towards -y."""
+    """Radians about z; 0 faces -y."""
     restless: float = 1.0
-    """Factor on every drift."""
+    """Factor on all drift."""
     waves_arm: bool = False
-    """Swings the right arm up and down all the time: a limit of the method."""
+    """True to swing the right arm up and down throughout, a limit of the method."""
     accents: Pose = field(default_factory=dict)
-    """Added to the pose."""
+    """Angles added to the pose."""
     gesture: str = ""
-    """wave or point: what the right arm does all the time, from the pose `stand`; empty: nothing."""
+    """Repeated gesture of the right arm from the pose `stand`: wave, point, or empty for none."""
     walks: bool = False
-    """Swings legs and arms as in walking: the case in which a freeze does not hold."""
+    """True to swing legs and arms as in walking, for which a freeze fails."""
     changes: tuple[tuple[float, float, Pose], ...] = ()
-    """(begin, end, pose after it): what bones do once, in seconds and in order; kind `held`."""
+    """One-time changes (begin, end, pose after it), in seconds and in order, for kind `held`."""
 
 
 @dataclass
 class Body:
-    """A person over the frames of a clip."""
+    """A person's body over the frames of a clip."""
 
     vertices: NDArray[np.float32]
-    """[T, V, 3] world, metres."""
+    """[T, V, 3] world coordinates in metres."""
     triangles: NDArray[np.int32]
     """[F, 3]."""
     uv: NDArray[np.float32]
@@ -116,11 +116,11 @@ class Body:
     texture: Picture
     """[N, N, 3] sRGB."""
     seat: tuple[float, float, float] | None
-    """x, y and height of the seat in metres; None if the person stands."""
+    """x, y and height of the seat in metres; None for a standing person."""
 
 
 class Bodies:
-    """The body model and what is derived from its topology once. The first time on a machine takes a minute."""
+    """The body model and data derived once from its topology. The first use on a machine takes a minute."""
 
     def __init__(self, texture_step: int = 1) -> None:
         import anny
@@ -134,15 +134,15 @@ class Bodies:
         self.uv = coordinates.numpy()[corners.numpy()].astype(np.float32)
         unposed = self.model(phenotype_kwargs={**dict.fromkeys(self.model.phenotype_labels, 0.5), "age": 0.67})
         self.rest_vertices: Array = unposed["vertices"][0].numpy()
-        """[V, 3] the unposed body of an adult: the space in which clothes are cut and painted."""
+        """[V, 3] the unposed body of an adult, on which clothes are defined and painted."""
         self.eye: Array = unposed["bone_poses"][0, self.bones.index("eye.L"), :3, 3].numpy()
-        """[3] middle of its left eye."""
+        """[3] centre of its left eye."""
         self.influence = self._influence()
         self.regions = self._regions()
         self.texels = self._texels()
 
     def _influence(self) -> dict[str, Array]:
-        """{group: [V] skinning weight} of groups of bones."""
+        """{group: [V] skinning weight of a group of bones}."""
         weights, bones = self.model.vertex_bone_weights.numpy(), self.model.vertex_bone_indices.numpy()
 
         def of(*stems: str, end: str = "") -> Array:
@@ -165,10 +165,10 @@ class Bodies:
         }
 
     def _regions(self) -> dict[str, Array]:
-        """{name: [V]} soft fields over the body: clothes and hair begin where they pass 0.5."""
+        """{name: [V] soft field over the body}; clothes and hair begin where it exceeds 0.5."""
         z, y = self.rest_vertices[:, 2], self.rest_vertices[:, 1]
         w = self.influence
-        # The hair line falls from the forehead to the nape; the unit is half the distance of the eyes.
+        # The hair line falls from the forehead to the nape. The unit is half the distance between the eyes.
         unit = self.eye[0]
         hair_line = (z - self.eye[2] - 1.9 * unit) - 0.8 * (self.eye[1] - 0.3 * unit - y)
         above_waist = np.clip((z - WAIST) / 0.02 + 0.5, 0.0, 1.0)
@@ -185,7 +185,7 @@ class Bodies:
         }
 
     def _texels(self) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int64]]:
-        """Which triangle covers each texel: (face [N*N], barycentric [N*N, 3], nearest covered texel [N*N])."""
+        """Triangle of each texel: (face [N*N], barycentric [N*N, 3], nearest covered texel [N*N])."""
         flat = np.concatenate([self.uv.reshape(-1, 2), np.zeros((3 * len(self.uv), 1), np.float32)], axis=1)
         size = self.texture_size
         at = ((np.arange(size) + 0.5) / size).astype(np.float32)
@@ -199,7 +199,7 @@ class Bodies:
         return hits.face, hits.barycentric, np.ravel_multi_index(tuple(nearest), empty.shape).ravel()
 
     def make(self, person: Person, seed: int, seconds: Array) -> Body:
-        """The body of a person at the given times [T]."""
+        """The body of a person at times [T]."""
         rng = stream(seed, person.name, "clothes")
         clothes = Clothes(
             sleeves=int(rng.integers(0, 3)),
@@ -226,7 +226,7 @@ class Bodies:
         return Body(world.astype(np.float32), self.triangles, self.uv, texture, seat)
 
     def _skinned(self, person: Person, rng: np.random.Generator, seconds: Array) -> Array:
-        """[T, V, 3] in the body frame: the pose, with joints that wander and twitch."""
+        """[T, V, 3] vertices in the body frame: the pose with drifting and twitching joints."""
         count = len(seconds)
         angles = {
             bone: np.tile(np.asarray(value, np.float64), (count, 1)) for bone, value in POSES[person.pose].items()
@@ -243,7 +243,7 @@ class Bodies:
         r = person.restless
         for bone, value in person.accents.items():
             add(bone, np.asarray(value, np.float64))
-        # Slow drift over seconds, as wide as muscles tire, then sway and tremble.
+        # Slow drift over seconds, as of tiring muscles, then sway and tremor.
         for side in (".L", ".R"):
             add("upperarm01" + side, r * np.array([2.2, 1.6, 0.8]) * wander(rng, seconds, 7.0, 3))
             add("lowerarm01" + side, r * np.array([2.2, 0.8, 0.8]) * wander(rng, seconds, 5.0, 3))
@@ -253,7 +253,7 @@ class Bodies:
         add("spine02", r * np.array([0.5, 0.5, 0.5]) * wander(rng, seconds, 3.0, 3))
         add("neck01", r * np.array([1.5, 1.0, 3.5]) * wander(rng, seconds, 6.0, 3))
         add("head", r * np.array([1.2, 0.8, 2.0]) * wander(rng, seconds, 3.0, 3))
-        # Quick small changes: a twitch of the head, a flick of a hand.
+        # Quick small changes: a twitch of the head and a flick of a hand.
         add("head", r * np.array([4.0, 0.0, 5.0]) * bumps(rng, seconds, 4.0, FLIP_SECONDS)[:, None])
         add("wrist.L", r * np.array([18.0, 0.0, 6.0]) * bumps(rng, seconds, 3.0, FLIP_SECONDS)[:, None])
         if person.waves_arm:
@@ -288,7 +288,7 @@ class Bodies:
         return out["vertices"].numpy().astype(np.float64)
 
     def _sway(self, person: Person, rng: np.random.Generator, seconds: Array, vertices: Array) -> Array:
-        """Tips the whole body about its feet, which come to the origin, by fractions of a degree; who sits, a fifth."""
+        """Tilts the body about its feet (moved to the origin) by fractions of a degree; a fifth of that when seated."""
         r = person.restless * (0.2 if person.pose in SEATED else 1.0)
         tilt = np.radians(r * np.array([0.45, 0.35, 0.25]) * wander(rng, seconds, 3.5, 3))
         feet = vertices[0, self.influence["feet"] > 0.5].mean(axis=0) * [1.0, 1.0, 0.0]
@@ -320,7 +320,7 @@ class Bodies:
         return torch.nn.functional.normalize(total, dim=2).numpy()
 
     def _texture(self, clothes: Clothes, fields: Array, rng: np.random.Generator) -> Picture:
-        """Paints every texel by the region and the place of its point on the rest body."""
+        """Paints every texel by region and position of its point on the rest body."""
         face, weights, nearest = self.texels
         used = np.flatnonzero(face >= 0)
         corner = self.triangles[face[used]]
@@ -341,16 +341,16 @@ class Bodies:
 
 @dataclass(frozen=True)
 class Clothes:
-    """What a person wears."""
+    """Clothes and hair of a person."""
 
     sleeves: int
-    """0 none, 1 to the elbow, 2 to the wrist."""
+    """0 for none, 1 to the elbow, 2 to the wrist."""
     dress: bool
     bald: bool
 
 
 def _gesture(gesture: str, seconds: Array) -> dict[str, Array]:
-    """{bone: [T, 3] degrees added to the pose `stand`}: a hand that waves, or an arm that points and sinks."""
+    """{bone: [T, 3] degrees added to the pose `stand`} for a waving hand, or an arm that points and sinks."""
     if not gesture:
         return {}
     of_arm = {bone: np.subtract(POSES[gesture][bone], _ARMS_DOWN[bone]) for bone in ("upperarm01.R", "lowerarm01.R")}
@@ -363,7 +363,7 @@ def _gesture(gesture: str, seconds: Array) -> dict[str, Array]:
 
 
 def _rotations(vectors: Array) -> Array:
-    """[..., 3] rotation vectors (radians) to [..., 3, 3] (Rodrigues)."""
+    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] in radians (Rodrigues)."""
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
@@ -375,7 +375,7 @@ def _rotations(vectors: Array) -> Array:
 
 
 def _skin(rng: np.random.Generator, at: Array, eye: Array) -> Array:
-    """Skin with freckles, brows and lips; `eye` is the middle of the left eye."""
+    """Skin colours with freckles, brows and lips; `eye` is the centre of the left eye."""
     tone = hsv(rng.uniform(0.05, 0.08), rng.uniform(0.35, 0.55), rng.uniform(0.45, 0.9))
     patches = 0.85 + 0.3 * solid(int(rng.integers(1 << 30)), at, 0.04)
     freckles = np.where(solid(int(rng.integers(1 << 30)), at, 0.008) > 0.8, 0.8, 1.0)
@@ -388,7 +388,7 @@ def _skin(rng: np.random.Generator, at: Array, eye: Array) -> Array:
 
 
 def _cloth(rng: np.random.Generator, at: Array, _eye: Array) -> Array:
-    """One of several patterns, in the space of the rest body, so that it moves with the wearer."""
+    """One of several patterns, defined on the rest body so that it moves with the wearer."""
     a, b, c = (colour(rng, (0.2, 0.85), (0.2, 0.95)) for _ in range(3))
     kind, pitch = rng.integers(5), rng.uniform(0.045, 0.08)
     x, y, z = at.T

@@ -1,4 +1,4 @@
-"""Where a scene plays: rooms with furniture, and open ground with trees and walls. Metres, z up, floor at 0."""
+"""Places of scenes: rooms with furniture, and open ground with trees and walls. Metres, z up, floor at 0."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from .panes import GLASS, MIRROR, Pane
 from .textures import TEXTURES
 
 WINDOW_WIDTH, WINDOW_LOW, WINDOW_HIGH = 2.2, 0.85, 2.25
-"""Metres: how wide a window is, where it begins and ends above the floor."""
+"""Width of a window, and heights of its lower and upper edges above the floor, in metres."""
 MIRROR_SIZE, MIRROR_LOW = (1.1, 1.5), 0.65
-"""Metres: width and height of a mirror, and where it begins above the floor."""
+"""Width and height of a mirror, and height of its lower edge above the floor, in metres."""
 MAX_VARIANTS = 10
-"""Pictures of one kind in a scene: after that they are used again."""
+"""Most pictures of one texture in a scene; further uses repeat them."""
 ROOM_SKIES = ("courtyard", "city", "forest")
 OPEN_SKIES = ("courtyard", "forest", "city", "sunrise")
 
 
 @dataclass
 class Material:
-    """A picture on a surface."""
+    """A texture on a surface."""
 
     texture: str
     """Name in TEXTURES."""
     variant: int
     """Seed of the picture within the scene."""
     emission: float = 0.0
-    """Radiance of a lamp's shade; 0: it only reflects."""
+    """Radiance of a lamp's shade; 0 for surfaces that only reflect."""
 
     @property
     def file(self) -> str:
@@ -40,7 +40,7 @@ class Material:
 
 @dataclass
 class Keepout:
-    """Ground that something needs: a disc."""
+    """A disc of ground to keep free."""
 
     x: float
     y: float
@@ -49,38 +49,38 @@ class Keepout:
 
 @dataclass(frozen=True)
 class WallAhead:
-    """What the wall shows that the camera looks at; x in metres, 0 in the middle of it."""
+    """Contents of the wall that the camera faces; x in metres, 0 at its centre."""
 
     window_x: float
-    """Middle of the window, which is then in this wall and in no other."""
+    """Centre of the window. The other walls then have none."""
     window_width: float = WINDOW_WIDTH
     mirror_x: float | None = None
-    """Middle of a mirror; None: there is none."""
+    """Centre of a mirror; None for no mirror."""
     glazed: bool = False
-    """Whether the window has a pane that reflects."""
+    """True if the window has a reflecting pane."""
     garden: bool = False
-    """Whether something stands outside, not only sky."""
+    """True for a garden outside, False for sky only."""
     sky_strength: float = 1.6
 
 
 @dataclass
 class Place:
-    """The still part of a scene, before anybody walks in."""
+    """The static part of a scene, without people."""
 
     materials: list[Material] = field(default_factory=list)
     lights: list[dict[str, Any]] = field(default_factory=list)
-    """As render_bpy.py reads them."""
+    """Lights in the format of render_bpy.py."""
     sky: str = "courtyard"
-    """Name of a CC0 world of Blender's studio lights."""
+    """Name of a CC0 world from Blender's studio lights."""
     sky_strength: float = 1.0
     sky_turn: float = 0.0
-    """Radians about z."""
+    """Rotation of the sky about z in radians."""
     panes: list[Pane] = field(default_factory=list)
-    """Glass and mirrors, which are not part of the mesh."""
+    """Glass and mirrors, which are not in the mesh."""
 
 
 class Furnisher:
-    """Puts things into a place, where the camera's path and the people leave room."""
+    """Adds furniture to a place, away from the camera's path and people."""
 
     def __init__(self, seed: int, path: Array, people: list[Keepout], ahead: WallAhead | None = None) -> None:
         self.seed = seed
@@ -93,7 +93,7 @@ class Furnisher:
         self.build = Builder(self.scales)
 
     def material(self, texture: str, fresh: bool = True, emission: float = 0.0) -> int:
-        """Index of a material of this texture: a new variant, or one that is there already."""
+        """Index of a material of this texture: a new variant, or an existing one."""
         same = [i for i, m in enumerate(self.place.materials) if m.texture == texture and m.emission == emission]
         if same and (not fresh or len(same) >= MAX_VARIANTS):
             return same[int(self.rng.integers(len(same)))]
@@ -102,7 +102,7 @@ class Furnisher:
         return len(self.scales) - 1
 
     def free(self, x: float, y: float, radius: float, from_path: float = 0.55) -> bool:
-        """Takes the disc if nothing has it, and says whether it did."""
+        """Reserves a disc; True if it was free and far enough from the path."""
         if np.hypot(self.path[:, 0] - x, self.path[:, 1] - y).min() < radius + from_path:
             return False
         if any(np.hypot(t.x - x, t.y - y) < t.radius + radius for t in self.occupied):
@@ -113,7 +113,7 @@ class Furnisher:
     # ------------------------------------------------------------------------------------------------- furniture
 
     def shelf(self, x: float, y: float, yaw: float, width: float) -> None:
-        """Open shelf with rows of books, its front towards local -y."""
+        """Adds an open shelf with rows of books, its front towards local -y."""
         wood, books = self.material("planks"), [self.material("books") for _ in range(2)]
         c, s = np.cos(yaw), np.sin(yaw)
 
@@ -138,7 +138,7 @@ class Furnisher:
                     self.build.ball(at(dx * width, 0, low + radius), [radius] * 3, self.material("fabric", False))
 
     def table(self, x: float, y: float, yaw: float) -> None:
-        """Four legs, a top, and things on it."""
+        """Adds a table with four legs and objects on it."""
         wood = self.material("planks")
         width, depth, height = self.rng.uniform(1.0, 1.5), self.rng.uniform(0.6, 0.8), self.rng.uniform(0.5, 0.76)
         c, s = np.cos(yaw), np.sin(yaw)
@@ -172,7 +172,7 @@ class Furnisher:
                 )
 
     def sofa(self, x: float, y: float, yaw: float) -> None:
-        """Seat, back, arms and two cushions; it looks towards local -y."""
+        """Adds a sofa with back, arms and two cushions; it faces local -y."""
         cloth, other = self.material("fabric"), self.material("fabric")
         c, s = np.cos(yaw), np.sin(yaw)
         parts = [
@@ -187,11 +187,11 @@ class Furnisher:
             self.build.box([x + c * dx - s * dy, y + s * dx + c * dy, z], size, material, yaw)
 
     def stool(self, x: float, y: float, height: float, yaw: float) -> None:
-        """What a seated person sits on."""
+        """Adds a seat for a person."""
         self.build.box([x, y, height / 2], [0.42, 0.42, height], self.material("fabric"), yaw)
 
     def boxes(self, x: float, y: float) -> None:
-        """A stack of cartons."""
+        """Adds a stack of cartons."""
         z = 0.0
         for _ in range(int(self.rng.integers(2, 4))):
             size = self.rng.uniform(0.3, 0.5, 3)
@@ -199,7 +199,7 @@ class Furnisher:
             z += size[2]
 
     def plant(self, x: float, y: float, height: float) -> None:
-        """A pot and balls of leaves."""
+        """Adds a potted plant with balls of leaves."""
         self.build.cylinder([x, y, 0.0], 0.2, 0.35, self.material("tiles", False))
         leaves = self.material("leaves", False)
         self.build.cylinder([x, y, 0.3], 0.03, height - 0.4, self.material("bark", False), 10)
@@ -209,7 +209,7 @@ class Furnisher:
             self.build.ball(at, [r, r, 0.7 * r], leaves, 10, 6)
 
     def lamp(self, x: float, y: float) -> None:
-        """A floor lamp that shines a little."""
+        """Adds a floor lamp."""
         self.build.cylinder([x, y, 0.0], 0.16, 0.03, self.material("concrete", False))
         self.build.cylinder([x, y, 0.03], 0.015, 1.45, self.material("concrete", False), 10)
         self.build.cylinder([x, y, 1.4], 0.2, 0.28, self.material("fabric"), 20)
@@ -217,7 +217,7 @@ class Furnisher:
     def posters(
         self, origin: Array, along: Array, length: float, spots: int, occupied: list[tuple[float, float]]
     ) -> None:
-        """Framed pictures on a wall from `origin` along the unit vector `along`, clear of the spans `occupied`."""
+        """Adds framed pictures on a wall from `origin` along the unit vector `along`, outside the spans `occupied`."""
         normal = np.array([along[1], -along[0], 0.0])
         for _ in range(4 * spots):
             if spots == 0:
@@ -237,7 +237,7 @@ class Furnisher:
     def wall(
         self, origin: Array, along: Array, length: float, height: float, window: tuple[float, float] | None
     ) -> None:
-        """A wall that faces the room (along x up points into it), with a window from `window[0]` to `window[1]`."""
+        """Adds a wall facing the room (`along` × z points into it), with a window from `window[0]` to `window[1]`."""
         texture = ("plaster", "wallpaper", "bricks", "plaster", "concrete")[self.rng.integers(5)]
         skin, board = self.material(texture), self.material("planks", False)
         up = np.array([0.0, 0.0, 1.0])
@@ -264,7 +264,7 @@ class Furnisher:
     # ------------------------------------------------------------------------------------------------- places
 
     def room(self) -> tuple[Place, Mesh]:
-        """A furnished room with ceiling lamps and a window."""
+        """Builds a furnished room with ceiling lamps and a window."""
         rng, place = self.rng, self.place
         half, front, back, height = rng.uniform(3.6, 4.3), -5.2, rng.uniform(3.4, 4.2), rng.uniform(2.7, 3.1)
         depth = back - front
@@ -313,7 +313,7 @@ class Furnisher:
         return place, self.build.mesh()
 
     def _panes(self, ahead: WallAhead, origin: Array, half: float) -> list[tuple[float, float]]:
-        """Hangs the mirror and glazes the window of the wall ahead; the spans that the mirror takes of it."""
+        """Adds the mirror and the window's pane to the wall ahead; returns the spans covered by the mirror."""
         along = np.array([1.0, 0.0, 0.0])
         if ahead.glazed:
             at = origin + along * (half + ahead.window_x - ahead.window_width / 2) + [0, 0, WINDOW_LOW]
@@ -329,7 +329,7 @@ class Furnisher:
         return [(start, start + width)]
 
     def _garden(self, x: float, back: float) -> None:
-        """What is seen through a window in the wall ahead: a lawn, a house, trees."""
+        """Adds the view through a window in the wall ahead: a lawn, a house, trees."""
         self.build.rect([x - 12, back + 0.3, -0.01], [24, 0, 0], [0, 16, 0], self.material("grass"))
         self._house(x + float(self.rng.uniform(-2.5, 2.5)), back + 7.5, 0.0)
         for dx in (-2.6, 0.2, 2.8):
@@ -386,10 +386,10 @@ class Furnisher:
                 self.plant(x, y, float(rng.uniform(0.9, 1.4)))
 
     def ground(self) -> tuple[Place, Mesh]:
-        """A paved square on grass or gravel, with trees, walls and benches around it."""
+        """Builds a paved square on grass or gravel, with trees, walls and benches around it."""
         rng, place = self.rng, self.place
         lawn = self.material(("grass", "gravel", "grass")[rng.integers(3)])
-        # A fine grid is not needed: one quad, far enough for a horizon and near enough for depths in 16 bits.
+        # One quad is enough. It is large enough for a horizon, and its depths fit in 16 bits.
         self.build.rect([-40, -40, 0], [80, 0, 0], [0, 80, 0], lawn)
         self.build.rect(
             [-4.2, -5.5, 0.012], [8.4, 0, 0], [0, 9.5, 0], self.material(("pavers", "tiles", "bricks")[rng.integers(3)])
@@ -462,13 +462,13 @@ def _panel(centre: list[float], width: float, depth: float, watts: float) -> dic
 
 
 def _portal(centre: Array, inward: Array, width: float, height: float) -> dict[str, Any]:
-    """Where the sky comes in: tells Cycles to look for light there."""
+    """A light portal at a window, where Cycles samples the sky's light."""
     light = {"type": "AREA", "location": centre.tolist(), "direction": inward.tolist()}
     return {**light, "size": [width, height], "energy": 0.0, "color": [1.0, 1.0, 1.0], "portal": True}
 
 
 def _sun(azimuth: float, elevation: float, strength: float) -> dict[str, Any]:
-    """From behind the camera at `azimuth` radians to the side and `elevation` radians above the horizon."""
+    """Sunlight from behind the camera, `azimuth` radians to the side and `elevation` radians above the horizon."""
     flat = np.cos(elevation)
     direction = [float(flat * np.sin(azimuth)), float(flat * np.cos(azimuth)), float(-np.sin(elevation))]
     light = {"type": "SUN", "location": [0.0, 0.0, 10.0], "direction": direction}

@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""Exact visibility: rays against triangles with Warp, on the CPU. Everything here is in the world's metres."""
+"""Exact visibility by casting rays at triangles with Warp, on the CPU. World coordinates in metres."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 SLACK = 2e-3
-"""Metres by which a ray may end before the point that it looks for."""
+"""Tolerance in metres by which a ray may end before its target point."""
 
 
 @wp.kernel(enable_backward=False)
@@ -42,18 +42,18 @@ def _nearest(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), found: wp.array(d
 
 @dataclass
 class Hits:
-    """What R rays met first."""
+    """First hits of R rays."""
 
     distance: NDArray[np.float32]
-    """[R] in lengths of the ray's direction; inf if nothing."""
+    """[R] in lengths of the ray's direction; inf without a hit."""
     face: NDArray[np.int32]
-    """[R] triangle, -1 if nothing."""
+    """[R] triangle; -1 without a hit."""
     barycentric: NDArray[np.float32]
     """[R, 3] weights of its corners."""
 
 
 class RayScene:
-    """Triangles ready to be looked at: `vertices` [V, 3] metres, `triangles` [F, 3]."""
+    """Triangles for ray casting: `vertices` [V, 3] in metres, `triangles` [F, 3]."""
 
     def __init__(self, vertices: NDArray, triangles: NDArray) -> None:
         self.vertices = np.ascontiguousarray(vertices, np.float32)
@@ -63,7 +63,7 @@ class RayScene:
         self._mesh = wp.Mesh(points, indices)
 
     def cast(self, origins: NDArray, directions: NDArray) -> Hits:
-        """First hits of rays from `origins` [R, 3] along `directions` [R, 3] (any length)."""
+        """First hits of rays from `origins` [R, 3] along `directions` [R, 3] of any length."""
         count = len(origins)
         length = np.linalg.norm(directions, axis=1, keepdims=True)
         hits = Hits(np.empty(count, np.float32), np.empty(count, np.int32), np.zeros((count, 3), np.float32))
@@ -81,7 +81,7 @@ class RayScene:
         return hits
 
     def nearest(self, points: NDArray) -> NDArray[np.float64]:
-        """[P, 3] the points of the triangles that are nearest to `points` [P, 3]."""
+        """[P, 3] points on the triangles nearest to `points` [P, 3]."""
         found = np.empty((len(points), 3), np.float32)
         places = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device="cpu")
         output = wp.array(found, dtype=wp.vec3, device="cpu", copy=False)
@@ -89,15 +89,15 @@ class RayScene:
         return found.astype(np.float64)
 
     def sees(self, eye: NDArray, points: NDArray) -> NDArray[np.bool_]:
-        """[P] whether nothing lies between `eye` [3] and `points` [P, 3]."""
+        """bool [P]: no triangle is between `eye` [3] and `points` [P, 3]."""
         return self.clear(np.broadcast_to(eye, points.shape), points)
 
     def clear(self, begin: NDArray, end: NDArray) -> NDArray[np.bool_]:
-        """[P] whether nothing lies between points [P, 3] and [P, 3], but for what the latter are on."""
+        """bool [P]: no triangle is between points `begin` [P, 3] and `end` [P, 3]; surfaces at `end` are ignored."""
         away = end - begin
         length = np.linalg.norm(away, axis=1)
         return self.cast(begin, away).distance * length >= length - SLACK
 
     def escapes(self, eye: NDArray, directions: NDArray) -> NDArray[np.bool_]:
-        """[R] whether rays from `eye` [3] along `directions` [R, 3] meet nothing."""
+        """bool [R]: rays from `eye` [3] along `directions` [R, 3] hit nothing."""
         return self.cast(np.broadcast_to(eye, directions.shape), directions).face < 0

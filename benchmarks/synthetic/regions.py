@@ -1,20 +1,20 @@
-"""What can be known of each picture's pixels: depth, what was in view at t*, what moves. From exact geometry.
+"""Exact masks of each picture from geometry: depth, points seen at t*, and moving points.
 
-Rays through the pixel centres meet the triangles of the frozen scene. A pixel of the truth is *seen* if its surface
-point lies inside the clip's own frame t* and nothing stands before it there (sky: if that direction is in the frame
-and open). It *moves* if the projection of its surface point into this very view is, at any frame of the clip, farther
-than MOVING_PX from where it is at t*: a still wall before which somebody moves does not. Shadows, exposure and the
-rolling shutter are no motion in this sense; the views are those of the exact cameras, all rows at the frame's time.
+Rays through the pixel centres are cast at the triangles of the frozen scene. A pixel of the truth is *seen* if its
+surface point is inside the clip's own frame t* and unoccluded there (sky: if its direction is in the frame and
+unoccluded). It *moves* if, at any frame of the clip, its surface point projects in this view farther than MOVING_PX
+from its place at t*. A still wall behind a mover does not move. Shadows, exposure and the rolling shutter do not count
+as motion. Views are those of the exact cameras, with all rows at the frame's time.
 
-In a mirror what is reflected counts: it is seen at t* if the mirror shows it there, and moves as its image moves. On
-glass either layer may move; seen is what stands behind it. Depth is that of the mirror itself, and of what is behind
-glass.
+In a mirror the reflected point counts: it is seen at t* if the mirror shows it there, and moves as its image moves. On
+glass either layer may move; *seen* refers to the point behind the glass. Depth is the mirror's own, and that of the
+point behind glass.
 
 Hard scenes have masks of their things (`Regions.things`). `glass` and `mirror` are the pixels of panes in which nothing
-moves, `wall` those of the still wall that they are in, within `WALL_METRES` of one. `swinging`, `arm` and `hair` are
-the pixels whose centre shows the thing; hair is thinner than a pixel, so a pixel is hair if at least `HAIR_SHARE` of
-`HAIR_RAYS` squared rays through it meet a strand. Scenes of the kind `held` have a mask per thing that is held, and the
-region `held`: see `held_elsewhere`.
+moves, `wall` those of the surrounding still wall within `WALL_METRES` of a pane. `swinging`, `arm` and `hair` are the
+pixels whose centre shows the thing. Hair is thinner than a pixel: a pixel is hair if at least `HAIR_SHARE` of
+`HAIR_RAYS` squared rays through it hit a strand. Scenes of kind `held` have a mask per held thing, and the region
+`held`: see `held_elsewhere`.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from .sizes import HELD, MOVING_PX, THING, Size
 DEPTH_STEPS_PER_METRE = 1000.0
 HAIR_RAYS, HAIR_SHARE = 4, 0.15
 NUDGE = 1e-4
-"""Metres by which a ray that a pane reflects begins before it."""
+"""Offset in metres of a reflected ray's origin in front of the pane."""
 STILL_SECONDS = 0.5
-"""How long before and after a plate nothing moves in a pixel of the region `held`."""
+"""Seconds before and after a plate without motion in a pixel of the region `held`."""
 ELSEWHERE_METRES, SWAY_METRES = 0.04, 0.02
-"""A surface point stood elsewhere if it was farther away than the first, and stands still while it is never farther
-away than the second: see docs/synthetic.md for how far those who hold still sway."""
+"""Displacements in metres: above the first a surface point counts as elsewhere, up to the second as still. See
+docs/synthetic.md for the sway of people who hold still."""
 WALL_METRES, WALL_DEPTH = 0.6, 0.04
-"""How far around a pane the wall is beside it, and how far before or behind the pane's plane a point is on the wall:
-bare wall, and pictures on it, but no furniture."""
+"""Distances in metres: around a pane within which its wall counts, and greatest distance of a wall point from the
+pane's plane. `WALL_DEPTH` includes pictures on the wall, but no furniture."""
 
 
 @dataclass
@@ -58,19 +58,19 @@ class Geometry:
     """All triangles of a scene over its clip."""
 
     static: NDArray[np.float32]
-    """[S, 3] vertices that never move."""
+    """[S, 3] vertices of static objects."""
     moving: NDArray[np.float32]
-    """[T, M, 3] those that may; numbered after the static ones."""
+    """[T, M, 3] vertices of movers, numbered after the static ones."""
     triangles: NDArray[np.int32]
     """[F, 3]."""
     panes: list[Pane]
-    """Which are not among the triangles."""
+    """Panes, which are not among the triangles."""
     things: dict[str, NDArray[np.bool_]]
-    """{name of a thing that a hard scene is about: [F] which triangles are it}."""
+    """{name of a hard scene's thing: [F] mask of its triangles}."""
 
     @classmethod
     def load(cls, folder: Path) -> Geometry:
-        """What generate.write_geometry wrote and the camera can see."""
+        """Loads the visible geometry written by generate.write_geometry."""
         plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
         with np.load(folder / "geometry" / "static.npz", allow_pickle=False) as data:
             static, triangles = data["vertices"], [data["triangles"]]
@@ -93,12 +93,12 @@ class Geometry:
         return cls(static, np.concatenate(moving, axis=1), np.concatenate(triangles), panes, its)
 
     def at(self, index: int) -> RayScene:
-        """The scene as it stands at a frame."""
+        """The scene at a frame."""
         return RayScene(np.concatenate([self.static, self.moving[index]]), self.triangles)
 
 
 def _thing_faces(folder: Path, plan: dict[str, Any]) -> list[tuple[str, str, NDArray[np.bool_]]]:
-    """(name, mover, which of the mover's triangles) of everything that a hard scene is about."""
+    """(name, mover, mask of the mover's triangles) of every thing of a hard scene."""
     found: list[tuple[str, str, NDArray[np.bool_]]] = []
     if "thing" in plan:
         with np.load(folder / "geometry" / "thing.npz", allow_pickle=False) as data:
@@ -123,26 +123,26 @@ class View:
         return -self.matrix[:3, :3].T @ self.matrix[:3, 3]
 
     def rays(self, dx: float = 0.5, dy: float = 0.5) -> Array:
-        """[H*W, 3] world directions through the pixels, of unit depth: through their centres, or as far into them."""
+        """[H*W, 3] world directions of unit depth through the pixels, at offset (dx, dy) in each (default: centre)."""
         x, y = np.meshgrid(np.arange(self.width) + dx, np.arange(self.height) + dy)
         local = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
         return local.reshape(-1, 3) @ self.matrix[:3, :3]
 
     def project(self, points: Array, at_infinity: bool = False) -> tuple[Array, Array]:
-        """([..., 2] pixels, [...] depth) of world points, or of directions."""
+        """([..., 2] pixels, [...] depth) of world points or, at infinity, of directions."""
         local = points @ self.matrix[:3, :3].T + (0.0 if at_infinity else self.matrix[:3, 3])
         depth = local[..., 2]
         safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
         return local[..., :2] / safe[..., None] * self.K[[0, 1], [0, 1]] + self.K[:2, 2], depth
 
     def shows(self, pixels: Array, depth: Array) -> NDArray[np.bool_]:
-        """[...] whether projected points fall into the picture."""
+        """bool [...]: projected points are inside the picture."""
         inside = (pixels >= 0.0).all(-1) & (pixels[..., 0] <= self.width) & (pixels[..., 1] <= self.height)
         return inside & (depth > 0.0)
 
 
 def write_regions(folder: Path, seed: int, kind: str, size: Size, progress: Callable[[int, int], None]) -> None:
-    """masks/NNNNNN.npz for the clip's frames and truth/<t*>/NNNNNN.npz for the truth's; what exists is left alone."""
+    """Writes missing masks/NNNNNN.npz for the clip's frames and truth/<t*>/NNNNNN.npz for the truth's."""
     views = views_of(seed, size, kind)
     instants = set(size.t_star_indices())
     todo: dict[int, list[tuple[int | None, Path]]] = {}
@@ -215,20 +215,20 @@ def region_maps(geometry: Geometry, scene: RayScene, index: int, view: View, own
 
 @dataclass
 class Shown:
-    """What R rays see in a pane by reflection."""
+    """R reflected rays of a pane."""
 
     rays: NDArray[np.int64]
-    """[R] which of the picture's rays meet it."""
+    """[R] indices of the picture's rays that hit the pane."""
     distance: Array
-    """[R] at which depth."""
+    """[R] depth of the pane."""
     moving: NDArray[np.bool_]
-    """[R] whether what is reflected is ever elsewhere in the pane."""
+    """[R] whether the reflected image ever moves in the pane."""
     seen: NDArray[np.bool_]
-    """[R] whether the pane shows it in the clip's own frame, too."""
+    """[R] whether the pane also shows it in the clip's own frame."""
 
 
 def show_pane(geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index: int, view: View, own: View) -> Shown:
-    """What a pane reflects in a view of frame `index`, where nothing stands before it; `hits` are the view's own."""
+    """Reflections of an unoccluded pane in a view of frame `index`; `hits` are those of the view."""
     rays = view.rays()
     distance = pane.distance_to(view.eye, rays)
     which = np.flatnonzero(distance < hits.distance)
@@ -243,7 +243,7 @@ def show_pane(geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index
     points = at + back * np.where(hit, reflected.distance, 0.0)[:, None]
     seen = np.zeros(len(which), bool)
     if hit.any():
-        # From the own eye: the image of the point, if the line to it passes the pane and nothing is in its way.
+        # The image of the point is seen from `own.eye` if the line to it hits the pane and is unoccluded.
         images = pane.mirrored(points[hit])
         away = images - own.eye
         through = own.eye + away * pane.distance_to(own.eye, away)[:, None].clip(max=1.0)
@@ -258,7 +258,7 @@ def show_pane(geometry: Geometry, scene: RayScene, pane: Pane, hits: Hits, index
 def _things(
     geometry: Geometry, scene: RayScene, hits: Hits, view: View, moving: NDArray[np.bool_], shown: list[Shown]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Masks [R] of what a hard scene is about, see the module."""
+    """Masks [R] of a hard scene's things, as described in this module."""
     masks: dict[str, NDArray[np.bool_]] = {}
     of_panes = np.zeros(len(hits.face), bool)
     for pane, pane_view in zip(geometry.panes, shown, strict=True):
@@ -286,7 +286,7 @@ def _things(
 def _moving(
     geometry: Geometry, hits: Hits, index: int, show: Callable[[Array], tuple[Array, Array]]
 ) -> NDArray[np.bool_]:
-    """[R] whether the surface that each ray met is ever elsewhere in a view, which `show` projects into."""
+    """[R] whether the surface hit by each ray ever moves in a view, into which `show` projects."""
     moving = np.zeros(len(hits.face), bool)
     corners = geometry.triangles[np.maximum(hits.face, 0)] - len(geometry.static)
     which = np.flatnonzero((hits.face >= 0) & (corners[:, 0] >= 0))
@@ -308,13 +308,13 @@ def _moving(
 def held_elsewhere(
     geometry: Geometry, standing: Callable[[int], RayScene], index: int, pose: int, view: View, window: int
 ) -> NDArray[np.bool_]:
-    """[H, W] pixels in which plate `pose` shows another state than the scene of frame `index`, and stands still.
+    """[H, W] still pixels in which plate `pose` shows another state than the scene of frame `index`.
 
-    The surface that the truth shows stood elsewhere when the plate was taken, or the plate's surface stands elsewhere
-    in the truth; and in no frame up to `window` before or after the plate did either surface of the pixel move.
+    The surface of the truth was elsewhere at the plate's time, or the plate's surface is elsewhere in the truth. In
+    addition, neither surface of the pixel moves in any frame up to `window` before or after the plate.
 
     Args:
-        standing: the scene of a frame.
+        standing: returns the scene of a frame.
         view: the camera of frame `pose`.
     """
     rays = view.rays()
@@ -332,7 +332,7 @@ def held_elsewhere(
 
 
 def _displaced(geometry: Geometry, hits: Hits, time: int, other: int) -> Array:
-    """[R] metres between where the surface points that rays met at a frame are and where they are at another."""
+    """[R] distance in metres of surface points hit by rays at frame `time` from their positions at frame `other`."""
     corners = geometry.triangles[np.maximum(hits.face, 0)] - len(geometry.static)
     which = np.flatnonzero((hits.face >= 0) & (corners[:, 0] >= 0))
     moved = np.zeros(len(hits.face))

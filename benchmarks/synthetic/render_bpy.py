@@ -1,12 +1,12 @@
 # pyright: reportMissingModuleSource=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false
-# Nodes, sockets and lights are more to Blender than their types say; the add-on, which has to be right in five
-# Blenders, is checked without these exceptions.
-"""Renders the pictures that a plan.json lists: `python render_bpy.py SCENE_FOLDER`, inside a bpy wheel's Python.
+# Blender's type stubs for nodes, sockets and lights are incomplete. The add-on, which must work in five versions of
+# Blender, is checked without these exceptions.
+"""Renders the pictures listed in a plan.json: `python render_bpy.py SCENE_FOLDER`, inside a bpy wheel's Python.
 
-Cycles on the CPU, in one process per scene so that its data persist. Needs bpy, numpy and the standard library only.
-Standard output carries JSON lines {"done", "total", "seconds"}; standard input is held open by the parent, and when it
-closes this process ends. Pictures that exist are left alone; each is written beside its place and renamed.
+Uses Cycles on the CPU, in one process per scene to keep its data. Needs only bpy, numpy and the standard library.
+Standard output has JSON lines {"done", "total", "seconds"}. The parent holds standard input open; when it closes, this
+process ends. Existing pictures are kept; each new one is written to a temporary file and renamed.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ import numpy as np
 from mathutils import Matrix, Vector
 
 METER_GREY = 0.20
-"""Scene-linear value that the median of the metered pixels is exposed to."""
+"""Scene-linear value to which the median of the metered pixels is exposed."""
 METER_BRIGHT = 0.95
 METER_SIZE = 64
 
 
 def main(folder: Path) -> None:
-    """Renders what is missing."""
+    """Renders the missing pictures."""
     threading.Thread(target=_die_with_parent, daemon=True).start()
     plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
     jobs = [job for job in plan["jobs"] if not (folder / job["out"]).exists()]
@@ -57,7 +57,7 @@ def _die_with_parent() -> None:
 
 
 class Stage:
-    """The Blender scene."""
+    """The Blender scene and its rendering."""
 
     def __init__(self, folder: Path, plan: dict[str, Any]) -> None:
         self.folder, self.plan, self.oversize = folder, plan, plan["oversize"]
@@ -65,7 +65,7 @@ class Stage:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = bpy.context.scene
         self._settings()
-        # A scene with panes has its things in a collection of their own, which is held out of the panes' layer.
+        # In a scene with panes, all other objects are in their own collection, a holdout in the panes' view layer.
         self.collection = self.scene.collection
         if plan.get("panes"):
             self.collection = self._collection("things")
@@ -124,9 +124,9 @@ class Stage:
         settings.exr_codec = "NONE"
 
     def _develop(self) -> None:
-        """Compositor: denoises the light that falls on surfaces by itself, then multiplies by their colour.
+        """Sets up the compositor: it denoises light separately, then multiplies by the surfaces' colour.
 
-        Colours come almost free of noise; a denoiser that sees light and texture together mistakes one for the other.
+        The colour pass is almost free of noise. A denoiser of light and texture together confuses noise and texture.
         """
         layer = self.scene.view_layers[0]
         for name in ("diffuse_direct", "diffuse_indirect", "diffuse_color", "emit", "environment"):
@@ -158,10 +158,10 @@ class Stage:
         return made
 
     def _reflections(self) -> None:
-        """The panes, in a view layer that shows nothing but what they reflect; the other layer is without them.
+        """Adds the panes, in a view layer that shows only their reflections; the other layer excludes them.
 
-        Their one closure is the reflection, weighted by the share that is reflected: a surface that chose between
-        reflection and what is behind it by chance would be full of noise.
+        A pane's only closure is the reflection, weighted by its reflectance. A surface that chose randomly between
+        reflection and the world behind it would be noisy.
         """
         panes = self._collection("panes")
         for number, pane in enumerate(self.plan["panes"]):
@@ -201,14 +201,14 @@ class Stage:
         return material
 
     def _with_panes(self, tree: Any, mixed: Any, behind: Any) -> Any:
-        """Mixes in what panes reflect: behind * (1 - share reflected) + reflection; `behind` if there are none."""
+        """Mixes in the panes' reflections: behind * (1 - reflectance) + reflection; returns `behind` without panes."""
         if not self.plan.get("panes"):
             return behind
         passes, denoise = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("CompositorNodeDenoise")
         passes.layer = "reflections"
         light = mixed("ADD", passes.outputs["Glossy Direct"], passes.outputs["Glossy Indirect"])
         share = passes.outputs["Glossy Color"]
-        # Through a clear mirror the renderer's guides are those of what is seen in it.
+        # For a perfect mirror the renderer's guide passes are those of the reflected surfaces.
         for guide in ("Normal", "Albedo"):
             tree.links.new(passes.outputs[f"Denoising {guide}"], denoise.inputs[guide])
         tree.links.new(mixed("MULTIPLY", light, share), denoise.inputs["Image"])
@@ -216,7 +216,7 @@ class Stage:
         return mixed("ADD", left, denoise.outputs[0])
 
     def _without(self, mover: dict[str, Any], made: Any) -> Any:
-        """A mover less the triangles of the scene's thing, hidden until it is requested; None if nothing is left."""
+        """A mover without the triangles of the scene's thing, initially hidden; None if all or none are removed."""
         with np.load(self.folder / "geometry" / "thing.npz", allow_pickle=False) as data:
             gone = data["gone"]
         if gone.all() or not gone.any():
@@ -285,7 +285,7 @@ class Stage:
         if emission:
             surface.inputs["Emission Color"].default_value = (1.0, 0.97, 0.92, 1.0)
             surface.inputs["Emission Strength"].default_value = emission
-            # It is seen, but the area light beside it does the lighting.
+            # The surface is visible, but the area light near it does the lighting.
             material.cycles.emission_sampling = "NONE"
         return material
 
@@ -313,9 +313,9 @@ class Stage:
         return made
 
     def _go_to(self, time: float, elsewhen: dict[str, float]) -> None:
-        """Moves everything to a time in (fractional) frames, between neighbouring frames linearly.
+        """Moves all movers to a time in fractional frames, interpolated linearly between neighbouring frames.
 
-        `elsewhen`: {mover: the time that it goes to instead}.
+        `elsewhen`: {mover: another time for this mover}.
         """
         if (time, elsewhen) == self.time:
             return
@@ -337,7 +337,7 @@ class Stage:
         self.camera.matrix_world = Matrix(world_to_camera).inverted() @ Matrix.Diagonal((1, -1, -1, 1))
 
     def render(self, job: dict[str, Any], stops: float, out: Path) -> None:
-        """One picture, in one piece or in strips of rows that have each their own time."""
+        """Renders one picture, whole or in strips of rows, each with its own time."""
         out.parent.mkdir(parents=True, exist_ok=True)
         width, height = self.plan["width"], self.plan["height"]
         render = self.scene.render
@@ -348,7 +348,7 @@ class Stage:
         for band in [] if "box" in job else job["bands"]:
             low, high = band["rows"]
             render.use_border = high - low < height
-            # Blender counts rows from below.
+            # Blender's border counts rows from below.
             render.border_min_y, render.border_max_y = 1.0 - high / height, 1.0 - low / height
             light[low:high] = self._exposed(job, band)[low:high]
         render.use_border = False
@@ -357,7 +357,7 @@ class Stage:
         os.replace(partial, out)
 
     def _render_box(self, job: dict[str, Any], light: np.ndarray) -> None:
-        """The pixels of a box without the scene's thing; the rest stays black."""
+        """Renders the pixels of a box without the scene's thing; the rest stays black."""
         (left, top, right, bottom), (height, width, _) = job["box"], light.shape
         render = self.scene.render
         render.use_border = True
@@ -369,19 +369,19 @@ class Stage:
         render.border_min_x, render.border_max_x = 0.0, 1.0
 
     def _exposed(self, job: dict[str, Any], band: dict[str, Any]) -> np.ndarray:
-        """[h, w, 3] scene-linear: the band, or the mean over the moments while the shutter is open."""
+        """[h, w, 3] scene-linear light of the band, or its mean over the moments of the open shutter."""
         elsewhen = job.get("elsewhen", {})
         if "shutter" not in job:
             return self._light_of(band, elsewhen)
         pictures = []
         for number, moment in enumerate(job["shutter"]):
-            # Each moment has noise of its own, so that the mean has less.
+            # Each moment has independent noise, which the mean reduces.
             self.scene.cycles.seed = (job["noise"] + number) % (1 << 31)
             pictures.append(self._light_of(moment, elsewhen))
         return np.mean(pictures, axis=0)
 
     def _light_of(self, band: dict[str, Any], elsewhen: dict[str, float] | None = None) -> np.ndarray:
-        """[h, w, 3] scene-linear, rows downwards: the rendered pixels averaged to those of the picture."""
+        """[h, w, 3] scene-linear light, rows downwards, averaged from rendered pixels to picture pixels."""
         self._go_to(band["time"], elsewhen or {})
         self._place_camera(band["world_to_camera"])
         path = self.folder / f".render.{os.getpid()}.exr"
@@ -398,7 +398,7 @@ class Stage:
         return fine.mean(axis=(1, 3))[::-1, :, :3]
 
     def meter(self) -> float:
-        """Stops that bring the clip to a good exposure, as a camera would that is then locked."""
+        """Stops that expose the clip well, like the locked exposure of a camera."""
         render = self.scene.render
         frames = [job for job in self.plan["jobs"] if job["out"].startswith("frames/")]
         size = render.resolution_x, render.resolution_y
@@ -415,16 +415,16 @@ class Stage:
 
 
 def srgb(light: np.ndarray) -> np.ndarray:
-    """Scene-linear [H, W, 3] to 8-bit sRGB (IEC 61966-2-1): Blender's view transform Standard."""
+    """Scene-linear [H, W, 3] as 8-bit sRGB (IEC 61966-2-1), equal to Blender's view transform Standard."""
     light = np.clip(light, 0.0, 1.0)
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-8) ** (1 / 2.4) - 0.055)
     return np.round(255.0 * encoded).astype(np.uint8)
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """A PNG of [H, W, 3] uint8 with nothing but its pixels: Blender's own also tell when and how long it rendered."""
+    """A PNG of [H, W, 3] uint8 with pixels only; PNGs written by Blender also contain the date and render time."""
     height, width, _ = pixels.shape
-    # Filter 1 (Sub) in every row: each byte less the one of the pixel before.
+    # Filter 1 (Sub) in every row: each byte minus the same byte of the previous pixel.
     rows = pixels.copy()
     rows[:, 1:] -= pixels[:, :-1]
     data = np.concatenate([np.ones((height, 1), np.uint8), rows.reshape(height, -1)], axis=1).tobytes()
@@ -439,7 +439,7 @@ def png(pixels: np.ndarray) -> bytes:
 
 
 def _metered(folder: Path, plan: dict[str, Any], stage: Stage) -> float:
-    """The clip's exposure in stops: measured once, then kept in meter.json."""
+    """The clip's exposure in stops, measured once and then read from meter.json."""
     path = folder / "meter.json"
     if path.exists():
         return json.loads(path.read_text(encoding="utf-8"))["stops"]

@@ -1,7 +1,7 @@
 """Prints the reprojection errors of COLMAP models as JSON: `python -m benchmarks.synthetic.residuals MODEL...`.
 
-One list per model of [name of the image, x, y of the keypoint, error in pixels]. A process of its own for the reasons
-that torch_backend/sfm/worker.py gives.
+One list per model of [image name, x, y of the keypoint, error in pixels]. It is a separate process for the reasons
+given in torch_backend/sfm/worker.py.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pycolmap
 
 
 def residuals(folder: str) -> list[tuple[str, float, float, float]]:
-    """(name of the image, x, y, error) of every observation of a triangulated point, in pixels."""
+    """(image name, x, y, error) of every observation of a triangulated point, in pixels."""
     model = pycolmap.Reconstruction(folder)
     found: list[tuple[str, float, float, float]] = []
     for point in model.points3D.values():

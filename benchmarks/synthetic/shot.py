@@ -1,13 +1,12 @@
-"""From a synthetic scene to a product's shot folder: cameras solved by COLMAP, or the exact ones.
+"""Makes shot folders of the product from a synthetic scene, with cameras solved by COLMAP or with exact ones.
 
-`solved_shot` puts the clip through the product's own import and solve. Its freezes are rendered at the solved poses of
-the clip's frames, as the product does, and compared with the truth of the same frames: `truth_as_solved` takes the
-truth's pictures and maps through the undistortion that the clip's frames went through. `similarity_to_exact` says how
-far the solved cameras are from the exact ones.
+`solved_shot` uses the product's import and solve. Its freezes are rendered at the solved poses of the clip's frames, as
+in the product, and compared with the truth of the same frames. `SolvedPixels` applies the undistortion of the clip's
+frames to the truth's pictures and maps. `similarity_to_exact` measures the difference of solved and exact cameras.
 
-`exact_shot` writes the same folder from the exact cameras; units are metres. Its points are triangulated by COLMAP
-with the poses held (triangulate.py, a child process). Where that finds too few (`tiny`), they are sampled from the
-exact surfaces that some frames see, displaced by half a pixel of noise: `points_from` in solve.json says which.
+`exact_shot` writes the same folder from the exact cameras, in metres. COLMAP triangulates its points with fixed poses
+(triangulate.py, a child process). If it finds too few (`tiny`), points are sampled from the exact surfaces visible in
+some frames, displaced by half a pixel of noise. `points_from` in solve.json names the source.
 """
 
 from __future__ import annotations
@@ -52,30 +51,30 @@ class Similarity:
     translation: NDArray[np.float64]
     """[3] metres."""
     rms: float
-    """Metres between the mapped solved camera centres and the exact ones, root mean square."""
+    """Root mean square distance in metres of the mapped solved camera centres from the exact ones."""
     rotation_error_deg: float
-    """Median angle between the mapped solved orientations and the exact ones."""
+    """Median angle in degrees between the mapped solved orientations and the exact ones."""
 
 
 def import_clip(scene: SyntheticScene, folder: str | Path, report: Reporter) -> Shot:
-    """A shot with the clip's frames imported; every frame is solved and trained on."""
+    """A shot with the clip's frames imported; every frame is solved and used for training."""
     shot = Shot.create(folder, scene.name)
     import_footage(shot, str(scene.root / "frames"), FootageConfig(step=1, fps=scene.fps), report)
     return shot
 
 
 def solved_shot(scene: SyntheticScene, folder: str | Path, report: Reporter) -> Shot:
-    """A shot whose cameras COLMAP found. JobError if it cannot."""
+    """A shot with cameras solved by COLMAP. JobError if the solve fails."""
     shot = import_clip(scene, folder, report)
     solve_shot(shot, SolveConfig(), report)
     return shot
 
 
 def exact_shot(scene: SyntheticScene, folder: str | Path, report: Reporter) -> Shot:
-    """A shot with the exact cameras, in metres; left alone if it is there already."""
+    """A shot with the exact cameras, in metres; an existing one is kept."""
     shot = import_clip(scene, folder, report)
     frames = load_frames(shot)
-    # The product's own key: its solve step finds this shot solved and leaves it so.
+    # With the product's key, the product's solve step accepts this shot as solved and keeps it.
     key = content_key(SOLVE_VERSION, SolveConfig(), frames["key"])
     record = shot.solve / "solve.json"
     if record.is_file() and read_json(record).get("key") == key and read_json(record).get("cameras") == "exact":
@@ -120,7 +119,7 @@ def exact_shot(scene: SyntheticScene, folder: str | Path, report: Reporter) -> S
 
 
 def exact_cameras(scene: SyntheticScene, similarity: Similarity | None = None) -> CameraPath:
-    """The exact cameras of the clip in metres, or in the solve units of a shot that `similarity` maps to them."""
+    """The exact cameras of the clip in metres, or in the solve units of the shot of `similarity`."""
     intrinsics = [scene.K[0, 0], scene.K[1, 1], scene.K[0, 2], scene.K[1, 2]]
     cameras = []
     for frame in scene.frames:
@@ -135,10 +134,10 @@ def exact_cameras(scene: SyntheticScene, similarity: Similarity | None = None) -
 
 
 def similarity_to_exact(scene: SyntheticScene, shot: Shot) -> Similarity:
-    """Maps a solved shot to the exact world by its registered cameras.
+    """The similarity that maps a solved shot to the exact world, from its registered cameras.
 
-    Scale and translation fit the centres (Umeyama, PAMI 1991); the rotation fits the orientations, because the centres
-    of a camera that walks straight ahead leave the turn about that line open.
+    Scale and translation fit the centres (Umeyama, PAMI 1991). The rotation fits the orientations, because the centres
+    of a camera that walks straight ahead leave the rotation about this line undetermined.
     """
     solved = [c for c in CameraPath.load(shot.solve / "cameras.json").frames if c.source == "registered"]
     views = np.array([c.viewmat for c in solved]).reshape(-1, 4, 4)
@@ -157,10 +156,10 @@ def similarity_to_exact(scene: SyntheticScene, shot: Shot) -> Similarity:
 
 
 class SolvedPixels:
-    """What a solved shot did to the clip's pixels, for the truth's pictures and maps."""
+    """The resampling of the clip's frames by a solve, for the truth's pictures and maps."""
 
     def __init__(self, shot: Shot) -> None:
-        """ValueError if the shot was not solved with SIMPLE_RADIAL or exact cameras."""
+        """ValueError unless the shot was solved with SIMPLE_RADIAL or has exact cameras."""
         record = read_json(shot.solve / "solve.json")
         if record["camera_model"] not in ("SIMPLE_RADIAL", "PINHOLE"):
             raise ValueError(f"the undistortion of {record['camera_model']} is not known here, only SIMPLE_RADIAL's")
@@ -169,7 +168,7 @@ class SolvedPixels:
         k = record["distortion"][0] if record["distortion"] else 0.0
         x, y = np.meshgrid(np.arange(path.width) + 0.5, np.arange(path.height) + 0.5)
         u, v = (x - cx) / fx, (y - cy) / fy
-        # K is that of the undistorted frames, `focal_px` that of the clip as it was filmed.
+        # K belongs to the undistorted frames, `focal_px` to the original clip.
         focal = record["focal_px"]
         radial = 1.0 + k * (u**2 + v**2)
         where = np.stack([cx + focal * u * radial, cy + focal * v * radial], axis=-1)
@@ -178,18 +177,18 @@ class SolvedPixels:
         self._row = np.clip(np.floor(where[..., 1]).astype(np.int64), 0, path.height - 1)
 
     def picture(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """[H, W, 3] as the solve resamples the clip's frames."""
+        """[H, W, 3] picture resampled like the clip's frames in the solve."""
         return self._resample(pixels)
 
     def regions(self, regions: Regions) -> Regions:
-        """Maps of the nearest pixel."""
+        """The maps resampled by nearest pixel."""
         at = self._row, self._column
         things = {name: mask[at] for name, mask in regions.things.items()}
         return Regions(regions.depth[at], regions.moving[at], regions.seen[at], things)
 
 
 def _triangulated(scene: SyntheticScene, shot: Shot, names: list[str]) -> dict[str, NDArray] | None:
-    """points.npz's arrays from the child process, filtered as the product does; None if it found nothing."""
+    """The arrays of points.npz from the child process, filtered as in the product; None if it found no points."""
     scratch = shot.solve / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
@@ -226,7 +225,7 @@ def _triangulated(scene: SyntheticScene, shot: Shot, names: list[str]) -> dict[s
 
 
 def surface_points(scene: SyntheticScene) -> dict[str, NDArray]:
-    """Points on what some frames of the clip see, each half a pixel off: xyz [P, 3] metres, rgb, error px, track."""
+    """Points on surfaces seen in some frames, with half a pixel of noise: xyz [P, 3] metres, rgb, error px, track."""
     rng = stream(scene.seed, "surface points")
     chosen = [scene.frames[i] for i in np.linspace(0, len(scene.frames) - 1, SURFACE_FRAMES).round().astype(int)]
     xyz, rgb = [], []

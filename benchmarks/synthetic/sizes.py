@@ -1,4 +1,4 @@
-"""How large a benchmark is, and which scene a seed stands for."""
+"""Sizes of the benchmark, and properties of a scene that follow from its seed."""
 
 from __future__ import annotations
 
@@ -8,51 +8,52 @@ FORMAT_VERSION = 1
 TUNING_SEEDS = range(0, 10)
 REPORT_SEEDS = range(100, 110)
 LIMITS = ("moving-shadow", "exposure-ramp", "fast-mover", "rolling-shutter")
-"""Kinds of scenes beside `plain`: each breaks one assumption of the method."""
+"""Kinds of scenes that each break one assumption of the method."""
 VERDICTS = ("walker", "still", "tripod")
-"""Kinds of scenes that the verdict is tried on: somebody walks through, nothing moves, the camera only turns."""
+"""Kinds of scenes for testing the verdict: a person walks through, nothing moves, the camera only turns."""
 HARD = ("glass", "swinging", "arm", "hair", "held")
-"""Kinds of scenes each with a thing that a freeze loses: a window and a mirror, an apple on a thread, an arm that waves
-or points, fine hair before a bright window, and what stands still in two states (held.py)."""
+"""Kinds of scenes, each with a thing that a freeze tends to lose. These are a window and a mirror, an apple on a
+thread, an arm that waves or points, fine hair before a bright window, and things that are still in two states
+(held.py)."""
 HELD = "held"
-"""The kind of held.py, and the region of its truth that another state stood in."""
+"""The kind of held.py, and the region of its truth that showed another state."""
 THING = "thing_"
-"""What the names of a hard scene's masks begin with in its .npz files."""
+"""Prefix of a hard scene's mask names in its .npz files."""
 KINDS = ("plain", *LIMITS, *VERDICTS, *HARD)
 CAMERA_MOVES = ("forward", "pan", "return", "orbit")
 MOVING_PX = 0.5
-"""A pixel moves if its surface point is ever farther than this, in pixels of the view, from where it is at t*."""
+"""Displacement of a surface point from its place at t*, in pixels of the view, above which its pixel moves."""
 T_STAR_STEP = 8
-"""Every how many frames an instant is a candidate (paper, section Experiments)."""
+"""Interval in frames between candidate instants (paper, section Experiments)."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """Extent of one scene and how many scenes the benchmark has."""
+    """Extent of one scene, and number of scenes in the benchmark."""
 
     name: str
     scenes: int
     frames: int
-    """Frames of the clip."""
+    """Number of frames of the clip."""
     fps: float
-    """Frames per second: small sizes sample the same seconds of people and camera more coarsely."""
+    """Frames per second; small sizes sample the same motion more coarsely."""
     width: int
-    """Pixels."""
+    """Width in pixels."""
     height: int
-    """Pixels."""
+    """Height in pixels."""
     t_stars: int
-    """Frozen instants with a truth."""
+    """Number of frozen instants with truth."""
     pose_step: int
-    """The truth is rendered at every such pose of the clip."""
+    """Interval in frames between poses at which the truth is rendered."""
     samples: int
     """Cycles samples per rendered pixel."""
     oversize: int
-    """The picture is rendered and denoised at this many times its size, then averaged."""
+    """Factor by which the picture is rendered and denoised larger, then averaged."""
     texture_step: int
-    """Pictures on surfaces have their size divided by this: finer than the pixels they would only be noise."""
+    """Divisor of texture sizes; texels finer than the picture's pixels would only be noise."""
 
     def t_star_indices(self) -> list[int]:
-        """Zero-based frame indices of the instants: spread over the multiples of 8, never the first if few."""
+        """Zero-based frame indices of the instants, spread over the multiples of 8; without the first frame if few."""
         candidates = list(range(0, self.frames, T_STAR_STEP))
         if self.t_stars >= len(candidates):
             return candidates
@@ -60,7 +61,7 @@ class Size:
         return [candidates[min(int(step * (i + 0.5)), len(candidates) - 1)] for i in range(self.t_stars)]
 
     def pose_indices(self) -> list[int]:
-        """Zero-based frame indices of the poses that have a truth."""
+        """Zero-based frame indices of the poses with truth."""
         return list(range(0, self.frames, self.pose_step))
 
 
@@ -77,7 +78,7 @@ SIZES = {
 
 
 def place_of(seed: int, kind: str = "plain") -> str:
-    """`room` or `ground`: where the scene of a seed plays. What needs a wall or a ceiling always plays in a room."""
+    """Place of a seed's scene: `room` or `ground`. Kinds that need a wall or a ceiling are always in a room."""
     return "ground" if seed % 10 in (1, 4, 7) and kind not in ("glass", "swinging", "hair") else "room"
 
 

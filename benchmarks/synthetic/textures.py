@@ -1,7 +1,7 @@
-"""Pictures for walls, floors, furniture and posters, drawn with numpy from a random stream.
+"""Textures for walls, floors, furniture and posters, drawn with numpy from a random stream.
 
-Each function returns [N, N, 3] uint8 sRGB that tiles (posters do not need to). They are rich in corners on purpose:
-COLMAP has to find its features in them at 135 lines.
+Each function returns [N, N, 3] uint8 sRGB that tiles (except posters). Textures have many corners, so that COLMAP finds
+features in them at a height of 135 lines.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Picture = NDArray[np.uint8]
 
 
 def hsv(hue: float, saturation: float, value: float) -> Array:
-    """[3] sRGB in [0, 1]."""
+    """[3] sRGB colour in [0, 1]."""
     channel = (np.array([5.0, 3.0, 1.0]) + hue * 6.0) % 6.0
     return value * (1.0 - saturation * np.clip(np.minimum(channel, 4.0 - channel), 0.0, 1.0))
 
 
 def colour(rng: np.random.Generator, saturation: tuple[float, float], value: tuple[float, float]) -> Array:
-    """[3] a random hue within the given ranges."""
+    """[3] sRGB colour of random hue, with saturation and value in the given ranges."""
     return hsv(rng.uniform(), rng.uniform(*saturation), rng.uniform(*value))
 
 
@@ -33,7 +33,7 @@ def _picture(rgb: Array) -> Picture:
 
 
 def halved(picture: Picture) -> Picture:
-    """Half the size, by averaging 2x2: edges that were drawn hard become soft, as a camera's pixels want them."""
+    """The picture at half size, by averaging 2x2 pixels; this softens hard edges like a camera's pixels."""
     size = len(picture) // 2
     mean = picture.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
     return np.round(mean).astype(np.uint8)
@@ -45,13 +45,13 @@ def _grid(size: int) -> tuple[Array, Array]:
 
 
 def _per_cell(rng: np.random.Generator, *indices: NDArray[np.int64]) -> Array:
-    """Uniform random value per cell, looked up by small non-negative indices."""
+    """Uniform random value per cell, indexed by small non-negative integers."""
     shape = [int(i.max()) + 1 for i in indices]
     return rng.uniform(size=shape)[indices]
 
 
 def planks(rng: np.random.Generator, size: int) -> Picture:
-    """Boards along x with grain."""
+    """Wooden boards along x with grain."""
     y, x = _grid(size)
     rows, cols = 10, 2
     row = (y * rows).astype(np.int64)
@@ -68,7 +68,7 @@ def planks(rng: np.random.Generator, size: int) -> Picture:
 
 
 def bricks(rng: np.random.Generator, size: int) -> Picture:
-    """Running bond with mortar."""
+    """Bricks in running bond with mortar."""
     y, x = _grid(size)
     rows, cols = 16, 8
     row = (y * rows).astype(np.int64)
@@ -161,7 +161,7 @@ def pavers(rng: np.random.Generator, size: int) -> Picture:
 
 
 def gravel(rng: np.random.Generator, size: int) -> Picture:
-    """Pebbles of many greys."""
+    """Pebbles in many shades of grey."""
     a, b = fractal(rng, size, 0.9), fractal(rng, size, 0.5)
     return _picture(
         (0.15 + 0.75 * np.round(5 * a) / 5 * (0.6 + 0.8 * b))[..., None] * colour(rng, (0.05, 0.3), (0.8, 1.0))
@@ -259,13 +259,13 @@ def bark(rng: np.random.Generator, size: int) -> Picture:
 
 @dataclass(frozen=True)
 class Texture:
-    """A kind of surface."""
+    """Drawing function and scale of a texture."""
 
     draw: Callable[[np.random.Generator, int], Picture]
     metres: float
-    """Length of one side of the picture on the surface; 0: stretched over each face."""
+    """Side of the picture on the surface in metres; 0 stretches it over each face."""
     pixels: int = 1024
-    """Side of the picture."""
+    """Side of the picture in pixels."""
 
 
 TEXTURES = {

@@ -1,8 +1,8 @@
-"""The child process that triangulates a clip with known cameras: `python -m benchmarks.synthetic.triangulate REQUEST`.
+"""Child process that triangulates a clip with known cameras: `python -m benchmarks.synthetic.triangulate REQUEST`.
 
-COLMAP's features and matches as in the product's solve, its triangulation with the poses held. A process of its own for
-the reasons that torch_backend/sfm/worker.py gives. The request is the worker's plus "K" [fx, fy, cx, cy], "width",
-"height" and "cameras" {file: 4x4 world-to-camera}. Writes points.npz beside it, as the worker does.
+COLMAP extracts features and matches as in the product's solve, and triangulates with fixed poses. It is a separate
+process for the reasons given in torch_backend/sfm/worker.py. The request is the worker's plus "K" [fx, fy, cx, cy],
+"width", "height" and "cameras" {file: 4x4 world-to-camera}. Writes points.npz to the request's folder, like the worker.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch_backend.sfm.request import SEED, Request
 
 
 def main(path: str) -> int:
-    """Runs the request; 1 if nothing could be triangulated."""
+    """Runs the request; returns 1 if no point could be triangulated, else 0."""
     threading.Thread(target=_die_with_parent, daemon=True).start()
     request = Request(Path(path))
     data = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -18,11 +18,11 @@ import numpy as np
 from mathutils import Matrix
 
 FILM_MM = 36.0
-"""Width of the film back; its height follows from the shape of the pictures, so that pixels are square."""
+"""Width of the film back in mm; its height follows from the aspect ratio of the pictures, for square pixels."""
 
 
 def main(source: Path, files: list[Path]) -> None:
-    """Builds the camera in an empty scene and exports it to each of the files."""
+    """Creates the camera in an empty scene and exports it to each of the files."""
     told = json.loads(source.read_text(encoding="utf-8"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene: Any = bpy.context.scene
@@ -47,7 +47,7 @@ def main(source: Path, files: list[Path]) -> None:
 
 
 def _camera(told: dict[str, Any]) -> Any:
-    """A camera with the lens of the pictures; its principal point becomes Blender's shift, in widths of the film."""
+    """A camera with the pictures' lens; its principal point becomes Blender's shift, in units of the film's width."""
     (fx, _, cx), (_, _, cy), _ = told["K"]
     width, height = told["width"], told["height"]
     data = bpy.data.cameras.new("matchmove")
