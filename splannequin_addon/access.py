@@ -1,9 +1,9 @@
-"""Typed access where Blender's type stubs are loose: our settings on a scene, and pointers that are typed as optional
-but are always set where they are used.
+"""Typed access where Blender's type stubs are loose.
 
-Does not import bpy at run time.
-No other file imports types of this package for the type checker only: the settings classes lie above every module that
-reads them.
+Covers our settings on a scene, and pointers that are typed as optional but are always set where they are used. Does not
+import bpy at run time.
+Only this file imports types of this package for the type checker alone. At run time, an import of the settings classes
+would be circular, because they depend on modules that read settings.
 """
 
 from __future__ import annotations

@@ -389,7 +389,7 @@ def colour_space(encoding: str | tuple[float, ...]) -> str:
         try:
             space = _space_of(image)
             known = space.bl_rna.properties["name"].enum_items.keys()
-            first = [n for n in (*likely, space.name) if n in known]  # the last one has the role for byte images
+            first = [n for n in (*likely, space.name) if n in known]  # the last one is the default of byte images
             image.pack(data=_PROBE, data_len=len(_PROBE))
             image.source = "FILE"
             space.is_data = True

@@ -1,7 +1,7 @@
 """Registers all parts of the add-on in order and unregisters them in reverse order: all or nothing, and only once.
 
-Packages below the steps are registered through their modules. Each of the five steps provides one object with its
-classes and other parts to register.
+Lower-level packages are registered through their modules. Each of the five steps provides one object with its classes
+and other parts to register.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _undo(acts: Sequence[Callable[[], None]]) -> None:
     if hasattr(bpy.types.Scene, "splannequin"):
         del bpy.types.Scene.splannequin  # pyright: ignore[reportAttributeAccessIssue]
     kinds = (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu, bpy.types.UIList, bpy.types.AddonPreferences)
-    # Property groups come last, and groups that contain others before those: a class must go before its targets.
+    # Property groups come last. A group is unregistered before the groups that it contains.
     left = [cls for kind in (*kinds, bpy.types.PropertyGroup) for cls in reversed(kind.__subclasses__())]
     for cls in left:
         if _is_ours(cls) and getattr(cls, "is_registered", False):

@@ -3,8 +3,8 @@
     .venv-bpy-5.0/bin/python splannequin_addon/run_in_bpy.py bake --shot SHOT --take TAKE --output DIR
     blender --background --factory-startup --python splannequin_addon/run_in_bpy.py -- bake --shot SHOT ...
 
-The package is loaded from this file's repository under the name of an installed extension, so that relative imports,
-preferences and operators work the same way. Installs nothing and writes no preferences.
+The package is loaded from this file's repository under the name of an installed extension. Relative imports,
+preferences and operators therefore work the same way. Installs nothing and writes no preferences.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ def _pixels_apart(
 ) -> float:
     """Largest distance in pixels between the projections of the same point by two cameras.
 
-    The points are those that `wanted` shows in the middle and the corners of the picture.
+    The points project to the middle and the corners of `wanted`'s image.
 
     Args:
         seen: first camera, K in pixels of the render.

@@ -28,8 +28,8 @@ from .take_files import Take
 _CG = "cg"
 """Tag value of our Render Layers node, which is not part of the plate's stream."""
 _HOW = "splannequin_how"
-"""Key of the last fit that we set on the plate's Scale node. A fit set by the artist stays until the plate or the scene
-changes shape."""
+"""Property of the plate's Scale node: the fit that we set last. A fit set by the artist stays until the plate or the
+scene changes shape."""
 _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
 """Layers of every frozen frame. Other layers of the table exist only in some takes."""
 
@@ -55,7 +55,7 @@ def insert(
             None: unchanged.
 
     Returns:
-        What was changed, one sentence each.
+        One sentence for each change.
 
     Raises:
         contract.JobError: `where` is "PLATE" and no node shows the plate, or the compositor is linked from another
@@ -266,8 +266,7 @@ def _show_plate(
     plate: original_plate.Plate,
     take: Take,
 ) -> bool:
-    """Links the undistorted plate to our group, so that Mix fades between plate and freeze, or updates the existing
-    stream.
+    """Links the undistorted plate to our group, or updates the existing link. Mix then fades between plate and freeze.
 
     The artist may edit the minimal tree: existing nodes of ours are reused, and the artist's links are kept.
     Returns False without changes if the artist links another stream to the group, or shows another image in our node.
@@ -332,7 +331,8 @@ def _follow_plate(
     ours: Sequence[bpy.types.Node],
     plate: original_plate.Plate,
 ) -> None:
-    """Adapts the nodes between Plate and the group to a plate. Links from our nodes still carry the stream."""
+    """Adapts the nodes between Plate and the group to a plate. A new node takes over the links of the node it
+    replaces."""
     fit = next((n for n in ours if n.bl_idname == "CompositorNodeScale"), None)
     inner = next((n for n in ours if original_plate.kind(n)), None)
     wanted, stream = original_plate.between(plate), present(reader.outputs)["Image"]

@@ -76,7 +76,7 @@ def fitted(
     margin: tuple[int, int],
     layers: dict[str, bpy.types.NodeSocket],
 ) -> dict[str, bpy.types.NodeSocket]:
-    """The layers' sockets by name, without overscan and scaled to the render size of the moment of rendering.
+    """The layers' sockets by name, without overscan and scaled to the render size at the time of rendering.
 
     Frames with a wider aspect ratio than the render are cropped to the camera's view. Taller renders get bars.
     """
@@ -104,7 +104,7 @@ def fitted(
 def how_it_fits(scene: bpy.types.Scene, size: tuple[int, int]) -> str:
     """How to fit an image of a size into the render: the widths match, as in the solved camera."""
     tall = scene.render.resolution_x * size[1] / (scene.render.resolution_y * size[0])
-    # Equal aspect ratios up to rounding: both modes give the same. Where cropping leaves a row unset, use "Fit".
+    # With equal aspect ratios up to rounding, both modes work. Then use "Fit" where cropping leaves a row unset.
     alike = abs(tall - 1.0) < 0.01 and not compat.CROPS_WHOLE
     return "Crop" if tall > 0.99 and not alike else "Fit"
 

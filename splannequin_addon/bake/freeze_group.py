@@ -85,8 +85,8 @@ def shown(scene: bpy.types.Scene) -> tuple[Path, float] | None:
 
 
 def cg_softness(scene: bpy.types.Scene) -> bpy.types.NodeSocket | None:
-    """The freeze group's input for the softness between CG and frozen depth. None if no CG is linked, or if the input
-    is."""
+    """The freeze group's input for the softness between CG and frozen depth. None if no CG is linked, or if this input
+    itself has a link."""
     tree = compat.compositor_tree(scene)
     node = group_node(tree) if tree else None
     if node is None or not node.inputs["CG"].is_linked:

@@ -18,8 +18,8 @@ _EVEN, _SOFT = 0.005, 0.01
 """Tolerances as fractions of the frozen depth. CG up to `_EVEN` behind the frozen surface counts as in front. Over a
 further `_SOFT` it fades behind.
 
-`_EVEN` is the median error of frozen depth on truth (docs/benchmarks.md, "Depth"). Without it, the frozen surface shows
-through objects standing on it, a quarter of their rims and a twelfth of their shadows.
+`_EVEN` is the median error of frozen depth on truth (docs/benchmarks.md, "Depth"). Without this tolerance, the frozen
+surface shows through objects that stand on it: through a quarter of their rims and a twelfth of their shadows.
 """
 _SHADOW = 0.05
 """Fraction of its depth by which a caught shadow (black CG) counts as nearer. A take's surface mesh lies up to 3 %

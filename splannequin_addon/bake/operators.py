@@ -54,7 +54,7 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams | None:
         """Freeze parameters after a new reading of the artist's camera, if the take uses one; else None.
 
-        Frames that the camera's motion since the freeze affects are stale.
+        Frames whose camera pose has changed since the freeze are stale.
         """
         return takes.read_camera(scene, self.step) if own_camera.follows_camera(scene) else None
 

@@ -14,8 +14,8 @@ from ..scene import session
 from . import render_settings, rendering
 
 _IDLE_TURNS = 2
-"""Timer turns without a render job after which a render without an end handler counts as over. The first turn may come
-before the render job starts."""
+"""Number of timer turns without a render job after which a render counts as over, even without an end handler. The
+first turn may come before the render job starts."""
 _runs: dict[Path, rendering.Run] = {}
 """Shot -> its running render."""
 _ended: dict[Path, bool] = {}

@@ -2,9 +2,9 @@
 
 During a bake, the scene itself stores what was changed. A file saved in between, or an undo step, is repaired when it
 is loaded. A file that the artist saves during a bake holds the artist's settings.
-These settings stay as the artist has them, because they are choices about the result: file format, colour mode, depth,
-compression and the linear space of EXR files; size in percent, range and step; the compositor's precision. So do all
-settings for rendering the scene's objects (engine, samples, motion blur, Freestyle, simplify, background scene).
+Settings that are choices about the result stay as the artist has them. These are file format, colour mode, depth,
+compression and the linear space of EXR files; size in percent, range and step; the compositor's precision. They include
+all settings for rendering the scene's objects (engine, samples, motion blur, Freestyle, simplify, background scene).
 """
 
 from __future__ import annotations

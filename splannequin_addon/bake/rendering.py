@@ -32,9 +32,9 @@ _UNINTERRUPTED = 2.0
 """Seconds between two thread switches of Python while Blender renders.
 
 One global variable of Blender stores whether Python may write to data. A render that begins while a panel is drawn
-restores the panel's "no" when it ends. Then Python can write nothing until Blender is restarted. In series of 8 renders
-in 4.3.2, this happened after the second render at Python's default of 5 ms, and never at 2 s, because a draw is then
-not interrupted.
+restores the panel's "no" when it ends. Then Python can write nothing until Blender is restarted. Measured in 4.3.2 with
+8 renders each: at Python's default of 5 ms, the fault appeared after the second render. At 2 s it never appeared,
+because a draw is then not interrupted.
 """
 _usual_interval = [sys.getswitchinterval()]
 """Switch interval before the first of the running renders changed it."""
@@ -157,7 +157,7 @@ class Run:
         try:
             if self._check_cancelled and self.error is None:
                 try:
-                    self._check_cancelled()  # a request during the render may have gone to another add-on's handler
+                    self._check_cancelled()  # a handler of another add-on may have swallowed the request
                 except BaseException as error:
                     self.error = error
             if self._spoilt and self.error is None:
@@ -350,7 +350,7 @@ def _places(scene: bpy.types.Scene, frames: list[int], folder: Path | None) -> d
     before = scene.render.filepath, scene.render.use_file_extension
     try:
         scene.render.use_file_extension = True
-        # The folder is a temporary one, because Blender creates the folder of a movie's name.
+        # Uses the temporary directory, because Blender creates the folder of a movie's path.
         scene.render.filepath = compat.literal(os.path.join(tempfile.gettempdir(), DIGITS))
         return {n: folder / path.name for n, path in _named(scene, frames).items()}
     finally:

@@ -93,8 +93,10 @@ class Bake(Step):
         return True
 
     def late(self, job: jobs.Job) -> str:
-        """Note that asks for another bake: selecting a shot starts no render and keeps the other take in the
-        compositor."""
+        """Note about a job that ended late: its frames need another bake.
+
+        Selecting a shot starts no render and keeps the other take in the compositor.
+        """
         return "Its frames were rendered meanwhile. Bake again to put them into your compositor."
 
     def in_use(self, shot: Path, folder: Path) -> str:

@@ -56,7 +56,7 @@ def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:
 
 
 def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(width and height, overscan on left and right and above and below) of an EXR, in pixels.
+    """((width, height), overscan (left and right, above and below)) of an EXR, in pixels.
 
     Reads the header, because Blender reports 0 x 0 for a multilayer file. Raises ValueError without a header, or if the
     margins of opposite sides differ: Blender centres the pixels regardless of the frame's position.

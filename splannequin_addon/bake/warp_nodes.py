@@ -58,9 +58,9 @@ def looked_up(
 def _between(
     tree: bpy.types.NodeTree, share: bpy.types.NodeSocket, size: int
 ) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Sockets of the two pixels around a position in a row of `size` pixels, and of the weight of the second.
+    """Sockets (first pixel, second pixel, weight of the second) for a position in a row of `size` pixels.
 
-    Positions are fractions 0..1 of the row.
+    The position and the coordinates of both pixels are fractions 0..1 of the row.
     """
 
     def on(source: bpy.types.NodeSocket, operation: str, *values: float) -> bpy.types.NodeSocket:

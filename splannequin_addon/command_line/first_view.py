@@ -1,4 +1,4 @@
-"""The window of a shot.blend that was made without a window, when it is opened.
+"""Sets up how a window shows a shot.blend that was created without a window.
 
 The 3D viewport looks through the solved camera at t*, with the freeze as its background image and a light for added
 objects. The solve's points are hidden, because they would cover the image. Applies only to scenes that this add-on

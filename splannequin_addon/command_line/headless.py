@@ -149,7 +149,7 @@ def make_surface(args: argparse.Namespace, console: Console) -> int:
 
 
 def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
-    """Import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
+    """Runs import, solve, train, freeze and bake. Writes OUTPUT/shot.blend and OUTPUT/summary.json."""
     began = time.perf_counter()
     output = _output(args)
     shot = output / (args.shot_name + contract.SHOT_SUFFIX)
@@ -490,5 +490,5 @@ def parser() -> argparse.ArgumentParser:
     top, verbs = contract.command_line(
         "blender --background [FILE.blend] --command splannequin", contract.BLENDER, _UNSET
     )
-    verbs["bake"].add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # to the launcher, by stdin
+    verbs["bake"].add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # ends when stdin closes
     return top

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 
 def imported(scene: bpy.types.Scene, shot: Path) -> list[str]:
-    """Sets up the scene after an import: its size, rate and range if it is new or the artist allows it, and the clip's
-    camera."""
+    """Sets up the scene after an import and adds the clip's camera. Returns the changes as sentences.
+
+    The scene gets the clip's size, rate and range if it is new or if the artist allows it.
+    """
     state = inventory.read(shot)
     props = settings_of(scene)
     selection.see(scene, state)

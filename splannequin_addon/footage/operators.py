@@ -41,7 +41,7 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Sets the clip. A new clip next to an imported shot starts another shot."""
+        """Sets the clip. If the selected shot is already imported, another clip starts a new shot."""
         props = settings_of(scene_in(context))
         if not self.filepath:
             self.report({"ERROR"}, "No file was given")

@@ -112,7 +112,8 @@ def _world(
     """A world that emits a panorama's light.
 
     The panorama's directions are those of the scene at the time it was made. Two Mapping nodes convert the scene's
-    current directions: the first, driven by the shot's root, to the solve's axes, the second to the panorama's axes.
+    current directions. The first, driven by the shot's root, converts them to the solve's axes, the second to the
+    panorama's axes.
     """
     world = bpy.data.worlds.new(name)
     world[TAG] = True

@@ -2,8 +2,8 @@
 
 A path is one pose per frame, camera-to-world, [F, 4, 4] float64, Blender's camera axes (x right, y up, looking along
 -z), solve units. Positions and rotations are processed separately. Rotations are unit quaternions (w, x, y, z).
-Multiplying them by a fixed rotation from either side is an orthogonal map, so results do not depend on the choice of
-world or camera axes.
+Multiplying them by a fixed rotation from either side is an orthogonal map. Results therefore do not depend on the
+choice of world or camera axes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Timing:
 def smoothed(poses: Array, position: float, rotation: float) -> Array:
     """A path without sway. The first and the last pose stay.
 
-    Each coordinate y minimises |y - x|^2 + b |y''|^2 (a Whittaker smoother): motion of the period p keeps the fraction
+    Each coordinate y minimises |y - x|^2 + b |y''|^2 (a Whittaker smoother). Motion of the period p keeps the fraction
     1 / (1 + (c / p)^4). The cutoff period c, at which half remains, is the amount times the length of the path.
 
     Args:

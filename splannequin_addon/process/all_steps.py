@@ -119,7 +119,7 @@ def _begin_next(chain: Chain, scene: bpy.types.Scene) -> None:
     chain.step, chain.began = chain.ahead.pop(0), time.monotonic()
     ops: Any = bpy.ops  # our operators are not in the stubs
     window = job_timer.window_of(scene) or next(iter(bpy.context.window_manager.windows), None)
-    with contextlib.suppress(RuntimeError):  # Blender's form of an error that an operator reports
+    with contextlib.suppress(RuntimeError):  # raised by Blender for errors that an operator reports
         with bpy.context.temp_override(window=window, scene=scene):  # pyright: ignore[reportUnknownMemberType]
             getattr(ops.splannequin, BUTTONS[chain.step])()
 

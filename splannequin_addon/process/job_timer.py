@@ -78,7 +78,7 @@ class Watch:
     """Name of a step -> (sentence, hint) about its failure on Blender's side."""
     work: Work | None = None
     """Work that Blender is doing for the shot."""
-    pending: dict[str, jobs.Job] = field(default_factory=dict[str, Any])  # the name `jobs` is a field in this class
+    pending: dict[str, jobs.Job] = field(default_factory=dict[str, Any])  # `jobs` is the field here, not the module
     """Name of a step -> job that succeeded while no scene had this shot selected. It is applied once the shot is
     selected."""
     unread: tuple[str, str] | None = None
@@ -224,7 +224,7 @@ def refresh(watch: Watch) -> bool:
         watch.state = inventory.read(watch.shot)
         selection.look_again()
     except (OSError, ValueError, KeyError) as error:
-        # Try again later: a network disk may be back, or a file may have been in replacement on Windows.
+        # Try again later: a network disk may return, or a file was being replaced on Windows.
         watch.state, watch.stamp = ShotState(watch.shot), ()
         why = getattr(error, "strerror", None) or error
         known = watch.unread

@@ -177,7 +177,7 @@ def is_alive(job: Job, status: contract.Status | None) -> bool:
     """True if the job's process still works on it, or may be about to.
 
     A process that is only stopped, for example by a sleeping computer, is alive regardless of its heartbeat. A job on
-    another computer is alive as long as it holds the shot's lock.
+    another computer is alive as long as it holds the shot's lock, which can be removed on that computer or by hand.
     """
     if job.process is not None:
         return job.process.poll() is None

@@ -1,7 +1,7 @@
 """Base class of a step, and the registry of steps. Each step's package provides one object.
 
-Operators, timer, panel and command line use this object for the backend request, the changes to the scene, the panel's
-content, and the removal of a shot. A new step is a new package (see CONTRIBUTING.md).
+This object defines the backend request, the changes to the scene, the panel's content, and the removal of a shot.
+Operators, timer, panel and command line use it. A new step is a new package (see CONTRIBUTING.md).
 """
 
 from __future__ import annotations
@@ -163,7 +163,8 @@ def add(step: Step) -> None:
 
 
 def step_of(job: jobs.Job) -> str:
-    """Name of the step that a job belongs to. The job's note is needed because Freeze and Bake use the same kind."""
+    """Name of the step that a job belongs to. Read from the job's folder, because Freeze and Bake use the same kind of
+    job."""
     noted = _noted(job, contract.STEP_FILE)
     names = [s.name for s in STEPS.values() if job.kind in (s.kind, *s.also)]
     return noted if noted in names else names[0]

@@ -40,7 +40,7 @@ def write(scene: bpy.types.Scene, shot: Path) -> None:
 
 
 def in_solve(placement: contract.Placement) -> Matrix:
-    """The inverse of a placement: from scene units to the coordinates of the solve, under its root."""
+    """The inverse of a placement: converts scene coordinates to solve coordinates, for objects under the root."""
     return Matrix(np.array(placement.scene_from_solve).reshape(4, 4).tolist()).inverted()
 
 

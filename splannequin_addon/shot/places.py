@@ -1,8 +1,8 @@
 """Locations of the clip, the shot folder and its results. A folder that is moved as a whole keeps working.
 
 Settings store paths relative to the .blend once it is saved, as Blender does. Older files stored absolute paths. When
-such a file is opened, missing paths are searched for near the .blend. A shot folder that has disappeared is
-distinguished from one that does not exist yet, and can be located.
+such a file is opened, missing paths are searched for near the .blend. A missing shot folder can be located. The panel
+distinguishes it from a folder that has not been created yet.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def tidy(scene: bpy.types.Scene) -> None:
     for entry in settings_of(scene).made:
         if entry.collection is not None and entry.collection not in scene.collection.children_recursive:
             entry.collection = None
-        own = [entry.collection.objects] if entry.collection is not None else []  # short, with most of our objects
+        own = [entry.collection.objects] if entry.collection is not None else []  # short list, most of our objects
         for name in (*PARTS, "plate"):
             item = getattr(entry, name)
             if item is not None and not _stands(item, [*own, scene.objects]):

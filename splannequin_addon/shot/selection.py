@@ -1,6 +1,6 @@
 """Several shots in one scene. The scene's settings are those of the selected shot; the other shots are in a list.
 
-With a single shot the list is empty. The list item of the selected shot is outdated: the current values are in the
+With a single shot the list is empty. The list item of the selected shot is outdated. Its current values are in the
 scene's settings, and are copied back when another shot is selected. The same applies to the scene's size, rate and
 range, if a shot has set them.
 """

@@ -1,7 +1,7 @@
 """Placement of a solve in the scene: floor, origin and scale from selected points. Plain numpy, no bpy.
 
-A change is a [4, 4] float64 world matrix, to be multiplied from the left onto the transform of the shot's root: a
-rotation, a translation or a uniform scale. A uniform scale of the root therefore stays uniform.
+A change is a [4, 4] float64 world matrix: a rotation, a translation or a uniform scale. It is multiplied from the left
+onto the transform of the shot's root. A uniform scale of the root therefore stays uniform.
 """
 
 from __future__ import annotations

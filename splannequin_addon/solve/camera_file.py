@@ -1,6 +1,6 @@
 """Cameras of Alembic, FBX and USD files, read by Blender's importers in a separate Blender process.
 
-A file may have gigabytes, and an importer may crash on a damaged file. The separate process protects the artist's
+A file may be gigabytes large, and an importer may crash on a damaged file. The separate process protects the artist's
 Blender from both, and from leftover data. It starts with factory settings, and scripts in files do not run.
 """
 

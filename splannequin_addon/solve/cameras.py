@@ -68,8 +68,8 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
     """Loads the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
 
     Objects from an earlier call for the same shot are updated to the new solve. They keep their children, links and
-    settings. The root keeps its transform, unless the solve's world has changed between the scene's and an arbitrary
-    one.
+    settings. The root keeps its transform, unless the solve's coordinates changed between the scene's world and an
+    arbitrary world.
 
     Args:
         scene: the scene. Of its settings, only the active camera is changed.

@@ -1,8 +1,8 @@
 """Import and export of cameras on Blender's side.
 
-Import: a file that the backend reads is passed on unchanged. Cameras from Blender's tracker, from the scene, or from a
-file that Blender reads are written as a nerfstudio transforms.json, whose camera axes are Blender's. Export: the
-backend writes the files.
+Import: a file that the backend reads is passed on unchanged. Other cameras are written as a nerfstudio transforms.json,
+whose camera axes are Blender's. They come from Blender's tracker, from the scene, or from a file that Blender reads.
+Export: the backend writes the files.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> 
     Args:
         scene: the scene.
         shot: shot folder, or None.
-        is_read: cameras for which `reads_in_turns` is True are written elsewhere.
+        is_read: the caller writes cameras for which `reads_in_turns` is True.
 
     Raises JobError, which names what is missing, and OSError if the shot cannot be written.
     """

@@ -22,8 +22,8 @@ _WORDS = {"NONE": "", "ALPHA": contract.MASK_ALPHA, "FOUND": contract.MASK_FOUND
 def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolveParams:
     """Solve parameters from the artist's settings. Writes drawn masks and cameras of the scene into the shot first.
 
-    With `rendered`, these files are written elsewhere. Raises JobError, which names a missing choice or a file that
-    cannot be written.
+    With `rendered`, the caller writes these files. Raises JobError, which names a missing choice or a file that cannot
+    be written.
     """
     shot = selection.shot_folder(scene)
     params = exchange.params(scene, shot, rendered)

@@ -19,7 +19,7 @@ from . import mattes, motion_overlay
 
 
 def _in_editor(context: bpy.types.Context, image: bpy.types.Image, mode: str) -> Any | None:
-    """Shows an image in an Image Editor: in this window first, else another window, else a new one. None in background
+    """Shows an image in an Image Editor of this window, else of another one, else in a new window. None in background
     mode."""
     if bpy.app.background:
         return None

@@ -27,7 +27,7 @@ from ..shot import inventory, scene_objects
 from . import motion_overlay
 
 _FRAME = "splannequin_matte"
-"""Property of a painted image: frame number. `MATTE_SHOT` is its other property for the shot."""
+"""Property of a painted image: frame number. `MATTE_SHOT` is the property for its shot."""
 _PICTURE = "splannequin_picture"
 """Property of a painted image: digest of the frame's image, to detect that another clip was imported since."""
 MOVING_TINT = (255, 64, 0)
@@ -131,7 +131,7 @@ def _is_of(image: bpy.types.Image, shot: Path, frame: int) -> bool:
 def _lost(image: bpy.types.Image) -> bool:
     """True if an image has lost its paint, and is black or empty.
 
-    Its file is missing, or it was saved without being packed, as by earlier versions.
+    The cause is a missing file, or an earlier version that saved the image without packing it.
     """
     return image.source == "GENERATED" or not all(size_of(image))
 

@@ -19,7 +19,7 @@ from . import alignment
 HAND_HEIGHT = 1.5
 """Typical height in metres of a handheld camera of a standing person."""
 STEADY = 0.5
-"""Maximum variation of such a camera's height relative to the height: from eye to waist level."""
+"""Maximum variation of such a camera's height, as a fraction of the height: from eye to waist level."""
 
 
 def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
@@ -74,7 +74,7 @@ def guess_scale(scene: bpy.types.Scene, shot: Path, is_new: bool) -> list[str]:
     """
     entry = present(scene_objects.of(scene, shot))
     if is_new:
-        entry.scaled, entry.guessed_scale = entry.world == contract.SCENE_WORLD, 0.0  # that world has units
+        entry.scaled, entry.guessed_scale = entry.world == contract.SCENE_WORLD, 0.0  # its scale is known
     before = entry.guessed_scale
     if scaled(scene, shot) or not (is_new or before):
         return []

@@ -35,8 +35,8 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
         shot: shot folder.
 
     Raises:
-        contract.JobError: the shot is not imported, the render's aspect ratio differs from the frames, or the camera is
-            missing, not a perspective camera, or still.
+        contract.JobError: the shot is not imported, or the render's aspect ratio differs from the frames. Also if the
+            camera is missing, is not a perspective camera or does not move.
     """
     uid, (numbers, size) = scene.session_uid, camera_samples.frames_of(shot)
     _refuse_other_shape(scene, size)
