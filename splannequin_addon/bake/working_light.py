@@ -1,7 +1,7 @@
 """Nodes that decode working frames with a highlight shoulder. Blender reads these frames as sRGB.
 
-Below the knee they are sRGB. Above it they encode light up to 64 times white, see `torch_backend/contract/colour.py`.
-Blender's curve nodes would end at 1.
+Below the knee the values are sRGB. Above it they encode light up to 64 times white, see
+`torch_backend/contract/colour.py`. Blender's curve nodes would end at 1.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ class SPLANNEQUIN_OT_check_move(step_operator.StepOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Disabled without a camera of the artist's, or without a trained run."""
+        """Disabled without an artist's camera, or without a trained run."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         state = job_timer.watch_of(folder).state if folder else None

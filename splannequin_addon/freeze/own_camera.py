@@ -1,4 +1,4 @@
-"""Reads a camera of the artist's frame by frame, and checks whether a take uses one."""
+"""Reads the artist's camera frame by frame, and checks whether a take uses one."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ class AtWork(Exception):
 def remove(folder: Path, wait: bool = False) -> bool:
     """Removes the environment in `folder`. True if there was one.
 
-    The environment is renamed at once. A background thread deletes its gigabytes, unless `wait` is set.
+    The environment is renamed at once. A background thread deletes its files, unless `wait` is set.
     Raises ValueError if Splannequin did not create the environment, and AtWork if any detectable process runs in it.
     """
     environment = folder / ".venv"

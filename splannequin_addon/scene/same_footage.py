@@ -99,7 +99,7 @@ def _place(path: Path) -> str:
 
 
 def first_number(clip: bpy.types.MovieClip) -> int:
-    """Our number of the first frame of a movie clip."""
+    """Splannequin's frame number of a movie clip's first frame."""
     number = _file_number(Path(bpy.path.abspath(clip.filepath))) if clip.source == "SEQUENCE" else 1
     return number + clip.frame_offset
 

@@ -28,8 +28,10 @@ def _facts(path: Path) -> dict[str, Any]:
 
 
 def paused(run: Path) -> dict[str, Any] | None:
-    """Progress of an unfinished run with a checkpoint: `iteration` of `end`, `preset`, `config`, `depth_source`; else
-    None."""
+    """Progress of an unfinished run with a checkpoint; None for any other run.
+
+    The keys are `iteration`, `end`, `preset`, `config` and `depth_source`.
+    """
     header = facts(RunFolder(run).checkpoint)
     try:
         config = header["config"]
@@ -56,8 +58,10 @@ class _Count:
 
 
 def anew(run: Path) -> dict[str, Any] | None:
-    """Progress, as from `paused`, of a run's repeated training, from its newest checkpoint, and its `folder`; else
-    None."""
+    """Progress of a run's repeated training, from its newest checkpoint; None if there is none.
+
+    The keys are those of `paused`, and `folder`.
+    """
     saved = sorted(RunFolder(run).next.glob(f"*/{contract.CHECKPOINT_FILE}"), key=_saved)
     progress = paused(saved[-1].parent) if saved else None
     return None if progress is None else {**progress, "folder": saved[-1].parent}

@@ -62,7 +62,7 @@ def look_again() -> None:
 
 
 def settings(scene: bpy.types.Scene) -> list[OneShot]:
-    """Settings of all shots of a scene in list order. Those of the selected shot are the scene's."""
+    """Settings of all shots of a scene in list order. The scene holds the settings of the selected shot."""
     held = settings_of(scene)
     return [held if i == held.loaded_shot else item for i, item in enumerate(held.shots)] or [held]
 
