@@ -191,8 +191,10 @@ def is_alive(job: Job, status: contract.Status | None) -> bool:
 
 
 def refuse_second_writer(shot: Path) -> None:
-    """Raises JobError if a job writes into the shot or is about to. The message names the job, its start and its
-    host."""
+    """Raises JobError if a job writes into the shot or is about to.
+
+    For the holder of the lock, the message names the job, its start and its host.
+    """
     try:
         writer = contract.read_writer(shot)
     except (OSError, ValueError):
