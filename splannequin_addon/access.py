@@ -1,8 +1,9 @@
-"""What Blender's types leave open, settled in one place for the checker: our settings on a scene, and pointers that may
-be empty by their type and are not where we ask for them. No bpy at run time, and nothing of the stubs.
+"""Typed access where Blender's type stubs are loose.
 
-This is the one file that imports types of ours for the checker alone: those of the settings stand above everything that
-reads them.
+Covers our settings on a scene, and pointers that are typed as optional but are always set where they are used. Does not
+import bpy at run time.
+Only this file imports types of this package for the type checker alone. At run time, an import of the settings classes
+would be circular, because they depend on modules that read settings.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ if TYPE_CHECKING:
     from .settings import SPLANNEQUIN_PG_scene, SPLANNEQUIN_PG_shot
 
     Outcome = set[OperatorReturnItems]
-    """What an operator returns: FINISHED, CANCELLED, RUNNING_MODAL, PASS_THROUGH, INTERFACE."""
+    """Return value of an operator: FINISHED, CANCELLED, RUNNING_MODAL, PASS_THROUGH, INTERFACE."""
     Icon = IconItems
     """Name of one of Blender's icons."""
     OneShot = SPLANNEQUIN_PG_scene | SPLANNEQUIN_PG_shot
-    """The settings of a shot: the chosen one's are the scene's."""
+    """Settings of a shot. The scene itself holds those of the selected shot."""
     OperatorBase = bpy.types.Operator
-    """What a class is that operators have in common, to the checker. Blender takes it for no operator."""
+    """Base class of mixins for operators, for the type checker only. Blender does not register such a mixin as an
+    operator."""
 else:
     Outcome, Icon = set, str
     OneShot = OperatorBase = object
@@ -36,18 +38,18 @@ class _Drawn(Protocol):
 
 
 def present(pointer: T | None) -> T:
-    """A pointer that is never empty where it is used: the window manager of a context, the tree of a group."""
+    """The pointer, asserted not to be None: the window manager of a context, the tree of a group."""
     assert pointer is not None
     return pointer
 
 
 def scene_in(context: bpy.types.Context) -> bpy.types.Scene:
-    """The scene that a context is about."""
+    """The scene of a context."""
     return present(context.scene)
 
 
 def scene_holding(settings: bpy.types.bpy_struct) -> bpy.types.Scene:
-    """The scene whose settings these are."""
+    """The scene that holds these settings."""
     return settings.id_data  # pyright: ignore[reportReturnType]
 
 
@@ -57,50 +59,51 @@ def layout_of(drawn: _Drawn) -> bpy.types.UILayout:
 
 
 def settings_of(scene: bpy.types.Scene) -> SPLANNEQUIN_PG_scene:
-    """What the artist set in a scene."""
+    """The artist's settings of a scene."""
     held: Any = scene
     return held.splannequin
 
 
 def named(things: bpy.types.bpy_prop_collection[T], name: str) -> T | None:
-    """What is called so in a collection, None if nothing is. Its own `get`, say its types, finds nothing ever."""
+    """The item of this name in a collection, or None. According to the type stubs, `get` always returns None."""
     found: Any = things.get(name)
     return found
 
 
 def value_of(socket: bpy.types.NodeSocket) -> Any:
-    """The value that a socket has where nothing is led into it. Not every kind of sockets has one."""
+    """The value of a socket without a link. Not every type of socket has a value."""
     kind: Any = socket
     return kind.default_value
 
 
 def set_value(socket: bpy.types.NodeSocket, value: float | tuple[float, ...]) -> None:
-    """Sets it."""
+    """Sets the value of a socket without a link."""
     kind: Any = socket
     kind.default_value = value
 
 
 def pixels_of(image: bpy.types.Image) -> Any:
-    """All channels of all pixels of an image, bottom row first, to be read or set whole. A float, says its type."""
+    """All channels of all pixels of an image, bottom row first, to be read or set at once. The stubs type them as a
+    float."""
     return image.pixels
 
 
 def size_of(footage: bpy.types.Image | bpy.types.MovieClip) -> tuple[int, int]:
-    """Width and height in pixels. An array without items, says its type."""
+    """Width and height in pixels. The stubs type the size as an array without items."""
     size: Any = footage.size
     return int(size[0]), int(size[1])
 
 
 def library_of(block: bpy.types.ID) -> bpy.types.Library | None:
-    """The file that a data-block is linked from, None of one of this file. Its types say that there always is one."""
+    """The file that a data-block is linked from, or None for a local one. The stubs type the library as always set."""
     return block.library
 
 
 def camera_of(thing: bpy.types.Object) -> bpy.types.Camera:
-    """The lens of an object that is a camera."""
+    """The camera data of a camera object."""
     return thing.data  # pyright: ignore[reportReturnType]
 
 
 def mesh_of(thing: bpy.types.Object) -> bpy.types.Mesh:
-    """The mesh of an object that is one."""
+    """The mesh of a mesh object."""
     return thing.data  # pyright: ignore[reportReturnType]

@@ -1,8 +1,4 @@
-"""Every difference between Blender 4.2 and 5.2 that the add-on meets, and nowhere else.
-
-The compositor tree moved from `scene.node_tree` (4.x, output: Composite node) to `scene.compositing_node_group`
-(5.x, output: the group's output node); Math and Mix nodes took the shader names; node options became sockets.
-"""
+"""All differences between Blender 4.2 and 5.2 that the add-on handles, except those of animation."""
 
 from __future__ import annotations
 
@@ -17,25 +13,25 @@ from ..torch_backend.contract import PROBE, UserError
 if TYPE_CHECKING:
     from bpy.stub_internal.rna_enums import PropertyFlagItems
 
-# A feature is looked up where Blender lists it, which also works in a Blender that was never tried. A behaviour is not
-# listed, so it goes by the version.
+# Features are detected in Blender's type information, which also works in untested versions. Behaviours are not listed
+# there, so they depend on the version.
 HAS_COMPOSITING_GROUP = "compositing_node_group" in bpy.types.Scene.bl_rna.properties
-"""True where the compositor is a node group of the scene (5.0 on)."""
+"""True if the compositor is a node group of the scene (5.0 on)."""
 HAS_TEXTURE_NODE = hasattr(bpy.types, "CompositorNodeTexture")
-"""True where the compositor has a Texture node, which knows a pixel's place in the frame (until 5.0)."""
+"""True if the compositor has a Texture node, which gives a pixel's position in the frame (until 5.0)."""
 CROPS_WHOLE = bpy.app.version >= (4, 5, 0)
-"""True where a Scale node that crops sets every pixel: before 4.5 a row or column at the border is left unset."""
+"""True if a cropping Scale node sets every pixel. Before 4.5 a row or column at the border is left unset."""
 TURNS_VIDEOS = bpy.app.version >= (4, 5, 0)
-"""True if a video is turned by quarter turns as its header says. 4.2 and 4.3 show it as stored; 4.4 was not tried."""
+"""True if Blender rotates a video by the quarter turns in its header. 4.2 and 4.3 do not; 4.4 was not tested."""
 
 HAS_PATH_TEMPLATES = "is_path_supports_templates" in bpy.types.Property.bl_rna.properties
-"""True where braces in an output path are templates (4.5 on)."""
+"""True if braces in an output path are templates (4.5 on)."""
 
 POINT_SHADERS = ("POINT_FLAT_COLOR", "FLAT_COLOR") if bpy.app.version >= (4, 5, 0) else ("FLAT_COLOR",)
-"""Built-in shaders that colour points, the best first: points have one of their own since 4.5."""
+"""Built-in shaders that colour points, best first. A dedicated point shader exists since 4.5."""
 
 PATH_OPTIONS: set[PropertyFlagItems] = set()
-"""Options of a path property that may hold a path relative to the .blend (`//`); said aloud since 4.5."""
+"""Options of a path property that may hold a path relative to the .blend (`//`). Needed since 4.5."""
 if "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties:
     PATH_OPTIONS.add("PATH_SUPPORTS_BLEND_RELATIVE")
 
@@ -46,7 +42,7 @@ def compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree | None:
 
 
 def own_compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
-    """The scene's compositor tree, copied first if another scene has it, too (5.0 on). Only for a scene with one."""
+    """The scene's compositor tree, copied first if another scene shares it (5.0 on). The scene must have a tree."""
     if not HAS_COMPOSITING_GROUP:
         return _own_tree(scene)
     tree = scene.compositing_node_group
@@ -55,14 +51,14 @@ def own_compositor_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
     if not sharing:
         return tree
     fresh = scene.compositing_node_group = tree.copy()
-    for node in fresh.nodes:  # what showed one of these scenes in the shared tree stood for the scene itself
+    for node in fresh.nodes:  # nodes of the shared tree that showed another of these scenes now show this one
         if isinstance(node, bpy.types.CompositorNodeRLayers) and node.scene in sharing:
             node.scene = scene
     return fresh
 
 
 def _own_tree(scene: Any) -> bpy.types.NodeTree:
-    """The scene's tree until 5.0, which no newer Blender's types know of."""
+    """The scene's compositor tree before 5.0. The type stubs of newer versions lack it."""
     return scene.node_tree
 
 
@@ -80,13 +76,13 @@ def enable_compositor(scene: bpy.types.Scene) -> None:
 
 
 def compositor_switches(scene: bpy.types.Scene) -> dict[str, bool]:
-    """What `enable_compositor` may change, by name."""
+    """Values that `enable_compositor` may change, by name."""
     nodes = {} if HAS_COMPOSITING_GROUP else {"use_nodes": bool(scene.use_nodes)}
     return {"use_compositing": bool(scene.render.use_compositing), **nodes}
 
 
 def restore_compositor_switches(scene: bpy.types.Scene, switches: Mapping[str, bool]) -> None:
-    """Sets what `compositor_switches` told; other names are passed over."""
+    """Restores the values from `compositor_switches`. Ignores other names."""
     if "use_compositing" in switches:
         scene.render.use_compositing = switches["use_compositing"]
     if "use_nodes" in switches:
@@ -94,7 +90,7 @@ def restore_compositor_switches(scene: bpy.types.Scene, switches: Mapping[str, b
 
 
 def new_compositor_tree(scene: bpy.types.Scene, name: str) -> bpy.types.NodeTree:
-    """An empty tree with an output node, made the scene's own. Only for a scene without one."""
+    """A new tree with an output node, assigned to the scene. Only for a scene without a tree."""
     if not HAS_COMPOSITING_GROUP:
         scene.use_nodes = True
         tree = _own_tree(scene)
@@ -109,7 +105,7 @@ def new_compositor_tree(scene: bpy.types.Scene, name: str) -> bpy.types.NodeTree
 
 
 def drop_compositor_tree(scene: bpy.types.Scene) -> None:
-    """Takes the tree that `new_compositor_tree` made away again."""
+    """Removes the tree that `new_compositor_tree` made."""
     if not HAS_COMPOSITING_GROUP:
         _own_tree(scene).nodes.clear()
         scene.use_nodes = False
@@ -121,19 +117,19 @@ def drop_compositor_tree(scene: bpy.types.Scene) -> None:
 
 
 def output_socket(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket | None:
-    """The input socket through which the tree's picture leaves: of the Composite or of the group output node."""
+    """The input socket of the tree's output: of the Composite node, or of the group output node."""
     if HAS_COMPOSITING_GROUP:
         nodes = [n for n in tree.nodes if isinstance(n, bpy.types.NodeGroupOutput) and n.is_active_output]
         sockets = [s for n in nodes for s in n.inputs if s.type == "RGBA"]
         return sockets[0] if sockets else None
     nodes = [n for n in tree.nodes if n.bl_idname == "CompositorNodeComposite"]
-    # Several Composite nodes are legal and which one renders is not told: the active one, then a linked one.
+    # With several Composite nodes, Blender does not report which one renders: prefer the active one, then a linked one.
     nodes.sort(key=lambda n: (n == tree.nodes.active, n.inputs["Image"].is_linked))
     return nodes[-1].inputs["Image"] if nodes else None
 
 
 def new_output_node(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket | None:
-    """Adds the missing output node to a tree; returns the socket through which the picture leaves."""
+    """Adds the missing output node to a tree. Returns its image input."""
     if not HAS_COMPOSITING_GROUP:
         return tree.nodes.new("CompositorNodeComposite").inputs["Image"]
     if not any(i.in_out == "OUTPUT" and str(i.socket_type) == "NodeSocketColor" for i in sockets_of(tree)):
@@ -143,7 +139,7 @@ def new_output_node(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket | None:
 
 
 def new_mix_node(tree: bpy.types.NodeTree, blend: str = "MIX") -> tuple[Any, Any, Any, Any, Any]:
-    """A colour mix node: (node, factor socket, first colour, second colour, result). Only MIX clamps its factor."""
+    """A colour mix node as (node, factor socket, first colour, second colour, result). Only MIX clamps its factor."""
     if HAS_COMPOSITING_GROUP:
         node: Any = tree.nodes.new("ShaderNodeMix")
         node.data_type = "RGBA"
@@ -158,38 +154,38 @@ def new_mix_node(tree: bpy.types.NodeTree, blend: str = "MIX") -> tuple[Any, Any
 
 
 def sockets_of(group: bpy.types.NodeTree) -> list[bpy.types.NodeTreeInterfaceSocket]:
-    """Inputs and outputs of a group, as its nodes have them."""
+    """Input and output sockets of a group's interface."""
     assert group.interface is not None
     return [i for i in group.interface.items_tree if isinstance(i, bpy.types.NodeTreeInterfaceSocket)]
 
 
 def new_socket(group: bpy.types.NodeTree, name: str, side: str, kind: str, text: str = "") -> Any:
-    """Gives a group an input or output; `side` is "INPUT" or "OUTPUT", `kind` the name of a class of sockets."""
-    face: Any = group.interface  # whose types know sockets without a kind alone
+    """Adds an input or output to a group. `side` is "INPUT" or "OUTPUT", `kind` the name of a socket class."""
+    face: Any = group.interface  # the stubs only know sockets without a type
     return face.new_socket(name, in_out=side, socket_type=kind, description=text)
 
 
 def new_math_node(tree: bpy.types.NodeTree, operation: str = "MULTIPLY") -> Any:
-    """A Math node on inputs[0] and inputs[1]: MULTIPLY, LESS_THAN and so on."""
+    """A Math node with operands inputs[0] and inputs[1]. Examples of `operation`: MULTIPLY, LESS_THAN."""
     node: Any = tree.nodes.new("ShaderNodeMath" if HAS_COMPOSITING_GROUP else "CompositorNodeMath")
     node.operation = operation
     return node
 
 
 def new_over_node(tree: bpy.types.NodeTree) -> tuple[Any, Any, Any]:
-    """An Alpha Over node of premultiplied pictures: (node, background socket, foreground socket)."""
+    """An Alpha Over node for premultiplied images, as (node, background socket, foreground socket)."""
     node: Any = tree.nodes.new("CompositorNodeAlphaOver")
     pictures = [s for s in node.inputs if s.type == "RGBA"]
     return node, pictures[0], pictures[1]
 
 
 def new_fit_node(tree: bpy.types.NodeTree, how: str = "Fit") -> Any:
-    """A Scale node that brings inputs[0] to the render size, and leaves what has that size as it is, bit by bit.
+    """A Scale node that scales inputs[0] to the render size. An input of that size is unchanged, bit by bit.
 
     Args:
-        tree: where it is made.
-        how: "Fit" shows all and leaves bars, "Crop" fills the frame and cuts off what is over; both keep the shape.
-            "Stretch" does not.
+        tree: node tree that gets the node.
+        how: "Fit" shows the whole image and leaves bars. "Crop" fills the frame and cuts off the rest. "Stretch"
+            changes the aspect ratio.
     """
     node: Any = tree.nodes.new("CompositorNodeScale")
     if HAS_COMPOSITING_GROUP:
@@ -201,18 +197,18 @@ def new_fit_node(tree: bpy.types.NodeTree, how: str = "Fit") -> Any:
 
 
 def set_fit(fit: bpy.types.Node, how: str) -> None:
-    """Has a node of `new_fit_node` do it in another way."""
+    """Changes the mode of a node from `new_fit_node`."""
     node: Any = fit
     if HAS_COMPOSITING_GROUP:
         node.inputs["Frame Type"].default_value = how
-        beyond = "Extend" if how == "Crop" else "Clip"  # else the outermost pixels fade out
+        beyond = "Extend" if how == "Crop" else "Clip"  # Clip would fade out the outermost pixels
         node.inputs["Extension X"].default_value = node.inputs["Extension Y"].default_value = beyond
     else:
         node.frame_method = how.upper()
 
 
 def new_quotient(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, value: bpy.types.NodeSocket) -> Any:
-    """Socket of a picture whose four channels are divided by a value; 0 where that is 0. Until 4.5."""
+    """Socket of an image with its four channels divided by a value; 0 where the value is 0. Until 4.5."""
     node: Any = tree.nodes.new("CompositorNodeMixRGB")
     node.blend_type = "DIVIDE"
     parts = tree.nodes.new("CompositorNodeSeparateColor")
@@ -226,7 +222,8 @@ def new_quotient(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, value:
 
 
 def with_alpha(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, alpha: bpy.types.NodeSocket) -> Any:
-    """Socket of a picture with another alpha; its colours stay. A mix has its first picture's until 5.1, then a mix."""
+    """Socket of an image with another alpha and unchanged colours. Needed because a Mix node takes the first image's
+    alpha until 5.1, then a mix of both."""
     node: Any = tree.nodes.new("CompositorNodeSetAlpha")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Type"].default_value = "Replace Alpha"
@@ -238,7 +235,7 @@ def with_alpha(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, alpha: b
 
 
 def new_nearest_node(tree: bpy.types.NodeTree) -> Any:
-    """A node whose output is the least of inputs[0] at a pixel and its eight neighbours."""
+    """A node that outputs the minimum of inputs[0] over a pixel and its eight neighbours."""
     node: Any = tree.nodes.new("CompositorNodeDilateErode")
     if "Size" in node.inputs:  # 4.5 on
         node.inputs["Size"].default_value = -1
@@ -252,7 +249,7 @@ def new_nearest_node(tree: bpy.types.NodeTree) -> Any:
 
 
 def new_crop_node(tree: bpy.types.NodeTree, margin: tuple[int, int], size: tuple[int, int]) -> Any:
-    """A Crop node that leaves the middle, `size`, of inputs[0]: `margin` pixels are cut off each side, up and down."""
+    """A Crop node that keeps the central `size` of inputs[0]. It removes `margin` (x, y) pixels from each side."""
     node: Any = tree.nodes.new("CompositorNodeCrop")
     (left, low), (width, height) = margin, size
     if "Width" in node.inputs:  # 4.5 on
@@ -262,16 +259,16 @@ def new_crop_node(tree: bpy.types.NodeTree, margin: tuple[int, int], size: tuple
     else:
         node.use_crop_size, node.relative = True, False
         node.min_x, node.max_x = left, left + width
-        node.min_y, node.max_y = low + height, low  # the upper one first
+        node.min_y, node.max_y = low + height, low  # Blender 4.2 expects the upper edge first
     return node
 
 
 def new_look_up(
     tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, x: bpy.types.NodeSocket, y: bpy.types.NodeSocket
 ) -> Any:
-    """Socket of a picture's pixels at coordinates x and y, 0..1 over it, each the nearest one, as it is."""
+    """Socket of an image sampled at coordinates x and y (0..1) with the nearest pixel's exact value."""
     place: Any = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeCombineXYZ")
-    place.inputs["Z"].default_value = 1.0  # 0 would be nothing
+    place.inputs["Z"].default_value = 1.0  # at 0 the node returns nothing
     node: Any = tree.nodes.new("CompositorNodeMapUV")
     if HAS_COMPOSITING_GROUP:
         node.inputs["Interpolation"].default_value = "Nearest"
@@ -286,20 +283,20 @@ def new_look_up(
 
 
 def new_coordinates(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> tuple[Any, Any]:
-    """Sockets of the first two values of a vector."""
+    """Sockets of a vector's first two components."""
     s, t, _ = separated(tree, vector)
     return s, t
 
 
 def separated(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket) -> tuple[Any, Any, Any]:
-    """Sockets of a picture's red, green and blue, nothing cut."""
+    """Sockets of an image's red, green and blue channels, without clamping."""
     node: Any = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeSeparateXYZ")
     tree.links.new(picture, node.inputs[0])
     return node.outputs["X"], node.outputs["Y"], node.outputs["Z"]
 
 
 def combined(tree: bpy.types.NodeTree, channels: Sequence[bpy.types.NodeSocket]) -> Any:
-    """Socket of an opaque picture of its red, green and blue."""
+    """Socket of an opaque image made of red, green and blue channels."""
     node: Any = tree.nodes.new(f"{'Shader' if HAS_COMPOSITING_GROUP else 'Compositor'}NodeCombineXYZ")
     for socket, channel in zip(node.inputs, channels, strict=True):
         tree.links.new(channel, socket)
@@ -307,9 +304,9 @@ def combined(tree: bpy.types.NodeTree, channels: Sequence[bpy.types.NodeSocket])
 
 
 def sized(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, size: tuple[int, int]) -> Any:
-    """Socket of a picture brought to a size in pixels; one that has it stays as it is, bit by bit.
+    """Socket of an image scaled to a size in pixels. An image of that size is unchanged, bit by bit.
 
-    The picture itself before 4.5, where a Scale node leaves no pixel as it is.
+    Before 4.5 it is `picture` itself, because a Scale node there changes every pixel.
     """
     if not CROPS_WHOLE:
         return picture
@@ -325,12 +322,12 @@ def sized(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, size: tuple[i
 
 
 def literal(path: str) -> str:
-    """An output path that means these very letters: braces are doubled where Blender would fill something in."""
+    """An output path that Blender uses literally: braces are doubled where Blender expands templates."""
     return path.replace("{", "{{").replace("}", "}}") if HAS_PATH_TEMPLATES else path
 
 
 def set_png(settings: bpy.types.ImageFormatSettings) -> None:
-    """8-bit RGB PNG as a scene's output format. RGB, so that holes come out black instead of divided by alpha."""
+    """Sets 8-bit RGB PNG as a scene's output format. RGB keeps holes black; RGBA would divide them by alpha."""
     if hasattr(settings, "media_type"):
         settings.media_type = "IMAGE"
     settings.file_format = "PNG"
@@ -341,18 +338,18 @@ def set_png(settings: bpy.types.ImageFormatSettings) -> None:
 
 
 _PROBE = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 1\n" + bytes((*(int(256 * v) for v in PROBE), 128))
-"""A picture of one pixel, `PROBE`, as a file."""
+"""Bytes of an image file with the single pixel `PROBE`."""
 _LIKELY = {
     "linear": ("Linear Rec.709", "Linear Rec.709 (sRGB)", "lin_rec709", "Utility - Linear - sRGB", "Linear"),
     "srgb": ("sRGB", "sRGB - Texture", "sRGB Encoded Rec.709 (sRGB)", "Utility - sRGB - Texture", "sRGB EOTF"),
 }
-"""What colour configurations call these spaces: looked at first, and believed where none can be told by its effect."""
+"""Usual names of these spaces in colour configurations. They are tried first, and used if no space passes the test."""
 _spaces: dict[str | tuple[float, ...], str] = {}
-"""Encoding -> colour space. The configuration is chosen once, when Blender starts."""
+"""Encoding -> colour space. Cached, because the configuration is fixed when Blender starts."""
 
 
 def set_image_colour(image: bpy.types.Image, encoding: str | tuple[float, ...]) -> None:
-    """States the encoding of an image's file, as `colour_space`."""
+    """Sets the colour space of an image file by its encoding, see `colour_space`."""
     name = colour_space(encoding)
     space = _space_of(image)
     if space.name != name:
@@ -360,17 +357,17 @@ def set_image_colour(image: bpy.types.Image, encoding: str | tuple[float, ...]) 
 
 
 def _space_of(image: bpy.types.Image) -> Any:
-    """Where an image's colour space is set. Its types list the names of one configuration, and there are others."""
+    """The colour space settings of an image. The stubs list the names of one configuration only."""
     return image.colorspace_settings
 
 
 def set_data(image: bpy.types.Image) -> None:
-    """States that an image's file holds numbers, not colours."""
+    """Marks an image's file as numbers, not colours."""
     _space_of(image).is_data = True
 
 
 def knows_colour(encoding: str | tuple[float, ...]) -> bool:
-    """True if `colour_space` finds one."""
+    """True if `colour_space` finds a space for an encoding."""
     try:
         return bool(colour_space(encoding))
     except ValueError:
@@ -378,12 +375,13 @@ def knows_colour(encoding: str | tuple[float, ...]) -> bool:
 
 
 def colour_space(encoding: str | tuple[float, ...]) -> str:
-    """Name that Blender's colour configuration (its own, or that of $OCIO) gives an encoding.
+    """Name of an encoding's colour space in Blender's colour configuration (its own, or that of $OCIO).
 
-    The space is known by what it does to a pixel, so it may be called anything. ValueError if there is none.
+    The space is identified by its effect on a pixel, so its name does not matter. Raises ValueError if there is none.
 
     Args:
-        encoding: "linear" (Rec.709 primaries), "srgb", or the linear Rec.709 light that `contract.PROBE` means.
+        encoding: "linear" (Rec.709 primaries), "srgb", or the linear Rec.709 light that the file value `contract.PROBE`
+            encodes.
     """
     if encoding not in _spaces:
         likely = _LIKELY[encoding] if isinstance(encoding, str) else ()
@@ -391,7 +389,7 @@ def colour_space(encoding: str | tuple[float, ...]) -> str:
         try:
             space = _space_of(image)
             known = space.bl_rna.properties["name"].enum_items.keys()
-            first = [n for n in (*likely, space.name) if n in known]  # the second is a role: bytes
+            first = [n for n in (*likely, space.name) if n in known]  # the last one is the default of byte images
             image.pack(data=_PROBE, data_len=len(_PROBE))
             image.source = "FILE"
             space.is_data = True
@@ -417,7 +415,7 @@ def colour_space(encoding: str | tuple[float, ...]) -> str:
 
 
 def _reads_as(image: bpy.types.Image, name: str, wanted: Sequence[float]) -> bool:
-    """True if a picture is read as the wanted scene-linear colour in the named space. Its space is set."""
+    """True if an image reads as the wanted scene-linear colour in the named space. Sets the image's colour space."""
     _space_of(image).name = name
     near = 2e-3 * max(1.0, *(abs(value) for value in wanted))
     return max(abs(a - b) for a, b in zip(_first_pixel(image), wanted, strict=True)) < near
@@ -425,12 +423,12 @@ def _reads_as(image: bpy.types.Image, name: str, wanted: Sequence[float]) -> boo
 
 def _first_pixel(image: bpy.types.Image) -> tuple[float, float, float]:
     """Red, green and blue of an image's first pixel."""
-    pixels: Any = image.pixels  # a single float, says its type
+    pixels: Any = image.pixels  # the stubs type them as a single float
     return pixels[0], pixels[1], pixels[2]
 
 
 def usd_import_options() -> list[str]:
-    """Names of the switches of Blender's USD importer; none in a Blender without one."""
+    """Names of the options of Blender's USD importer; empty in a Blender without one."""
     importers: Any = bpy.ops.wm
     try:
         return list(importers.usd_import.get_rna_type().properties.keys())
@@ -439,6 +437,6 @@ def usd_import_options() -> list[str]:
 
 
 def splat_import_option() -> str:
-    """Name of the USD importer's switch for Gaussian splats, in a Blender that reads them; empty in any other."""
+    """Name of the USD importer's option for Gaussian splats; empty if this Blender cannot import them."""
     names = [name for name in usd_import_options() if name.startswith("import_")]
     return next((name for name in names if "splat" in name or "particle_field" in name), "")

@@ -1,4 +1,4 @@
-"""Every difference between Blender 4.2 and 5.2 in animation that the add-on meets: actions have layers from 4.4 on."""
+"""All differences in animation between Blender 4.2 and 5.2 that the add-on handles: actions have layers since 4.4."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 
 if TYPE_CHECKING:
     _Animated = bpy.types.Scene | bpy.types.Object | bpy.types.Camera
-    """What is keyed here."""
+    """Data-blocks that this module animates."""
 
 
 def _enumerated(name: str) -> Mapping[str, int]:
-    """Values of a property of a key, by identifier."""
+    """Values of an enumeration property of keyframes, by identifier."""
     prop: Any = bpy.types.Keyframe.bl_rna.properties[name]
     return {item.identifier: item.value for item in prop.enum_items}
 
 
 def fcurves(datablock: _Animated) -> Iterator[bpy.types.FCurve]:
-    """The F-curves of a data-block's action, whether actions have layers (4.4 on) or not."""
+    """The F-curves of a data-block's action, with or without layers (4.4 on)."""
     data = datablock.animation_data
     if data is None or data.action is None:
         return
@@ -34,8 +34,8 @@ def curves_of_strip(strip: bpy.types.NlaStrip) -> list[bpy.types.FCurve]:
 
 
 def _curves(animation: bpy.types.AnimData | bpy.types.NlaStrip) -> list[Any]:
-    """Collections of the F-curves of an action: one for each of its strips (4.4 on), or the one it has."""
-    action: Any = animation.action  # whose types know the strips of one Blender, and curves of another
+    """Collections of F-curves of an action: one per strip (4.4 on), or the action's only one."""
+    action: Any = animation.action  # the stubs know strips of one version and curves of another
     if hasattr(action, "layers") and action.layers:
         bags = [strip.channelbag(animation.action_slot) for layer in action.layers for strip in layer.strips]
         return [bag.fcurves for bag in bags if bag is not None]
@@ -43,7 +43,7 @@ def _curves(animation: bpy.types.AnimData | bpy.types.NlaStrip) -> list[Any]:
 
 
 def remove_fcurves(datablock: _Animated, data_path: str) -> None:
-    """Removes the F-curves and drivers of a data-block that lead to a data path."""
+    """Removes the F-curves and drivers of a data path from a data-block."""
     data = datablock.animation_data
     if data is None:
         return
@@ -59,13 +59,13 @@ def remove_fcurves(datablock: _Animated, data_path: str) -> None:
 def set_keys(
     datablock: _Animated, frames: Sequence[int], channels: Mapping[str, np.ndarray], types: Sequence[str] = ()
 ) -> None:
-    """Keys channels of a data-block, straight between keys, all at once; what else is keyed of it stays.
+    """Sets keyframes of several channels at once, with linear interpolation. Other channels keep their keyframes.
 
     Args:
-        datablock: what is animated.
+        datablock: data-block to animate.
         frames: [F] ascending frame numbers.
-        channels: data path -> values [F, C], a column per array index. Keys that they have are replaced.
-        types: [F] type of each key, which has a colour of its own: KEYFRAME, JITTER, EXTREME; empty: all KEYFRAME.
+        channels: data path -> values [F, C], one column per array index. Existing keys of these channels are replaced.
+        types: [F] type of each key, which sets its colour: KEYFRAME, JITTER, EXTREME. Empty: all KEYFRAME.
     """
     known = _enumerated("type")
     animation: Any = datablock.animation_data_create()
@@ -96,7 +96,7 @@ def set_keys(
 
 
 def remove_keys(datablock: _Animated, data_paths: Sequence[str]) -> None:
-    """Removes the F-curves of a data-block that lead to these data paths; an action that is empty then goes, too."""
+    """Removes the F-curves of these data paths from a data-block. Also removes the action if it is then empty."""
     data = datablock.animation_data
     if data is None or data.action is None:
         return

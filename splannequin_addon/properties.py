@@ -1,7 +1,7 @@
-"""Blender's properties as the type checker reads them: `clip = StringProperty(...)` in a class is a str of its objects.
+"""Blender's properties with types for a type checker: in a class, `clip = StringProperty(...)` is a str attribute.
 
-Blender wants them as annotations, and an annotation that is a call says nothing to a checker. So classes assign them,
-with the functions of this file, and `annotate` makes annotations of them before the classes are registered.
+Blender requires properties as annotations, but a type checker cannot use an annotation that is a call. Classes
+therefore assign properties with this module's functions. `annotate` converts them to annotations before registration.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Item = TypeVar("Item", covariant=True)
 
 
 class Items(Protocol[Item]):
-    """What a collection of property groups can do."""
+    """Interface of a collection of property groups."""
 
     def __len__(self) -> int: ...
 
@@ -27,20 +27,20 @@ class Items(Protocol[Item]):
     def __getitem__(self, index: int) -> Item: ...
 
     def add(self) -> Item:
-        """A new one, at the end."""
+        """Appends a new item and returns it."""
         ...
 
     def remove(self, index: int) -> None:
-        """Takes one out."""
+        """Removes the item at an index."""
         ...
 
     def clear(self) -> None:
-        """Takes all out."""
+        """Removes all items."""
         ...
 
 
 class _Declared:
-    """A property of a class that Blender does not know yet."""
+    """A property assigned in a class but not yet annotated."""
 
     def __init__(self, declare: Callable[..., object], options: dict[str, object]) -> None:
         self.declare = declare
@@ -48,11 +48,11 @@ class _Declared:
 
 
 _declared: dict[type, dict[str, _Declared]] = {}
-"""What each class assigned, which `annotate` took out of it."""
+"""Class -> its assigned properties, which `annotate` removed from it."""
 
 
 def _of(declare: Callable[P, object], kind: type[T]) -> Callable[P, T]:
-    """A function of bpy.props, with the type of what its property holds."""
+    """A function of bpy.props, typed as returning the property's value type."""
 
     def assigned(*_: P.args, **options: P.kwargs) -> T:
         return _Declared(declare, options)  # pyright: ignore[reportReturnType]
@@ -77,7 +77,7 @@ if TYPE_CHECKING:
         options: set[str] | None = None,
         poll: Callable[[bpy.types.bpy_struct, T], bool] | None = None,
     ) -> T | None:
-        """A pointer to a data-block, or to none."""
+        """A pointer to a data-block, or None."""
         raise NotImplementedError
 
     def CollectionProperty(  # noqa: N802
@@ -90,7 +90,7 @@ else:
 
 
 def annotate(cls: type) -> None:
-    """Makes annotations of the properties that a class and what it is made of assign, for Blender to read."""
+    """Converts properties assigned in a class and its bases to annotations, for Blender to read."""
     for one in cls.__mro__:
         for name, value in list(vars(one).items()):
             if isinstance(value, _Declared):
@@ -101,8 +101,8 @@ def annotate(cls: type) -> None:
 
 
 def release(cls: type) -> None:
-    """Leaves names in the annotations once Blender has read them: over what else stood there, bpy 4.2 as a module
-    crashes when Python ends."""
+    """Replaces the annotations by strings once Blender has read them. Otherwise the module bpy 4.2 crashes when Python
+    ends."""
     for one in cls.__mro__:
         for name, value in _declared.get(one, {}).items():
             one.__annotations__[name] = value.declare.__name__

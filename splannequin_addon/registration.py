@@ -1,7 +1,7 @@
-"""Registers everything the add-on has, in order, and unregisters it in reverse: all of it or nothing, and once.
+"""Registers all parts of the add-on in order and unregisters them in reverse order: all or nothing, and only once.
 
-Rooms below the steps are told of by their modules; each of the five steps hands in one object, with its classes and
-whatever else it has Blender know.
+Lower-level packages are registered through their modules. Each of the five steps provides one object with its classes
+and other parts to register.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .train.step import STEP as TRAIN
 from .ui import job_operators, menu, preferences, shots_panel
 
 _STEPS = (IMPORT, SOLVE, TRAIN, FREEZE, BAKE)
-"""In the order of the work, and of their panels."""
+"""The steps in order of execution, which is also the order of their panels."""
 _CLASSES = (
     *shots_panel.CLASSES,
     *job_operators.CLASSES,
@@ -37,10 +37,10 @@ _PARTS: tuple[steps.Part, ...] = (
     settings,
     preferences,
 )
-"""Before the classes."""
+"""Modules that are registered before the classes."""
 _PARTS_AFTER: tuple[steps.Part, ...] = (
     menu,
-    render_settings,  # before what looks at the output path of a file that is saved
+    render_settings,  # first, because later handlers use the output path of a file being saved
     places,
     *(part for step in _STEPS for part in step.parts),
     job_timer,
@@ -49,23 +49,23 @@ _PARTS_AFTER: tuple[steps.Part, ...] = (
 
 
 def owner() -> str:
-    """Package of the copy of the add-on that Blender knows now; "" for none."""
-    for cls in bpy.types.PropertyGroup.__subclasses__():  # `bpy.types` has no groups of properties as attributes
+    """Package of the copy of the add-on that is registered in Blender; "" if there is none."""
+    for cls in bpy.types.PropertyGroup.__subclasses__():  # `bpy.types` has no attributes for property groups
         if cls.__name__ == settings.SPLANNEQUIN_PG_scene.__name__ and getattr(cls, "is_registered", False):
             return cls.__module__.partition(".splannequin_addon.")[0]
     return ""
 
 
 def registered() -> bool:
-    """True between `register` and `unregister` of this copy."""
+    """True between `register` and `unregister` of this copy of the add-on."""
     return owner() == backend.PACKAGE
 
 
 def register() -> None:
-    """Makes the add-on's classes, properties, timer, handlers and command known to Blender: all, or none if one fails.
+    """Registers the add-on's classes, properties, timer, handlers and command: all, or none if one fails.
 
     Raises:
-        RuntimeError: another copy of the add-on is enabled, and goes on working; or something cannot be registered.
+        RuntimeError: another copy of the add-on is enabled (it stays enabled), or a part cannot be registered.
     """
     if registered():
         return
@@ -80,7 +80,7 @@ def register() -> None:
     undo: list[Callable[[], None]] = []
     try:
         for begin, end in _acts():
-            undo.append(end)  # also of what fails halfway
+            undo.append(end)  # before the call, to undo a partial registration
             begin()
     except Exception as error:
         _undo(undo)
@@ -91,13 +91,13 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Undoes `register`, in reverse. What fails does not keep the rest from being undone."""
+    """Undoes `register` in reverse order. An error in one part does not stop the others."""
     if registered():
         _undo([end for _, end in _acts()])
 
 
 def _acts() -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
-    """What registers each thing, and what takes it back, in order."""
+    """Pairs of (register, unregister) functions, in order."""
     for part in _PARTS:
         yield part.register, part.unregister
     for cls in _CLASSES:
@@ -107,7 +107,8 @@ def _acts() -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
 
 
 def _undo(acts: Sequence[Callable[[], None]]) -> None:
-    """Takes things back in reverse, and then whatever of ours is left: a part that failed may have done half of it."""
+    """Unregisters parts in reverse order, then everything else that this add-on left registered after partial
+    failures."""
     for act in reversed(acts):
         with contextlib.suppress(Exception):
             act()
@@ -118,7 +119,7 @@ def _undo(acts: Sequence[Callable[[], None]]) -> None:
     if hasattr(bpy.types.Scene, "splannequin"):
         del bpy.types.Scene.splannequin  # pyright: ignore[reportAttributeAccessIssue]
     kinds = (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu, bpy.types.UIList, bpy.types.AddonPreferences)
-    # Groups last, and those that hold others before these: a class is taken back before what it points to.
+    # Property groups come last. A group is unregistered before the groups that it contains.
     left = [cls for kind in (*kinds, bpy.types.PropertyGroup) for cls in reversed(kind.__subclasses__())]
     for cls in left:
         if _is_ours(cls) and getattr(cls, "is_registered", False):
@@ -131,8 +132,10 @@ def _is_ours(thing: object) -> bool:
 
 
 def _take_tooltips_from_docstrings() -> None:
-    """Gives each of our classes its docstring as tooltip, on one line: Blender would keep the source's line breaks, and
-    translations would be looked up with them."""
+    """Sets each class's docstring as its tooltip, on one line.
+
+    Blender would keep the source's line breaks, and would look up translations with them.
+    """
     for kind in (bpy.types.Operator, bpy.types.Panel, bpy.types.Menu):
         for cls in kind.__subclasses__():
             if cls.__module__.startswith(f"{__package__}.") and cls.__doc__ and "bl_description" not in vars(cls):
@@ -140,6 +143,6 @@ def _take_tooltips_from_docstrings() -> None:
 
 
 def _holders_of_properties() -> list[type]:
-    """Those of our classes that may have properties."""
+    """Classes of this add-on that may have properties."""
     kinds = (bpy.types.Operator, bpy.types.PropertyGroup, bpy.types.AddonPreferences)
     return [c for kind in kinds for c in kind.__subclasses__() if c.__module__.startswith(f"{__package__}.")]

@@ -1,10 +1,10 @@
-"""Runs the Blender side of Splannequin where the extension is not installed: under a `bpy` wheel, or a bare Blender.
+"""Runs the Blender side of Splannequin without an installed extension: in a `bpy` wheel, or in a plain Blender.
 
     .venv-bpy-5.0/bin/python splannequin_addon/run_in_bpy.py bake --shot SHOT --take TAKE --output DIR
     blender --background --factory-startup --python splannequin_addon/run_in_bpy.py -- bake --shot SHOT ...
 
-The package is loaded from this file's repository under the name that Blender gives an installed extension, so that
-relative imports, preferences and operators are the same in both. Nothing is installed and no preference is written.
+The package is loaded from this file's repository under the name of an installed extension. Relative imports,
+preferences and operators therefore work the same way. Installs nothing and writes no preferences.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ PACKAGE = "bl_ext.user_default.splannequin"
 
 
 def load_package() -> types.ModuleType:
-    """The extension package under its Blender name; loaded once, not registered."""
-    with contextlib.suppress(ImportError):  # in a Python without Blender, for modules that need none
+    """The extension package under its Blender name, loaded once and not registered."""
+    with contextlib.suppress(ImportError):  # a Python without Blender, for modules that do not need it
         import bpy  # noqa: F401  # pyright: ignore[reportUnusedImport]  -- makes `bl_ext` where Blender has it
 
     if PACKAGE in sys.modules:
@@ -45,7 +45,7 @@ def load_package() -> types.ModuleType:
 
 
 def main() -> int:
-    """Registers the package and runs the command line that `blender --command splannequin` runs."""
+    """Registers the package and runs the same command line as `blender --command splannequin`."""
     arguments = sys.argv[1:]
     if "--" in arguments:
         arguments = arguments[arguments.index("--") + 1 :]
@@ -55,7 +55,7 @@ def main() -> int:
     try:
         return headless.main(arguments)
     finally:
-        # bpy 4.x as a module frees what is registered after Python has ended, and crashes over panels.
+        # As a module, bpy 4.x frees registered classes after Python has ended, and crashes on panels.
         package.unregister()
 
 

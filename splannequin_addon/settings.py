@@ -1,4 +1,4 @@
-"""What the artist sets, kept in the scene: it travels with the .blend. Each step's settings stand in its room."""
+"""Settings of the artist, stored in the scene and so in the .blend. Each step's settings are in its package."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from .ui import folds
 
 
 def _chosen(props: SPLANNEQUIN_PG_scene, context: bpy.types.Context) -> None:
-    """Another shot of the list was clicked."""
+    """Update callback: another shot of the list was selected."""
     selection.choose(scene_holding(props), props.active_shot)
 
 
 class ShotSettings(ImportSettings, SolveSettings, TrainSettings, FreezeSettings):
-    """One shot and what is to be done with it. What is named here is put away when another shot is chosen."""
+    """Settings of one shot. They are stored in the list of shots while another shot is selected."""
 
 
 class SPLANNEQUIN_PG_shot(ShotSettings, bpy.types.PropertyGroup):
@@ -77,7 +77,7 @@ class SPLANNEQUIN_PG_scene(ShotSettings, BakeSettings, folds.Folds, bpy.types.Pr
 
 
 def register() -> None:
-    """Registers the property groups and hangs them on the scene."""
+    """Registers the property groups and adds them to the scene type."""
     bpy.utils.register_class(scene_objects.SPLANNEQUIN_PG_splats)
     bpy.utils.register_class(scene_objects.SPLANNEQUIN_PG_surface)
     bpy.utils.register_class(scene_objects.SPLANNEQUIN_PG_made)

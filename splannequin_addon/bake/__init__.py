@@ -1,1 +1,1 @@
-"""The step Bake: the freeze in the scene's compositor, and its render."""
+"""The Bake step: inserts the freeze into the scene's compositor and renders it."""

@@ -1,7 +1,7 @@
-"""Compares the camera that the scene's objects are rendered through with the one that the frozen take was seen from.
+"""Compares the scene's render camera with the camera of the frozen take.
 
-CG that is combined with a take by depth has to be seen from the very camera of the take, in every frame: the clip's
-solved camera, or the artist's own that the take was frozen from. Otherwise it slides over the frozen picture.
+CG that is combined with a take by depth must be rendered from the take's camera in every frame. That camera is the
+clip's solved camera or the artist's camera of the freeze. With any other camera the CG slides over the frozen picture.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from ..shot import inventory, scene_objects, seen_camera
 from . import freeze_group, placing
 
 TOLERANCE_PX = 0.5
-"""Largest distance, in pixels of the render, between where the two cameras show a point of the scene."""
+"""Largest allowed distance, in pixels of the render, between the projections of a scene point by the two cameras."""
 
 
 def is_led_in(scene: bpy.types.Scene) -> bool:
-    """True if a render of a scene is led into the freeze's input CG."""
+    """True if a render of the scene is linked to the freeze group's CG input."""
     return bool(_layers(scene))
 
 
 def check(scene: bpy.types.Scene, frames: Sequence[int]) -> bool:
-    """True if CG is led into the freeze. JobError if it is seen by another camera than the take, in any frame."""
+    """True if CG is linked to the freeze. Raises JobError if the CG camera differs from the take's camera in any
+    frame."""
     layers = _layers(scene)
     shown = freeze_group.shown(scene)
     if not layers or shown is None:
@@ -54,16 +55,16 @@ def check(scene: bpy.types.Scene, frames: Sequence[int]) -> bool:
 
 
 def difference(scene: bpy.types.Scene, take: Path, frames: Sequence[int], camera: str = "") -> str:
-    """How the scene's camera differs from the one that a take was seen from, a sentence; empty if they agree.
+    """The difference between the scene's camera and the take's camera, as a sentence; empty if they agree.
 
     Args:
-        scene: the scene. Its current frame is put back.
+        scene: the scene. Its current frame is restored.
         take: folder of the take.
-        frames: frames to compare, those of them that the take's camera has.
-        camera: name of another camera of the scene; empty: the scene's own, as markers switch it.
+        frames: frames to compare. Frames that the take's camera lacks are skipped.
+        camera: name of a camera of the scene; empty: the active camera, as markers switch it.
 
     Raises:
-        contract.JobError: it is not known what the take was seen from.
+        contract.JobError: the camera of the take is unknown.
     """
     shot, before = take.parent.parent, scene.frame_current
     path = seen_from(shot, take.name)
@@ -78,7 +79,7 @@ def difference(scene: bpy.types.Scene, take: Path, frames: Sequence[int], camera
             away = _pixels_apart(seen, known[number], size, (path.width, path.height), depth)
             if not away <= TOLERANCE_PX:
                 name = camera or (scene.camera.name if scene.camera is not None else "")
-                pixels = min(away, 9999.0)  # infinite: it looks another way
+                pixels = min(away, 9999.0)  # infinite if the camera looks away
                 return (
                     f"CG would slide: at frame {number} the camera {name} of {scene.name} sees things {pixels:.1f} px "
                     f"beside where the camera of take {take.name} saw them."
@@ -90,7 +91,7 @@ def difference(scene: bpy.types.Scene, take: Path, frames: Sequence[int], camera
 
 
 def matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int]) -> bpy.types.Object | None:
-    """The camera of the scene that sees what a take was frozen from, if it has one and no marker switches cameras."""
+    """The scene's camera that matches the take's camera. None without a match, or if markers switch cameras."""
     if any(marker.camera is not None for marker in scene.timeline_markers):
         return None
     some = [frames[0], frames[len(frames) // 2], frames[-1]]
@@ -100,7 +101,10 @@ def matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int]) -
 
 
 def use_matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int]) -> list[str]:
-    """Makes the camera that a take was seen from the scene's, if it is not; says so. JobError if there is none."""
+    """Makes the matching camera the scene's active camera if the two differ. Returns a sentence for each change.
+
+    Raises JobError if no camera matches.
+    """
     why = difference(scene, take, frames)
     if not why:
         return []
@@ -116,7 +120,7 @@ def use_matching_camera(scene: bpy.types.Scene, take: Path, frames: Sequence[int
 
 
 def seen_from(shot: Path, take: str) -> contract.CameraPath:
-    """The camera that a take was seen from: the clip's, or the artist's own. JobError if it is not known any more."""
+    """The camera path of a take: the clip's or the artist's. Raises JobError if it is no longer known."""
     facts = inventory.read(shot).takes.get(take, {})
     own = seen_camera.path_of(shot, facts)
     try:
@@ -133,7 +137,7 @@ def seen_from(shot: Path, take: str) -> contract.CameraPath:
 
 
 def _layers(scene: bpy.types.Scene) -> list[Any]:
-    """The Render Layers nodes whose picture gets to the freeze's input CG."""
+    """The Render Layers nodes upstream of the freeze group's CG input."""
     tree = compat.compositor_tree(scene)
     node = freeze_group.group_node(tree) if tree is not None else None
     found: list[Any] = []
@@ -149,15 +153,16 @@ def _pixels_apart(
     taken: tuple[int, int],
     depth: float,
 ) -> float:
-    """Largest distance in pixels between where two cameras show a point, of those that the second one shows in the
-    middle and the corners of the picture.
+    """Largest distance in pixels between the projections of the same point by two cameras.
+
+    The points project to the middle and the corners of `wanted`'s image.
 
     Args:
-        seen: a camera, K in pixels of the render.
-        wanted: another one, K in pixels of a take.
+        seen: first camera, K in pixels of the render.
+        wanted: second camera, K in pixels of the take.
         size: width and height of the render in pixels.
-        taken: those of the take, which is brought to the render's width.
-        depth: of the points, solve units.
+        taken: width and height of the take in pixels. The take is scaled to the render's width.
+        depth: depth of the points, solve units.
     """
     (width, height), larger = size, size[0] / taken[0]
     fx, fy, cx, cy = wanted.K

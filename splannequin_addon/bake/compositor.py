@@ -1,10 +1,10 @@
-"""The node group "Splannequin Freeze" in the scene's compositor: inserted, updated, removed.
+"""The node group "Splannequin Freeze" in the scene's compositor: inserts, updates and removes it.
 
-It stands in for the plate where a node of the artist's tree shows it, so that the grade goes on from there; else before
-the output. Nothing else in the tree is touched: the links that leave the plate, or the one into the output, are led
-through the group, and led back when the group is removed. The group reads the take's multilayer EXR files; scene frame
-n shows n.exr. Where the take was frozen with detail the group can tell plate from splats, and freeze the stream that is
-led into it by the take's warp, see `warp_nodes`.
+The group replaces the plate behind the node that shows the plate, so that the artist's grade applies to the freeze.
+Without such a node, the group goes before the output. Only the links from the plate, or the link to the output, are
+rerouted through the group. Removing the group restores them. The group reads the take's multilayer EXR files; scene
+frame n shows n.exr. For a take that was frozen with detail, the group can also separate plate pixels from splats. It
+can also freeze its input stream by the take's warp, see `warp_nodes`.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ from .node_names import GAP, GROUP_NAME
 from .take_files import Take
 
 _CG = "cg"
-"""The mark of our node that is no part of the plate's stream."""
+"""Tag value of our Render Layers node, which is not part of the plate's stream."""
 _HOW = "splannequin_how"
-"""How we last had the plate fitted: what the artist set instead stays until the plate or the scene has a new shape."""
+"""Property of the plate's Scale node: the fit that we set last. A fit set by the artist stays until the plate or the
+scene changes shape."""
 _LAYERS = tuple(layer.name for layer in contract.layers_of(""))
-"""Of every frozen frame; what else is in the table is in some."""
+"""Layers of every frozen frame. Other layers of the table exist only in some takes."""
 
 
 def insert(
@@ -41,24 +42,25 @@ def insert(
     where: str = "AUTO",
     warp: bool | None = None,
 ) -> list[str]:
-    """Puts the freeze group into the scene's compositor, or updates the one that is there.
+    """Puts the freeze group into the scene's compositor, or updates the existing group.
 
     Args:
-        scene: the scene; given a minimal tree (plate, group, output) if it has none.
+        scene: the scene. A minimal tree (plate, group, output) is created if it has none.
         take: the frozen frames.
         plate: first file of the undistorted plate, for the minimal tree.
-        footage: files by which a node that shows the plate is known: the plate's, the clip's.
-        where: "PLATE" behind the node that shows the plate, "OUTPUT" before the output, "AUTO" the first of these
-            that there is. A group that is there already stays where it is with "AUTO".
-        warp: the group freezes the stream that is led into it, by the take's warp, instead of showing the take's own
-            frames; None: as it does, or not.
+        footage: files of the plate and of the clip, by which a node that shows the plate is recognised.
+        where: "PLATE": behind the node that shows the plate. "OUTPUT": before the output. "AUTO": behind the plate if a
+            node shows it, else before the output; an existing group stays in place.
+        warp: True: the group freezes its input stream by the take's warp. False: the group shows the take's frames.
+            None: unchanged.
 
     Returns:
-        What was changed, one sentence each.
+        One sentence for each change.
 
     Raises:
-        contract.JobError: "PLATE", and no node shows it; or the compositor is linked from another file.
-        ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is as it was.
+        contract.JobError: `where` is "PLATE" and no node shows the plate, or the compositor is linked from another
+            file.
+        ValueError: the frames lack a layer, or Blender cannot show them or the plate. The tree is unchanged.
     """
     changes: list[str] = []
     _need_own(compat.compositor_tree(scene))
@@ -67,7 +69,7 @@ def insert(
     frozen, flow, stream = _frozen_image(take), _warp_image(take) if wanted else None, None
     if plate is not None and freeze_group.shows_plate(scene):
         stream = original_plate.plate_of(take, _shot_of(take), plate)
-    if compat.compositor_tree(scene) is not None:  # now that nothing stands against the change
+    if compat.compositor_tree(scene) is not None:  # all checks have passed
         freeze_group.own_tree(scene)
         behind = placing.place_of(scene, footage, where)
     enabled = compat.compositor_enabled(scene)
@@ -95,8 +97,10 @@ def insert(
 def _placed(
     tree: bpy.types.NodeTree, before: dict[str, bool], behind: bpy.types.NodeSocket | None, where: str
 ) -> tuple[bpy.types.CompositorNodeGroup, list[str]]:
-    """(the group's node, a sentence for each change): a new one, or the one that is there, behind a socket or, with
-    None, before the output."""
+    """(the group's node, a sentence for each change). The node is new, or the existing one.
+
+    `behind` is the socket to insert the node behind, or None to insert it before the output.
+    """
     node = freeze_group.group_node(tree)
     if node is None:
         node = freeze_group.new_node(tree, before)
@@ -113,7 +117,8 @@ def _placed(
 
 
 def _need_own(tree: bpy.types.NodeTree | None) -> None:
-    """JobError if a compositor lies in another file: what is changed here would be gone when this one is opened."""
+    """Raises JobError if the compositor is linked from another file: changes would be lost when this file is
+    reopened."""
     library = library_of(tree) if tree is not None else None
     if library is not None:
         raise contract.JobError(
@@ -128,7 +133,7 @@ def _shot_of(take: Take) -> Path:
 
 
 def _frozen_image(take: Take) -> bpy.types.Image:
-    """The take's frames as a data-block. ValueError if they lack a layer."""
+    """The take's frames as an image data-block. Raises ValueError if a layer is missing."""
     image = sequences.load_sequence(
         numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", take.light
     )
@@ -136,7 +141,7 @@ def _frozen_image(take: Take) -> bpy.types.Image:
 
 
 def _warp_image(take: Take) -> bpy.types.Image | None:
-    """The take's warp as a data-block, None if it has none. ValueError if it lacks a layer."""
+    """The take's warp as an image data-block, or None without a warp. Raises ValueError if a layer is missing."""
     return (
         _with_layers(sequences.load_sequence(*_warp_picture(take)), take, warp_nodes.LAYERS)
         if any(take.plate_size)
@@ -145,7 +150,7 @@ def _warp_image(take: Take) -> bpy.types.Image | None:
 
 
 def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bpy.types.Image:
-    """A sequence of the take, once it is known to have some layers. ValueError if not."""
+    """The image sequence of a take, after a check that it has the named layers. Raises ValueError if one is missing."""
     layers = _layers_of(image, take)
     missing = [n for n in names if n not in layers]
     if missing:
@@ -154,7 +159,7 @@ def _with_layers(image: bpy.types.Image, take: Take, names: Sequence[str]) -> bp
 
 
 def _layers_of(image: bpy.types.Image, take: Take) -> set[str]:
-    """Names of the layers that an Image node shows of a sequence of the take."""
+    """Names of the layers that an Image node shows of one of the take's image sequences."""
     group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
     try:
         node = group.nodes.new("CompositorNodeImage")
@@ -165,7 +170,10 @@ def _layers_of(image: bpy.types.Image, take: Take) -> set[str]:
 
 
 def may_combine_cg(scene: bpy.types.Scene) -> bpy.types.CompositorNodeGroup:
-    """Our node, if the scene's render can be led into it. JobError if it is not there, or its CG is taken."""
+    """The freeze group's node, if the scene's render can be linked to it.
+
+    Raises JobError without the group, or if its CG input is already linked.
+    """
     tree = compat.compositor_tree(scene)
     _need_own(tree)
     node = freeze_group.group_node(tree) if tree else None
@@ -181,9 +189,9 @@ def may_combine_cg(scene: bpy.types.Scene) -> bpy.types.CompositorNodeGroup:
 
 
 def combine_cg(scene: bpy.types.Scene) -> list[str]:
-    """Leads the scene's own render into the group, where it stands among the frozen by depth; says what was changed.
+    """Links the scene's render to the group, which composites it with the frozen frames by depth. Returns the changes.
 
-    The view layer must have its depth pass. JobError as `may_combine_cg`.
+    The view layer must have its depth pass. Raises JobError as `may_combine_cg` does.
     """
     may_combine_cg(scene)
     tree = freeze_group.own_tree(scene)
@@ -199,7 +207,7 @@ def combine_cg(scene: bpy.types.Scene) -> list[str]:
 
 
 def remove(scene: bpy.types.Scene) -> bool:
-    """Takes the group out, leads the link back, deletes what only we used. True if there was one."""
+    """Removes the group, restores the link and deletes data that only we used. True if there was a group."""
     tree = compat.compositor_tree(scene)
     node = freeze_group.group_node(tree) if tree else None
     if tree is None or node is None or library_of(tree):
@@ -212,7 +220,7 @@ def remove(scene: bpy.types.Scene) -> bool:
     images = [n.image for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
     textures = [t for n in group.nodes if n.bl_idname == "CompositorNodeTexture" and (t := getattr(n, "texture", None))]
     tree.nodes.remove(node)
-    if group.users == 0:  # another scene may show it
+    if group.users == 0:  # unless another scene uses it
         bpy.data.node_groups.remove(group)
     for ours in [n for n in tree.nodes if n.get(TAG)]:
         images += original_plate.drop(ours)
@@ -229,7 +237,7 @@ def remove(scene: bpy.types.Scene) -> bool:
 
 
 def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Iterator[None]:
-    """Has Blender read what `insert` needs, one picture a turn: it does so while its window stands still."""
+    """Loads the images that `insert` needs, one per iteration. Blender's window is blocked while it loads an image."""
     wanted: list[tuple[Path, str, sequences.Encoding]] = [
         (numbered.frame_path(take.folder, take.first), f"Frozen {take.folder.name}", take.light)
     ]
@@ -243,7 +251,7 @@ def read_ahead(take: Take, plate: Path | None = None, warp: bool = False) -> Ite
 
 
 def _warp_picture(take: Take) -> tuple[Path, str, sequences.Encoding]:
-    """File, name and encoding of a take's warp."""
+    """First file, data-block name and encoding of a take's warp."""
     warps = contract.TakeFolder(take.folder).warps
     return numbered.frame_path(warps, take.first), f"Warp {take.folder.name}", take.light
 
@@ -258,12 +266,10 @@ def _show_plate(
     plate: original_plate.Plate,
     take: Take,
 ) -> bool:
-    """Leads the undistorted plate into our group, so that Mix fades between plate and freeze; or shows it where it is.
+    """Links the undistorted plate to our group, or updates the existing link. Mix then fades between plate and freeze.
 
-    The minimal tree is the artist's from then on: a node of ours that is there is made no second time, and no link of
-    the artist's is cut.
-
-    False, and nothing is changed, where the artist leads something else into the group, or shows it in our node.
+    The artist may edit the minimal tree: existing nodes of ours are reused, and the artist's links are kept.
+    Returns False without changes if the artist links another stream to the group, or shows another image in our node.
     """
     ours, before = _stream_of(tree, node), placing.links_of(node.inputs["Image"])
     reader = next((n for n in ours if isinstance(n, bpy.types.CompositorNodeImage)), None)
@@ -284,7 +290,7 @@ def _show_plate(
 
 
 def _stream_of(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> list[bpy.types.Node]:
-    """Our nodes of the plate's stream. A copy of one has our mark, too: what leads into the group goes before."""
+    """Our nodes of the plate's stream. Copies of them carry the same tag, so nodes upstream of the group come first."""
     marked = [n for n in tree.nodes if n.get(TAG) and n.get(TAG) != _CG]
     led = placing.upstream(node)
     return sorted(marked, key=lambda n: n not in led)
@@ -305,7 +311,7 @@ def _make_stream(
     plate: original_plate.Plate,
     take: Take,
 ) -> None:
-    """The stream in a tree that has none: in a row, left to right."""
+    """Builds the plate's stream from left to right in a tree without one."""
     reader = tree.nodes.new("CompositorNodeImage")
     assert isinstance(reader, bpy.types.CompositorNodeImage)
     reader[TAG] = True
@@ -325,7 +331,8 @@ def _follow_plate(
     ours: Sequence[bpy.types.Node],
     plate: original_plate.Plate,
 ) -> None:
-    """Brings what stands between Plate and group to a plate; what leaves a node of ours goes on leaving the stream."""
+    """Adapts the nodes between Plate and the group to a plate. A new node takes over the links of the node it
+    replaces."""
     fit = next((n for n in ours if n.bl_idname == "CompositorNodeScale"), None)
     inner = next((n for n in ours if original_plate.kind(n)), None)
     wanted, stream = original_plate.between(plate), present(reader.outputs)["Image"]

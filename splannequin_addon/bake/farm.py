@@ -1,4 +1,4 @@
-"""Export for Farm: the shot and what the artist set, handed to the backend, which writes the job."""
+"""Export for Farm: passes the shot and the artist's settings to the backend, which writes the job."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from . import farm_job
 
 
 def requests_of(scene: bpy.types.Scene, shot: Path) -> dict[str, Any]:
-    """Step -> parameters of what is to be done for the scene's shot: the freeze, and what it lacks before it.
+    """Step -> parameters of each step the scene's shot still needs: the freeze, and missing steps before it.
 
-    The artist's camera is read, if the take is seen from one.
+    Reads the artist's camera if the take uses one.
     """
     state = inventory.read(shot)
     found: dict[str, Any] = {}
@@ -60,11 +60,11 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a shot."""
+        """Disabled without a shot."""
         folder = selection.shot_folder(scene_in(context))
         watch = job_timer.watch_of(folder) if folder is not None else None
         if watch is not None and bpy.app.background:
-            job_timer.refresh(watch)  # no timer does
+            job_timer.refresh(watch)  # no timer runs in background mode
         if watch is None or watch.state is None or not watch.state.info:
             cls.poll_message_set(tr("Import a clip first"))
             return False
@@ -76,7 +76,7 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Has the backend write; in a window the panel tells when it is done."""
+        """Starts the export in the backend. With a window, the panel reports when it is done."""
         scene = scene_in(context)
         shot = selection.shot_folder(scene)
         if shot is None or not self.directory:
@@ -102,7 +102,7 @@ class SPLANNEQUIN_OT_export_for_farm(bpy.types.Operator):
 
 
 def _tell(shot: Path, asked: children.Question) -> None:
-    """Puts what came of an export onto the panel."""
+    """Shows the result of an export on the panel."""
     watch = job_timer.watch_of(shot)
     try:
         watch.notes["bake"] = farm_job.written(asked)

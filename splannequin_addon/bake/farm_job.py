@@ -11,21 +11,22 @@ from ...torch_backend.contract.files import is_json_object
 from ..process import backend, children
 
 REQUEST = "request.json"
-"""Parameters of the steps, in the job's folder."""
+"""File name, in the job's folder, of the steps' parameters."""
 
 
 def begin(words: contract.FarmWords, requests: dict[str, Any]) -> children.Question:
-    """Has the backend write a job, or what tasks took, without waiting.
+    """Makes the backend write a farm job or report what tasks took, without waiting.
 
     Args:
-        words: what is asked for; paths among it are absolute.
-        requests: step -> its parameters, those of `contract.PARAMS` or dicts of some of them; written into the job's
-            folder.
+        words: the request; its paths are absolute.
+        requests: step -> its parameters: an instance of `contract.PARAMS`, or a dict of some of its fields. They are
+            written into the job's folder.
 
     Raises:
-        contract.JobError: there is no backend, or it cannot be started; OSError: the folder cannot be written.
+        contract.JobError: there is no backend, or it cannot be started.
+        OSError: the folder cannot be written.
     """
-    backend.python()  # before anything is written
+    backend.python()  # fails before anything is written
     device: list[str] = []
     if words.action == "export":
         values: dict[str, dict[str, Any]] = {
@@ -40,5 +41,5 @@ def begin(words: contract.FarmWords, requests: dict[str, Any]) -> children.Quest
 
 
 def written(asked: children.Question) -> list[str]:
-    """What the backend says of the job that it wrote, line by line. JobError with its own sentence if it failed."""
+    """The backend's report on the job it wrote, line by line. Raises JobError with the backend's message on failure."""
     return [line.rstrip() for line in asked.answer("{}").splitlines() if line.strip()]

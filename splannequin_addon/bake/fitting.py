@@ -1,4 +1,4 @@
-"""A take's layers at the size of the scene's picture, and what knows a pixel's place in it."""
+"""Crops and scales a take's layers to the scene's render size, and provides the horizontal ramp for the wipe."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .node_names import GAP
 
 
 def across(group: bpy.types.NodeTree) -> bpy.types.NodeSocket:
-    """Socket of a value that rises from 0 at the frame's left to 1 at its right."""
+    """Socket of a value that rises from 0 at the left edge of the frame to 1 at the right edge."""
     if compat.HAS_TEXTURE_NODE:
         node: Any = group.nodes.new("CompositorNodeTexture")
         node.texture = _blend()
@@ -27,7 +27,7 @@ def across(group: bpy.types.NodeTree) -> bpy.types.NodeSocket:
     ramp.label = "From left to right"
     wide = compat.new_fit_node(group, "Stretch")
     group.links.new(ramp.outputs["Image"], wide.inputs[0])
-    # A scaled picture fades out over its last pixels: those of the ramp lie outside of the frame.
+    # A scaled image fades out over its outermost pixels. Oversizing the ramp puts those pixels outside the frame.
     larger = group.nodes.new("CompositorNodeScale")
     for name in ("X", "Y"):
         set_value(larger.inputs[name], _BEYOND)
@@ -39,13 +39,13 @@ def across(group: bpy.types.NodeTree) -> bpy.types.NodeSocket:
 RAMP = "Splannequin Ramp"
 _STEPS, _ROWS = 1024, 32
 _WIDE = {layer.name for layer in contract.FRAME_LAYERS if len(layer.channels) > 1}
-"""Layers that have more than one number in a pixel."""
+"""Layers with more than one channel."""
 _BEYOND = 1.1
-"""How much larger than the frame the ramp is shown."""
+"""Size of the ramp relative to the frame."""
 
 
 def _blend() -> bpy.types.Texture:
-    """A texture that rises from left to right. A scaled picture would do, but 4.3 leaves its lowest row unset."""
+    """A texture that rises from left to right. Blender 4.3 leaves the lowest row of a scaled image unset."""
     texture = next((t for t in bpy.data.textures if t.get(TAG) and t.type == "BLEND"), None)
     if texture is None:
         texture = bpy.data.textures.new(RAMP, "BLEND")
@@ -54,7 +54,7 @@ def _blend() -> bpy.types.Texture:
 
 
 def _ramp() -> bpy.types.Image:
-    """A picture that rises from 0 at the frame's left to 1 at its right: 5.0 has no node that does."""
+    """An image that rises from 0 at the left edge of the frame to 1 at the right. Blender 5.0 has no node for this."""
     image = next((i for i in bpy.data.images if i.get(TAG) and i.name.startswith(RAMP)), None)
     if image is not None:
         return image
@@ -76,9 +76,9 @@ def fitted(
     margin: tuple[int, int],
     layers: dict[str, bpy.types.NodeSocket],
 ) -> dict[str, bpy.types.NodeSocket]:
-    """The layers' sockets, by name: without overscan, and scaled to the render's size, whatever it is when it renders.
+    """The layers' sockets by name, without overscan and scaled to the render size at the time of rendering.
 
-    Frames wider than the scene's picture are cut, as the camera sees it; flatter ones leave bars.
+    Frames with a wider aspect ratio than the render are cropped to the camera's view. Taller renders get bars.
     """
     names, sockets = tuple(layers), dict(layers)
     for row, name in enumerate(names if any(margin) else ()):
@@ -102,15 +102,15 @@ def fitted(
 
 
 def how_it_fits(scene: bpy.types.Scene, size: tuple[int, int]) -> str:
-    """How a picture of a size is brought to the scene's: its width fits, as the solved camera's does."""
+    """How to fit an image of a size into the render: the widths match, as in the solved camera."""
     tall = scene.render.resolution_x * size[1] / (scene.render.resolution_y * size[0])
-    # Of one shape but for rounding: both do; where cropping leaves a line unset, not that.
+    # With equal aspect ratios up to rounding, both modes work. Then use "Fit" where cropping leaves a row unset.
     alike = abs(tall - 1.0) < 0.01 and not compat.CROPS_WHOLE
     return "Crop" if tall > 0.99 and not alike else "Fit"
 
 
 def _whole(group: bpy.types.NodeTree, layer: bpy.types.NodeSocket) -> bpy.types.NodeSocket | None:
-    """Socket of 1 wherever a layer has pixels; None where a scaled picture does not fade out at its border."""
+    """Socket of 1 wherever a layer has pixels. None where Blender does not fade out the border of a scaled image."""
     if compat.HAS_COMPOSITING_GROUP:
         return None
     node = compat.new_math_node(group, "GREATER_THAN")
@@ -123,7 +123,7 @@ def _whole(group: bpy.types.NodeTree, layer: bpy.types.NodeSocket) -> bpy.types.
 def _unfaded(
     group: bpy.types.NodeTree, layer: bpy.types.NodeSocket, coverage: bpy.types.NodeSocket | None, picture: bool
 ) -> bpy.types.NodeSocket:
-    """Socket of a scaled layer whose outermost pixels are as strong as the others."""
+    """Socket of a scaled layer with the fade-out of its outermost pixels undone."""
     if coverage is None:
         return layer
     if picture:

@@ -1,4 +1,4 @@
-"""The node of the freeze in a scene's compositor: its sockets, their defaults, and what it shows."""
+"""The freeze group's node in a scene's compositor: its sockets, their defaults, and the take it shows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WARPS = "splannequin_warps"
 
 
 def switch_warp(node: bpy.types.CompositorNodeGroup, wanted: bool, possible: bool) -> list[str]:
-    """Gives our node the factor of the warp, or takes it away; says what was changed. The inside is not touched."""
+    """Adds the warp factor to our node, or removes it. Returns the changes. The inside of the group is unchanged."""
     group, name = present(node.node_tree), AS_WARP
     sockets = [i for i in compat.sockets_of(group) if i.in_out == "INPUT" and i.name == name]
     group[_WARPS] = wanted
@@ -38,14 +38,14 @@ def switch_warp(node: bpy.types.CompositorNodeGroup, wanted: bool, possible: boo
 
 
 def wants_warp(scene: bpy.types.Scene) -> bool:
-    """True if the scene's freeze group freezes the stream that is led into it, or would if its take had a warp."""
+    """True if the scene's freeze group is set to freeze its input stream by a warp, even if its take has none."""
     tree = compat.compositor_tree(scene)
     node = group_node(tree) if tree else None
     return node is not None and bool(present(node.node_tree).get(_WARPS))
 
 
 def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
-    """Sentences about settings of our node that the take has no layers for."""
+    """A sentence for each setting of our node whose layers the take lacks."""
     inside, remarks = present(node.node_tree).nodes, list[str]()
     if value_of(node.inputs[GRAIN]) and GRAIN not in inside:
         remarks.append("The take has no grain to add: freeze it again.")
@@ -56,7 +56,7 @@ def lacking(node: bpy.types.CompositorNodeGroup) -> list[str]:
 
 
 def shows_plate(scene: bpy.types.Scene) -> bool:
-    """True if the plate is the stream of the scene's tree: one that was made here, or that `insert` would make."""
+    """True if our nodes show, or `insert` would make them show, the plate as the scene's stream."""
     tree = compat.compositor_tree(scene)
     if tree is None or not len(tree.nodes):
         return True
@@ -65,13 +65,13 @@ def shows_plate(scene: bpy.types.Scene) -> bool:
 
 
 def group_node(tree: bpy.types.NodeTree) -> bpy.types.CompositorNodeGroup | None:
-    """Our group's node in a compositor tree, or None."""
+    """The freeze group's node in a compositor tree, or None."""
     groups = (n for n in tree.nodes if isinstance(n, bpy.types.CompositorNodeGroup))
     return next((n for n in groups if _is_ours(n.node_tree)), None)
 
 
 def shown(scene: bpy.types.Scene) -> tuple[Path, float] | None:
-    """(folder of the take that the freeze group shows, what its depth is multiplied by); None without the group."""
+    """(folder of the take that the freeze group shows, its depth factor); None without the group."""
     tree = compat.compositor_tree(scene)
     node = group_node(tree) if tree else None
     if node is None:
@@ -85,26 +85,27 @@ def shown(scene: bpy.types.Scene) -> tuple[Path, float] | None:
 
 
 def cg_softness(scene: bpy.types.Scene) -> bpy.types.NodeSocket | None:
-    """Input of the freeze group that mixes CG with what is frozen; None where no CG is led in, or by a link."""
+    """The freeze group's input for the softness between CG and frozen depth. None if no CG is linked, or if this input
+    itself has a link."""
     tree = compat.compositor_tree(scene)
     node = group_node(tree) if tree else None
     if node is None or not node.inputs["CG"].is_linked:
         return None
-    socket = node.inputs.get(SOFTNESS)  # a group of an earlier version has none until it is updated
+    socket = node.inputs.get(SOFTNESS)  # missing in a group of an earlier version until it is updated
     return None if socket is None or socket.is_linked else socket
 
 
 def set_depth_scale(scene: bpy.types.Scene, scale: float) -> None:
-    """Has the freeze group multiply depth by another scale. Only where `shown` says that there is one."""
+    """Sets the depth factor of the freeze group. Call it only if `shown` returns a take."""
     node = present(group_node(own_tree(scene)))
     set_value(present(node.node_tree).nodes[DEPTH].inputs[1], scale)
 
 
 def own_tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
-    """The scene's compositor tree, after which it shares neither the tree nor our group with another scene.
+    """The scene's compositor tree. Afterwards no other scene shares this tree or our group.
 
-    A copy of a scene shares our group, and since 5.0 a linked copy shares the whole tree: a change for one scene would
-    change the other. What is shared is copied. Only for a scene that has a tree.
+    A copied scene shares our group, and since Blender 5.0 a linked copy shares the whole tree. A change for one scene
+    would change the other, so shared data is copied. The scene must have a tree.
     """
     tree = compat.own_compositor_tree(scene)
     nodes = [n for n in tree.nodes if isinstance(n, bpy.types.CompositorNodeGroup) and _is_ours(n.node_tree)]
@@ -131,7 +132,7 @@ _LOOKS = (
     ("Splat", 0.0, "1: the splats alone, as they were before the plates' pixels came in"),
     (INVENTED, 0.0, "1: what splats made up is tinted, what comes from a plate is not"),
 )
-"""Factors of what only takes with detail can show."""
+"""Factors that only takes with detail support."""
 _SOFTNESS_TIP = (
     "Distance in scene units, before and behind a frozen surface, over which objects fade from in front to behind: for "
     "hair, smoke and what touches. 0: a clean cut"
@@ -141,12 +142,12 @@ _PASSES = tuple(layer for layer in contract.layers_of("passes") if layer.output)
 
 
 def _factor(socket: Any, value: float) -> None:
-    """Makes a new socket of a group a factor from 0 to 1."""
+    """Sets up a new float socket of a group as a factor from 0 to 1."""
     socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
 
 
 def give_sockets(group: bpy.types.NodeTree) -> set[str]:
-    """Gives a group the sockets that it lacks, those of an older version stay; returns the names of new inputs."""
+    """Adds the missing sockets to a group; sockets of an older version stay. Returns the names of new inputs."""
     existing = {(i.in_out, i.name) for i in compat.sockets_of(group)}
     given: set[str] = set()
 
@@ -180,9 +181,9 @@ def give_sockets(group: bpy.types.NodeTree) -> set[str]:
 
 
 def give_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[str]:
-    """Gives our node the outputs of the passes among a take's layers, and takes away those of passes it lacks.
+    """Adds the outputs of the take's passes to our node, and removes the outputs of missing passes.
 
-    An output that leads somewhere stays without its pass. Returns a sentence for each of these.
+    A linked output stays even if its pass is missing. Returns a sentence for each such output.
     """
     group, remarks = present(node.node_tree), list[str]()
     outputs = {i.name: i for i in compat.sockets_of(group) if i.in_out == "OUTPUT"}
@@ -199,7 +200,7 @@ def give_passes(node: bpy.types.CompositorNodeGroup, layers: Set[str]) -> list[s
 
 
 def set_defaults(node: bpy.types.CompositorNodeGroup, names: set[str]) -> None:
-    """Gives the named inputs of our node their values: a node does not always take its group's."""
+    """Sets the named inputs of our node to their defaults: a node does not always inherit its group's defaults."""
     for name, value, _ in (*_FACTORS, *_LOOKS):
         if name in names:
             set_value(node.inputs[name], value)
@@ -214,7 +215,7 @@ def set_defaults(node: bpy.types.CompositorNodeGroup, names: set[str]) -> None:
 
 
 def new_node(tree: bpy.types.NodeTree, before: dict[str, bool]) -> bpy.types.CompositorNodeGroup:
-    """A node of a new group, with all its sockets and nothing inside; `before` says how the compositor was."""
+    """A node of a new group with all sockets and an empty inside. `before` is the compositor's earlier state."""
     group = bpy.data.node_groups.new(GROUP_NAME, "CompositorNodeTree")
     assert isinstance(group, bpy.types.CompositorNodeTree)
     group[TAG] = True
@@ -224,6 +225,6 @@ def new_node(tree: bpy.types.NodeTree, before: dict[str, bool]) -> bpy.types.Com
     assert isinstance(node, bpy.types.CompositorNodeGroup)
     node.node_tree = group
     node.name = node.label = GROUP_NAME
-    node.width = 240.0  # "Show What Is Invented" and "CG Depth" stand there whole, with their values
+    node.width = 240.0  # wide enough to show "Show What Is Invented" and "CG Depth" with their values
     set_defaults(node, {s.name for s in node.inputs})
     return node

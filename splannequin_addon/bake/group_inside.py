@@ -1,4 +1,4 @@
-"""The inside of the freeze's group: frames, warp, grain, objects among the frozen, mattes."""
+"""The inside of the freeze group: frames, warp, grain, CG composited by depth, mattes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from .node_names import AS_WARP, DEPTH, FROZEN, GAP, GRAIN, INVENTED, SOFTNESS
 from .take_files import Take
 
 _NOTHING = 0.1 * contract.NO_DEPTH
-"""A depth of CG from here on is no surface's."""
+"""Depths of CG from this value on mean that the pixel shows no surface."""
 _EVEN, _SOFT = 0.005, 0.01
-"""Shares of the frozen depth: as far behind it CG is still in front, and within so much more it goes behind. The first
-is the median error of frozen depth on truth (docs/benchmarks.md, "Depth"): without it the frozen comes through what
-stands on it, and through a quarter of the rims and a twelfth of the shadows on a frozen surface."""
+"""Tolerances as fractions of the frozen depth. CG up to `_EVEN` behind the frozen surface counts as in front. Over a
+further `_SOFT` it fades behind.
+
+`_EVEN` is the median error of frozen depth on truth (docs/benchmarks.md, "Depth"). Without this tolerance, the frozen
+surface shows through objects that stand on it: through a quarter of their rims and a twelfth of their shadows.
+"""
 _SHADOW = 0.05
-"""Share of its depth by which a caught shadow, black CG, counts as nearer: a take's surface lies up to 3 % behind its
-frames (docs/benchmarks.md, "The frozen scene as a mesh"), where shadows had holes."""
+"""Fraction of its depth by which a caught shadow (black CG) counts as nearer. A take's surface mesh lies up to 3 %
+behind its frames (docs/benchmarks.md, "The frozen scene as a mesh"), which left holes in shadows."""
 
 
 def fill(
@@ -30,7 +33,7 @@ def fill(
     image: bpy.types.Image,
     warp: bpy.types.Image | None,
 ) -> None:
-    """(Re)builds the inside of our node's group; its sockets, and so the links around it, stay."""
+    """Builds or rebuilds the inside of our node's group. Its sockets, and so the links to it, stay."""
     group, shown = present(node.node_tree), {i.name for i in (image, warp) if i is not None}
     readers = [n for n in group.nodes if isinstance(n, bpy.types.CompositorNodeImage)]
     old = {n.image.name for n in readers if n.image} - {fitting.RAMP}
@@ -54,18 +57,18 @@ def fill(
         layers["Combined"] = _looked_at(group, enter, layers)
     for layer in contract.FRAME_LAYERS:
         if not layer.output and layer.name != GRAIN:
-            layers.pop(layer.name, None)  # nothing behind this reads it
+            layers.pop(layer.name, None)  # no later node reads this layer
     fitted = fitting.fitted(scene, group, take.size, take.margin, layers)
     share = _share(group, enter, fitted)
     nearer = _nearer(group, _cg_depth(group, enter), depth.outputs[0], enter.outputs[SOFTNESS])
     group.links.new(share, factor)
-    # CG stands in both: Mix, Wipe and mattes choose between stream and frozen frame, not whether an object is there.
+    # CG is in both inputs: Mix, Wipe and the mattes choose between stream and frozen frame but do not hide CG.
     group.links.new(_among(group, enter, enter.outputs["Image"], nearer, "CG in your stream"), first)
     group.links.new(_among(group, enter, _grainy(group, enter, fitted), nearer, "CG among the frozen"), second)
     group.links.new(mixed, leave.inputs["Image"])
     group.links.new(fitted["Depth"], depth.inputs[0])
     group.links.new(depth.outputs[0], leave.inputs["Depth"])
-    if "Source" in fitted:  # numbers, whatever scaling made of them
+    if "Source" in fitted:  # plate numbers: scaling may have made fractions of them
         whole = compat.new_math_node(group, "ROUND")
         group.links.new(fitted["Source"], whole.inputs[0])
         fitted["Source"] = whole.outputs[0]
@@ -81,7 +84,7 @@ def fill(
 def _warped(
     group: bpy.types.NodeTree, enter: bpy.types.Node, own: bpy.types.NodeSocket, image: bpy.types.Image, take: Take
 ) -> bpy.types.NodeSocket:
-    """Socket of the frozen picture: the take's own, or what is led into the group, frozen by the take's warp."""
+    """Socket of the frozen image: the take's frames, or the group's input frozen by the take's warp."""
     reader = group.nodes.new("CompositorNodeImage")
     reader.name = reader.label = "Warp"
     reader.location = (-3 * GAP, -1500.0)
@@ -96,13 +99,13 @@ def _warped(
 
 
 _TINT, _TINTED = (1.0, 0.0, 0.4, 1.0), 0.6
-"""Colour that shows what is invented, and how much of it there is where nothing is plate."""
+"""Colour of the tint for invented pixels, and its strength where no pixel comes from a plate."""
 
 
 def _looked_at(
     group: bpy.types.NodeTree, enter: bpy.types.Node, layers: dict[str, bpy.types.NodeSocket]
 ) -> bpy.types.NodeSocket:
-    """Socket of the frozen picture, or of the splats alone, with what is invented tinted as much as is asked for."""
+    """Socket of the frozen image or the splats alone, with invented pixels tinted by the requested amount."""
     node, factor, first, second, chosen = compat.new_mix_node(group)
     node.label, node.location = "Splat", (-2 * GAP, 500.0)
     group.links.new(enter.outputs["Splat"], factor)
@@ -124,7 +127,7 @@ def _looked_at(
 def _grainy(
     group: bpy.types.NodeTree, enter: bpy.types.Node, layers: dict[str, bpy.types.NodeSocket]
 ) -> bpy.types.NodeSocket:
-    """Socket of the frozen picture with as much of its grain as is requested; earlier takes have none."""
+    """Socket of the frozen image with the requested amount of grain. Earlier takes have no grain."""
     if GRAIN not in layers:
         return layers["Combined"]
     node, factor, first, second, summed = compat.new_mix_node(group, "ADD")
@@ -143,7 +146,7 @@ def _among(
     nearer: bpy.types.NodeSocket,
     label: str,
 ) -> bpy.types.NodeSocket:
-    """Socket of a picture with CG in front of it, as far as it is nearer, else behind, by as much as both cover."""
+    """Socket of an image composited with CG: CG over it where CG is nearer, under it elsewhere."""
     front, under, over = compat.new_over_node(group)
     group.links.new(picture, under)
     group.links.new(enter.outputs["CG"], over)
@@ -162,13 +165,13 @@ def _among(
 
 
 def _cg_depth(group: bpy.types.NodeTree, enter: bpy.types.Node) -> bpy.types.NodeSocket:
-    """Socket of the depth of CG; where a pixel has none, the nearest of its neighbours': it may be that one's edge.
+    """Socket of the depth of CG. Pixels without a depth use the nearest depth of their neighbours.
 
-    A pixel that CG covers in part often tells the depth of what is behind: nothing.
+    A pixel that CG covers partly often has the depth of the empty background.
     """
     around = compat.new_nearest_node(group)
     group.links.new(enter.outputs["CG Depth"], around.inputs[0])
-    # Where there is a depth, the other is made so large that the lesser of the two is the pixel's own.
+    # Where the pixel has a depth, the neighbours' depth is raised so far that the minimum keeps the pixel's depth.
     has_depth = compat.new_math_node(group, "LESS_THAN")
     has_depth.inputs[1].default_value = _NOTHING
     group.links.new(enter.outputs["CG Depth"], has_depth.inputs[0])
@@ -188,7 +191,8 @@ def _cg_depth(group: bpy.types.NodeTree, enter: bpy.types.Node) -> bpy.types.Nod
 def _shadows_nearer(
     group: bpy.types.NodeTree, enter: bpy.types.Node, depth: bpy.types.NodeSocket
 ) -> bpy.types.NodeSocket:
-    """Socket of the depth of CG, less by `_SHADOW` of itself where CG is black, as what a catcher shows of a shadow."""
+    """Socket of the depth of CG, reduced by the fraction `_SHADOW` where CG is black, as a shadow catcher renders
+    it."""
     red, green, blue = compat.separated(group, enter.outputs["CG"])
     brighter, brightest = (compat.new_math_node(group, "MAXIMUM") for _ in range(2))
     black, share, nearer = (compat.new_math_node(group, o) for o in ("LESS_THAN", "MULTIPLY_ADD", "MULTIPLY"))
@@ -208,10 +212,9 @@ def _shadows_nearer(
 def _nearer(
     group: bpy.types.NodeTree, cg: bpy.types.NodeSocket, frozen: bpy.types.NodeSocket, softness: bpy.types.NodeSocket
 ) -> bpy.types.NodeSocket:
-    """Socket of how much CG is in front: 1 up to `_EVEN` behind the frozen depth, 0 from `_SOFT` more, smooth.
+    """Socket of the weight of CG in front: 1 up to `_EVEN` behind the frozen depth, falling smoothly to 0 over `_SOFT`.
 
-    Softness, in scene units, makes the way from 1 to 0 longer by itself at both ends. At 0 each step with it changes
-    no bit.
+    Softness, in scene units, extends the transition by that length at both ends. At 0 it changes no bit of the result.
     """
     ratio = compat.new_math_node(group, "DIVIDE")
     group.links.new(cg, ratio.inputs[0])
@@ -246,7 +249,7 @@ def _nearer(
 def _share(
     group: bpy.types.NodeTree, enter: bpy.types.Node, layers: dict[str, bpy.types.NodeSocket]
 ) -> bpy.types.NodeSocket:
-    """Socket of how much of the frozen frame shows: Mix, left of Wipe, and where the mattes let it."""
+    """Socket of the frozen frame's weight: the product of Mix, the area left of Wipe and the mattes."""
     left = compat.new_math_node(group, "LESS_THAN")
     left.label = "Left of the wipe"
     group.links.new(fitting.across(group), left.inputs[0])

@@ -1,4 +1,4 @@
-"""Frozen frames through the scene's compositor to the artist's output."""
+"""Inserts frozen frames into the scene's compositor and renders to the artist's output."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from .take_files import Take
 
 
 def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = None) -> list[str]:
-    """Puts a take into the scene's compositor, or updates it; returns what was changed, in words.
+    """Puts a take into the scene's compositor, or updates it. Returns the changes as sentences.
 
     Args:
         scene: the scene.
         shot: shot folder.
         take: name of the take.
-        warp: True freezes the plate that is led into the group, False shows the take's own frames, None: as it does.
+        warp: True: freeze the plate linked to the group. False: show the take's frames. None: unchanged.
 
     Raises:
-        contract.JobError: the take has no frames, or is to be used as a warp and cannot be.
+        contract.JobError: the take has no frames, or its warp is requested but cannot be used.
     """
     frozen, plate = _sources(scene, shot, take)
     if warp:
@@ -47,14 +47,14 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = No
 
 
 def read_ahead(scene: bpy.types.Scene, shot: Path, take: str) -> Iterator[None]:
-    """Has Blender read what `insert` will need, a picture a turn. JobError as `insert`."""
+    """Loads the images that `insert` will need, one per iteration. Raises JobError as `insert` does."""
     frozen, plate = _sources(scene, shot, take)
     shown = plate if freeze_group.shows_plate(scene) else None
     return compositor.read_ahead(frozen, shown, freeze_group.wants_warp(scene))
 
 
 def _need_warp(shot: Path, take: Take) -> None:
-    """JobError if a take cannot freeze a plate that shows frame n at frame n."""
+    """Raises JobError if the take's warp cannot freeze a plate that shows frame n at scene frame n."""
     name = take.folder.name
     if inventory.read(shot).takes.get(name, {}).get("camera_path"):
         raise contract.JobError(
@@ -71,7 +71,7 @@ def _need_warp(shot: Path, take: Take) -> None:
 
 
 def _sources(scene: bpy.types.Scene, shot: Path, take: str) -> tuple[Take, Path | None]:
-    """A take, and the first picture of its plate if there is one. JobError if the take has no frames."""
+    """A take, and the first image of its plate if there is one. Raises JobError if the take has no frames."""
     try:
         frozen = take_files.take_of(contract.ShotFolder(shot).takes / take, scene_objects.depth_scale(scene, shot))
     except FileNotFoundError as error:
@@ -83,26 +83,26 @@ def _sources(scene: bpy.types.Scene, shot: Path, take: str) -> tuple[Take, Path 
 
 
 def _footage(scene: bpy.types.Scene, shot: Path, plate: Path | None) -> list[Path]:
-    """Footage by which a node that shows the plate is known: the undistorted plate, the clip as it was imported, where
-    it is now if it was moved, and as it is chosen in the panel."""
+    """Files by which a node that shows the plate is recognised: the undistorted plate, the clip's imported and current
+    locations, and the panel's clip."""
     state = inventory.read(shot)
     clips = [str(state.info.get("source", "")), places.source_of(state), paths.absolute(settings_of(scene).clip)]
     return [*([plate] if plate is not None else []), *(Path(clip) for clip in dict.fromkeys(clips) if clip)]
 
 
 def remove(scene: bpy.types.Scene) -> bool:
-    """Takes the freeze out of the scene's compositor. True if it was there."""
+    """Removes the freeze from the scene's compositor. True if there was one."""
     return compositor.remove(scene)
 
 
 def fit_take(scene: bpy.types.Scene, shot: Path, take: str, new: bool = False) -> list[str]:
-    """Gives the scene the rate and range of a take, and a size that loses no pixel of it; says what changed.
+    """Sets the scene's frame rate and range to a take's, and a size that keeps every pixel. Returns the changes.
 
     Args:
-        scene: the scene. What the artist has set in it stays, and it never becomes smaller.
+        scene: the scene. Settings of the artist stay, and the render size is not reduced.
         shot: shot folder.
         take: name of the take.
-        new: the scene is a new one, which takes the plate's size.
+        new: the scene is new and gets the plate's size.
     """
     frozen, state, render = (
         take_files.take_of(contract.ShotFolder(shot).takes / take),
@@ -111,7 +111,7 @@ def fit_take(scene: bpy.types.Scene, shot: Path, take: str, new: bool = False) -
     )
     width, height = size = _plate_size(state) if new else (render.resolution_x, render.resolution_y)
     alike = abs(width * frozen.size[1] - height * frozen.size[0]) <= 0.02 * width * frozen.size[1]
-    if frozen.size[0] > width or (new and not alike):  # of a camera of the artist's own
+    if frozen.size[0] > width or (new and not alike):  # a take from the artist's camera
         size = frozen.size
     elif not new:
         size = None
@@ -129,9 +129,9 @@ def _plate_size(state: ShotState) -> tuple[int, int]:
 
 
 def insert_freeze(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | None = None) -> list[str]:
-    """Puts a take into the scene's compositor, or its warp, and keeps the plate's colours if the artist consents.
+    """Puts a take or its warp into the scene's compositor, and preserves the plate's colours if that setting is on.
 
-    The footage's timecode goes into the metadata of what is rendered.
+    Writes the footage's timecode into the metadata of rendered files.
     """
     with rollback.scene_of(scene):
         changes = scene_setup.keep_plate_colours(scene) if settings_of(scene).keep_colours else []
@@ -140,9 +140,9 @@ def insert_freeze(scene: bpy.types.Scene, shot: Path, take: str, warp: bool | No
 
 
 def timecode_note(state: ShotState) -> str:
-    """What the metadata of rendered files says of the footage's timecode; empty if it carries none.
+    """Timecode note for the metadata of rendered files; empty if the footage has no timecode.
 
-    Blender's own Time counts from frame 0, and it has no place for another start.
+    Blender's Time stamp counts from frame 0 and supports no other start.
     """
     first = state.frame_range[0]
     code = state.timecode_at(first)
@@ -150,16 +150,16 @@ def timecode_note(state: ShotState) -> str:
 
 
 def combine_cg(scene: bpy.types.Scene, shot: Path) -> list[str]:
-    """Has the scene's own objects stand among the frozen. JobError if the freeze is not in the compositor."""
+    """Composites the scene's objects with the frozen frames. Raises JobError if the freeze is not in the compositor."""
     compositor.may_combine_cg(scene)
     with rollback.scene_of(scene):
-        changes = scene_setup.render_cg(scene)  # first: without the pass the node has no socket for it
+        changes = scene_setup.render_cg(scene)  # first: without the depth pass the node lacks its socket
         changes += cg_camera.use_matching_camera(scene, _shown_take(scene), rendering.frames_of(scene))
         return compositor.combine_cg(scene) + changes
 
 
 def _shown_take(scene: bpy.types.Scene) -> Path:
-    """Folder of the take that the compositor shows. JobError if its picture is gone."""
+    """Folder of the take that the compositor shows. Raises JobError if its image is missing."""
     shown = freeze_group.shown(scene)
     if shown is None:
         raise contract.JobError(
@@ -169,24 +169,24 @@ def _shown_take(scene: bpy.types.Scene) -> Path:
 
 
 def bring_in(scene: bpy.types.Scene, shot: Path, take: str, alone: bool = True) -> None:
-    """Has a take put into the compositor and rendered by the timer, in turns: Blender stands still in each.
+    """Inserts a take into the compositor and renders it, in steps run by the timer. Each step blocks Blender's window.
 
     Args:
-        scene: the scene; with `alone` no other one that works on the shot is changed.
+        scene: the scene.
         shot: shot folder.
         take: name of a take.
-        alone: see `scene`.
+        alone: change only this scene, not other scenes that use the shot.
     """
     job_timer.work(shot, "bake", _turns(scene.session_uid, shot, take, scene.session_uid if alone else 0))
 
 
 def _turns(scene_uid: int, shot: Path, take: str, only: int) -> Iterator[None]:
-    """A picture a turn; the compositor; the render, a turn after it, since Blender takes its time for both."""
+    """Steps of `bring_in`: load one image each, then set up the compositor, then render. The last two block longest."""
     if session.scene_of(scene_uid) is None:
         return
     with contextlib.suppress(
         contract.JobError, OSError, RuntimeError, ValueError
-    ):  # inserting fails alike, and says so
+    ):  # `insert_freeze` reports the same error
         yield from read_ahead(present(session.scene_of(scene_uid)), shot, take)
     seen = 0
 
@@ -194,7 +194,7 @@ def _turns(scene_uid: int, shot: Path, take: str, only: int) -> Iterator[None]:
         nonlocal seen
         changes = insert_freeze(scene, shot, take)
         if job_timer.window_of(scene) is not None:
-            changes += rendering.choose_output(scene, shot, take)  # here, for it belongs to the same undo step
+            changes += rendering.choose_output(scene, shot, take)  # now, as part of the same undo step
             seen = scene.session_uid
         else:
             changes.append(f"{scene.name} is in no window: it was not rendered.")
@@ -208,5 +208,5 @@ def _turns(scene_uid: int, shot: Path, take: str, only: int) -> Iterator[None]:
     window = job_timer.window_of(scene) if scene is not None else None
     if window is not None:
         with bpy.context.temp_override(window=window, scene=window.scene):  # pyright: ignore[reportUnknownMemberType]
-            ops: Any = bpy.ops  # ours are not in its types
+            ops: Any = bpy.ops  # our operators are not in the stubs
             ops.splannequin.render("INVOKE_DEFAULT")

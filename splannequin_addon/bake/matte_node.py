@@ -1,4 +1,4 @@
-"""A matte of a take in the scene's compositor: a Cryptomatte node that picks it by name."""
+"""Adds a Cryptomatte node to the scene's compositor that selects a take's matte by name."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from ..ui import step_operator
 
 
 def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str]:
-    """Adds a Cryptomatte node of a matte to the scene's compositor, linked to nothing; returns what was done, in words.
+    """Adds an unlinked Cryptomatte node of a matte to the scene's compositor. Returns the changes as sentences.
 
-    JobError if the take has no such matte, or the scene no compositor that can be changed.
+    Raises JobError if the take lacks the matte, or if the scene has no editable compositor.
     """
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
     frames = numbered.frame_numbers(folder.cryptomattes)
@@ -33,7 +33,7 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
     tree = compat.own_compositor_tree(scene)
     image = sequences.load_numbers(folder.cryptomatte(frames[0]), f"Mattes {take}")
     if image.source != "SEQUENCE":
-        size_of(image)  # reads it: Blender 4.2 picks nothing from a sequence whose first picture it has not read
+        size_of(image)  # loads the image: Blender 4.2 selects no matte from a sequence whose first image is not loaded
         image.source = "SEQUENCE"
     if any(_shows(node, folder.cryptomatte(frames[0]), name) for node in tree.nodes):
         return [f"The node of the matte {name} is there already."]
@@ -49,12 +49,12 @@ def insert(scene: bpy.types.Scene, shot: Path, take: str, name: str) -> list[str
 
 
 def _quoted(name: str) -> str:
-    """A name as a node's list of names has it: separated by commas, in quotation marks where it has one."""
+    """A matte's name in the syntax of the node's comma-separated list: quoted if it contains a comma."""
     return f'"{name}"' if "," in name else name
 
 
 def _shows(node: bpy.types.Node, path: Path, name: str) -> bool:
-    """True of a Cryptomatte node that picks this matte from this sequence."""
+    """True for a Cryptomatte node that selects this matte from this sequence."""
     picker: Any = node
     if node.bl_idname != "CompositorNodeCryptomatteV2" or picker.image is None or picker.source != "IMAGE":
         return False
@@ -71,7 +71,7 @@ class SPLANNEQUIN_OT_insert_matte(bpy.types.Operator):
     name = StringProperty(name="Matte", description="Name of the matte", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Adds the node; a refusal is reported."""
+        """Adds the node; reports an error."""
         take = settings_of(scene_in(context)).take_name
         return step_operator.edit(self, context, "bake", lambda scene, shot: insert(scene, shot, take, self.name))
 

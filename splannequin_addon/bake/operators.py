@@ -1,4 +1,4 @@
-"""The button Bake, and its parts one by one."""
+"""The operators of the Bake step: the whole bake, and each of its parts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
     step = "bake"
 
     def perform(self, context: bpy.types.Context) -> Outcome:
-        """Bakes; a complete take needs no backend."""
+        """Bakes the shot. A complete take needs no backend."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         take = settings_of(scene).take_name
@@ -44,7 +44,7 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
         )
         if outcome == {"FINISHED"}:
             try:
-                ops: Any = bpy.ops  # ours are not in its types
+                ops: Any = bpy.ops  # our operators are not in the stubs
                 ops.splannequin.render("EXEC_DEFAULT")
             except RuntimeError as error:
                 self.report({"ERROR"}, str(error).strip())
@@ -52,7 +52,10 @@ class SPLANNEQUIN_OT_bake(step_operator.StepOperator, bpy.types.Operator):
         return outcome
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams | None:
-        """Reads the artist's camera again, if the take is seen from one: what moved since is stale."""
+        """Freeze parameters after a new reading of the artist's camera, if the take uses one; else None.
+
+        Frames whose camera pose has changed since the freeze are stale.
+        """
         return takes.read_camera(scene, self.step) if own_camera.follows_camera(scene) else None
 
     def after(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
@@ -77,11 +80,11 @@ class SPLANNEQUIN_OT_render(bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Blocks until the frames are on disk."""
+        """Renders and blocks until all frames are written."""
         return self._render(context, "EXEC_DEFAULT")
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Renders in the background of the window, as Blender's own Render Animation does."""
+        """Renders without blocking the window, as Blender's Render Animation does."""
         return self._render(context, "INVOKE_DEFAULT")
 
     def _render(self, context: bpy.types.Context, how: str) -> Outcome:
@@ -137,7 +140,7 @@ class SPLANNEQUIN_OT_freeze_as_warp(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Inserts or updates the group, the other way."""
+        """Toggles between the take's frames and its warp, and inserts or updates the group."""
         take, warp = settings_of(scene_in(context)).take_name, not freeze_group.wants_warp(scene_in(context))
         return step_operator.edit(
             self, context, "bake", lambda scene, shot: insertion.insert_freeze(scene, shot, take, warp)
@@ -153,7 +156,7 @@ class SPLANNEQUIN_OT_combine_cg(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Adds one Render Layers node and two links."""
+        """Adds a Render Layers node and its two links."""
         return step_operator.edit(self, context, "bake", insertion.combine_cg)
 
 
@@ -166,11 +169,11 @@ class SPLANNEQUIN_OT_remove_shot(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Removes what Splannequin put into the file."""
+        """Removes everything that Splannequin added to the file."""
 
         def remove(scene: bpy.types.Scene, shot: Path) -> list[str]:
             notes = begin.remove_all(scene, shot)
-            job_timer.watch_of(shot).notes.clear()  # they tell of what is no longer there
+            job_timer.watch_of(shot).notes.clear()  # the notes describe what was just removed
             return notes
 
         return step_operator.edit(self, context, "bake", remove)

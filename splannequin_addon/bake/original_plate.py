@@ -1,7 +1,7 @@
-"""The footage itself as the minimal tree's plate: the video or sequence as it was filmed, at its own size and depth.
+"""The original footage as the minimal tree's plate: the video or sequence as filmed, at its size and bit depth.
 
-Its lens is taken away by the take's ST map. Where Blender would show the files otherwise than the freeze read them, the
-working frames stand in, and a sentence says why.
+The take's ST map removes the lens distortion. Where Blender would read the files differently from the freeze, the
+working frames replace the footage, and a sentence gives the reason.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from .node_names import GAP
 from .take_files import Take
 
 LENS = "Splannequin Undistort"
-"""Name of the group that takes the lens away."""
+"""Name of the group that removes the lens distortion."""
 LIGHT = "Splannequin Working Light"
-"""Name of the group that gives working frames their highlights back."""
+"""Name of the group that restores the highlights of working frames."""
 _IS_OURS = "splannequin_lens"
 _MAP = "ST Map"
-"""Name of the node in the first of them that shows the map."""
+"""Name of the node that shows the ST map, in the group `LENS`."""
 
 
 @dataclass(frozen=True)
 class Footage:
-    """Facts in a take about the footage that it was frozen from."""
+    """Facts stored in a take about the footage that it was frozen from."""
 
     file: Path
-    """The video, or a picture of the sequence."""
+    """The video, or one image of the sequence."""
     size: tuple[int, int]
-    """Width and height of its pictures in pixels."""
+    """Width and height of its images in pixels."""
     probe: tuple[float, ...]
-    """Linear Rec.709 light that `contract.PROBE` means in its files."""
+    """Linear Rec.709 light that the file value `contract.PROBE` encodes."""
     space: str
-    """Name of its colour space."""
+    """Name of the footage's colour space."""
     map: Path | None
-    """ST map from it to the plate without the lens; None: there is no lens."""
+    """ST map that removes the footage's lens distortion; None without distortion."""
     shift: int = 0
-    """Number of a frame in the shot minus its number in the footage."""
+    """Frame number in the shot minus frame number in the footage."""
 
 
 @dataclass
@@ -54,21 +54,24 @@ class Plate:
     """The plate of a take as data-blocks."""
 
     image: bpy.types.Image
-    """Video or sequence."""
+    """Video or image sequence."""
     map: bpy.types.Image | None
-    """ST map by which it is undistorted."""
+    """ST map that undistorts the image, or None."""
     said: list[str]
-    """What it is, a sentence each."""
+    """Sentences that describe the plate."""
     size: tuple[int, int]
     """Width and height of the plate in pixels."""
     shift: int = 0
-    """Number of a frame in the shot minus its number in the image's files."""
+    """Frame number in the shot minus frame number of the image's files."""
     has_shoulder: bool = False
-    """True if it is read as sRGB and has a shoulder, see `working_light`."""
+    """True if the image is read as sRGB and has a shoulder, see `working_light`."""
 
 
 def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
-    """The footage that a take was frozen from, or None and, if the take knows of it, why it cannot be shown."""
+    """(the footage that a take was frozen from, ""), or (None, the reason why it cannot be shown).
+
+    The reason is empty if the take does not record its footage.
+    """
     try:
         footage: dict[str, Any] = dict(contract.read_json(contract.TakeFolder(take.folder).facts).get("footage") or {})
         if not footage:
@@ -89,11 +92,12 @@ def footage_of(take: Take, shot: Path) -> tuple[Footage | None, str]:
         probe = tuple(float(value) for value in footage["probe"])
         return Footage(file, (width, height), probe, str(footage["space"]), st, int(footage.get("shift") or 0)), ""
     except (OSError, ValueError, TypeError, KeyError, contract.JobError):
-        return None, ""  # of an earlier version, or damaged
+        return None, ""  # the facts are damaged or of an earlier version
 
 
 def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
-    """What the tree shows as the plate: the footage, else the working frames. ValueError if neither can be shown."""
+    """The plate that the tree shows: the footage, else the working frames. Raises ValueError if neither can be
+    shown."""
     footage, why = footage_of(take, shot)
     image = None
     if footage is not None:
@@ -113,7 +117,7 @@ def plate_of(take: Take, shot: Path, stand_in: Path) -> Plate:
 
 
 def read_ahead(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
-    """Has Blender read the pictures that `plate_of` will need, one a turn."""
+    """Loads the images that `plate_of` will need, one per iteration."""
     footage, _ = footage_of(take, shot)
     if footage is None or not compat.knows_colour(footage.probe):
         sequences.read(stand_in, working_name(stand_in), "srgb", take.first, take.last)
@@ -127,7 +131,7 @@ def read_ahead(take: Take, shot: Path, stand_in: Path) -> Iterator[None]:
 
 
 def working_name(plate: Path) -> str:
-    """Name of the data-block of a shot's working frames."""
+    """Name of the image data-block of a shot's working frames."""
     return f"Plate {plate.parent.parent.stem}"
 
 
@@ -140,7 +144,7 @@ def _map_name(take: Take) -> str:
 
 
 def _image(footage: Footage, frames: tuple[int, int]) -> tuple[bpy.types.Image | None, str]:
-    """The footage as a data-block, or None and why Blender does not show it as it is."""
+    """(the footage as an image, ""), or (None, the reason why Blender does not show it as filmed)."""
     try:
         image = sequences.load_sequence(footage.file, _name(footage), footage.probe, opaque=True)
     except ValueError:
@@ -160,12 +164,12 @@ def _image(footage: Footage, frames: tuple[int, int]) -> tuple[bpy.types.Image |
 
 
 def between(plate: Plate) -> str:
-    """What stands between a plate's picture and its fit: LENS, LIGHT, or nothing."""
+    """Name of the group needed between a plate's image and its Scale node: LENS, LIGHT or empty."""
     return LENS if plate.map is not None else LIGHT if plate.has_shoulder else ""
 
 
 def kind(node: bpy.types.Node) -> str:
-    """LENS or LIGHT of a node that `through` made, empty of any other."""
+    """LENS or LIGHT for a group node that `through` made, else empty."""
     group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
     if group is None or not group.get(_IS_OURS):
         return ""
@@ -175,8 +179,11 @@ def kind(node: bpy.types.Node) -> str:
 def through(
     tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket, plate: Plate, location: tuple[float, float]
 ) -> bpy.types.NodeSocket:
-    """Socket of a plate's picture without its lens, or with its light, by a group node of ours in a tree; the picture
-    itself if it needs neither."""
+    """Socket of a plate's image after a new group node of ours, which removes the lens distortion or restores
+    highlights.
+
+    Returns `picture` itself if the plate needs neither.
+    """
     wanted = between(plate)
     if not wanted:
         return picture
@@ -195,7 +202,7 @@ def through(
 
 
 def refill(node: bpy.types.Node, plate: Plate) -> None:
-    """Has a node of ours show a plate, of which the same stands between; the links around it stay."""
+    """Rebuilds the inside of a group node of ours for another plate of the same kind. The links to the node stay."""
     assert isinstance(node, bpy.types.CompositorNodeGroup)
     group = present(node.node_tree)
     group.nodes.clear()
@@ -203,7 +210,7 @@ def refill(node: bpy.types.Node, plate: Plate) -> None:
 
 
 def _fill(group: bpy.types.NodeTree, plate: Plate) -> None:
-    """The inside of a group from picture to picture."""
+    """Builds the inside of a group, from its input image to its output image."""
     enter, leave = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
     enter.location, leave.location = (-3 * GAP, 0.0), (4 * GAP, 0.0)
     if plate.map is not None:
@@ -218,14 +225,14 @@ def _fill(group: bpy.types.NodeTree, plate: Plate) -> None:
 
 
 def images_of(node: bpy.types.Node) -> list[bpy.types.Image]:
-    """The images that a node of ours shows, itself or in its group."""
+    """The images that a node of ours shows, directly or inside its group."""
     group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
     nodes = group.nodes if group is not None and group.get(_IS_OURS) else [node]
     return [n.image for n in nodes if isinstance(n, bpy.types.CompositorNodeImage) and n.image]
 
 
 def drop(node: bpy.types.Node) -> list[bpy.types.Image]:
-    """Removes a node of ours from its tree, and its group if it is one of these; returns the images it showed."""
+    """Removes a node of ours from its tree, and its group if unused. Returns the images that the node showed."""
     images = images_of(node)
     group = node.node_tree if isinstance(node, bpy.types.CompositorNodeGroup) else None
     present(node.id_data).nodes.remove(node)  # pyright: ignore

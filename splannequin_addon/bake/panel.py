@@ -1,4 +1,4 @@
-"""The panel of the step Bake."""
+"""The panel of the Bake step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class BakePanel(step_panel.StepPanel):
     folds = "bake"
 
     def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Which take, and which of its frames: The frame range and step of the scene."""
+        """The take, and the scene's frame range and step."""
         layout.prop(settings_of(scene_in(context)), "take_name")
         row = layout.row(align=True)
         row.prop(scene_in(context), "frame_start", text="First")
@@ -26,7 +26,7 @@ class BakePanel(step_panel.StepPanel):
         row.prop(scene_in(context), "frame_step", text="Step")
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Colours, and the parts of the step one by one."""
+        """Colours, and the operators of the single parts of the step."""
         layout.prop(settings_of(scene_in(context)), "keep_colours")
         layout.prop(settings_of(scene_in(context)), "insert_at")
         softness = freeze_group.cg_softness(scene_in(context))

@@ -1,6 +1,6 @@
-"""Where the freeze stands in a compositor: as the plate where a node shows it, else before the output.
+"""The position of the freeze in a compositor: behind the node that shows the plate, else before the output.
 
-Only links are moved, and led back.
+Inserting and removing the group only reroutes links.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PICTURES = ("CompositorNodeImage", "CompositorNodeMovieClip")
 def lead_through(
     tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup, behind: bpy.types.NodeSocket | None
 ) -> None:
-    """Leads a picture through our node: all that leaves a socket, or with None what goes to the output."""
+    """Routes links through our node: all links from the socket `behind`, or, with None, the link to the output."""
     if behind is not None:
         source, targets, beside = behind, [present(link.to_socket) for link in links_of(behind)], present(behind.node)
         node.location = (beside.location.x + beside.width + 30.0, beside.location.y - 320.0)
@@ -39,7 +39,7 @@ def lead_through(
 
 
 def lead_past(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> None:
-    """Leads what goes through our node past it again."""
+    """Undoes `lead_through`: reconnects the group's input directly to the targets of its output."""
     sources = [present(link.from_socket) for link in links_of(node.inputs["Image"])]
     for target in [present(link.to_socket) for link in links_of(node.outputs["Image"])]:
         if sources:
@@ -49,14 +49,16 @@ def lead_past(tree: bpy.types.NodeTree, node: bpy.types.CompositorNodeGroup) -> 
 
 
 def stands_in(node: bpy.types.CompositorNodeGroup) -> bool:
-    """True if our node stands behind the plate, not before the output."""
+    """True if our node lies behind the plate, False if it lies before the output."""
     return bool(present(node.node_tree).get(_STANDS_IN))
 
 
 def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy.types.NodeSocket | None:
-    """Socket that the group goes behind: the plate's, in the artist's tree; None for before the output.
+    """Socket to insert the group behind: the plate's in the artist's tree; None to insert it before the output.
 
-    A plate that is undistorted or brought to the render's size first is taken after that, as the frozen frames are.
+    Nodes that only undistort the plate or scale it to the render size come before the group, because frozen frames
+    already have both.
+    Raises JobError if `where` is "PLATE" and no node shows the plate.
     """
     tree = compat.compositor_tree(scene)
     if where == "OUTPUT" or tree is None:
@@ -66,7 +68,7 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
     led = [n for n in led if n.bl_idname in _PICTURES and not n.get(TAG) and not n.mute]
     nodes = [n for n in tree.nodes if n in led and _picture(n).is_linked]
     found = [n for n in nodes if same_footage.shows(_shown(n), footage)]
-    if where == "PLATE" and not found:  # by another name, then: the chosen one, or the only one
+    if where == "PLATE" and not found:  # shown under another name: take the active node, or the only one
         found = [n for n in nodes if n == tree.nodes.active] or (nodes if len(nodes) == 1 else [])
     if not found:
         if where == "PLATE":
@@ -90,17 +92,17 @@ def place_of(scene: bpy.types.Scene, footage: Sequence[Path], where: str) -> bpy
 
 
 def links_of(socket: bpy.types.NodeSocket) -> list[bpy.types.NodeLink]:
-    """The links that begin or end at a socket, as they are now: moving one changes what the socket tells."""
+    """The links that begin or end at a socket, as a list: rerouting a link changes `socket.links`."""
     return list(present(socket.links))
 
 
 def _picture(node: bpy.types.Node) -> bpy.types.NodeSocket:
-    """Output of an Image or Movie Clip node that the picture leaves through."""
+    """The image output of an Image or Movie Clip node."""
     return next(s for s in node.outputs if s.enabled and s.type == "RGBA")
 
 
 def upstream(end: bpy.types.Node | None) -> list[bpy.types.Node]:
-    """Nodes whose picture gets to a node, with that."""
+    """`end` and all nodes that it depends on."""
     waiting: list[bpy.types.Node | None] = [end]
     found: list[bpy.types.Node] = []
     while waiting:
@@ -119,7 +121,7 @@ def _shown(node: bpy.types.Node) -> bpy.types.Image | bpy.types.MovieClip | None
 
 
 def _conforms(scene: bpy.types.Scene, node: bpy.types.Node, plate: bpy.types.Node) -> bool:
-    """True if a node only undistorts the plate, or brings one of another size to the render's."""
+    """True if a node only undistorts the plate, or scales a plate of another size to the render size."""
     if node.mute or node.bl_idname == "CompositorNodeMovieDistortion":
         return not node.mute
     return node.bl_idname == "CompositorNodeScale" and size_of(present(_shown(plate))) != scene_setup.render_size(scene)

@@ -1,4 +1,4 @@
-"""How far a render of a baked shot is, and its end: Blender renders by itself, and tells handlers of every frame."""
+"""Progress and end of the render of a baked shot. Blender renders independently and calls handlers for each frame."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ from ..scene import session
 from . import render_settings, rendering
 
 _IDLE_TURNS = 2
-"""Turns of the timer without a render job after which a render that told no end is over: one may be before it."""
+"""Number of timer turns without a render job after which a render counts as over, even without an end handler. The
+first turn may come before the render job starts."""
 _runs: dict[Path, rendering.Run] = {}
-"""Shot -> its render that goes on."""
+"""Shot -> its running render."""
 _ended: dict[Path, bool] = {}
-"""Shot -> whether its render was cancelled, once a handler told its end. The scene is put back by the timer, since
-handlers of a window's render run in a thread of its own."""
+"""Shot -> whether its render was cancelled, set by the handlers at the end of a render.
+
+The timer restores the scene, because handlers of a window's render run in a separate thread.
+"""
 
 
 def began(shot: Path, run: rendering.Run) -> None:
-    """A render of a baked shot begins, for which the scene is set up."""
+    """Starts to track the render of a baked shot. The scene must already be set up."""
     _runs[shot] = run
     _ended.pop(shot, None)
     watch = job_timer.watch_of(shot)
@@ -45,7 +48,7 @@ def began(shot: Path, run: rendering.Run) -> None:
             idle = 0
             return True
         idle += 1
-        # Cancel takes the work away; a movie's file that cannot be begun ends a render without a word.
+        # Cancel clears `watch.work`. A movie file that cannot be opened ends a render without a handler call.
         if shot not in _ended and job_timer.watch_of(shot).work is not None and idle < _IDLE_TURNS:
             return True
         finish(shot)
@@ -55,7 +58,7 @@ def began(shot: Path, run: rendering.Run) -> None:
 
 
 def finish(shot: Path) -> None:
-    """Puts the scene of a render that is over back, and has the panel tell how it ended."""
+    """Restores the scene after a render and shows the result on the panel."""
     run = _runs.pop(shot, None)
     if run is None:
         return
@@ -96,7 +99,7 @@ def _end(scene: bpy.types.Scene, is_cancelled: bool) -> None:
 
 @persistent
 def _on_load(*_: object) -> None:
-    """Another file: the renders of the one before are over."""
+    """Handler: another file was loaded, so renders of the previous file are over."""
     for shot, run in list(_runs.items()):
         if session.scene_of(run.scene_uid) is None:
             _ended[shot] = True
@@ -110,7 +113,7 @@ _HANDLERS = (
 
 
 def register() -> None:
-    """Listens to renders."""
+    """Registers the handlers for renders, loading and saving."""
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
 

@@ -1,11 +1,10 @@
-"""The render settings that a bake needs, in one table. Each row is set while a bake renders, said, and set back.
+"""The render settings that a bake needs, in one table. Each row is applied for the bake, reported and then restored.
 
-While a bake goes on, what it changed is noted in the scene itself: a file that was saved in between, or an undo step,
-is put right when it is loaded. A file that the artist saves meanwhile holds the artist's own settings.
-
-Left as the artist has them, because they are choices about the result: file format, colour mode, depth, compression and
-the linear space of EXR files; size in percent, range and step; the compositor's precision; everything that only decides
-how the scene's own objects are rendered (engine, samples, motion blur, Freestyle, simplify, background scene).
+During a bake, the scene itself stores what was changed. A file saved in between, or an undo step, is repaired when it
+is loaded. A file that the artist saves during a bake holds the artist's settings.
+Settings that are choices about the result stay as the artist has them. These are file format, colour mode, depth,
+compression and the linear space of EXR files; size in percent, range and step; the compositor's precision. They include
+all settings for rendering the scene's objects (engine, samples, motion blur, Freestyle, simplify, background scene).
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from ..access import library_of, settings_of
 from ..scene import scene_setup
 
 _NOTED = "splannequin_bake_settings"
-"""Property of a scene that is being baked: JSON, [owner, name, value before, value of the bake] for each change."""
+"""Custom property of a scene during a bake: JSON, one [owner, name, value before, value of the bake] per change."""
 _SRGB = ("sRGB", "sRGB - Display", "sRGB Monitor", "sRGB Display")
-"""Names of the display whose values are those of sRGB files: Blender's, and those of ACES configurations."""
+"""Names of displays with sRGB values: Blender's, and those of ACES configurations."""
 _OUT = "render.image_settings"
 _COLOURS = "Files are written for an sRGB display without a look, so that the plate keeps its colours."
 
@@ -37,22 +36,22 @@ class Setting:
     """A row of the table."""
 
     owner: str
-    """What has the setting, as a path from the scene; empty: the scene."""
+    """Owner of the setting as a path from the scene; empty for the scene itself."""
     name: str
-    """Name of the setting. The row is skipped in a Blender that lacks it."""
+    """Name of the setting. A Blender version without the setting skips the row."""
     values: tuple[Any, ...]
-    """Values that the bake can use. The first that this Blender knows is set, unless the setting has one of them."""
+    """Values that the bake accepts. Unless the setting has one of them, the first one this Blender supports is set."""
     why: str
-    """Sentence for the artist when the setting was changed; empty if no pixel depends on it."""
+    """Sentence for the artist when the setting was changed; empty if it affects no pixel."""
     when: str = "always"
-    """When the row is in force:
+    """Condition under which the row applies:
 
     always   in every bake
-    strips   the scene's sequencer holds something
-    cg       the scene's own render is led into the freeze
-    keep     the plate's colours are to be kept
-    colours  they are to be kept, and the scene would change them
-    exact    the same frame has to be the same bytes, whoever renders it
+    strips   the scene's sequencer has strips
+    cg       the scene's render is linked to the freeze
+    keep     the plate's colours should be preserved
+    colours  as keep, and the scene would change the colours
+    exact    a frame must be byte-identical on every computer
     """
 
 
@@ -83,23 +82,23 @@ SETTINGS: tuple[Setting, ...] = (
         Setting(f"{_OUT}.view_settings", name, (value,), _COLOURS, "colours")
         for name, value in scene_setup.NEUTRAL_VIEW.items()
     ),
-    # Metadata that tells when and where a picture was made; the frame's number, too, for it is padded to the digits of
-    # the range's last.
+    # Stamps that depend on time and computer. Also the frame number, because Blender pads it to the digits of the
+    # range's last frame.
     *(
         Setting("render", f"use_stamp_{name}", (False,), "", "exact")
         for name in ("date", "time", "render_time", "memory", "hostname", "filename", "frame")
     ),
 )
-"""Settings that a bake needs, in the order in which they are set."""
+"""Settings that a bake needs, in the order of their application."""
 
 
 def needed(scene: bpy.types.Scene, is_exact: bool, has_cg: bool) -> list[Setting]:
-    """The rows that are in force for a bake of a scene.
+    """The rows that apply to a bake of a scene.
 
     Args:
-        scene: the scene, as the artist left it.
-        is_exact: the same frame has to be the same bytes, whoever renders it.
-        has_cg: the scene's own render is led into the freeze.
+        scene: the scene with the artist's settings.
+        is_exact: a frame must be byte-identical on every computer.
+        has_cg: the scene's render is linked to the freeze.
     """
     keep = bool(settings_of(scene).keep_colours)
     force = {
@@ -110,9 +109,9 @@ def needed(scene: bpy.types.Scene, is_exact: bool, has_cg: bool) -> list[Setting
 
 
 def apply(scene: bpy.types.Scene, rows: Iterable[Setting]) -> list[str]:
-    """Gives the scene what a bake needs, and notes in it what was there; returns what was changed, one sentence each.
+    """Applies rows to the scene and stores the previous values in it. Returns one sentence for each change.
 
-    JobError if a setting is animated, or cannot be set; nothing is changed then.
+    Raises JobError if a setting is animated or cannot be set; then nothing is changed.
     """
     rows = list(rows)
     moving = _animated(scene)
@@ -126,7 +125,7 @@ def apply(scene: bpy.types.Scene, rows: Iterable[Setting]) -> list[str]:
             )
     remarks: list[str] = []
     noted: list[tuple[str, str, Any, Any]] = []
-    # All of them first: one setting may change another, as a display does whose views have other names.
+    # Read all values first: setting one can change another. A display, for example, resets a view it does not have.
     were = [(row, getattr(_owner(scene, row.owner), row.name)) for row in rows]
     try:
         for row, before in were:
@@ -151,27 +150,27 @@ def apply(scene: bpy.types.Scene, rows: Iterable[Setting]) -> list[str]:
 
 
 def set_noted(scene: bpy.types.Scene, owner: str, name: str, value: Any) -> None:
-    """Gives one more setting a value, which `restore` takes back."""
+    """Sets one more setting, which `restore` will reset."""
     holder = _owner(scene, owner)
     noted = json.loads(scene.get(_NOTED, "[]"))
     before = getattr(holder, name)
     setattr(holder, name, value)
-    noted.append((owner, name, before, getattr(holder, name)))  # a path that is too long was cut off
+    noted.append((owner, name, before, getattr(holder, name)))  # read back, because Blender truncates long paths
     scene[_NOTED] = json.dumps(noted)
 
 
 def restore(scene: bpy.types.Scene) -> None:
-    """Restores the settings that a bake changed, except those that were changed again since."""
+    """Restores the settings that a bake changed. Settings that were changed again since keep their value."""
     noted = json.loads(scene.get(_NOTED, "[]"))
     for owner, name, before, _ in [one for one in noted if getattr(_owner(scene, one[0]), one[1]) == one[3]]:
-        with contextlib.suppress(TypeError):  # an enumeration that has another value since
+        with contextlib.suppress(TypeError):  # the enumeration no longer has this value
             setattr(_owner(scene, owner), name, before)
     if _NOTED in scene:
         del scene[_NOTED]
 
 
 def _set(owner: Any, row: Setting) -> bool:
-    """Sets the first of a row's values that this Blender knows. False if it knows none."""
+    """Sets the first of a row's values that this Blender supports. False if it supports none."""
     for value in row.values:
         try:
             setattr(owner, row.name, value)
@@ -189,7 +188,7 @@ def _owner(scene: bpy.types.Scene, path: str) -> Any:
 
 def _has(scene: bpy.types.Scene, row: Setting) -> bool:
     if row.name == "use_nodes" and compat.HAS_COMPOSITING_GROUP:
-        return False  # it is there, and says nothing any more
+        return False  # the property exists but has no effect
     try:
         return hasattr(_owner(scene, row.owner), row.name)
     except ValueError:
@@ -197,18 +196,18 @@ def _has(scene: bpy.types.Scene, row: Setting) -> bool:
 
 
 def _has_strips(scene: bpy.types.Scene) -> bool:
-    """True if the scene's sequencer holds anything, wherever it lies: it replaces the picture out of its range, too."""
+    """True if the scene's sequencer has strips. Strips outside the frame range also replace the rendered image."""
     editor: Any = scene.sequence_editor
     return editor is not None and bool(len(editor.strips if hasattr(editor, "strips") else editor.sequences))
 
 
 def _is_linear(scene: bpy.types.Scene) -> bool:
-    """True if the files hold light, not what a display is to show."""
+    """True if the output format stores scene-linear light rather than display values."""
     return bool(scene.render.image_settings.has_linear_colorspace)
 
 
 def _keeps_colours(scene: bpy.types.Scene) -> bool:
-    """True if files leave with the colours that the plate came in with."""
+    """True if written files keep the plate's colours."""
     out: Any = scene.render.image_settings
     display: Any = scene.display_settings
     moving = any(path.startswith(("view_settings.", "display_settings.")) for path in _animated(scene))
@@ -232,13 +231,13 @@ def _animated(scene: bpy.types.Scene) -> set[str]:
 # ------------------------------------------------------------------------------------------- saving, loading, undo
 
 going_on: dict[int, bool] = {}
-"""`session_uid` of each scene that is being baked -> whether its file was saved since the last frame was written."""
+"""`session_uid` of each scene being baked -> whether its file was saved since the last frame was written."""
 _paused: dict[int, Any] = {}
-"""`session_uid` of a scene -> what the bake had noted, while its file is saved."""
+"""`session_uid` of a scene -> the stored changes of its bake, while the file is being saved."""
 
 
 def left_behind() -> Iterator[bpy.types.Scene]:
-    """Scenes whose settings are those of a bake that does not go on."""
+    """Scenes with settings of a bake that is no longer running."""
     for scene in bpy.data.scenes:
         if _NOTED in scene and scene.session_uid not in going_on and not library_of(scene):
             yield scene
@@ -258,7 +257,8 @@ def _on_undo(*_: object) -> None:
 
 @persistent
 def _on_save(*_: object) -> None:
-    """The file is to hold the artist's settings. The frame that is being rendered may get some of them."""
+    """Handler: restores the artist's settings before the file is saved. The frame being rendered may use some of
+    them."""
     _paused.clear()
     for scene in bpy.data.scenes:
         if scene.session_uid in going_on and _NOTED in scene:
@@ -269,7 +269,7 @@ def _on_save(*_: object) -> None:
 
 @persistent
 def on_saved(*_: object) -> None:
-    """Handler: the bake goes on with its own settings."""
+    """Handler: applies the bake's settings again after the file was saved."""
     for scene in bpy.data.scenes:
         noted = _paused.pop(scene.session_uid, None)
         if noted is None or scene.session_uid not in going_on:
@@ -277,7 +277,7 @@ def on_saved(*_: object) -> None:
         for owner, name, _, ours in json.loads(noted):
             setattr(_owner(scene, owner), name, ours)
         scene[_NOTED] = noted
-        going_on[scene.session_uid] = True  # a frame may have begun meanwhile
+        going_on[scene.session_uid] = True  # a frame may have started during the save
 
 
 _HANDLERS = (
@@ -287,7 +287,7 @@ _HANDLERS = (
 
 
 def register() -> None:
-    """Listens to files that are loaded and saved, and to undo; `on_saved` is registered where it comes last."""
+    """Registers handlers for load, save and undo. `bake.progress` registers `on_saved`, so that it runs last."""
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
 

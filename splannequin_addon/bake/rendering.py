@@ -1,8 +1,8 @@
-"""The render of a baked shot: which frames, where to, and as whole pictures on disk.
+"""The render of a baked shot: its frames, its output paths, and checks that written images are complete.
 
-Every bake goes this way: Blender renders into a folder beside the output, and a picture takes its name once it was
-found whole and lies on the disk. So a full disk, a kill or a second bake of the same frames leaves earlier pictures as
-they were.
+Every bake works this way: Blender renders into a temporary folder inside the output folder. An image is moved to its
+final name after a check that it is complete and flushed to disk. A full disk, a killed process or a second bake of the
+same frames therefore leaves earlier images intact.
 """
 
 from __future__ import annotations
@@ -25,32 +25,34 @@ from ..scene.ownership import BAKES, DIGITS
 from . import render_settings
 
 COMPOSITED = "composited"
-"""Folder of the pictures, in the output folder of a bake."""
+"""Name of the images' folder inside the output folder of a bake."""
 _BESIDE = ".part-"
-"""Begins the name of a folder in which a part of a bake is made."""
+"""Name prefix of the temporary folder for one part of a bake."""
 _UNINTERRUPTED = 2.0
 """Seconds between two thread switches of Python while Blender renders.
 
-Blender keeps in one global whether Python may write. A render that begins while a panel is drawn restores the panel's
-"no" at its end, and Python can write nothing until Blender is started again. It was seen in 4.3.2, of 8 renders after
-the second at Python's usual 5 ms, and after none at 2 s: a draw that is not interrupted leaves no chance for it."""
+One global variable of Blender stores whether Python may write to data. A render that begins while a panel is drawn
+restores the panel's "no" when it ends. Then Python can write nothing until Blender is restarted. Measured in 4.3.2 with
+8 renders each: at Python's default of 5 ms, the fault appeared after the second render. At 2 s it never appeared,
+because a draw is then not interrupted.
+"""
 _usual_interval = [sys.getswitchinterval()]
-"""The interval before the first of the running renders changed it."""
-_DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (what Blender gives a new file)
+"""Switch interval before the first of the running renders changed it."""
+_DEFAULT_OUTPUTS = ("/tmp/", "/tmp\\", "//", "")  # noqa: S108  (Blender's defaults for new files)
 
 
 def frames_of(scene: bpy.types.Scene) -> range:
-    """Frames that a bake is about: the scene's range and step, as Blender renders them."""
+    """Frames of a bake: the scene's range and step, as Blender renders them."""
     return range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
 
 
 def default_output(shot: Path, take: str) -> Path:
-    """Where a bake goes if the scene names no folder of its own."""
+    """Output folder of a bake if the scene has none set."""
     return shot / BAKES / take
 
 
 def choose_output(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
-    """Gives the scene an output path if it still has Blender's default; returns what was changed, in words."""
+    """Sets the scene's output path if it still has Blender's default. Returns the changes as sentences."""
     if scene.render.filepath not in _DEFAULT_OUTPUTS:
         return []
     scene.render.filepath = output_path(default_output(shot, take))
@@ -58,12 +60,12 @@ def choose_output(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
 
 
 def output_path(folder: Path) -> str:
-    """The output path of a scene whose pictures go to a folder, as a .blend holds it."""
+    """Output path for a scene that renders into a folder, in the form stored in a .blend."""
     return compat.literal(paths.blend_path(folder / DIGITS))
 
 
 class Run:
-    """A render of a scene's range. `begin`, have Blender render the animation, `finish`."""
+    """A render of a scene's range. Call `begin`, have Blender render the animation, then call `finish`."""
 
     def __init__(
         self,
@@ -77,21 +79,21 @@ class Run:
         """
         Args:
             scene: a scene with the freeze inserted.
-            folder: where pictures go, as NNNNNN.*; None: to the scene's output path.
-            is_exact: the same frame has to be the same bytes, whoever renders it.
-            on_frame: called with (frames done, frames in all).
-            check_cancelled: called between frames; what it raises ends the render.
-            check: called before anything is changed, with the scene and its frames; True if the scene's own render is
-                led into the freeze. What it raises stands against the render.
+            folder: output folder for NNNNNN.*; None: the scene's output path.
+            is_exact: a frame must be byte-identical on every computer.
+            on_frame: called with (frames done, total frames).
+            check_cancelled: called between frames; an exception from it ends the render.
+            check: called with the scene and its frames before anything is changed. Returns True if the scene's render
+                is linked to the freeze. An exception from it prevents the render.
         """
         self._check = check
         self.wanted = list(frames_of(scene))
         self.done: list[int] = []
-        """Frames that Blender has rendered; their pictures are in their places."""
+        """Frames that Blender has rendered and whose images have their final names."""
         self.said: list[str] = []
-        """What was changed for the render, and what its pictures are, a sentence each."""
+        """Sentences about the changes made for the render, and about its images."""
         self.error: BaseException | None = None
-        """What ended it."""
+        """The exception that ended the render."""
         self.scene_uid = scene.session_uid
         self._folder, self._is_exact = folder, is_exact
         self.on_frame, self._check_cancelled = on_frame, check_cancelled
@@ -99,20 +101,21 @@ class Run:
         self._places: dict[int, Path] = {}
         self._made: dict[int, Path] = {}
         self._spoilt: list[int] = []
-        """Frames during which the file was saved: the scene had the artist's settings for a moment."""
+        """Frames during which the file was saved, so that they may have used the artist's settings."""
         self._beside = Path()
         self._room = 8 * scene.render.resolution_x * scene.render.resolution_y
         self._frame = scene.frame_current
 
     def begin(self, scene: bpy.types.Scene) -> None:
-        """Sets the scene up for the render. JobError if it cannot be rendered so; it is as it was then."""
+        """Sets up the scene for the render. Raises JobError if the scene cannot be rendered; the scene is then
+        unchanged."""
         if not self.wanted:
             raise contract.JobError(
                 f"The last frame of {scene.name}, {scene.frame_end}, comes before the first, {scene.frame_start}.",
                 "Set the range of frames.",
                 contract.ExitCode.BAKE,
             )
-        render_settings.restore(scene)  # what a bake left that was killed
+        render_settings.restore(scene)  # changes left by a bake that was killed
         has_cg = self._check(scene, self.wanted) if self._check is not None else False
         self._places = _places(scene, self.wanted, self._folder)
         first = self._places[self.wanted[0]].parent
@@ -120,7 +123,7 @@ class Run:
         self.said = render_settings.apply(scene, render_settings.needed(scene, self._is_exact, has_cg))
         self.said += _told(scene)
         try:
-            contract.make_folder(first)  # apart, for what the system says of it
+            contract.make_folder(first)  # first and separately, so that an OS error names this folder
             contract.make_folder(self._beside)
             where = self._beside / (self._places[self.wanted[0]].name if self._is_movie else DIGITS)
             self._made = _aimed(scene, where, self.wanted)
@@ -136,14 +139,14 @@ class Run:
         bpy.app.handlers.render_write.append(self._written)
 
     def finish(self, scene: bpy.types.Scene | None, is_cancelled: bool = False) -> None:
-        """Puts the scene back, and a movie into its place.
+        """Restores the scene, and moves a movie to its final name.
 
         Args:
-            scene: the scene; None if it is gone.
-            is_cancelled: somebody stopped the render in Blender: what lacks is no failure.
+            scene: the scene; None if it no longer exists.
+            is_cancelled: the user stopped the render in Blender; missing frames are then no error.
 
         Raises:
-            contract.JobError: a picture could not be written; whatever ended it otherwise.
+            contract.JobError: an image could not be written. Any other exception that ended the render is raised again.
         """
         with contextlib.suppress(ValueError):
             bpy.app.handlers.render_write.remove(self._written)
@@ -153,7 +156,7 @@ class Run:
         try:
             if self._check_cancelled and self.error is None:
                 try:
-                    self._check_cancelled()  # asked for while Blender was at work, in a handler of someone else's
+                    self._check_cancelled()  # a handler of another add-on may have swallowed the request
                 except BaseException as error:
                     self.error = error
             if self._spoilt and self.error is None:
@@ -175,13 +178,13 @@ class Run:
             self._clean(scene)
 
     def refused(self, error: RuntimeError) -> None:
-        """Notes what Blender says of a scene that it does not render, or of a picture that it could not write."""
+        """Stores Blender's error about a scene that it cannot render, or an image that it cannot write."""
         message = " ".join(str(error).split()).removeprefix("Error: ")
         message = message.replace(str(self._beside), str(self._folder_name()))
         self.error = self.error or self._or_full(f"Blender could not render the scene: {message}", None)
 
     def is_of(self, scene: bpy.types.Scene) -> bool:
-        """True if it renders this scene."""
+        """True if this run renders the scene."""
         return scene.session_uid == self.scene_uid
 
     def _clean(self, scene: bpy.types.Scene | None) -> None:
@@ -192,7 +195,8 @@ class Run:
         shutil.rmtree(self._beside, ignore_errors=True)
 
     def _written(self, scene: bpy.types.Scene, *_: object) -> None:
-        """Handler: Blender has written a frame. In a window this is another thread: of bpy it only ends the render."""
+        """Handler: Blender has written a frame. In a window it runs in another thread, so its only bpy access ends the
+        render."""
         if not self.is_of(scene):
             return
         number = scene.frame_current
@@ -209,14 +213,14 @@ class Run:
                     self.on_frame(len(self.done), len(self.wanted))
                 if self._check_cancelled:
                     self._check_cancelled()
-        except BaseException as error:  # Blender prints what a handler raises, and renders on
+        except BaseException as error:  # Blender would print it and continue to render
             self.error = self.error or (_in_words(error) if isinstance(error, OSError) else error)
         if self.error is not None:
-            # The render's loop counts on from here: at the last frame it ends, and closes what it writes to.
+            # The render loop continues from this frame number: after the last frame it ends and closes its files.
             scene.frame_current = scene.frame_end
 
     def _publish(self, made: Path, place: Path, what: str) -> None:
-        """Gives a whole file its name. JobError if it is not whole; OSError."""
+        """Moves a complete file to its final name. Raises JobError if it is incomplete, or OSError."""
         if not contract.is_whole_picture(made):
             raise self._or_full(f"Blender wrote {what} only in part to {place.parent}.", made)
         with open(made, "rb+") as file:
@@ -225,7 +229,7 @@ class Run:
         contract.replace_file(made, place)
 
     def _publish_movie(self, is_whole: bool) -> None:
-        """Gives a movie its name. One that was stopped takes none that is there already."""
+        """Moves a movie to its final name. An incomplete movie does not replace an existing file."""
         folder = self._places[self.wanted[0]].parent
         for made in sorted(self._beside.iterdir()):
             place = folder / made.name
@@ -236,14 +240,14 @@ class Run:
                     self.error = self.error or (_in_words(error) if isinstance(error, OSError) else error)
 
     def _or_full(self, message: str, made: Path | None) -> contract.JobError:
-        """What to say of a picture that Blender did not write, or not whole: that the disk is full, if it is.
+        """The error for an image that Blender wrote partly or not at all: a full disk, or `message`.
 
         Args:
-            message: what to say otherwise.
-            made: what there is of the picture.
+            message: message if the disk is not full.
+            made: the incomplete image file, or None.
         """
         folder = self._folder_name()
-        # A truncated file still lies on the disk and occupies the last free space.
+        # A truncated file remains on the disk and uses the last free space.
         if is_full(self._beside, self._room if made is None or not made.exists() else 1 << 18):
             return contract.disk_error(folder)
         return contract.JobError(
@@ -264,21 +268,21 @@ def render(
     say: Callable[[str], None] | None = None,
     check: Callable[[bpy.types.Scene, Sequence[int]], bool] | None = None,
 ) -> list[int]:
-    """Renders the scene's range through the compositor to folder/NNNNNN.*, blocking; returns the frames written.
+    """Renders the scene's range through the compositor to folder/NNNNNN.*, blocking. Returns the frame numbers.
 
     Args:
         scene: a scene with the freeze inserted.
-        folder: where the pictures go.
-        png: make 8-bit RGB PNG the scene's output format; else it stays what it is.
-        on_frame: called with (frames done, frames in all).
-        check_cancelled: called between frames; what it raises ends the bake. Frames written so far stay, a movie file
-            is closed and holds them.
-        is_part: several computers make one bake.
-        say: called with what was changed for the render, and is set back.
+        folder: output folder.
+        png: set the scene's output format to 8-bit RGB PNG; otherwise keep it.
+        on_frame: called with (frames done, total frames).
+        check_cancelled: called between frames; an exception from it ends the bake. Frames written so far stay; a movie
+            file is closed with them.
+        is_part: this is one of several parts of a bake, rendered on several computers.
+        say: called with each sentence about settings that the render changes temporarily.
         check: see `Run`.
 
     Raises:
-        contract.JobError: Blender refused, a setting stands against it, or a picture could not be written.
+        contract.JobError: Blender refused, a setting prevents the render, or an image could not be written.
     """
     if png:
         compat.set_png(scene.render.image_settings)
@@ -303,7 +307,7 @@ def render(
 
 
 def is_full(folder: Path, size: int) -> bool:
-    """True if the disk of a folder has no room, or its owner no quota, for a file of `size` bytes: it is tried."""
+    """True if the disk of a folder, or the user's quota, has no room for `size` bytes. Writes a test file."""
     probe = folder / f".room-{uuid.uuid4().hex[:12]}"
     try:
         with open(probe, "wb") as file:
@@ -319,9 +323,9 @@ def is_full(folder: Path, size: int) -> bool:
 
 
 def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
-    """The scene's range, if all of its pictures are in `folder`; what killed parts left there is removed.
+    """The scene's frames if `folder` has a complete image of each. Removes temporary folders of killed parts.
 
-    JobError names the first that lacks or is not whole.
+    Raises JobError, which names the first missing or incomplete frame.
     """
     if png:
         compat.set_png(scene.render.image_settings)
@@ -339,13 +343,13 @@ def gathered(scene: bpy.types.Scene, folder: Path, png: bool) -> list[int]:
 
 
 def _places(scene: bpy.types.Scene, frames: list[int], folder: Path | None) -> dict[int, Path]:
-    """Frame -> file that its picture goes to, as Blender names it."""
+    """Frame -> its output file, as Blender names it."""
     if folder is None:
         return _named(scene, frames)
     before = scene.render.filepath, scene.render.use_file_extension
     try:
         scene.render.use_file_extension = True
-        # Of a movie's name Blender makes the folder.
+        # Uses the temporary directory, because Blender creates the folder of a movie's path.
         scene.render.filepath = compat.literal(os.path.join(tempfile.gettempdir(), DIGITS))
         return {n: folder / path.name for n, path in _named(scene, frames).items()}
     finally:
@@ -353,7 +357,7 @@ def _places(scene: bpy.types.Scene, frames: list[int], folder: Path | None) -> d
 
 
 def _named(scene: bpy.types.Scene, frames: list[int]) -> dict[int, Path]:
-    """Frame -> file that Blender writes it to. JobError if Blender cannot make sense of the scene's output path."""
+    """Frame -> the file that Blender writes. Raises JobError if Blender cannot resolve the scene's output path."""
     try:
         return {n: Path(os.path.abspath(bpy.path.abspath(scene.render.frame_path(frame=n)))) for n in frames}
     except RuntimeError as error:
@@ -365,16 +369,17 @@ def _named(scene: bpy.types.Scene, frames: list[int]) -> dict[int, Path]:
 
 
 def _aimed(scene: bpy.types.Scene, pattern: Path, frames: list[int]) -> dict[int, Path]:
-    """Has the scene write to a path, taken by the letter; returns frame -> file. JobError if Blender cannot."""
+    """Sets the scene's output path to a literal path. Returns frame -> file. Raises JobError if Blender cannot use
+    it."""
     text = os.path.abspath(pattern)
     if os.name == "posix":
-        text = "/" + text.lstrip("/")  # two slashes would mean: beside the .blend
+        text = "/" + text.lstrip("/")  # two slashes would mean relative to the .blend
     try:
         render_settings.set_noted(scene, "render", "filepath", compat.literal(text))
         made = _named(scene, frames)
-    except (ValueError, contract.JobError) as error:  # ValueError: a name that is no UTF-8
+    except (ValueError, contract.JobError) as error:  # ValueError: the name is not valid UTF-8
         raise _unusable(pattern.parent.parent) from error
-    if any(path.parent != Path(text).parent for path in made.values()):  # it was cut off, or something was filled in
+    if any(path.parent != Path(text).parent for path in made.values()):  # truncated, or a variable expanded
         raise _unusable(pattern.parent.parent)
     return made
 
@@ -393,7 +398,7 @@ def _in_words(error: OSError) -> BaseException:
 
 
 def _told(scene: bpy.types.Scene) -> list[str]:
-    """Sentences about output settings of the artist that are easily overlooked."""
+    """Sentences about output settings of the artist that are easy to overlook."""
     render, found = scene.render, list[str]()
     if render.resolution_percentage != 100:
         width, height = scene_setup.render_size(scene)

@@ -1,4 +1,4 @@
-"""What the artist sets for the bake: the scene's own, whichever shot is chosen."""
+"""Settings of the bake. They belong to the scene, independent of the selected shot."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from ..properties import BoolProperty, EnumProperty
 
 
 class BakeSettings:
-    """Colours, and the place in the compositor."""
+    """Colours, and the group's position in the compositor."""
 
     keep_colours = BoolProperty(
         name="Keep Plate Colours",

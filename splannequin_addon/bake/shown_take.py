@@ -1,4 +1,4 @@
-"""Which take a scene's compositor shows, and whether its depth fits the scene."""
+"""The take that a scene's compositor shows, and whether its depth matches the scene's scale."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 
 
 def shown(scene: bpy.types.Scene, shot: Path) -> str:
-    """Name of the take of this shot that the scene's compositor shows; empty if there is none, or another shot's."""
+    """Name of this shot's take that the scene's compositor shows; empty without one, or for another shot's take."""
     found = freeze_group.shown(scene)
     return found[0].name if found is not None and found[0].parent == contract.ShotFolder(shot).takes else ""
 
 
 def stale_scale(scene: bpy.types.Scene, shot: Path) -> bool:
-    """True if the shot was scaled since its take was put into the compositor: its depth does not fit the scene's."""
+    """True if the shot was scaled since its take was inserted, so that the compositor's depth does not match the
+    scene."""
     found = freeze_group.shown(scene)
     if found is None or not shown(scene, shot):
         return False
@@ -29,7 +30,7 @@ def stale_scale(scene: bpy.types.Scene, shot: Path) -> bool:
 
 
 def follow_scale(scene: bpy.types.Scene, shot: Path) -> list[str]:
-    """Brings the depth of a take in the compositor to the shot's scale; returns what was changed, in words."""
+    """Sets the depth factor in the compositor to the shot's scale. Returns the changes as sentences."""
     if not stale_scale(scene, shot):
         return []
     freeze_group.set_depth_scale(scene, scene_objects.depth_scale(scene, shot))

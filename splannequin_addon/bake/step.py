@@ -1,4 +1,4 @@
-"""The step Bake: what it asks the backend for, what its end changes, and what the panel says of it."""
+"""The Bake step: its backend request, the changes when it ends, and its texts on the panel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from . import farm, freeze_group, insertion, matte_node, operators, panel, progr
 
 
 class Bake(Step):
-    """The take in the scene's compositor, and its render. Its job freezes what the take lacks."""
+    """The take in the scene's compositor, and its render. The job freezes the take's missing frames."""
 
     name = "bake"
     label = "Bake"
@@ -33,7 +33,7 @@ class Bake(Step):
     parts = (progress,)
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:
-        """What the take was asked for with, for the frames of the scene's range."""
+        """The parameters that the take was frozen with, for the frames of the scene's range."""
         props, folder = settings_of(scene), selection.shot_folder(scene)
         params = takes.params_of(scene)
         if folder is None:
@@ -47,7 +47,7 @@ class Bake(Step):
         return params
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
-        """The state of Bake: whether the scene's compositor shows the freeze."""
+        """Panel state of Bake, which depends on whether the scene's compositor shows the freeze."""
         props = settings_of(scene)
         if state is None or (props.take_name not in state.takes and props.run_name not in state.runs):
             return View(False, False, [], self.needs)
@@ -72,15 +72,18 @@ class Bake(Step):
         return View(True, True, lines, f"Frames go to {scene.render.filepath}")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """The take comes into the compositor."""
+        """Inserts the take into the compositor."""
         return insertion.insert_freeze(scene, job.shot, job.params["take"])
 
     def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
-        """In turns: Blender reads pictures, compositor and render. Changes only the scene from which the job was
-        started; if that is gone, all scenes that work on the shot."""
+        """Inserts and renders the take in steps run by the timer.
+
+        Changes only the scene that started the job. If that scene no longer exists, all scenes that use the shot are
+        changed.
+        """
         name, take = steps.scene_of(job), str(job.params["take"])
         named = next((s for s in bpy.data.scenes if s.name == name and not library_of(s)), None)
-        target = session.scene_of(job.scene_uid) or named  # by its name in another file, and of a job found again
+        target = session.scene_of(job.scene_uid) or named  # by name in another file, or after a restart
         if target is None:
             insertion.bring_in(scene, job.shot, take, alone=False)
         elif target in selection.scenes_of(job.shot):
@@ -90,11 +93,14 @@ class Bake(Step):
         return True
 
     def late(self, job: jobs.Job) -> str:
-        """Choosing a shot starts no render, and leaves the other's take in the compositor."""
+        """Note about a job that ended late: its frames need another bake.
+
+        Selecting a shot starts no render and keeps the other take in the compositor.
+        """
         return "Its frames were rendered meanwhile. Bake again to put them into your compositor."
 
     def in_use(self, shot: Path, folder: Path) -> str:
-        """A take whose frames are shown in this file."""
+        """The reason why a take cannot be deleted: this file shows its frames. Empty if it does not."""
         if shown(folder):
             return "The compositor shows this take: bake another one, or remove the shot from the scene, first"
         return ""
@@ -104,12 +110,12 @@ class Bake(Step):
         return _baked(scene) == shot
 
     def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
-        """Takes the freeze out of the compositor, unless it is another shot's."""
+        """Removes the freeze from the compositor, unless it belongs to another shot."""
         gone = _baked(scene) not in others and insertion.remove(scene)
         return ["The freeze left the compositor."] if gone else []
 
     def scaled(self, scene: bpy.types.Scene, shot: Path) -> list[str]:
-        """Depth in the compositor is in scene units."""
+        """Updates the depth factor in the compositor, since depth is in scene units."""
         return shown_take.follow_scale(scene, shot)
 
 
@@ -120,7 +126,7 @@ def _baked(scene: bpy.types.Scene) -> Path | None:
 
 
 def shown(take: Path) -> bool:
-    """True if an image of this file that something uses is a frame of the take."""
+    """True if a used image of this file shows a frame of the take."""
     wanted = os.path.abspath(take)
     used = (image.filepath for image in bpy.data.images if image.users and image.filepath)
     return any(paths.same(os.path.dirname(paths.absolute(file)), wanted) for file in used)

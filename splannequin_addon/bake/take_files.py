@@ -1,4 +1,4 @@
-"""A take's files on disk, as the compositor reads them: which frames there are, and what their headers say. No bpy."""
+"""A take's files on disk as the compositor reads them: frame numbers and header values. No bpy."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ class Take:
     folder: Path
     """Folder of NNNNNN.exr."""
     first: int
-    """First frame number there is."""
+    """First existing frame number."""
     last: int
-    """Last frame number there is, inclusive."""
+    """Last existing frame number, inclusive."""
     depth_scale: float = 1.0
-    """Scene units per solve unit: what the depth layer is multiplied by."""
+    """Scene units per solve unit: factor of the depth layer."""
     size: tuple[int, int] = (0, 0)
     """Width and height of the frames in pixels, without overscan."""
     margin: tuple[int, int] = (0, 0)
-    """Pixels beyond the frame on the left and right, and above and below: overscan."""
+    """Overscan in pixels: (left and right, above and below)."""
     plate_size: tuple[int, int] = (0, 0)
-    """Width and height in pixels of the plate that the take's warp is for; (0, 0): it has none."""
+    """Width and height in pixels of the plate that the take's warp applies to; (0, 0) without a warp."""
     light: str | tuple[float, ...] = "linear"
-    """The light that its frames hold, as `compat.colour_space` names it."""
+    """Encoding of the frames' light, in the form that `compat.colour_space` accepts."""
 
 
 def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
-    """The take in a folder. FileNotFoundError if it holds no frozen frame."""
+    """The take in a folder. Raises FileNotFoundError if the folder has no frozen frames."""
     numbers = numbered.frame_numbers(folder)
     if not numbers:
         raise contract.MissingError(f"{folder} holds no frozen frames (NNNNNN.exr)")
@@ -46,7 +46,7 @@ def take_of(folder: Path, depth_scale: float = 1.0) -> Take:
 
 
 def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:
-    """Width and height of the plate that a take's warp is for; (0, 0) if a frame lacks its warp."""
+    """Width and height of the plate that a take's warp applies to; (0, 0) if any frame lacks its warp."""
     folder = contract.TakeFolder(take).warps
     if set(numbers) - set(numbered.frame_numbers(folder)):
         return 0, 0
@@ -56,10 +56,10 @@ def _plate_size(take: Path, numbers: Sequence[int]) -> tuple[int, int]:
 
 
 def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
-    """An EXR's width and height, and the pixels it has beyond them left and right, and above and below.
+    """((width, height), overscan (left and right, above and below)) of an EXR, in pixels.
 
-    From its header: Blender says 0 x 0 of a multilayer file. ValueError without one, or for margins that are not the
-    same on opposite sides: Blender centres the pixels, wherever the frame lies in them.
+    Reads the header, because Blender reports 0 x 0 for a multilayer file. Raises ValueError without a header, or if the
+    margins of opposite sides differ: Blender centres the pixels regardless of the frame's position.
     """
     header = _exr_header(path)
     frame, data = (_exr_value(header, name, "box2i", "<4i") for name in ("displayWindow", "dataWindow"))
@@ -75,14 +75,14 @@ def exr_windows(path: Path) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _exr_header(path: Path) -> bytes:
-    """First 16 KiB of an OpenEXR file, which hold its attributes; empty for any other file."""
+    """First 16 KiB of an OpenEXR file, which contain its attributes; empty for any other file."""
     with contract.open_regular(path) as source:
         header = source.read(16384)
     return header if header[:4] == b"\x76\x2f\x31\x01" else b""
 
 
 def _exr_value(header: bytes, name: str, kind: str, form: str) -> tuple[Any, ...] | None:
-    """Value of an attribute, as `struct` unpacks it; None if the header lacks it."""
+    """Value of an attribute as `struct` unpacks it; None if the header lacks the attribute."""
     key = f"{name}\0{kind}\0".encode()
     at = header.find(key)
     return None if at < 0 else struct.unpack_from(form, header, at + len(key) + 4)

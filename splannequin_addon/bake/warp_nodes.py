@@ -1,8 +1,8 @@
 """Nodes that freeze a plate by a take's warp: matte * plate(ST) + fill (`torch_backend/freeze/composite/warp.py`).
 
-Blender's own smooth filters differ from version to version, and none leaves a pixel that does not move as it is. So the
-four pixels around a place are looked up as they are, and blended by how far the place lies between them, in steps of
-1/256 of a pixel: what lies on a pixel's centre is that pixel.
+Blender's smooth filters differ between versions, and none reproduces an unmoved pixel exactly. These nodes instead look
+up the four nearest pixels unfiltered and blend them bilinearly, in steps of 1/256 of a pixel. A position at a pixel's
+centre gives exactly that pixel.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import bpy
 
 LAYERS = ("Combined", "Alpha", "ST", "Matte")
-"""Of a warp: the fill, how opaque the frozen frame is, coordinates, and how much the plate gives."""
+"""Layers of a warp: the fill, the frozen frame's alpha, the ST coordinates, and the plate's weight."""
 _STEPS = 256.0
 _WIDE = 180.0
 
@@ -24,13 +24,13 @@ _WIDE = 180.0
 def frozen(
     tree: bpy.types.NodeTree, plate: bpy.types.NodeSocket, warp: bpy.types.NodeOutputs, size: tuple[int, int]
 ) -> bpy.types.NodeSocket:
-    """Socket of a plate frozen by a warp, as large as the warp.
+    """Socket of a plate frozen by a warp, at the warp's size.
 
     Args:
-        tree: where the nodes are made.
+        tree: node tree that gets the nodes.
         plate: socket of the plate.
         warp: outputs of the Image node that shows the warp, `LAYERS`.
-        size: width and height of the plate that the warp is for.
+        size: width and height of the plate that the warp applies to.
     """
     names = {node.name for node in tree.nodes}
     shown = looked_up(tree, plate, warp["ST"], size)
@@ -44,7 +44,7 @@ def frozen(
 def looked_up(
     tree: bpy.types.NodeTree, plate: bpy.types.NodeSocket, st: bpy.types.NodeSocket, size: tuple[int, int]
 ) -> bpy.types.NodeSocket:
-    """Socket of a plate of `size` seen through an ST map, bilinear, as large as the map."""
+    """Socket of a plate of `size` sampled bilinearly through an ST map, at the map's size."""
     plate = compat.sized(tree, plate, size)
     s, t = compat.new_coordinates(tree, st)
     (left, right, across), (low, high, up) = (_between(tree, v, n) for v, n in zip((s, t), size, strict=True))
@@ -58,7 +58,10 @@ def looked_up(
 def _between(
     tree: bpy.types.NodeTree, share: bpy.types.NodeSocket, size: int
 ) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Two neighbouring pixels of a row of `size`, 0..1 over it, and how far towards the second one a place lies."""
+    """Sockets (first pixel, second pixel, weight of the second) for a position in a row of `size` pixels.
+
+    The position and the coordinates of both pixels are fractions 0..1 of the row.
+    """
 
     def on(source: bpy.types.NodeSocket, operation: str, *values: float) -> bpy.types.NodeSocket:
         node = compat.new_math_node(tree, operation)
@@ -73,9 +76,9 @@ def _between(
     rest = compat.new_math_node(tree, "SUBTRACT")
     tree.links.new(place, rest.inputs[0])
     tree.links.new(first, rest.inputs[1])
-    # A quarter into a pixel, Nearest finds it in 4.3, too, where it takes a pixel's centre for the border to the next.
+    # Blender 4.3's Nearest rounds a pixel's centre to the next pixel. A quarter into the pixel is safe in all versions.
     at = [on(first, "MULTIPLY_ADD", 1.0 / size, (n + 0.25) / size) for n in (0, 1)]
-    # The second may lie past the last pixel, where there is nothing: then the place lies on the first.
+    # The second pixel may lie outside the image, where no pixel exists. Its weight is then 0.
     return at[0], at[1], rest.outputs[0]
 
 
@@ -86,7 +89,7 @@ def _mixed(
     other: bpy.types.NodeSocket,
     blend: str = "MIX",
 ) -> bpy.types.NodeSocket:
-    """Socket of two pictures, or a picture and a value, mixed."""
+    """Socket of the blend of two images, or of an image and a value."""
     _, factor, first, second, result = compat.new_mix_node(tree, blend)
     if isinstance(amount, (float, int)):
         factor.default_value = amount

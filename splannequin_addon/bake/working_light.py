@@ -1,7 +1,7 @@
-"""The light of working frames that have a shoulder, as nodes: Blender reads them as sRGB, which up to a value they are.
+"""Nodes that decode working frames with a highlight shoulder. Blender reads these frames as sRGB.
 
-Above it they hold light up to 64 times white, as `torch_backend/contract/colour.py` says; one of Blender's curves of
-its own would end at 1.
+Below the knee the values are sRGB. Above it they encode light up to 64 times white, see
+`torch_backend/contract/colour.py`. Blender's curve nodes would end at 1.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     import bpy
 
 _KNEE = ((contract.SHOULDER_FROM + 0.055) / 1.055) ** 2.4
-"""Light at which the shoulder begins."""
+"""Light level at which the shoulder begins."""
 _WIDE = 180.0
 
 
 def has_shoulder(shot_folder: contract.ShotFolder) -> bool:
-    """True if the working frames of a shot have one; False too where its record cannot be read."""
+    """True if the working frames of a shot have a shoulder. False also if the record cannot be read."""
     try:
         return contract.read_json(shot_folder.listing).get("display") == contract.SHOULDER
     except (OSError, ValueError, contract.JobError):
@@ -32,9 +32,9 @@ def has_shoulder(shot_folder: contract.ShotFolder) -> bool:
 
 
 def lit(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Socket of a picture's light, scene-linear; the picture was read as sRGB and has a shoulder. It is opaque."""
+    """Socket of the scene-linear light of an image that was read as sRGB and has a shoulder. The result is opaque."""
     names = {node.name for node in tree.nodes}
-    # The curve is of Rec.709's light; where Blender works in another, there and back.
+    # The curve is defined for linear Rec.709. In another working space the channels are converted there and back.
     channels = _through(tree, list(compat.separated(tree, picture)), Color.from_scene_linear_to_rec709_linear)
     channels = _through(tree, [_bent_back(tree, c) for c in channels], Color.from_rec709_linear_to_scene_linear)
     whole = compat.combined(tree, channels)
@@ -44,11 +44,12 @@ def lit(tree: bpy.types.NodeTree, picture: bpy.types.NodeSocket) -> bpy.types.No
 
 
 def _bent_back(tree: bpy.types.NodeTree, channel: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Light of a channel that was read as sRGB: max(c, knee) through the curve, less the knee, plus min(c, knee)."""
+    """Decoded light of a channel that was read as sRGB: max(c, knee) through the curve, less the knee, plus min(c,
+    knee)."""
     start, roll = contract.SHOULDER_FROM, contract.SHOULDER_ROLL
     srgb = _on(tree, _on(tree, channel, "MAXIMUM", _KNEE), "POWER", 1.0 / 2.4)
     grown = _on(tree, _on(tree, srgb, "MULTIPLY_ADD", 1.055 / roll, -(0.055 + start) / roll), "EXPONENT")
-    # 0.8 + roll (e - 1), and of that sRGB's light
+    # 0.8 + roll (e - 1), decoded from sRGB to light
     base = _on(tree, grown, "MULTIPLY_ADD", roll / 1.055, (start - roll + 0.055) / 1.055)
     above = _on(tree, _on(tree, base, "POWER", 2.4), "SUBTRACT", _KNEE)
     node = compat.new_math_node(tree, "ADD")
@@ -60,7 +61,7 @@ def _bent_back(tree: bpy.types.NodeTree, channel: bpy.types.NodeSocket) -> bpy.t
 def _through(
     tree: bpy.types.NodeTree, channels: list[bpy.types.NodeSocket], convert: Callable[[Color], Color]
 ) -> list[bpy.types.NodeSocket]:
-    """Channels in another linear space; themselves if it is the same."""
+    """The channels converted to another linear space; unchanged if the spaces are equal."""
     units = [convert(Color([float(n == k) for n in range(3)])) for k in range(3)]
     columns: list[tuple[float, float, float]] = [(unit.r, unit.g, unit.b) for unit in units]
     same = all(abs(columns[k][n] - float(n == k)) < 1e-4 for n in range(3) for k in range(3))

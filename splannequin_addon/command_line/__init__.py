@@ -1,1 +1,1 @@
-"""The add-on without a window: `blender --command splannequin`."""
+"""Command line of the add-on, without a window: `blender --command splannequin`."""

@@ -16,11 +16,11 @@ def _main(arguments: list[str]) -> int:
 
 
 def register() -> None:
-    """Makes the command known to Blender."""
+    """Registers the command with Blender."""
     _handles.append(bpy.utils.register_cli_command("splannequin", _main))
 
 
 def unregister() -> None:
-    """Takes it back."""
+    """Unregisters the command."""
     while _handles:
         bpy.utils.unregister_cli_command(_handles.pop())

@@ -1,4 +1,4 @@
-"""What a command of the Blender side prints while it runs."""
+"""Output of a command on the Blender side."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ...torch_backend import contract
 
 
 class Console:
-    """Prints what jobs say: lines for people, or events as JSON lines."""
+    """Prints job events: as lines for people, or as JSON lines."""
 
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
@@ -26,13 +26,13 @@ class Console:
             print(f"  note: {event.data['message']} {event.data['hint']}".rstrip(), flush=True)
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        """Progress of work that is Blender's own."""
+        """Reports the progress of work done in Blender."""
         data = {"stage": stage, "done": done, "total": total, "message": message, "eta_seconds": None}
         self(contract.Event("progress", self._seq, time.time(), data))
         self._seq += 1
 
     def say(self, sentence: str) -> None:
-        """A sentence for people."""
+        """Prints a sentence for people; nothing in JSON mode."""
         if not self.as_json:
             print(sentence, flush=True)
 

@@ -1,8 +1,8 @@
-"""How a shot.blend that was made without a window looks when it is opened in one.
+"""Sets up how a window shows a shot.blend that was created without a window.
 
-The 3D viewport looks through the solved camera at the instant's frame, the freeze stands behind it, and a light is
-there for what the artist adds. The solve's points are hidden: they would cover the picture. For scenes that we made:
-nothing of an artist's own file is changed.
+The 3D viewport looks through the solved camera at t*, with the freeze as its background image and a light for added
+objects. The solve's points are hidden, because they would cover the image. Applies only to scenes that this add-on
+created, never to an artist's file.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from ..shot import inventory, scene_objects
 from ..solve import cameras
 
 _SUN = (math.radians(50.0), 0.0, math.radians(-40.0))
-"""Rotation of the light: from above, behind and beside a camera that looks along y."""
+"""Rotation of the light: from above, behind and to one side of a camera that looks along y."""
 _STRENGTH = 3.0
-"""Of the light, W/m2: a white surface that faces it is about as bright as white."""
+"""Strength of the light in W/m2: a white surface facing it renders as about white."""
 
 
 def set_up(scene: bpy.types.Scene, shot: Path, name: str) -> None:
-    """Prepares a new scene, in which the take `name` stands in the compositor, to be saved and opened in a window."""
+    """Prepares a new scene, whose compositor shows the take `name`, to be saved and opened in a window."""
     camera = cameras.find(scene, shot, "CAMERA")
     if camera is None:
         return
     facts = inventory.read(shot).takes.get(name, {})
-    if not facts.get("camera_path"):  # else its frames are of another camera's view
+    if not facts.get("camera_path"):  # otherwise the frames have another camera's view
         take = take_files.take_of(contract.ShotFolder(shot).takes / name)
         shown_frames.show(scene, shot, name, take.first, take.last)
     instant = facts.get("t_star_frame")
@@ -46,7 +46,7 @@ def set_up(scene: bpy.types.Scene, shot: Path, name: str) -> None:
 
 
 def _light(scene: bpy.types.Scene, shot: Path) -> None:
-    """A sun, if the scene has no light."""
+    """Adds a sun if the scene has no light."""
     if any(item.type == "LIGHT" for item in scene.objects):
         return
     name = f"{scene_objects.name_of(shot)} light"

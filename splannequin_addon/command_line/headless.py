@@ -1,11 +1,11 @@
-"""The command line of the Blender side: the buttons' own code, blocking, with a console instead of a panel.
+"""The command line of the Blender side. It runs the operators' code, blocking, with a console instead of a panel.
 
     blender --background [FILE.blend] --command splannequin freeze CLIP --t-star 34 --output DIR
     blender --background --command splannequin freeze SHOT --t-star 40
     .venv-bpy-5.0/bin/python splannequin_addon/run_in_bpy.py bake --shot SHOT --take freeze --output DIR
 
-Exit codes are `contract.ExitCode`: 0 done, 2 wrong arguments, 3 footage, 4 solve, 5 train, 6 freeze, 7 bake, 8 disk,
-9 no backend, 130 cancelled.
+Exit codes are `contract.ExitCode`: 0 done, 2 wrong arguments, 3 footage, 4 solve, 5 train, 6 freeze, 7 bake, 8 disk, 9
+no backend, 130 cancelled.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from . import first_view
 from .console import Console
 
 _interrupts: list[int] = []
-"""Signals that asked this command to stop."""
+"""Signals received by this command."""
 
 
 def _interrupt(number: int, frame: object) -> None:
-    """Remembered, because Blender swallows what is raised in a handler of its own while it renders."""
+    """Records the signal, because Blender swallows exceptions raised in its handlers during a render."""
     _interrupts.append(number)
     raise KeyboardInterrupt
 
@@ -51,7 +51,8 @@ def _stop_if_interrupted() -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs one command; returns an exit code. Ctrl-C and SIGTERM cancel the job at work with a checkpoint."""
+    """Runs one command and returns its exit code. Ctrl-C and SIGTERM cancel the running job, which saves a
+    checkpoint."""
     before: dict[int, Any] = {}
     _interrupts.clear()
     for name in ("SIGINT", "SIGTERM", "SIGBREAK"):
@@ -107,10 +108,11 @@ def export(args: argparse.Namespace, console: Console) -> int:
 
 
 def export_for_farm(args: argparse.Namespace, console: Console) -> int:
-    """`farm export SHOT... --output DIR`: a job for a render farm; `farm measure`: rates of what its tasks took."""
+    """`farm export SHOT... --output DIR`: a job for a render farm; `farm measure`: rates from measured task
+    durations."""
     _output(args)
     words: contract.FarmWords = contract.words_of(args)
-    args.t_star = None  # instants are takes of their own
+    args.t_star = None  # each instant becomes a separate take
     requests: dict[str, Any] = {kind: dataclasses.asdict(params) for kind, params in asked(args).items()}
     if not contract.trains_anew(args):
         del requests["train"]
@@ -130,24 +132,24 @@ def train(args: argparse.Namespace, console: Console) -> int:
 
 
 def freeze(args: argparse.Namespace, console: Console) -> int:
-    """`freeze SHOT`: the step alone. `freeze CLIP`: all that is missing of a shot of its own, and the bake."""
+    """`freeze SHOT`: this step only. `freeze CLIP`: all missing steps in a new shot, and the bake."""
     return (
         _one_step(args, console, "freeze", args.clip) if contract.freezes_a_shot(args) else _freeze_clip(args, console)
     )
 
 
 def make_mattes(args: argparse.Namespace, console: Console) -> int:
-    """`mattes SHOT`, `combine SHOT`: jobs that the step Freeze starts."""
+    """`mattes SHOT`, `combine SHOT`: jobs of the Freeze step."""
     return _one_step(args, console, "freeze", args.shot)
 
 
 def make_surface(args: argparse.Namespace, console: Console) -> int:
-    """`surface SHOT`, `light SHOT`: jobs that the step Freeze starts."""
+    """`surface SHOT`, `light SHOT`: jobs of the Freeze step."""
     return _one_step(args, console, "freeze", args.shot)
 
 
 def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
-    """Import, solve, train, freeze, scene, bake; leaves OUTPUT/shot.blend and OUTPUT/summary.json."""
+    """Runs import, solve, train, freeze and bake. Writes OUTPUT/shot.blend and OUTPUT/summary.json."""
     began = time.perf_counter()
     output = _output(args)
     shot = output / (args.shot_name + contract.SHOT_SUFFIX)
@@ -180,13 +182,13 @@ def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
 
 
 def bake_take(args: argparse.Namespace, console: Console) -> int:
-    """`bake --shot SHOT --take TAKE --output DIR`: a frozen take through the compositor."""
+    """`bake --shot SHOT --take TAKE --output DIR`: sends a frozen take through the compositor."""
     began = time.perf_counter()
     shot = _shot(args)
     output = _output(args)
     scene, fresh = _scene(args.blend)
     settings_of(scene).shot_path = str(shot)
-    if fresh:  # else the range is the artist's, like everything else in the file
+    if fresh:  # an existing file keeps the artist's range
         _fit_range(scene, shot, args.take)
     first = scene.frame_start if args.first is None else args.first
     last = scene.frame_end if args.last is None else args.last
@@ -225,7 +227,7 @@ def _bake_a_part(
     span: range,
     console: Console,
 ) -> int:
-    """`bake --part frames` and `--part file`: a bake that several computers make together, of a take that is there."""
+    """`bake --part frames` and `--part file`: one part of a bake of an existing take, shared by several computers."""
     if not takes.complete(shot, args.take, span):
         raise contract.JobError(
             f"Take {args.take} of {shot.name} lacks frames from {span.start} to {span.stop - 1}.",
@@ -250,7 +252,7 @@ def _bake_a_part(
 
 
 def write_stmaps(args: argparse.Namespace, console: Console) -> int:
-    """`stmaps SHOT`: ST maps of the lens, both ways."""
+    """`stmaps SHOT`: ST maps of the lens, in both directions."""
     shot = _shot(args)
     question = stmaps.begin(shot, args.width)
     question.wait()
@@ -276,7 +278,7 @@ def status(args: argparse.Namespace, console: Console) -> int:
 
 
 def doctor(args: argparse.Namespace, console: Console) -> int:
-    """`doctor`: this Blender, and what the backend's environment can do, as JSON."""
+    """`doctor`: this Blender's version and the capabilities of the backend's environment, as JSON."""
     facts: dict[str, Any] = {"blender": bpy.app.version_string, "blender_python": sys.version.split()[0]}
     facts["backend_python"] = backend.python()
     facts["backend"] = json.loads(backend.doctor(args.gpu))
@@ -304,21 +306,21 @@ def _one_step(args: argparse.Namespace, console: Console, step: str, shot: str) 
 
 
 def _scene(blend: str) -> tuple[Any, bool]:
-    """The scene to work in, and whether it is a new one: `blend`'s, or the file that Blender was started with."""
+    """(the scene to work in, whether it is new). It comes from `blend` or from the file Blender was started with."""
     if blend:
         path = Path(blend).absolute()
         if not path.is_file():
             raise contract.MissingError(f"{path} does not exist: --blend names a .blend file")
         try:
-            # Whoever made the file may be a stranger: its scripts, and drivers that call Python, do not run.
+            # The file may come from a stranger, so its scripts and its drivers with Python do not run.
             bpy.ops.wm.open_mainfile(filepath=str(path), use_scripts=False)
-        except RuntimeError as error:  # no .blend, a damaged one, or one of a newer Blender
+        except RuntimeError as error:  # not a .blend, damaged, or saved by a newer Blender
             raise contract.JobError(
                 f"Blender {bpy.app.version_string} cannot open {path}: {str(error).strip()}",
                 "Open it in the Blender that saved it.",
                 ExitCode.USAGE,
             ) from error
-        bpy.context.view_layer.update()  # drivers are told of when they are evaluated
+        bpy.context.view_layer.update()  # drivers are only reported once they are evaluated
         if bpy.app.autoexec_fail:
             print(
                 f"Note: {path.name} has Python in it, which was not run ({bpy.app.autoexec_fail_message}). "
@@ -332,7 +334,7 @@ def _scene(blend: str) -> tuple[Any, bool]:
 
 
 def _fit_range(scene: bpy.types.Scene, shot: Path, take: str) -> None:
-    """A new scene's range: the take's, or the clip's before there is a take."""
+    """Sets a new scene's range to the take's, or to the clip's if the take does not exist yet."""
     state = inventory.read(shot)
     facts = state.takes.get(take)
     scene.frame_start, scene.frame_end = (facts["first"], facts["last"]) if facts else state.frame_range
@@ -348,7 +350,8 @@ def _bake(
     span: range | None = None,
     warp: bool | None = None,
 ) -> dict[str, Any]:
-    """Compositor, render of `span` (None: the scene's range), shot.blend; returns what the summary tells of it."""
+    """Sets up the compositor, renders `span` (None: the scene's range) and saves shot.blend. Returns the summary's
+    facts."""
     _set_up(scene, fresh, shot, take, console, span, warp)
     folder = output / rendering.COMPOSITED
     numbers = _render(scene, folder, fresh, console)
@@ -359,7 +362,7 @@ def _bake(
 
 
 def _render(scene: bpy.types.Scene, folder: Path, fresh: bool, console: Console, is_part: bool = False) -> list[int]:
-    """The scene's range into a folder; the frames that were written."""
+    """Renders the scene's range into a folder. Returns the frames that were written."""
     return rendering.render(
         scene,
         folder,
@@ -375,7 +378,7 @@ def _render(scene: bpy.types.Scene, folder: Path, fresh: bool, console: Console,
 def _set_up(
     scene: bpy.types.Scene, fresh: bool, shot: Path, take: str, console: Console, span: range | None, warp: bool | None
 ) -> None:
-    """A take in the compositor of a scene, whose range is `span` then (None: as it is)."""
+    """Inserts a take into a scene's compositor and sets the scene's range to `span`, unless it is None."""
     changes = insertion.fit_take(scene, shot, take, fresh) if fresh or scene_setup.fitted(scene) else []
     if span is not None:
         scene.frame_start, scene.frame_end, scene.frame_step = span.start, span.stop - 1, span.step
@@ -385,7 +388,8 @@ def _set_up(
 
 
 def _summary_of(path: Path, shot: Path, take: str) -> dict[str, Any]:
-    """What a summary.json says of this take of this shot. A new summary if it is of another, damaged, or not there."""
+    """The entries of a summary.json for this take of this shot. A new summary if the file is missing, damaged or for
+    another take."""
     fresh: dict[str, Any] = {"version": 1, "shot": str(shot), "take": take}
     try:
         found = {**fresh, **contract.read_json(path)}
@@ -396,7 +400,7 @@ def _summary_of(path: Path, shot: Path, take: str) -> dict[str, Any]:
 
 
 def _told(output: Path, numbers: list[int]) -> dict[str, Any]:
-    """What a summary tells of a bake."""
+    """The summary's facts about a bake."""
     return {
         "composited_dir": str(output / rendering.COMPOSITED),
         "composited_frames": len(numbers),
@@ -406,13 +410,13 @@ def _told(output: Path, numbers: list[int]) -> dict[str, Any]:
 
 
 def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
-    """Saves the file with paths relative to it, so that its folder can be moved and rendered elsewhere."""
+    """Saves the file with relative paths, so that its folder can be moved and rendered elsewhere."""
     files = bpy.context.preferences.filepaths
     backups = files.save_version
     contract.sweep_half_written(blend.parent)
-    with contract.atomic_path(blend) as half:  # Blender reports success for a compressed file that is cut off
+    with contract.atomic_path(blend) as half:  # Blender reports success for a truncated compressed file
         try:
-            # The first save gives the file its place; what is relative to it is only known then.
+            # The first save gives the file a path, which relative paths need.
             bpy.ops.wm.save_as_mainfile(filepath=str(half), check_existing=False)
             files.save_version = 0
             scene = scene_in(bpy.context)
@@ -433,17 +437,17 @@ def _save(scene: bpy.types.Scene, blend: Path, frames: Path) -> None:
 
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
-    """Kind of job -> parameters that a parsed command line asks for; none of a command that starts no job."""
+    """Kind of job -> parameters from a parsed command line; empty for a command that starts no job."""
     return contract.requested_params(args, {"device": backend.device()})
 
 
 def _device(args: argparse.Namespace) -> str:
-    """Device of the backend: from the command line, else from the preferences."""
+    """Device of the backend: from the command line, otherwise from the preferences."""
     return args.device or backend.device()
 
 
 def _shot(args: argparse.Namespace) -> Path:
-    """The shot folder that a command is about. JobError if there is none."""
+    """The shot folder that a command names. Raises JobError if it does not exist."""
     shot = Path(args.shot).absolute()
     if not inventory.read(shot).info:
         raise contract.JobError(f"{shot} is no shot folder.", "Name the .splannequin folder.", ExitCode.USAGE)
@@ -451,7 +455,7 @@ def _shot(args: argparse.Namespace) -> Path:
 
 
 def _output(args: argparse.Namespace) -> Path:
-    """The --output folder, made if it is not there. JobError if it cannot be."""
+    """The --output folder, created if missing. Raises JobError if it cannot be created."""
     output = Path(args.output).absolute()
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -476,15 +480,15 @@ _DOES = {
     "status": status,
     "doctor": doctor,
 }
-"""Verb -> what it does."""
+"""Command -> its function."""
 _UNSET = {"device": "as the preferences say"}
-"""Field -> what is taken for it where a command says nothing."""
+"""Field -> description of its default, used if the command line does not set it."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """The grammar of the command line."""
+    """The argument parser of the command line."""
     top, verbs = contract.command_line(
         "blender --background [FILE.blend] --command splannequin", contract.BLENDER, _UNSET
     )
-    verbs["bake"].add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # to the launcher, by our input
+    verbs["bake"].add_argument("--tied", action="store_true", help=argparse.SUPPRESS)  # ends when stdin closes
     return top

@@ -1,1 +1,1 @@
-"""The step Import: footage into a shot folder."""
+"""The Import step: reads footage into a shot folder."""

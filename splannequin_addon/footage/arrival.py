@@ -1,4 +1,4 @@
-"""What a finished import changes in the scene."""
+"""Changes to the scene after an import."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 
 def imported(scene: bpy.types.Scene, shot: Path) -> list[str]:
-    """After the import: the scene takes the clip's size, rate and range if it is new or the artist consents."""
+    """Sets up the scene after an import and adds the clip's camera. Returns the changes as sentences.
+
+    The scene gets the clip's size, rate and range if it is new or if the artist allows it.
+    """
     state = inventory.read(shot)
     props = settings_of(scene)
     selection.see(scene, state)
@@ -31,7 +34,10 @@ def imported(scene: bpy.types.Scene, shot: Path) -> list[str]:
 
 
 def fit(scene: bpy.types.Scene, state: ShotState, force_k: bool = False) -> list[str]:
-    """Size, rate and range of the scene as the clip's, if the artist consents; with `force_k` as the solved plates'."""
+    """Sets the scene's size, rate and range to the clip's, if the artist allows it. Returns the changes as sentences.
+
+    With `force_k`, the size and intrinsics are those of the solved plates.
+    """
     props = settings_of(scene)
     if not (props.set_up_scene or scene_setup.untouched(scene) or scene_setup.fitted(scene)):
         return ["Your scene's size and range were left alone (Fit Scene to Clip is off)."]

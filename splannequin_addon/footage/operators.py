@@ -1,4 +1,4 @@
-"""Other ways to choose the clip: dropped on the 3D view, or from the Movie Clip editor."""
+"""The operators that choose or import the clip, including a drop on the 3D view and the Movie Clip editor's button."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..translations import tr
 from ..ui import icons, step_operator
 
 VIDEO = ".mp4;.mov;.m4v;.mkv;.avi;.mxf;.mts;.webm;.mpg;.mpeg"
-"""Endings of what is taken for footage when it is dropped. Images stay Blender's: they are often references."""
+"""Extensions of files that are accepted when dropped. Images are left to Blender, because they are often references."""
 
 
 class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
@@ -34,14 +34,14 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
     filter_folder = BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """A file that was dropped is used; from a menu, one is chosen."""
+        """Uses a dropped file, or opens the file browser."""
         if self.filepath:
             return self.execute(context)
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Sets the clip; another clip than before begins with a shot of its own, beside one that was imported."""
+        """Sets the clip. If the selected shot is already imported, another clip starts a new shot."""
         props = settings_of(scene_in(context))
         if not self.filepath:
             self.report({"ERROR"}, "No file was given")
@@ -62,7 +62,7 @@ class SPLANNEQUIN_OT_use_clip(bpy.types.Operator):
 
 
 def _is_of(one: OneShot, clip: str) -> bool:
-    """True if a clip, an absolute path, is that of a shot; or if the shot, opened without a clip, lies beside it."""
+    """True if a shot has this clip (an absolute path), or has no clip and lies at the clip's default shot folder."""
     if one.clip:
         return os.path.normcase(paths.absolute(one.clip)) == os.path.normcase(clip)
     return selection.folder_of(one) == selection.beside(Path(clip))
@@ -77,12 +77,12 @@ class SPLANNEQUIN_OT_use_movie_clip(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """On where a clip is shown."""
+        """Enabled if the editor shows a clip."""
         return getattr(context.space_data, "clip", None) is not None
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Hands its file on."""
-        ops: Any = bpy.ops  # ours are not in its types
+        """Passes the clip's file to `use_clip`."""
+        ops: Any = bpy.ops  # our operators are not in the stubs
         return ops.splannequin.use_clip(filepath=bpy.path.abspath(context.space_data.clip.filepath))
 
 
@@ -96,7 +96,7 @@ class SPLANNEQUIN_PT_movie_clip(bpy.types.Panel):
     bl_category = "Splannequin"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """One button; the five steps are in the 3D view."""
+        """One button. The five steps are in the 3D view."""
         layout_of(self).operator("splannequin.use_movie_clip", icon=icons.of("splannequin.use_movie_clip"))
         layout_of(self).label(text="Then see the 3D view's sidebar.", icon="INFO")
 
@@ -111,7 +111,7 @@ class SPLANNEQUIN_FH_video(bpy.types.FileHandler):
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:
-        """Only over the 3D view."""
+        """Accepts drops in the 3D view only."""
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
@@ -131,7 +131,8 @@ class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator)
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks for confirmation before frames are replaced on which work was done. Scripts pass `replace` instead."""
+        """Asks for confirmation before an import replaces frames that other work depends on. Scripts pass `replace`
+        instead."""
         question = replaces(scene_in(context))
         if not question:
             return self.execute(context)
@@ -141,13 +142,13 @@ class SPLANNEQUIN_OT_import_clip(step_operator.StepOperator, bpy.types.Operator)
         )
 
     def params(self, scene: bpy.types.Scene) -> jobs.Params | None:
-        """What the scene's settings say, with the consent."""
+        """Import parameters from the scene's settings, with the confirmation to replace."""
         params = steps.STEPS[self.step].params(scene)
         return dataclasses.replace(params, replace=self.replace)
 
 
 def replaces(scene: bpy.types.Scene) -> str:
-    """What an import would or may replace in the scene's shot, in words; empty if nothing."""
+    """Sentence about the work in the shot that an import would or may replace; empty if there is none."""
     clip, folder = paths.absolute(settings_of(scene).clip), selection.shot_folder(scene)
     if folder is None:
         return ""

@@ -1,4 +1,4 @@
-"""The panel of the step Import."""
+"""The panel of the Import step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ImportPanel(step_panel.StepPanel):
     folds = "footage"
 
     def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Clip, range, shot folder."""
+        """Clip, range, first frame number."""
         props = settings_of(scene_in(context))
         layout.prop(props, "clip", text="")
         row = layout.row(heading="Range")
@@ -36,7 +36,7 @@ class ImportPanel(step_panel.StepPanel):
         start.prop(props, "start", text="")
 
     def draw_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """No backend, no shot folder: what to do about it."""
+        """Problems with the backend or the shot folder, and their solutions."""
         self._backend_trouble(context, layout)
         watch = self._watch(context)
         if watch is not None and selection.missing(scene_in(context), watch.state):
@@ -48,7 +48,7 @@ class ImportPanel(step_panel.StepPanel):
             box.operator("splannequin.locate_shot", text="Locate", icon=icons.of("splannequin.locate_shot"))
 
     def _backend_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """No backend, or one that is being set up."""
+        """Problem with the backend, or the state of its set-up."""
         trouble, setup = job_timer.backend_trouble(), preferences.running_setup()
         if setup is not None:
             wrap(layout, context, "The backend is being set up.", "IMPORT")
@@ -69,12 +69,12 @@ class ImportPanel(step_panel.StepPanel):
         return "Import Anew" if gone else super()._label(context, view)
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Shot folder, which frames are solved, consent to set the scene up."""
+        """Shot folder, solved frames, colour, and the option to set up the scene."""
         props = settings_of(scene_in(context))
         layout.prop(props, "shot_path", text="Folder")
         for name in ("solve_step", "fps"):
             layout.prop(props, name)
-        layout.prop(props, "colour_space", text="Space")  # a sidebar of Blender's own width cuts its whole name
+        layout.prop(props, "colour_space", text="Space")  # the full name does not fit the sidebar's default width
         for name in ("lut", "matrix", "levels", "layer", "pixel_aspect", "set_up_scene"):
             layout.prop(props, name)
 

@@ -1,5 +1,7 @@
-"""The clip behind a camera of ours, from the import until the solved camera takes its place: the frames are seen at
-once. Neither the scene's own camera nor anything else of the artist's is touched."""
+"""A camera with the clip as its background image, shown from the import until the solved camera replaces it.
+
+Does not change the scene's active camera or any of the artist's data.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,11 @@ from ..scene import sequences
 from ..shot import scene_objects
 
 _REACH = 1e-2
-"""How far the camera sees, in scene units: the plate alone, nothing of the scene stands before it."""
+"""Clip end of the camera, in scene units. It is so small that no object of the scene covers the plate."""
 
 
 def show(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object | None:
-    """Makes the camera, in place of an earlier one of the shot; None if the import's frames are not there.
+    """Adds the camera to the scene and replaces an earlier one of the shot. None if the imported frames are missing.
 
     Args:
         scene: the scene; frame n of it shows frame n of the clip.
@@ -42,12 +44,12 @@ def show(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object | None:
 
 
 def find(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object | None:
-    """The camera, if the scene still has it."""
+    """The clip's camera, or None if the scene no longer has it."""
     return scene_objects.part(scene, shot, "plate")
 
 
 def remove(scene: bpy.types.Scene, shot: Path) -> bool:
-    """Takes the camera out of the file. True if it was there."""
+    """Removes the clip's camera from the file. True if there was one."""
     camera = find(scene, shot)
     if camera is None:
         return False
@@ -61,7 +63,7 @@ def remove(scene: bpy.types.Scene, shot: Path) -> bool:
 
 
 def _frames(shot: Path) -> tuple[int, int, Path] | None:
-    """First and last frame of an import, and the first one's picture."""
+    """(first frame, last frame, image of the first frame) of an import, or None."""
     try:
         listed = contract.read_json(contract.ShotFolder(shot).listing)["frames"]
         first, last, name = int(listed[0]["frame"]), int(listed[-1]["frame"]), Path(str(listed[0]["file"])).name

@@ -1,4 +1,4 @@
-"""What the artist sets for the import."""
+"""Settings of the import."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The step Import: what it asks the backend for, what its end changes, and what the panel says of it."""
+"""The Import step: its backend request, the changes when it ends, and its texts on the panel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Import(Step):
-    """Footage into a shot folder."""
+    """Reads footage into a shot folder."""
 
     name = "import"
     label = "Import"
@@ -32,7 +32,8 @@ class Import(Step):
     classes = operators.CLASSES
 
     def params(self, scene: bpy.types.Scene) -> contract.ImportParams:
-        """The clip and its range; the shot's own clip where none is chosen. JobError without either."""
+        """Import parameters for the chosen clip and range, or for the shot's clip if none is chosen. Raises JobError
+        without a clip."""
         props = settings_of(scene)
         clip = paths.absolute(props.clip) if props.clip else _imported_from(scene)
         if not clip:
@@ -46,7 +47,7 @@ class Import(Step):
         return params
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
-        """Footage: what was imported."""
+        """Panel state of Import: facts about the imported footage."""
         if state is None or not state.frames:
             chosen = bool(settings_of(scene).clip)
             return View(False, True, [], "Import the clip." if chosen else "Choose a clip of people holding still.")
@@ -62,24 +63,27 @@ class Import(Step):
         return View(True, True, lines, "", f"{state.frames} frames")
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """The scene is fitted to the clip, which shows behind a camera."""
+        """Fits the scene to the clip and shows the clip behind a camera."""
         return arrival.imported(scene, job.shot)
 
     def ended(self, job: jobs.Job) -> None:
-        """The shot that an import was to begin, and did not, is not left behind empty."""
+        """Deletes the empty shot folder of an import that failed or was cancelled."""
         if job.state != "done" and _discard(job):
             job_timer.meanwhile(functools.partial(_discard, job))
 
     def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
-        """Through the camera that shows the clip."""
+        """Looks through the camera that shows the clip."""
         camera = plate.find(scene, shot)
         if camera is not None:
             job_timer.look_through_camera(window, camera)
 
 
 def _discard(job: jobs.Job) -> bool:
-    """Takes away what an import left, unless another works there by now. True while its process has not ended: until
-    then it holds the shot's lock, and on Windows its log, which cannot be removed."""
+    """Removes the remains of a failed import, unless another job is running in the shot.
+
+    Returns True while the job's process is alive. Until it ends, it holds the shot's lock and, on Windows, its log
+    file, which cannot be deleted.
+    """
     if any(watch.shot == job.shot and watch.running() for watch in job_timer.watches()):
         return False
     if job.process is not None and job.process.poll() is None:
@@ -89,12 +93,12 @@ def _discard(job: jobs.Job) -> bool:
 
 
 def _imported_from(scene: bpy.types.Scene) -> str:
-    """The clip that the scene's shot was made of: one that was opened by its folder says it; empty without a shot."""
+    """The clip that the scene's shot was imported from, as the shot folder records it; empty without a shot."""
     folder = selection.shot_folder(scene)
     try:
         info = {} if folder is None else contract.read_json(contract.ShotFolder(folder).info_path)
         return str(info.get("source", ""))
-    except (OSError, ValueError, contract.JobError):  # the import itself says what is wrong with it
+    except (OSError, ValueError, contract.JobError):  # the import reports the error
         return ""
 
 

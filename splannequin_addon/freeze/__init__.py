@@ -1,1 +1,1 @@
-"""The step Freeze: the frozen instant, rendered or scrubbed through."""
+"""The Freeze step: renders the frozen instant, or scrubs through it."""

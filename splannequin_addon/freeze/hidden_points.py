@@ -1,7 +1,7 @@
-"""Hides the shot's point cloud while the frozen instant is drawn over it, without leaving a trace in a saved file.
+"""Hides the shot's point cloud while the frozen instant is drawn over it. Saved files never contain the hidden state.
 
-Which view layers were changed is kept in the scene, so that undo, a saved file, an autosave and a file that another
-Blender left behind after a crash can all be put right.
+The scene stores which view layers were changed. Undo, a saved file, an autosave and a file left by a crash can
+therefore all be repaired.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from ..access import library_of, settings_of
 from ..shot import scene_objects, selection
 
 _shot: Path | None = None
-"""Shot folder that is being scrubbed."""
+"""Shot folder that is being scrubbed, or None."""
 
 
 def begin(scene: bpy.types.Scene, shot: Path) -> None:
-    """Hides the points of a shot, in a scene, until `end`."""
+    """Hides the points of a shot in a scene until `end`."""
     global _shot
     _shot = shot
     _hide(scene, shot)
 
 
 def end() -> None:
-    """Shows in all scenes of the file the points that were hidden; those that the artist hid stay hidden."""
+    """Shows the points that were hidden, in all scenes of the file. Points that the artist hid stay hidden."""
     global _shot
     _shot = None
     _restore()
 
 
 def _hide(scene: bpy.types.Scene, shot: Path) -> None:
-    """Hides the points of a shot in every view layer that shows them, and notes which ones."""
+    """Hides the points of a shot in every view layer that shows them, and stores these layers."""
     entry, cloud = scene_objects.of(scene, shot), scene_objects.part(scene, shot, "points")
     if entry is None or cloud is None:
         return
@@ -49,7 +49,8 @@ def _hide(scene: bpy.types.Scene, shot: Path) -> None:
 
 @persistent
 def _restore(*_: object) -> None:
-    """Shows what `_hide` hid. Before a save, too: a file must never hold points hidden by us."""
+    """Shows the points that `_hide` hid. Also runs before a save, because a file must never contain points that we
+    hid."""
     for scene in bpy.data.scenes:
         for entry in settings_of(scene).made if not library_of(scene) else ():
             cloud = entry.points
@@ -62,7 +63,7 @@ def _restore(*_: object) -> None:
 
 
 def _names(told: str) -> list[str]:
-    """View layers that `_hide` noted; none where the file was edited by hand."""
+    """View layers that `_hide` stored; empty if the file was edited by hand."""
     try:
         names: object = json.loads(told)
     except ValueError:
@@ -72,7 +73,8 @@ def _names(told: str) -> list[str]:
 
 @persistent
 def _agree(*_: object) -> None:
-    """After a save, an undo or a file load: the points are hidden exactly while their shot is scrubbed."""
+    """Handler after a save, an undo or a file load: the points are hidden if and only if their shot is being
+    scrubbed."""
     _restore()
     if _shot is not None:
         for scene in selection.scenes_of(_shot):
@@ -80,20 +82,20 @@ def _agree(*_: object) -> None:
 
 
 def _handlers() -> list[tuple[Any, Any]]:
-    """(list of Blender's, function) of everything that is listened to."""
+    """Pairs of (Blender's handler list, function) that are registered."""
     lists = bpy.app.handlers
     after = [lists.save_post, lists.save_post_fail, lists.undo_post, lists.redo_post, lists.load_post]
     return [(lists.save_pre, _restore), *((one, _agree) for one in after)]
 
 
 def register() -> None:
-    """Listens to saving, undo and file loads."""
+    """Registers the handlers for save, undo and load."""
     for functions, function in _handlers():
         functions.append(function)
 
 
 def unregister() -> None:
-    """Shows the points, and listens no more."""
+    """Shows the points and removes the handlers."""
     end()
     for functions, function in _handlers():
         functions.remove(function)

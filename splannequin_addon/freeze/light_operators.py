@@ -1,4 +1,4 @@
-"""The buttons that make the light of a take the scene's world, and that give the previous world back."""
+"""Operators that make the light of a take the scene's world, and that restore the previous world."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class SPLANNEQUIN_OT_add_light(takes.NeedsTake, step_operator.StepOperator, bpy.
     step = "freeze"
 
     def perform(self, context: bpy.types.Context) -> Outcome:
-        """Has the panorama made, and makes it the world at the end."""
+        """Starts the job for the panorama, which becomes the world when the job ends."""
         scene = scene_in(context)
         scene_objects.check_root(scene, begin.needed(scene, self.step))
         return super().perform(context)
 
     def params(self, scene: bpy.types.Scene) -> contract.LightParams:
-        """The take that is chosen, and where the 3D cursor is."""
+        """The selected take, and the position of the 3D cursor."""
         position = ",".join(repr(float(value)) for value in scene.cursor.location)
         return contract.LightParams(take=settings_of(scene).take_name, position=position)
 
@@ -46,7 +46,7 @@ class SPLANNEQUIN_OT_remove_light(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a light."""
+        """Disabled without a light."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         if folder is None or lights.find(scene, folder) is None:
@@ -55,7 +55,7 @@ class SPLANNEQUIN_OT_remove_light(bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Gives the previous world back."""
+        """Restores the previous world."""
         return step_operator.edit(self, context, "freeze", _removed)
 
 

@@ -1,6 +1,6 @@
-"""The light of a take as the scene's world: a panorama of the frozen scene, which turns with the shot's root.
+"""The light of a take as the scene's world: a panorama of the frozen scene that rotates with the shot's root.
 
-The artist's own world stays in the file as it is, and comes back when ours is removed.
+The artist's world stays in the file unchanged, and returns when the light is removed.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ..shot import scene_objects
 
 
 def add(scene: bpy.types.Scene, shot: Path, take: str, key: str) -> list[str]:
-    """Makes a panorama of a take the scene's world; the shot's light of before is replaced. Returns what was done.
+    """Makes a panorama of a take the scene's world and replaces the shot's previous light. Returns the changes.
 
-    JobError if there is no such panorama, or the shot does not stand in the scene; ValueError if the colour
-    configuration has no linear Rec.709, RuntimeError if Blender cannot read the file.
+    Raises JobError if the panorama is missing or the shot has no objects in the scene. Raises ValueError if the colour
+    configuration lacks linear Rec.709, and RuntimeError if Blender cannot read the file.
     """
     scene_objects.check_root(scene, shot)
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
@@ -45,14 +45,13 @@ def add(scene: bpy.types.Scene, shot: Path, take: str, key: str) -> list[str]:
 
 
 def find(scene: bpy.types.Scene, shot: Path) -> bpy.types.World | None:
-    """The light of a shot, if the scene has one."""
+    """The light of a shot, or None if the scene has none."""
     entry = scene_objects.of(scene, shot)
     return entry.light if entry is not None else None
 
 
 def remove(scene: bpy.types.Scene, shot: Path) -> bool:
-    """Takes the light of a shot out of the file, and gives the scene the world back that it had. True if there was
-    one."""
+    """Removes the light of a shot from the file and restores the scene's previous world. True if there was a light."""
     entry = scene_objects.of(scene, shot)
     world = entry.light if entry is not None else None
     if entry is None or world is None:
@@ -64,7 +63,7 @@ def remove(scene: bpy.types.Scene, shot: Path) -> bool:
     if not any(one.light for one in settings_of(scene).made):
         settings_of(scene).world_before = None
     image = _image_in(world)
-    if world.users <= int(world.use_fake_user):  # else a copy of the scene has it
+    if world.users <= int(world.use_fake_user):  # otherwise a copy of the scene uses it
         bpy.data.worlds.remove(world)
         if image is not None and image.get(TAG) and image.users <= int(image.use_fake_user):
             bpy.data.images.remove(image)
@@ -72,13 +71,13 @@ def remove(scene: bpy.types.Scene, shot: Path) -> bool:
 
 
 def _keep_world(scene: bpy.types.Scene) -> None:
-    """Remembers the scene's world before a light takes its place."""
+    """Stores the scene's world before a light replaces it."""
     if scene.world not in [entry.light for entry in settings_of(scene).made if entry.light is not None]:
         settings_of(scene).world_before = scene.world
 
 
 def _give_world_back(scene: bpy.types.Scene) -> None:
-    """Where the scene's world went with a shot: another shot's light takes its place, or the world before all."""
+    """Sets the world of a scene whose light was removed: another shot's light, or the world from before all lights."""
     lights = [entry.light for entry in settings_of(scene).made if entry.light is not None]
     scene.world = lights[0] if lights else settings_of(scene).world_before
 
@@ -87,11 +86,12 @@ def _give_world_back(scene: bpy.types.Scene) -> None:
 
 
 def _image(path: Path) -> bpy.types.Image:
-    """A panorama as a data-block, reused by path; a file is named by what it shows, so it never changes."""
+    """A panorama as an image data-block, reused by path. A panorama file never changes, because its name identifies its
+    content."""
     for known in bpy.data.images:
         if known.get(TAG) and paths.same(paths.absolute(known.filepath), str(path)):
             return known
-    compat.colour_space("linear")  # before anything is made: a configuration may have none
+    compat.colour_space("linear")  # fails before anything is created if the configuration lacks the space
     image = bpy.data.images.load(contract.regular_file(path))
     image.name = f"{path.parent.parent.name} light"
     image[TAG] = True
@@ -101,7 +101,7 @@ def _image(path: Path) -> bpy.types.Image:
 
 
 def _image_in(world: bpy.types.World) -> bpy.types.Image | None:
-    """The panorama that a light shows."""
+    """The panorama image of a light."""
     nodes: Any = world.node_tree.nodes if world.node_tree is not None else ()
     return next((node.image for node in nodes if node.type == "TEX_ENVIRONMENT"), None)
 
@@ -109,10 +109,11 @@ def _image_in(world: bpy.types.World) -> bpy.types.Image | None:
 def _world(
     name: str, image: bpy.types.Image, root: bpy.types.Object, facts: contract.LightFacts
 ) -> bpy.types.World:  # fmt: skip
-    """A world that shines as a panorama does.
+    """A world that emits a panorama's light.
 
-    The panorama's directions are those of the scene that it was made for. Two Mapping nodes lead the scene's present
-    directions there: the first, driven by the shot's root, into the solve's axes; the second on into the panorama's.
+    The panorama's directions are those of the scene at the time it was made. Two Mapping nodes convert the scene's
+    current directions. The first, driven by the shot's root, converts them to the solve's axes, the second to the
+    panorama's axes.
     """
     world = bpy.data.worlds.new(name)
     world[TAG] = True
@@ -139,13 +140,14 @@ def _world(
 
 
 def _turn(facts: contract.LightFacts) -> Matrix:
-    """[3, 3] rotation from the solve's axes to the panorama's."""
+    """[3, 3] rotation from the solve's axes to the panorama's axes."""
     placement = contract.Placement.from_json(facts.placement)
     return Matrix((np.array(placement.scene_from_solve).reshape(4, 4)[:3, :3] / placement.scale).tolist())
 
 
 def _follow(rotation: bpy.types.NodeSocket, root: bpy.types.Object) -> None:
-    """Has a socket of three angles follow an object's rotation in the world. No script: it runs in any file."""
+    """Makes a socket of three angles follow an object's world rotation. The drivers use no Python, so they run in any
+    file."""
     for axis in range(3):
         curve: Any = rotation.driver_add("default_value", axis)
         driver = curve.driver

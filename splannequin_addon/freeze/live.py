@@ -1,7 +1,7 @@
-"""A live session of the backend, as Blender holds it: views are requested, frames arrive. No bpy here.
+"""Blender's end of a live session of the backend: requests views and receives frames. No bpy.
 
-The child draws (torch_backend/live.py); two threads move bytes, so that the main thread never waits for a pipe. They
-touch nothing but this module's plain data.
+The child process draws (torch_backend/live.py). Two threads transfer the bytes, so that the main thread never waits for
+a pipe. The threads access only this module's plain data.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from ...torch_backend import contract
 from ..process import children
 
 _PATIENCE_SECONDS = 10.0
-"""How long a closed child may take to end by itself."""
+"""Time that a closed child has to end before it is killed."""
 
 
 @dataclass
 class Frame:
-    """A frozen view that arrived."""
+    """A rendered view of the frozen instant."""
 
     asked: contract.LiveView
-    """What it was asked for with."""
+    """The request."""
     t_star: int
-    """Frame number at which time stands still: the asked one, or the nearest that was trained on."""
+    """Frame number at which time stands still: the requested one, or the nearest trained one."""
     rgba: np.ndarray
     """[H, W, 4] float32, premultiplied, display-referred, first row on top."""
     depth: np.ndarray
@@ -40,20 +40,20 @@ class Frame:
 
 @dataclass
 class Session:
-    """A child that draws one run of one shot. Made by `open_session`."""
+    """A child process that draws one run of one shot. Created by `open_session`."""
 
     shot: Path
     """Shot folder."""
     run: str
     """Name of the run."""
     facts: dict[str, Any] = field(default_factory=dict[str, Any])
-    """Its `ready` message (torch_backend/live.py); empty while it loads."""
+    """The child's `ready` message (torch_backend/live.py); empty while the child loads."""
     frames: dict[int, Frame] = field(default_factory=dict[int, Frame])
-    """Newest frame of each view."""
+    """View number -> its newest frame."""
     failure: tuple[str, str] | None = None
-    """(sentence, hint) of what ended it."""
+    """(sentence, hint) about the error that ended the session, or None."""
     drawn: int = 0
-    """Frames that have arrived."""
+    """Number of frames received."""
     _process: subprocess.Popen[bytes] | None = None
     _asked: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
     _to_send: dict[int, contract.LiveView] = field(default_factory=dict[int, contract.LiveView])
@@ -64,17 +64,18 @@ class Session:
 
     @property
     def open(self) -> bool:
-        """True while it draws, or is about to."""
+        """True while the session draws, or is about to."""
         return not self._closed and self.failure is None
 
     def begin(self, process: subprocess.Popen[bytes], log: Path) -> None:
-        """Talks to its child from now on, beside Blender; what that says of its end is in the file `log`."""
+        """Starts the threads that talk to the child. The child's messages about its end are in the file `log`."""
         self._process = process
         threading.Thread(target=self._send, name="splannequin live out", daemon=True).start()
         threading.Thread(target=self._read, args=(log,), name="splannequin live in", daemon=True).start()
 
     def ask(self, view: contract.LiveView) -> None:
-        """Asks for a view, without waiting; `seq` is set here. A newer one for the same view replaces an older one."""
+        """Requests a view without waiting, and sets its `seq`. A newer request replaces an older one for the same
+        view."""
         with self._change:
             self._seq += 1
             view.seq = self._seq
@@ -82,16 +83,17 @@ class Session:
             self._change.notify()
 
     def wanted(self, view: int) -> contract.LiveView | None:
-        """What was last asked for a view."""
+        """The last request for a view, or None."""
         return self._asked.get(view)
 
     def busy(self, view: int) -> bool:
-        """True while the last request for a view is not answered."""
+        """True while the last request for a view has no answer."""
         with self._change:
             return any(request.view == view for request in self._sent.values())
 
     def close(self) -> None:
-        """Ends the child; returns at once. Its memory is free as soon as it has seen that its input ended."""
+        """Ends the child and returns at once. The child exits, and frees its memory, when it sees the end of its
+        input."""
         with self._change:
             self._closed = True
             self._change.notify()
@@ -111,7 +113,7 @@ class Session:
                 for view in views:
                     contract.write_message(requests, {"kind": "view", **dataclasses.asdict(view)})
         except (OSError, ValueError):
-            pass  # the reader finds the end of the child's output and says why
+            pass  # the reader sees the end of the child's output and reports the cause
         with contextlib.suppress(OSError):
             process.stdin.close()
         try:
@@ -142,7 +144,7 @@ class Session:
         elif header["kind"] == "error" and "seq" not in header:
             self._fail(header["message"], header["hint"])
         elif header["kind"] == "error":
-            self._answered(header["seq"])  # this view cannot be drawn; the next one may
+            self._answered(header["seq"])  # this view cannot be drawn, but the next one may
         elif header["kind"] == "frame":
             request = self._answered(header["seq"])
             w, h = header["width"], header["height"]
@@ -152,7 +154,7 @@ class Session:
             self.drawn += 1
 
     def _answered(self, seq: int) -> contract.LiveView:
-        """The request that was answered; it and those of its view that it took the place of wait no more."""
+        """The answered request. Removes it, and older requests for the same view, from the waiting ones."""
         with self._change:
             request = self._sent.pop(seq)
             for older in [s for s, v in self._sent.items() if v.view == request.view and s < seq]:
@@ -166,18 +168,19 @@ class Session:
 
 
 def open_session(shot: Path, run: str, python: str, package_root: Path) -> Session:
-    """Starts a child for a run of a shot. JobError if its Python cannot be started, or its log would go through a link.
+    """Starts a child for a run of a shot. Raises JobError if its Python cannot be started, or if the log's folder is a
+    link.
 
     Args:
         python: interpreter of the backend's environment.
-        package_root: folder that holds `torch_backend`.
+        package_root: folder that contains `torch_backend`.
     """
     session = Session(shot, run)
     log = contract.ShotFolder(shot).live_log
     contract.ShotFolder(shot).own(log.parent)
     try:
         log.parent.mkdir(parents=True, exist_ok=True)
-        if contract.is_link(log):  # else what it leads to would be emptied
+        if contract.is_link(log):  # otherwise the target of the link would be emptied
             contract.remove_link(log)
         with open(log, "wb") as errors:
             placed = contract.python_child(python, "torch_backend", "live", str(shot.absolute()), "--run", run)
@@ -194,7 +197,7 @@ def open_session(shot: Path, run: str, python: str, package_root: Path) -> Sessi
 
 
 def last_line(log: Path) -> str:
-    """Last line of a session's log that says something, at most 200 characters."""
+    """Last non-empty line of a session's log, at most 200 characters."""
     try:
         with contract.open_regular(log) as source:
             source.seek(max(0, os.fstat(source.fileno()).st_size - contract.LONGEST_LINE))

@@ -1,4 +1,4 @@
-"""The buttons of the mattes: a frame to draw on, a matte from a mask, and one that is removed."""
+"""Operators for mattes: draw on a frozen frame, make a matte from a mask, remove a matte, combine takes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SPLANNEQUIN_OT_draw_matte(takes.NeedsTake, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Loads the frames, and a mask where none is chosen; in a window an editor shows both."""
+        """Loads the frames, and adds a mask if none is selected. In a window, an editor shows both."""
         scene = scene_in(context)
         folder, props = selection.shot_folder(scene), settings_of(scene)
         assert folder is not None
@@ -45,7 +45,7 @@ class SPLANNEQUIN_OT_draw_matte(takes.NeedsTake, bpy.types.Operator):
 
 
 def _editor(context: bpy.types.Context) -> Any:
-    """An Image Editor, the one in this window first, else in a new window."""
+    """An Image Editor: in this window if it has one, else in another window, else in a new window."""
     windows = sorted(context.window_manager.windows, key=lambda window: window != context.window)
     areas = [area for window in windows for area in window.screen.areas if area.type == "IMAGE_EDITOR"]
     if not areas:
@@ -65,7 +65,7 @@ class SPLANNEQUIN_OT_matte_from_mask(takes.NeedsTake, step_operator.StepOperator
     step = "freeze"
 
     def params(self, scene: bpy.types.Scene) -> contract.MatteParams:
-        """The lassos of the mask."""
+        """Matte parameters with the lassos of the mask."""
         return mattes.params_of(scene, begin.needed(scene, self.step))
 
 
@@ -80,14 +80,14 @@ class SPLANNEQUIN_OT_remove_matte(step_operator.StepOperator, bpy.types.Operator
     name = StringProperty(name="Matte", description="Name of the matte to delete", options={"SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks first: what is removed from disk does not come back with undo."""
+        """Asks for confirmation, because undo does not restore deleted files."""
         return context.window_manager.invoke_confirm(
             self, event, title="Delete this matte from disk?",
             message="It can be drawn again. This cannot be undone.", confirm_text="Remove", icon="WARNING",
         )  # fmt: skip
 
     def params(self, scene: bpy.types.Scene) -> contract.MatteParams:
-        """The matte that goes."""
+        """Matte parameters that remove the matte."""
         return contract.MatteParams(take=settings_of(scene).take_name, remove=self.name, device=backend.device())
 
 
@@ -112,11 +112,11 @@ class SPLANNEQUIN_OT_combine_takes(step_operator.StepOperator, bpy.types.Operato
     result = StringProperty(name="Into", description="Name of the take that is made", default="combined", options=set())
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks which take, and for a name."""
+        """Asks for the source take and for a name."""
         return context.window_manager.invoke_props_dialog(self)
 
     def params(self, scene: bpy.types.Scene) -> contract.CombineParams:
-        """This thing, beside those that the take has from elsewhere already."""
+        """Combine parameters for this thing, together with those that the combined take already has."""
         return mattes.combination(scene, begin.needed(scene, self.step), self.name, self.source, self.result)
 
 

@@ -1,4 +1,4 @@
-"""Mattes of things in a take: lassos from a mask that was drawn in Blender, and what their job left."""
+"""Mattes of objects in a take: lassos from a mask drawn in Blender, and the results of matte jobs."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from ..scene import paths, sequences
 from ..shot import inventory, scene_objects, selection
 
 CURVE_STEPS = 12
-"""Corners of a polygon for each piece of a curve between two points of a mask."""
+"""Polygon corners per curve segment between two points of a mask."""
 
 Corner = tuple[float, float]
 
 
 def params_of(scene: bpy.types.Scene, shot: Path) -> contract.MatteParams:
-    """The request for a matte from the chosen mask at the scene's current frame; its lassos are written into the take.
+    """Parameters of a matte job from the selected mask at the scene's current frame. Writes the lassos into the take.
 
-    Lassos of the same name at other frames stay. JobError if there is no take or no mask, or nothing is drawn in it.
+    Lassos of the same name at other frames stay. Raises JobError without a take or mask, or if the mask is empty.
     """
     props = settings_of(scene)
     mask, folder = props.matte_mask, take_of(shot, props.take_name)
@@ -56,7 +56,7 @@ def params_of(scene: bpy.types.Scene, shot: Path) -> contract.MatteParams:
 
 
 def sources_of(scene: bpy.types.Scene, matte: str) -> list[str]:
-    """Where a thing may come from: takes that have its matte, but the chosen one, and the clip itself."""
+    """Sources for an object: the clip itself, and all takes with its matte except the selected take."""
     folder = selection.shot_folder(scene)
     takes = inventory.read(folder).takes if folder is not None else {}
     chosen = settings_of(scene).take_name
@@ -64,11 +64,11 @@ def sources_of(scene: bpy.types.Scene, matte: str) -> list[str]:
 
 
 def combination(scene: bpy.types.Scene, shot: Path, matte: str, source: str, result: str) -> contract.CombineParams:
-    """What the take `result` is to be made of: a thing from `source`, and what it has from elsewhere already."""
+    """Parameters that make the take `result`, with an object from `source` and the objects it already has."""
     base = settings_of(scene).take_name
     takes = inventory.read(shot).takes
     before: dict[str, Any] = takes[result]["combined"] if result in takes else {}
-    if base == result and before:  # the combined take is chosen since it was made
+    if base == result and before:  # the combined take itself is selected
         base = str(before.get("base"))
     kept = before.get("things") if before.get("base") == base else None
     pairs = cast("dict[Any, Any]", kept) if isinstance(kept, dict) else {}
@@ -80,16 +80,16 @@ def combination(scene: bpy.types.Scene, shot: Path, matte: str, source: str, res
 
 
 def take_of(shot: Path, name: str) -> contract.TakeFolder:
-    """A take that is there. JobError if it is not."""
+    """The folder of an existing take. Raises JobError if it does not exist."""
     if name not in inventory.read(shot).takes:
         raise contract.JobError("There is no take yet.", "Freeze first.", contract.ExitCode.USAGE)
     return contract.TakeFolder(contract.ShotFolder(shot).take(name))
 
 
 def polygons(mask: bpy.types.Mask, width: int, height: int) -> list[list[Corner]]:
-    """Closed splines of a mask's visible layers as polygons, in pixels of a picture from its top left corner.
+    """Closed splines of a mask's visible layers as polygons, in pixels from the top left corner of an image.
 
-    A mask's coordinates go from 0 to 1 along the longer side of the picture, and are centred along the other.
+    Mask coordinates go from 0 to 1 along the longer side of the image, and are centred along the other side.
     """
     longest = max(width, height)
     found: list[list[Corner]] = []
@@ -104,7 +104,7 @@ def polygons(mask: bpy.types.Mask, width: int, height: int) -> list[list[Corner]
 
 
 def _corners(spline: bpy.types.MaskSpline) -> list[Corner]:
-    """A spline of a mask as a polygon, in the mask's coordinates: cubic pieces from point to point."""
+    """A spline of a mask as a polygon in mask coordinates, from its cubic segments."""
     points: list[Any] = list(spline.points)
     found: list[Corner] = []
     for n, point in enumerate(points):
@@ -122,7 +122,7 @@ def _corners(spline: bpy.types.MaskSpline) -> list[Corner]:
 
 
 def frozen_sequence(shot: Path, name: str) -> tuple[bpy.types.Image, int, int]:
-    """Frozen frames of a take without overscan, to draw on, as a sequence; and their first and last number."""
+    """(image sequence of a take's frozen frames without overscan, first frame, last frame), to draw on."""
     folder, facts = take_of(shot, name), inventory.read(shot).takes[name]
     path = folder.preview(facts["first"])
     if not path.is_file():
@@ -132,7 +132,7 @@ def frozen_sequence(shot: Path, name: str) -> tuple[bpy.types.Image, int, int]:
 
 
 def arrived(shot: Path, result: dict[str, Any]) -> list[str]:
-    """Has what shows mattes of a take read them again; returns what there is, in words."""
+    """Reloads images that show a take's mattes. Returns a sentence about the take's mattes."""
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(str(result["take"])))
     inside = os.path.abspath(folder.mattes)
     for image in bpy.data.images:

@@ -1,6 +1,6 @@
-"""Depth in the middle of a take's frame, read from its file. No bpy, which has no pixels of a multilayer EXR.
+"""Depth in the middle of a take's frame, read from its file. No bpy, which cannot read pixels of a multilayer EXR.
 
-Reads what the backend writes: one part, scan lines, ZIP.
+Supports only the format that the backend writes: single part, scan lines, ZIP.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import numpy as np
 from ...torch_backend import contract
 
 _LINES = 16
-"""Scan lines in a chunk of ZIP."""
+"""Scan lines per ZIP chunk."""
 _SIZES = {0: 4, 1: 2, 2: 4}
-"""Type of a channel (uint, half, float) -> bytes of a pixel."""
+"""Channel type (uint, half, float) -> bytes per pixel."""
 
 
 def of_frame(path: Path) -> float:
-    """Median of the layer Z around the middle of a frame, solve units; 0 if it has none, or is no such file.
+    """Median of the layer Z around the middle of a frame, solve units; 0 without depth or for an unsupported file.
 
-    Around means `_LINES` lines and as many columns, where the picture is no guess at infinity.
+    The area has `_LINES` lines and as many columns. Pixels without a surface (`contract.NO_DEPTH`) are ignored.
     """
     try:
         return _read(path)
@@ -58,7 +58,7 @@ def _read(path: Path) -> float:
 
 
 def _channels(listed: bytes) -> dict[str, int]:
-    """Channels in the order of the file -> bytes of a pixel."""
+    """Channel name -> bytes per pixel, in file order."""
     found: dict[str, int] = {}
     while listed and listed[0]:
         name, _, listed = listed.partition(b"\0")
@@ -68,8 +68,8 @@ def _channels(listed: bytes) -> dict[str, int]:
 
 
 def _unpacked(packed: bytes, size: int) -> np.ndarray:
-    """Bytes of a chunk [size] uint8, as they were before ZIP. ValueError for another number of them."""
-    if len(packed) == size:  # what ZIP would make larger is stored as it is
+    """Uncompressed bytes of a chunk, [size] uint8. Raises ValueError if their number differs from `size`."""
+    if len(packed) == size:  # a chunk that ZIP would enlarge is stored uncompressed
         return np.frombuffer(packed, np.uint8)
     unzipped = np.frombuffer(zlib.decompressobj().decompress(packed, size), np.uint8)
     if len(unzipped) != size:

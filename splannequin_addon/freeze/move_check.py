@@ -1,6 +1,6 @@
-"""Share of a camera's pictures that will be a guess: a live session draws their support, small, before the freeze.
+"""Estimates the guessed fraction of a camera's images before the freeze: a live session draws small support images.
 
-A pixel is a guess where the splats leave it uncovered, or where no frame near t* saw what they show there.
+A pixel is a guess if no splat covers it, or if no frame near t* saw the splats that it shows.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from ..ui import step_operator
 from . import live, own_camera, takes, viewport
 
 WIDTH = 160
-"""Of the small pictures, in pixels."""
+"""Width of the small images in pixels."""
 MOST_FRAMES = 24
-"""Number of frames of a camera that are drawn, at equal distances."""
+"""Maximum number of frames drawn per camera, evenly spaced."""
 _SUPPORTED = 0.5
-"""Support from which on a pixel is no guess: half of what it shows was seen near t*."""
+"""Support from which a pixel does not count as a guess: half of its content was seen near t*."""
 _PAUSE_SECONDS = 0.005
-"""Between two looks at the session, where nothing else waits for Blender."""
+"""Interval between checks of the session when Blender runs without a window."""
 _VIEW = -1
-"""Number of the live session's view: windows have theirs from 0 on."""
+"""View number in the live session. Windows use numbers from 0."""
 
 
 @dataclass(frozen=True)
 class Guesses:
-    """Share of a camera's pictures that is a guess."""
+    """Fraction of guessed pixels in a camera's images."""
 
     camera: str
     """Name of the camera."""
     shares: dict[int, float]
-    """Frame number -> share of its pixels, 0..1."""
+    """Frame number -> fraction of its pixels, 0..1."""
 
     def sentence(self) -> str:
-        """Mean and worst, in words."""
+        """Sentence about the mean and the worst frame."""
         mean = sum(self.shares.values()) / len(self.shares)
         worst = max(self.shares, key=lambda frame: self.shares[frame])
         sentences = [
@@ -57,15 +57,15 @@ class Guesses:
 
 
 def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_timer.Progress, None, Guesses]:
-    """Looks at the support along a camera, for the timer: a frame or less a turn. Keeps nothing of bpy between turns.
+    """Draws the support along a camera, at most one frame per timer step. Keeps no bpy data between steps.
 
     Args:
-        scene: the scene, whose range and settings are those of the freeze.
+        scene: the scene with the freeze's range and settings.
         shot: its shot folder.
-        name: of the camera object.
+        name: name of the camera object.
 
     Raises:
-        contract.JobError: the camera cannot be read, there is no run or no backend, or the session ended.
+        contract.JobError: the camera cannot be read, the run or backend is missing, or the session ended.
     """
     props = settings_of(scene)
     run, params = props.run_name, takes.params_of(scene)
@@ -112,25 +112,26 @@ def checking(scene: bpy.types.Scene, shot: Path, name: str) -> Generator[job_tim
 
 
 def share_of(frame: live.Frame | None, asked: contract.LiveView) -> float:
-    """Share of a drawn view's pixels that is a guess, 0..1. JobError if it is not the requested one."""
+    """Fraction of a drawn view's pixels that are guesses, 0..1. Raises JobError if the frame answers another
+    request."""
     if frame is None or frame.asked.seq != asked.seq:
         raise contract.JobError("The backend could not draw what the camera sees.", "Try again.")
     return float(np.count_nonzero(frame.rgba[..., 0] < _SUPPORTED) / max(1, frame.rgba[..., 0].size))
 
 
 def _still_open(drawn: live.Session) -> None:
-    """JobError if a session draws no more."""
+    """Raises JobError if a session has ended."""
     if not drawn.open:
         raise contract.JobError(*(drawn.failure or ("Scrubbing was stopped.", "Check the move again.")))
 
 
 def _percent(share: float) -> int:
-    """Whole percent; what is there is not called 0."""
+    """Fraction as whole percent, at least 1 if it is not 0."""
     return max(round(100.0 * share), 1 if share > 0.0 else 0)
 
 
 def _in_turns(scene_uid: int, shot: Path, name: str) -> Generator[job_timer.Progress, None, None]:
-    """`checking` in a window: what it found stands on the panel."""
+    """`checking` for a window: shows the result on the panel."""
     scene = session.scene_of(scene_uid)
     if scene is None:
         return
@@ -150,7 +151,7 @@ class SPLANNEQUIN_OT_check_move(step_operator.StepOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a camera of one's own, and without a trained run."""
+        """Disabled without an artist's camera, or without a trained run."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         state = job_timer.watch_of(folder).state if folder else None
@@ -163,10 +164,10 @@ class SPLANNEQUIN_OT_check_move(step_operator.StepOperator, bpy.types.Operator):
         return super().poll(context)
 
     def perform(self, context: bpy.types.Context) -> Outcome:
-        """Lets the timer poll the backend; without a window, waits for it."""
+        """Starts the check by the timer. Without a window, waits for the result."""
         scene, name = scene_in(context), own_camera.name_of(scene_in(context))
         folder = selection.shot_folder(scene)
-        assert folder is not None  # `poll` asked
+        assert folder is not None  # `poll` has checked it
         if not bpy.app.background:
             job_timer.work(folder, self.step, _in_turns(scene.session_uid, folder, name))
             return {"FINISHED"}
@@ -177,7 +178,7 @@ class SPLANNEQUIN_OT_check_move(step_operator.StepOperator, bpy.types.Operator):
 
 
 def waited(turns: Generator[job_timer.Progress, None, Guesses]) -> Guesses:
-    """What `checking` finds, all at once."""
+    """The result of `checking`, computed without interruption."""
     while True:
         try:
             next(turns)

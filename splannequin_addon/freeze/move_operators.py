@@ -1,4 +1,4 @@
-"""Camera moves made of the clip's own path: each an ordinary keyed camera under the shot's root, to freeze from."""
+"""Operators for camera moves based on the clip's path. Each adds an ordinary keyed camera under the shot's root."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from . import middle_depth, moves
 
 @dataclass(frozen=True)
 class ClipPath:
-    """The clip's own camera, a pose for each of its frames."""
+    """The clip's solved camera, with a pose for every frame."""
 
     shot: Path
     """Shot folder."""
@@ -35,7 +35,7 @@ class ClipPath:
     lenses: np.ndarray
     """[F, 3] focal length in mm, shift_x, shift_y."""
     solved: contract.CameraPath
-    """As the solve left it: with gaps where the clip has no frames."""
+    """The solve's camera path, with gaps where the clip has no frames."""
 
     @property
     def last(self) -> int:
@@ -48,7 +48,7 @@ class ClipPath:
 
 
 def clip_path(shot: Path) -> ClipPath:
-    """The solved camera of a shot. FileNotFoundError or ValueError names the file."""
+    """The solved camera of a shot. Raises FileNotFoundError or ValueError, which name the file."""
     solved = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
     if not solved.frames:
         raise contract.UserError(f"{shot} has no solved camera: solve again")
@@ -61,15 +61,15 @@ def clip_path(shot: Path) -> ClipPath:
 def add_camera(
     scene: bpy.types.Scene, path: ClipPath, kind: str, poses: np.ndarray, lenses: np.ndarray, fit_range: bool
 ) -> list[str]:
-    """Adds a keyed camera under the shot's root and has the freeze seen from it. Returns what was done.
+    """Adds a keyed camera under the shot's root and makes the freeze use it. Returns the changes as sentences.
 
     Args:
         scene: the scene, with the shot's root.
-        path: of the clip.
+        path: path of the clip.
         kind: last word of the camera's name.
-        poses: [N, 4, 4], one per frame from the clip's first on.
+        poses: [N, 4, 4], one per frame, starting at the clip's first frame.
         lenses: [N, 3].
-        fit_range: have the scene play those frames.
+        fit_range: set the scene's range to those frames.
     """
     root, solved = present(scene_objects.part(scene, path.shot, "root")), scene_objects.part(scene, path.shot, "camera")
     collection = present(scene_objects.of(scene, path.shot)).collection or scene.collection
@@ -90,7 +90,7 @@ def add_camera(
 
 
 class _Move(OperatorBase):
-    """What the four share: the clip's path in, a camera out."""
+    """Base class of the four moves: reads the clip's path, adds a camera."""
 
     kind = ""
     if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class _Move(OperatorBase):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without the solve in the scene."""
+        """Disabled without the solve in the scene."""
         scene = scene_in(context)
         shot = selection.shot_folder(scene)
         if shot is None or scene_objects.part(scene, shot, "root") is None:
@@ -169,12 +169,12 @@ class SPLANNEQUIN_OT_move_smooth(_Move, bpy.types.Operator):
     fit_range = BoolProperty(**_FIT)
 
     def moved(self, scene: bpy.types.Scene, path: ClipPath) -> tuple[np.ndarray, np.ndarray]:
-        """The smoothed path, frame by frame as the clip's."""
+        """The smoothed path, with one pose per frame of the clip."""
         return moves.smoothed(path.poses, self.position, self.rotation), path.lenses
 
 
 class _Stops(_Move):
-    """What the three share that stop on the way."""
+    """Base class of the three moves with a stop."""
 
     if TYPE_CHECKING:
         frame: int
@@ -210,7 +210,7 @@ class SPLANNEQUIN_OT_move_retime(_Stops, bpy.types.Operator):
     fit_range = BoolProperty(**_FIT)
 
     def moved(self, scene: bpy.types.Scene, path: ClipPath) -> tuple[np.ndarray, np.ndarray]:
-        """The path with the stop in it."""
+        """Poses and lenses of the path with the stop."""
         return self.stopped(scene, path, self.ease_in, self.hold, self.ease_out)[:2]
 
 
@@ -229,7 +229,7 @@ _BOTH: dict[str, Any] = {
 
 
 def _frames(scene: bpy.types.Scene, seconds: float) -> int:
-    """Whole frames of a scene that are as long."""
+    """Number of whole frames in a duration at the scene's frame rate."""
     return round(seconds * scene.render.fps / scene.render.fps_base)
 
 
@@ -248,7 +248,7 @@ class SPLANNEQUIN_OT_move_hold(_Stops, bpy.types.Operator):
     fit_range = BoolProperty(**_FIT)
 
     def moved(self, scene: bpy.types.Scene, path: ClipPath) -> tuple[np.ndarray, np.ndarray]:
-        """The path with the stop in it."""
+        """Poses and lenses of the path with the stop."""
         return self.stopped(scene, path, self.ease, _frames(scene, self.seconds), self.ease)[:2]
 
 
@@ -293,7 +293,7 @@ class SPLANNEQUIN_OT_move_orbit(_Stops, bpy.types.Operator):
     fit_range = BoolProperty(**_FIT)
 
     def moved(self, scene: bpy.types.Scene, path: ClipPath) -> tuple[np.ndarray, np.ndarray]:
-        """The path with the swing in it."""
+        """Poses and lenses of the path with the orbit during the stop."""
         poses, lenses, held = self.stopped(scene, path, self.ease, _frames(scene, self.seconds), self.ease)
         pose = moves.at(moves.smoothed(path.poses, self.smooth, self.smooth), np.array([self.frame - path.first]))[0]
         root = present(scene_objects.part(scene, path.shot, "root"))
@@ -301,21 +301,21 @@ class SPLANNEQUIN_OT_move_orbit(_Stops, bpy.types.Operator):
         depth = self.distance / scale if self.distance else found_depth(scene, path, self.frame, pose)
         up = np.array((root.matrix_world.inverted().to_3x3() @ Vector((0.0, 0.0, 1.0))).normalized(), dtype=np.float64)
         pivot = moves.in_the_middle(pose, _lens(path, self.frame), (path.solved.width, path.solved.height), depth)
-        # A positive turn around the camera's right brings the camera down: it looks along -z.
+        # A positive rotation about the camera's right axis moves the camera down, because the camera looks along -z.
         return moves.orbit(poses, held, pivot, up, (self.angle, -self.rise)), lenses
 
 
 def found_depth(scene: bpy.types.Scene, path: ClipPath, frame: int, pose: np.ndarray) -> float:
-    """Depth of what is in the middle of the clip's picture, solve units: of the chosen take's Z, else of the points.
+    """Depth in the middle of the clip's image, solve units: from the selected take's Z, else from the solve's points.
 
     Args:
-        scene: the scene, whose take is asked.
-        path: of the clip.
-        frame: number of the picture.
-        pose: of the camera there, [4, 4].
+        scene: the scene with the selected take.
+        path: path of the clip.
+        frame: frame number.
+        pose: the camera's pose at the frame, [4, 4].
 
     Raises:
-        contract.JobError: neither tells.
+        contract.JobError: neither source has a depth.
     """
     take = settings_of(scene).take_name
     facts = inventory.read(path.shot).takes.get(take)
@@ -337,7 +337,7 @@ def found_depth(scene: bpy.types.Scene, path: ClipPath, frame: int, pose: np.nda
 
 
 def _lens(path: ClipPath, frame: int) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels at a frame, of the nearest one that was solved."""
+    """fx, fy, cx, cy in pixels of the solved frame nearest to a frame."""
     K = min(path.solved.frames, key=lambda solved: abs(solved.frame - frame)).K
     return K[0], K[1], K[2], K[3]
 

@@ -1,8 +1,9 @@
-"""Camera moves made of a clip's own path: smoothed, retimed, held, in orbit. Plain numpy, no bpy.
+"""Camera moves computed from a clip's path: smoothed, retimed, held, orbit. Plain numpy, no bpy.
 
 A path is one pose per frame, camera-to-world, [F, 4, 4] float64, Blender's camera axes (x right, y up, looking along
--z), solve units. Positions and rotations are handled apart, rotations as unit quaternions (w, x, y, z): products with a
-fixed rotation from either side are orthogonal maps of them, so results do not depend on the world's or camera's axes.
+-z), solve units. Positions and rotations are processed separately. Rotations are unit quaternions (w, x, y, z).
+Multiplying them by a fixed rotation from either side is an orthogonal map. Results therefore do not depend on the
+choice of world or camera axes.
 """
 
 from __future__ import annotations
@@ -17,24 +18,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Timing:
-    """Which of the clip's poses the camera has at each output frame, one frame after the other."""
+    """The clip pose for each output frame."""
 
     frames: Array
-    """[N] frame number of the clip, fractional."""
+    """[N] fractional frame number of the clip."""
     held: Array
-    """[N] share of the stop that has passed, 0..1: 0 before it, 1 after it."""
+    """[N] elapsed fraction of the stop, 0..1: 0 before it, 1 after it."""
 
 
 def smoothed(poses: Array, position: float, rotation: float) -> Array:
-    """A path without its sways; the first and the last pose stay.
+    """A path without sway. The first and the last pose stay.
 
-    Each coordinate y minimises |y - x|^2 + b |y''|^2 (a Whittaker smoother): motion of the period p keeps the share
-    1 / (1 + (c / p)^4). The period c of which half is kept is the amount times the length of the path.
+    Each coordinate y minimises |y - x|^2 + b |y''|^2 (a Whittaker smoother). Motion of the period p keeps the fraction
+    1 / (1 + (c / p)^4). The cutoff period c, at which half remains, is the amount times the length of the path.
 
     Args:
-        poses: [F, 4, 4], at equal distances in time.
-        position: amount of smoothing of positions, 0..1; at 1 what repeats within the path is gone.
-        rotation: the same of rotations.
+        poses: [F, 4, 4], evenly spaced in time.
+        position: smoothing of positions, 0..1. At 1, motion that repeats within the path is removed.
+        rotation: smoothing of rotations, 0..1.
 
     Returns:
         [F, 4, 4] float64.
@@ -47,18 +48,18 @@ def smoothed(poses: Array, position: float, rotation: float) -> Array:
 
 
 def retimed(first: int, last: int, stop: float, ease_in: float, hold: float, ease_out: float) -> Timing:
-    """The clip's path with a stop: at the clip's pace, slower, still, faster, at the clip's pace again.
+    """The clip's path with a stop: normal speed, deceleration, standstill, acceleration, normal speed.
 
-    The pace falls and rises as a smoothstep, so it has no kink. An ease takes half its length of the clip: one that is
-    longer than the path on its side of the stop allows is shortened.
+    The speed changes as a smoothstep, so it has no kink. An ease covers half its length in clip frames. An ease that is
+    too long for its side of the stop is shortened.
 
     Args:
         first: first frame of the clip.
         last: last frame of the clip.
         stop: frame of the clip at which the camera stands still, within first..last.
-        ease_in: frames until it stands still.
-        hold: frames for which it stands still.
-        ease_out: frames until it has the clip's pace again.
+        ease_in: frames of the deceleration.
+        hold: frames of the standstill.
+        ease_out: frames of the acceleration.
     """
     ease_in, ease_out = min(ease_in, 2.0 * (stop - first)), min(ease_out, 2.0 * (last - stop))
     slower = stop - first - ease_in / 2.0
@@ -77,7 +78,7 @@ def retimed(first: int, last: int, stop: float, ease_in: float, hold: float, eas
 
 
 def filled(numbers: Array, poses: Array) -> Array:
-    """A pose for every frame from the first to the last, straight between those that there are, [F, 4, 4].
+    """A pose for every frame from first to last, [F, 4, 4], linearly interpolated.
 
     Args:
         numbers: [K] ascending frame numbers.
@@ -89,7 +90,7 @@ def filled(numbers: Array, poses: Array) -> Array:
 
 
 def between(wanted: Array, numbers: Array, values: Array) -> Array:
-    """Columns [K, C] known at ascending numbers [K], straight between them, at wanted numbers: [N, C]."""
+    """Columns [K, C] given at ascending numbers [K], linearly interpolated at the wanted numbers: [N, C]."""
     result = np.empty((len(wanted), values.shape[1]))
     for i in range(values.shape[1]):
         result[:, i] = np.interp(wanted, numbers, values[:, i])
@@ -97,7 +98,7 @@ def between(wanted: Array, numbers: Array, values: Array) -> Array:
 
 
 def at(poses: Array, places: Array) -> Array:
-    """Poses between those of a path, on a Catmull-Rom spline through them: the pace has no kinks.
+    """Poses at fractional indices of a path, on a Catmull-Rom spline through the path, so that the speed has no kinks.
 
     Args:
         poses: [F, 4, 4].
@@ -118,14 +119,14 @@ def at(poses: Array, places: Array) -> Array:
 
 
 def orbit(poses: Array, held: Array, pivot: Array, up: Array, angles: tuple[float, float]) -> Array:
-    """A path that swings around a point and back while it is held.
+    """A path with an orbit around a point, there and back, during its stop.
 
     Args:
         poses: [N, 4, 4].
-        held: [N], see `Timing`: the swing is greatest at 0.5 and nothing at 0 and 1, with no pace at either.
-        pivot: the point, [3].
-        up: the axis of the swing, [3], of length 1.
-        angles: radians around `up`, and around the camera's own right, both at the greatest.
+        held: [N], see `Timing`. The swing is largest at 0.5. At 0 and 1 the swing and its speed are 0.
+        pivot: centre of the orbit, [3].
+        up: axis of the orbit, unit vector [3].
+        angles: largest rotations in radians: around `up`, and around the camera's right axis.
 
     Returns:
         [N, 4, 4] float64.
@@ -140,13 +141,13 @@ def orbit(poses: Array, held: Array, pivot: Array, up: Array, angles: tuple[floa
 
 
 def in_the_middle(pose: Array, lens: tuple[float, float, float, float], size: tuple[int, int], depth: float) -> Array:
-    """The point at the middle of a picture, [3].
+    """The 3D point in the middle of an image, [3].
 
     Args:
         pose: [4, 4].
         lens: fx, fy, cx, cy in pixels.
         size: width and height in pixels.
-        depth: of the point along the camera's axis, solve units.
+        depth: depth of the point along the camera's axis, solve units.
     """
     fx, fy, cx, cy = lens
     ray = np.array([(size[0] / 2.0 - cx) / fx, -(size[1] / 2.0 - cy) / fy, -1.0])
@@ -154,7 +155,7 @@ def in_the_middle(pose: Array, lens: tuple[float, float, float, float], size: tu
 
 
 def depth_of_points(pose: Array, lens: tuple[float, float, float, float], size: tuple[int, int], xyz: Array) -> float:
-    """Median depth of the points that a picture shows, solve units; 0 if it shows none.
+    """Median depth of the points inside an image, solve units; 0 without such points.
 
     Args:
         pose: [4, 4].
@@ -184,9 +185,9 @@ def unsteadiness(poses: Array) -> tuple[float, float]:
 
 
 def quaternions(poses: Array) -> Array:
-    """Unit quaternions of poses, [F, 4], each on the side of the one before: q and -q turn alike."""
+    """Unit quaternions of poses, [F, 4]. Signs are chosen for continuity, because q and -q are the same rotation."""
     m = np.asarray(poses, dtype=np.float64)[:, :3, :3]
-    # 4 q q^T, of which the column with the largest diagonal is the most exact (Shepperd's method).
+    # 4 q q^T. The column with the largest diagonal element is the most accurate (Shepperd's method).
     products = np.empty((len(m), 4, 4))
     trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
     products[:, 0, 0] = 1.0 + trace
@@ -214,12 +215,12 @@ def rotations(q: Array) -> Array:
 
 
 def _quaternion_of(axes: Array, angles: Array) -> Array:
-    """[N, 4] of turns by angles [N] (radians) around axes [N, 3] of length 1."""
+    """Quaternions [N, 4] of rotations by angles [N] (radians) around unit axes [N, 3]."""
     return np.concatenate([np.cos(angles / 2)[:, None], np.sin(angles / 2)[:, None] * axes], axis=1)
 
 
 def _logarithm(matrices: Array) -> Array:
-    """Rotation vectors [N, 3], radians."""
+    """Rotation vectors [N, 3] of rotation matrices, radians."""
     q = quaternions(matrices)
     q = np.where(q[:, :1] < 0, -q, q)
     sine = np.sqrt((q[:, 1:] ** 2).sum(axis=1))
@@ -228,7 +229,7 @@ def _logarithm(matrices: Array) -> Array:
 
 
 def _apply(turns: Array, vectors: Array) -> Array:
-    """Vectors [N, 3], each turned by its rotation [N, 3, 3]."""
+    """Vectors [N, 3], each rotated by its matrix [N, 3, 3]."""
     return (turns * vectors[:, None, :]).sum(axis=2)
 
 
@@ -237,7 +238,7 @@ def _of_length_1(values: Array) -> Array:
 
 
 def _poses(values: Array) -> Array:
-    """[N, 4, 4] of positions and quaternions of any length, [N, 7]."""
+    """Poses [N, 4, 4] from positions and quaternions of any length, [N, 7]."""
     result = np.zeros((len(values), 4, 4))
     result[:, :3, :3], result[:, :3, 3], result[:, 3, 3] = rotations(values[:, 3:]), values[:, :3], 1.0
     return result
@@ -247,12 +248,13 @@ def _poses(values: Array) -> Array:
 
 
 def _low_pass(values: Array, period: float) -> Array:
-    """Columns [F, C] without what is faster than a period in frames, of which half is kept; the ends stay."""
+    """Columns [F, C] after a low-pass filter with a cutoff period in frames, of which half remains. The end values
+    stay."""
     count = len(values) - 2
     if count < 1 or period <= 0:
         return np.array(values, dtype=np.float64)
     weight = (period / (2.0 * np.pi)) ** 4
-    # The normal equations of the values between the ends have five diagonals.
+    # The normal equations of the inner values have five diagonals.
     second = np.zeros((3, count + 2))  # weights of y[i - 1], y[i], y[i + 1] in the second difference at i
     second[:, 1:-1] = np.array([1.0, -2.0, 1.0])[:, None]
     diagonal, one, two = 1.0 + np.zeros(count + 2), np.zeros(count + 2), np.zeros(count + 2)
@@ -275,9 +277,10 @@ def _low_pass(values: Array, period: float) -> Array:
 
 
 def _solve(diagonal: Array, one: Array, two: Array, wanted: Array) -> Array:
-    """x of A x = wanted [N, C]: A symmetric, positive, with the diagonals [N], [N-1] and [N-2]; by L D L^T.
+    """Solution x of A x = wanted [N, C], by L D L^T. A is symmetric positive definite with the diagonals [N], [N-1],
+    [N-2].
 
-    No LAPACK: see `axes.camera_to_world`.
+    Does not use LAPACK: see `axes.camera_to_world`.
     """
     count = len(diagonal)
     d, low, lower = np.zeros(count), np.zeros(count), np.zeros(count)

@@ -1,4 +1,4 @@
-"""The button Freeze, the instant, scrubbing, and the buttons of the list of takes."""
+"""Operators of the Freeze step: the freeze, the instant, scrubbing, and the list of takes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
     step = "freeze"
 
     def perform(self, context: bpy.types.Context) -> Outcome:
-        """Runs the step. In a window a camera of the artist's is read a few frames per turn of the timer."""
+        """Runs the step. In a window, the timer reads the artist's camera in steps of a few frames."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         if not own_camera.name_of(scene) or folder is None or bpy.app.background:
@@ -32,7 +32,7 @@ class SPLANNEQUIN_OT_freeze(step_operator.StepOperator, bpy.types.Operator):
         return {"FINISHED"}
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams | None:
-        """Reads the artist's camera, if one is chosen, all at once."""
+        """Reads the artist's camera without interruption, if one is selected."""
         return takes.read_camera(scene, self.step)
 
 
@@ -44,7 +44,7 @@ class SPLANNEQUIN_OT_t_star_here(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Takes the current frame, held within the clip's range."""
+        """Sets t* to the current frame, clamped to the clip's range."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         frame = scene.frame_current
@@ -79,9 +79,9 @@ class SPLANNEQUIN_OT_live(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a trained run, and where there is no view."""
+        """Disabled without a trained run, and without a 3D view."""
         if viewport.session() is not None:
-            return True  # it can be stopped, whatever became of the run
+            return True  # a running session can be stopped even if the run is gone
         if bpy.app.background:
             cls.poll_message_set(tr("There is no 3D view"))
             return False
@@ -116,14 +116,14 @@ class SPLANNEQUIN_OT_suggested_instant(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """On while scrubbing: the backend ranks the instants."""
+        """Enabled while scrubbing, because the backend ranks the instants."""
         if not viewport.suggestions():
             cls.poll_message_set(tr("Suggestions come with Scrub in View"))
             return False
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Takes the nearest suggestion on that side; at the end, the first on the other."""
+        """Sets t* to the nearest suggestion in that direction. At the end it wraps around."""
         props = settings_of(scene_in(context))
         frames = sorted(s["frame"] for s in viewport.suggestions())
         now = viewport.instant(scene_in(context))
@@ -144,7 +144,7 @@ class SPLANNEQUIN_OT_pick_take(pick_operators.Pick, bpy.types.Operator):
     name = StringProperty(name="Take", description="Name of the take", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Sets the take's name."""
+        """Sets the scene's take name."""
         state = pick_operators.known(context)[1]
         if self.name not in state.takes:
             refusal = state.damaged["take"].get(self.name) or f"This shot has no take {self.name!r}"
@@ -176,7 +176,7 @@ class SPLANNEQUIN_OT_add_splats(takes.NeedsTake, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Adds them; in a window the timer reads the file, and the panel tells when they are there."""
+        """Adds the splats. In a window, the timer reads the file and the panel reports when they are added."""
         scene = scene_in(context)
         folder, take = selection.shot_folder(scene), settings_of(scene).take_name
         if bpy.app.background or folder is None:

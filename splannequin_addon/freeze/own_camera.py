@@ -1,4 +1,4 @@
-"""A camera of the artist's, read frame by frame, and whether a take is seen from one."""
+"""Reads the artist's camera frame by frame, and checks whether a take uses one."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from ..shot import inventory, scene_objects, seen_camera, selection
 def sample_path(
     scene: bpy.types.Scene, name: str, shot: Path, width: int, every: int = 1
 ) -> Generator[int, None, contract.CameraPath]:
-    """Reads an animated camera over the scene's range, a frame per turn; yields frames done, returns the CameraPath.
+    """Reads an animated camera over the scene's range, one frame per step. Yields the frames done, returns the
+    CameraPath.
 
-    Nothing of bpy is kept between two turns. The scene's current frame is put back at the end.
+    Keeps no bpy data between steps. Restores the scene's current frame at the end.
 
     Args:
-        scene: the scene, whose range, render size and pixel aspect say what the camera sees.
-        name: of the camera object.
-        shot: shot folder whose solve the path is to be in.
-        width: of the frames in pixels; 0: the scene's.
-        every: of the scene's frames that one is read of, the last one as well.
+        scene: the scene with the range, render size and pixel aspect of the path.
+        name: name of the camera object.
+        shot: shot folder. The path is in the coordinates of its solve.
+        width: width of the frames in pixels; 0: the scene's.
+        every: read every n-th frame of the scene, and the last one.
 
     Raises:
-        contract.JobError: the camera is gone, or is no perspective camera.
+        contract.JobError: the camera no longer exists, or is not a perspective camera.
     """
     uid = scene.session_uid
     size = scene_setup.render_size(scene)
@@ -46,7 +47,7 @@ def sample_path(
 
 
 def name_of(scene: bpy.types.Scene) -> str:
-    """Name of the artist's camera to freeze from; empty for the clip's own move."""
+    """Name of the artist's camera to freeze from; empty for the clip's move."""
     camera, folder = settings_of(scene).path_camera, selection.shot_folder(scene)
     if camera is None or folder is None or camera == scene_objects.part(scene, folder, "camera"):
         return ""
@@ -54,14 +55,14 @@ def name_of(scene: bpy.types.Scene) -> str:
 
 
 def shutter_of(scene: bpy.types.Scene) -> float:
-    """Degrees of 360 that the shutter of the artist's camera is open, as the scene renders; 0 without motion blur."""
+    """Shutter angle of the artist's camera in degrees, as the scene renders; 0 without motion blur."""
     if not settings_of(scene).motion_blur or not name_of(scene):
         return 0.0
     return min(360.0 * scene.render.motion_blur_shutter, 360.0)
 
 
 def follows_camera(scene: bpy.types.Scene) -> bool:
-    """True if a bake has to look at the artist's camera again: the take was seen from one, and one is chosen."""
+    """True if a bake must read the artist's camera again: the take uses one, and one is selected."""
     folder = selection.shot_folder(scene)
     if folder is None or not name_of(scene):
         return False

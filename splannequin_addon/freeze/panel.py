@@ -1,4 +1,4 @@
-"""The panel of the step Freeze."""
+"""The panel of the Freeze step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from . import lights, viewport
 
 
 def can_scrub(view: steps.View, running: str | None) -> bool:
-    """True if scrubbing may begin, and always while there is a session to be stopped."""
+    """True if scrubbing can start, and always while a session can be stopped."""
     return viewport.session() is not None or (view.ready and running is None)
 
 
@@ -29,7 +29,7 @@ class FreezePanel(step_panel.StepPanel):
     folds = "freeze"
 
     def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The instant."""
+        """The instant t*."""
         props = settings_of(scene_in(context))
         row = layout.row()
         if props.choose_t_star:
@@ -51,7 +51,7 @@ class FreezePanel(step_panel.StepPanel):
                 )
 
     def _suggested(self, context: bpy.types.Context) -> int | None:
-        """The instant that is taken while none is chosen, once it is known: scrubbing asks for it, so does Freeze."""
+        """The suggested instant used if none is chosen; None until scrubbing or a freeze has determined it."""
         session, watch, props = viewport.session(), self._watch(context), settings_of(scene_in(context))
         at = (
             viewport.instant(scene_in(context))
@@ -64,13 +64,13 @@ class FreezePanel(step_panel.StepPanel):
         return props.t_star if take is not None and take["t_star_frame"] == props.t_star else None
 
     def draw_always(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Scrubbing: it can be stopped whatever runs, and whatever became of the shot."""
+        """Scrubbing. It can be stopped in any state of the shot."""
         watch, live = self._watch(context), layout.column()
         live.enabled = can_scrub(self._view(context), watch.running() if watch else None)
         self._live(context, live)
 
     def draw_body(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The step's body, and the takes to compare."""
+        """The step's body, and lists of mattes and takes."""
         super().draw_body(context, layout)
         watch = self._watch(context)
         if watch is None or watch.state is None or not watch.state.listed("take"):
@@ -92,7 +92,7 @@ class FreezePanel(step_panel.StepPanel):
                 row.operator("splannequin.remove_light", text="", icon=icons.of("splannequin.remove_light"))
 
     def _mattes(self, context: bpy.types.Context, layout: bpy.types.UILayout, take: dict[str, Any]) -> None:
-        """A mask to make one of, and what there is."""
+        """The mask for a new matte, and the list of mattes."""
         column = layout.column()
         column.enabled = self._idle(context)
         column.operator("splannequin.draw_matte", icon=icons.of("splannequin.draw_matte"))
@@ -112,7 +112,7 @@ class FreezePanel(step_panel.StepPanel):
         return watch is not None and watch.running() is None
 
     def _live(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Scrubbing: on or off, what is shown, suggestions and why."""
+        """Scrubbing: on or off, the displayed layer, and suggestions with their reasons."""
         session = viewport.session()
         row = layout.row(align=True)
         icon = "PAUSE" if session is not None else "HIDE_OFF"
@@ -131,7 +131,7 @@ class FreezePanel(step_panel.StepPanel):
             wrap(layout, context, viewport.note(), "ERROR")
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The take's name, what it is made of, its size, and where it is seen from."""
+        """The take's name, contents and size, and its camera."""
         props = settings_of(scene_in(context))
         for name in ("take_name", "detail", "develop", "freeze_width", "overscan", "passes", "deep"):
             layout.prop(props, name)

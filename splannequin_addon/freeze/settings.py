@@ -1,4 +1,4 @@
-"""What the artist sets for the freeze."""
+"""Settings of the freeze."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..translations import tr
 
 
 def takes_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
-    """(name, what it is) of the takes of the shot that `props` names, for the field's list."""
+    """(name, description) of each take of the shot that `props` belongs to, for the field's search list."""
     folder = selection.shot_folder(scene_holding(props))
     state = job_timer.watch_of(folder).state if folder else None
     takes = state.takes.items() if state is not None else ()
@@ -21,22 +21,22 @@ def takes_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
 
 
 def _instant_chosen(props: OneShot, context: bpy.types.Context) -> None:
-    """The artist ticked t*: an instant that was never set becomes the current frame, not frame 1."""
+    """Update callback: the artist chose to set t*. An unset instant becomes the current frame instead of frame 1."""
     if props.choose_t_star and not props.is_property_set("t_star"):
         props.t_star = scene_holding(props).frame_current
 
 
 def _instant_set(props: OneShot, context: bpy.types.Context) -> None:
-    """t* was set: it is held within the clip, whose range only the shot knows."""
+    """Update callback: clamps t* to the clip's range."""
     scene = scene_holding(props)
-    if props != settings_of(scene) or selection.is_switching():  # of a shot that waits in the list
+    if props != settings_of(scene) or selection.is_switching():  # settings of a shot that is not selected
         return
     folder = selection.shot_folder(scene)
     state = job_timer.watch_of(folder).state if folder else None
     if state is not None and state.frames:
         first, last = state.frame_range
         within = min(max(props.t_star, first), last)
-        if within != props.t_star:  # setting it calls this function again
+        if within != props.t_star:  # this assignment calls the function again
             props.t_star = within
 
 

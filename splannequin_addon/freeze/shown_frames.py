@@ -1,4 +1,4 @@
-"""The frozen frames behind the solved camera, in place of the plate, which stays there to be switched on again."""
+"""Shows the frozen frames as the solved camera's background instead of the plate, which stays there, switched off."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ..shot import scene_objects
 
 
 def show(scene: bpy.types.Scene, shot: Path, name: str, first: int, last: int) -> list[str]:
-    """Shows the previews of the take `name`: they are as large as its frames, and Blender reads them faster than EXRs.
+    """Shows the previews of the take `name`, which have the frames' size and load faster than EXR files.
 
-    The solve's points are hidden in all view layers, since they would cover the picture. Returns what was changed, in
-    words; nothing without a solved camera.
+    Hides the solve's points in all view layers, because they would cover the image. Returns the changes as sentences;
+    empty without a solved camera.
     """
     camera = scene_objects.part(scene, shot, "camera")
     path = contract.TakeFolder(contract.ShotFolder(shot).takes / name).preview(first)

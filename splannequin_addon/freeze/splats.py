@@ -1,7 +1,7 @@
-"""The splats of a take in Blender's scene, under the shot's root: one object a take.
+"""The splats of a take in Blender's scene, under the shot's root: one object per take.
 
-Where Blender's USD importer knows splats it brings them in. Elsewhere they are a mesh of loose vertices with their
-colours, opacities, sizes and rotations as attributes, shown as coloured points by a modifier.
+Uses Blender's USD importer if it supports splats. Otherwise the splats are a mesh of loose vertices, with colours,
+opacities, sizes and rotations as attributes. A modifier shows the vertices as coloured points.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from ..scene.ownership import TAG
 from ..shot import inventory, placement, scene_objects
 
 SHOWN_AS = "Splannequin Splats"
-"""Name of the node group and of the material that show splats."""
+"""Name of the node group and the material that show splats."""
 SH_C0 = 0.28209479177387814
-"""Value of the constant spherical harmonic: a colour is 0.5 + SH_C0 * f_dc, display sRGB."""
+"""Value of the constant spherical harmonic. A colour is 0.5 + SH_C0 * f_dc, in display sRGB."""
 CHUNK = 1 << 16
-"""Splats read in a turn of the timer: 16 MB of the largest, 10 ms from a warm disk."""
+"""Splats read per timer step: at most 16 MB, 10 ms from a warm disk cache."""
 _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
            "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
 
 
 def add(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
-    """Brings the splats of a take into a scene at once; what was there of that take is replaced. Returns what was done.
+    """Adds the splats of a take to a scene and replaces earlier ones of the take. Returns the changes as sentences.
 
-    JobError if the take has none, or the shot does not stand in the scene. Then the scene is as it was.
+    Raises JobError if the take has no splats or the shot has no objects in the scene; the scene is then unchanged.
     """
     for _ in adding(scene.session_uid, shot, take):
         pass
@@ -42,7 +42,7 @@ def add(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
 
 
 def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:
-    """The same for the timer: part of the file, or one attribute, a turn. Keeps nothing of bpy between two turns."""
+    """`add` in steps for the timer: part of the file, or one attribute, per step. Keeps no bpy data between steps."""
     scene = scene_objects.needed_scene(scene_uid)
     facts = _facts(scene, shot, take)
     del scene
@@ -63,7 +63,7 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
         for attribute in attributes(columns):
             del mesh
             yield None
-            mesh = present(named(bpy.data.meshes, called))  # an undo may have taken it away
+            mesh = present(named(bpy.data.meshes, called))  # an undo may have removed it
             _set(mesh, *attribute)
         scene = scene_objects.needed_scene(scene_uid)
         _facts(scene, shot, take)
@@ -76,7 +76,7 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
 
 
 def added_in_turns(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:
-    """`adding` in a window: an undo step of its own, and a note on the panel."""
+    """`adding` for a window: adds an undo step and a note on the panel."""
     yield from adding(scene_uid, shot, take)
     job_timer.watch_of(shot).notes["freeze"] = [_done(take)]
     job_timer.undo_step("freeze")
@@ -88,7 +88,7 @@ def _done(take: str) -> str:
 
 
 def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
-    """take.json of a take whose splats can be added. JobError says what is missing."""
+    """take.json of a take whose splats can be added. Raises JobError, which names what is missing."""
     facts = inventory.read(shot).takes.get(take)
     if facts is None or not contract.TakeFolder(contract.ShotFolder(shot).take(take)).ply.is_file():
         raise contract.JobError(f"Take {take} has no splats.", "Freeze first.", contract.ExitCode.USAGE)
@@ -100,9 +100,9 @@ def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
 
 
 def reading(path: Path) -> Generator[job_timer.Progress, None, dict[str, np.ndarray]]:
-    """Reads a 3DGS PLY in chunks; returns property -> float32 values of all vertices.
+    """Reads a 3DGS PLY in chunks. Returns property -> float32 values of all vertices.
 
-    ValueError if it is no such PLY or is cut short.
+    Raises ValueError for another kind of file, or a truncated one.
     """
     with contract.open_regular(path, contract.LONGEST_CHECKPOINT) as handle:
         count, fields = contract.read_ply_header(handle, path)
@@ -124,16 +124,17 @@ def reading(path: Path) -> Generator[job_timer.Progress, None, dict[str, np.ndar
 
 
 def attributes(columns: dict[str, np.ndarray]) -> Iterator[tuple[str, str, np.ndarray]]:
-    """(name, type, values) of what a splat's vertex carries, the place first.
+    """(name, type, values) of each vertex attribute of the splats, the position first.
 
-    Col: scene-linear colour from all sides alike, and opacity as its alpha. opacity: 0 to 1. scale: standard deviations
-    along its axes, in the object's units. rotation: unit quaternion wxyz. radius: of a ball of the same volume.
+    Col: scene-linear view-independent colour, with the opacity as alpha. opacity: 0 to 1. scale: standard deviations
+    along the splat's axes, in the object's units. rotation: unit quaternion wxyz. radius: radius of a ball of equal
+    volume.
     """
 
     def stacked(*names: str) -> np.ndarray:
         return np.stack([columns[name] for name in names], axis=1)
 
-    # Each is computed when it is its turn: of a million splats one takes 20 to 60 ms.
+    # Each attribute is computed only when it is requested. For a million splats, one takes 20 to 60 ms.
     yield "position", "FLOAT_VECTOR", stacked("x", "y", "z")
     opacity = 0.5 + 0.5 * np.tanh(0.5 * columns["opacity"])  # the logistic function, without overflow
     display = np.clip(0.5 + SH_C0 * stacked("f_dc_0", "f_dc_1", "f_dc_2"), 0.0, 1.0)
@@ -148,7 +149,7 @@ def attributes(columns: dict[str, np.ndarray]) -> Iterator[tuple[str, str, np.nd
 
 
 def _set(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None:
-    """Gives the vertices of a mesh an attribute."""
+    """Sets an attribute of a mesh's vertices."""
     attribute: Any = named(mesh.attributes, name) or mesh.attributes.new(name, kind, "POINT")  # pyright: ignore[reportArgumentType]
     field = {"FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color"}.get(kind, "value")
     if len(values):
@@ -159,18 +160,18 @@ def _set(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None
 
 
 def _show(scene: bpy.types.Scene, shot: Path, take: str, mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:
-    """Puts a finished mesh into the scene, in the place of the previous object."""
+    """Adds a finished mesh to the scene and replaces the previous object."""
     mesh.update()
     mesh.materials.append(_material())
     item = bpy.data.objects.new(mesh.name, mesh)
     modifier: Any = item.modifiers.new(SHOWN_AS, "NODES")
     modifier.node_group = _node_group()
-    item.hide_render = True  # else a bake would have them before the plate
+    item.hide_render = True  # otherwise a bake would render them over the plate
     _keep(scene, shot, take, [item], facts)
 
 
 def _keep(scene: bpy.types.Scene, shot: Path, take: str, items: list[bpy.types.Object], facts: dict[str, Any]) -> None:
-    """Hangs objects that stand in the take's placement on the shot's root, and remembers the first."""
+    """Parents objects, given in the take's placement, to the shot's root. Stores the first one as the take's splats."""
     remove(scene, shot, take)
     root, entry = present(scene_objects.part(scene, shot, "root")), scene_objects.new(scene, shot)
     stands = placement.in_solve(contract.placement_of(facts))
@@ -187,14 +188,14 @@ def _keep(scene: bpy.types.Scene, shot: Path, take: str, items: list[bpy.types.O
 def import_natively(
     scene: bpy.types.Scene, shot: Path, take: str, option: str, facts: dict[str, Any]
 ) -> bpy.types.Object | None:
-    """Brings in a take's USD stage by Blender's importer, cameras aside; None if no object came of it.
+    """Imports a take's USD stage with Blender's importer, without cameras. None if no object resulted.
 
     Args:
         scene: the context's scene.
         shot: shot folder.
-        take: name of the take; it has a USD stage.
-        option: the importer's switch for splats.
-        facts: its take.json.
+        take: name of a take with a USD stage.
+        option: name of the importer's option for splats.
+        facts: content of its take.json.
     """
     known = {item.session_uid for item in bpy.data.objects}
     file = contract.TakeFolder(contract.ShotFolder(shot).take(take)).usd
@@ -204,7 +205,7 @@ def import_natively(
     fresh = [item for item in bpy.data.objects if item.session_uid not in known]
     bpy.context.view_layer.update()
     filled = [(item, item.matrix_world.copy()) for item in fresh if item.data is not None]
-    for item, stands in filled:  # the stage's own hierarchy is of no use under the root
+    for item, stands in filled:  # the stage's hierarchy is not needed under the root
         item.parent = None
         item.matrix_basis = stands
         item.hide_render = True
@@ -216,7 +217,7 @@ def import_natively(
 
 
 def find(scene: bpy.types.Scene, shot: Path, take: str) -> bpy.types.Object | None:
-    """The object of a take's splats, if the scene still has it."""
+    """The object of a take's splats, or None if the scene no longer has it."""
     entry = scene_objects.of(scene, shot)
     kept = next((one for one in entry.splats if one.name == take), None) if entry is not None else None
     item = kept.object if kept is not None else None
@@ -224,13 +225,13 @@ def find(scene: bpy.types.Scene, shot: Path, take: str) -> bpy.types.Object | No
 
 
 def remove(scene: bpy.types.Scene, shot: Path, take: str | None = None) -> bool:
-    """Takes the splats of a take, or of all takes of a shot, out of the file. True if there were some."""
+    """Removes the splats of a take, or of all takes of a shot, from the file. True if there were any."""
     entry = scene_objects.of(scene, shot)
     return entry is not None and scene_objects.remove_kept(scene, entry.splats, take)
 
 
 def _material() -> bpy.types.Material:
-    """The material of splats: they shine in their own colour, as clear as they are opaque. Made once a file."""
+    """The material of splats: emission in the splat's colour, mixed with transparency by the opacity. One per file."""
     kept = next((m for m in bpy.data.materials if m.get(TAG) == SHOWN_AS), None)
     if kept is not None:
         return kept
@@ -255,7 +256,7 @@ def _material() -> bpy.types.Material:
 
 
 def _node_group() -> bpy.types.NodeTree:
-    """The modifier that makes points of the vertices, as large as the splats. Made once a file."""
+    """The node group that turns vertices into points with the splats' radii. One per file."""
     kept = next((g for g in bpy.data.node_groups if g.get(TAG) == SHOWN_AS), None)
     if kept is not None:
         return kept

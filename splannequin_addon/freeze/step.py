@@ -1,4 +1,4 @@
-"""The step Freeze: what it asks the backend for, what its end changes, and what the panel says of it."""
+"""The Freeze step: its backend request, the changes when it ends, and its texts on the panel."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ class Freeze(Step):
     parts = (viewport, hidden_points)
 
     def params(self, scene: bpy.types.Scene) -> contract.FreezeParams:
-        """The instant, and what the frames are made of."""
+        """Freeze parameters from the scene's settings."""
         return takes.params_of(scene)
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
-        """Freeze: which frames there are."""
+        """Panel state of Freeze: facts about the selected take."""
         if state is None or settings_of(scene).run_name not in state.runs:
             return View(False, False, [], self.needs)
         take = state.takes.get(settings_of(scene).take_name)
@@ -76,8 +76,11 @@ class Freeze(Step):
         return View(True, True, lines, "", brief)
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """An instant that the artist did not choose is set to the frozen one; mattes are read again where they are
-        shown; a surface is added to scenes with its shot, a light to the scene from which it was started."""
+        """Applies the result of a job of this step to a scene.
+
+        A freeze sets t* if the artist has not set it, and shows its frames. Mattes are reloaded. A surface is added to
+        every scene with the shot, a light only to the scene that requested it. A combined take is selected.
+        """
         if job.kind == "mattes":
             return mattes.arrived(job.shot, job.result)
         if job.kind == "surface":
@@ -93,14 +96,14 @@ class Freeze(Step):
             return [f"The take {job.result['take']} is chosen: {job.result['frames']} frames."]
         if not settings_of(scene).choose_t_star:
             settings_of(scene).t_star = int(job.result["t_star_frame"])
-        if job.result.get("camera_path"):  # the frames are of another camera's view
+        if job.result.get("camera_path"):  # the frames have another camera's view
             return []
         return shown_frames.show(
             scene, job.shot, str(job.result["take"]), int(job.result["first"]), int(job.result["last"])
         )
 
     def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
-        """Has the timer read a surface."""
+        """Loads a surface in steps run by the timer."""
         if job.kind != "surface" or scene_objects.part(scene, job.shot, "root") is None:
             return False
         take = str(job.result["take"])
@@ -108,13 +111,13 @@ class Freeze(Step):
         return True
 
     def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
-        """Takes splats, surfaces and the light out of the file."""
+        """Removes splats, surfaces and the light from the file."""
         done = ["Splats were removed."] if splats.remove(scene, shot) else []
         done += ["Surfaces were removed."] if surfaces.remove(scene, shot) else []
         return [*done, "The light was removed."] if lights.remove(scene, shot) else done
 
     def in_use(self, shot: Path, folder: Path) -> str:
-        """A run that is scrubbed through."""
+        """The reason why a run cannot be deleted: it is being scrubbed. Empty if it is not."""
         session = viewport.session()
         if session is not None and folder == contract.ShotFolder(shot).runs / session.run and session.shot == shot:
             return "You are scrubbing through this run: stop scrubbing first"
@@ -122,7 +125,7 @@ class Freeze(Step):
 
 
 def _lines(state: ShotState, take: dict[str, Any]) -> list[str]:
-    """What there is of a take: its instant and the first line of its verdict before the rest."""
+    """Sentences about a take: its instant and the first line of its verdict, then the rest."""
     frames = f"Take {take['take']}: {take['frame_count']} frames, {take['width']} x {take['height']}"
     instant = f"Time stands still at frame {take['t_star_frame']}"
     if take["t_star_per_frame"]:
@@ -134,7 +137,7 @@ def _lines(state: ShotState, take: dict[str, Any]) -> list[str]:
 
 
 def _own_verdict(state: ShotState, take: dict[str, Any]) -> list[str]:
-    """Lines of a take's verdict that do not stand under Train already: a take repeats what its run's found amiss."""
+    """Lines of a take's verdict that Train does not show already, because a take repeats the problems of its run."""
     run = contract.verdict_of(state.runs.get(take["run"], {}))
     sentences = [*run.sentences, *run.advice] if run is not None else []
     return [line for line in contract.verdict_lines(take) if line not in sentences]

@@ -1,4 +1,4 @@
-"""The button that makes the surface of a take and brings it into the scene."""
+"""The operator that makes the surface of a take and adds it to the scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class SPLANNEQUIN_OT_add_surface(takes.NeedsTake, step_operator.StepOperator, bp
     step = "freeze"
 
     def perform(self, context: bpy.types.Context) -> Outcome:
-        """Makes the surface if the take has none, and adds it; in a window the timer does both."""
+        """Adds the surface, and first makes it if the take has none. In a window, the timer does both."""
         scene = scene_in(context)
         folder, take = begin.needed(scene, self.step), settings_of(scene).take_name
         scene_objects.check_root(scene, folder)
@@ -34,7 +34,7 @@ class SPLANNEQUIN_OT_add_surface(takes.NeedsTake, step_operator.StepOperator, bp
         return {"FINISHED"}
 
     def params(self, scene: bpy.types.Scene) -> contract.SurfaceParams:
-        """The take that is chosen."""
+        """Surface parameters with the selected take."""
         return contract.SurfaceParams(take=settings_of(scene).take_name)
 
 

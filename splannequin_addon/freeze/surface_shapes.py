@@ -1,4 +1,4 @@
-"""The meshes of a take's surface, read from its file beside Blender's window."""
+"""The meshes of a take's surface, read from its file in a separate thread."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from ...torch_backend import contract
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What a mesh is filled with. Blender would take a second to find the edges of a large one."""
+    """Data of a mesh, including its edges. Blender would need a second to compute the edges of a large mesh."""
 
     places: np.ndarray
     """[V, 3] float32."""
     colors: np.ndarray
-    """[V, 4] float32 in 0..1, as displayed."""
+    """[V, 4] float32 in 0..1, display-referred."""
     edges: np.ndarray
-    """[E, 2] int32, vertices of each edge."""
+    """[E, 2] int32, vertex indices of each edge."""
     corners: np.ndarray
-    """[T, 3] int32, vertices of each triangle."""
+    """[T, 3] int32, vertex indices of each triangle."""
     sides: np.ndarray
-    """[T, 3] int32, edge of each triangle from each of its corners to the next."""
+    """[T, 3] int32, edge index of each triangle from each corner to the next."""
 
 
 def begin(path: Path) -> Future[list[Shape]]:
-    """Begins to read a surface in a thread; the result is its room and its people."""
+    """Starts to read a surface in a thread. The result is [room, people]."""
     pool = ThreadPoolExecutor(1)
     made = pool.submit(shapes, path)
     pool.shutdown(wait=False)
@@ -36,15 +36,15 @@ def begin(path: Path) -> Future[list[Shape]]:
 
 
 def shapes(path: Path) -> list[Shape]:
-    """The room and the people of a surface. ValueError as `read`."""
+    """The room and the people of a surface. Raises ValueError as `read` does."""
     whole = read(path)
     return [_part(*whole, people) for people in (False, True)]
 
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a take's surface, as the contract's fields say.
+    """Vertices and triangles of a take's surface, as structured arrays with the contract's fields.
 
-    ValueError if it is no such file, is cut short, or has triangles without vertices.
+    Raises ValueError for another kind of file, a truncated file, or triangles with invalid vertices.
     """
     with contract.open_regular(path, contract.LONGEST_CHECKPOINT) as handle:
         header = contract.read_surface_header(handle, path)
@@ -64,7 +64,7 @@ def _corners(triangles: np.ndarray) -> np.ndarray:
 
 
 def _part(vertices: np.ndarray, triangles: np.ndarray, people: bool) -> Shape:
-    """One part of a surface."""
+    """The room or the people of a surface."""
     kept, flat = np.unique(_corners(triangles[(triangles["people"] > 0) == people]), return_inverse=True)
     corners = flat.reshape(-1, 3).astype(np.int32)
     chosen = vertices[kept]

@@ -1,7 +1,7 @@
 """The frozen scene of a take as meshes in Blender's scene, under the shot's root: the room, and what moves in the clip.
 
-Both catch shadows, so that they are transparent in a render but for the shadows of things that stand among them, and
-hide what is behind them. They carry the frozen colours as a vertex attribute, which reflections show.
+Both are shadow catchers: a render shows only the shadows that other objects cast on them. They also hide objects behind
+them. A vertex attribute holds the frozen colours, which reflections show.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from .surface_shapes import Shape
 SHOWN_AS = "Splannequin Surface"
 """Name of the material."""
 PARTS = ("room", "people")
-"""The objects of a surface: what stands still, and what moves in the clip."""
+"""The objects of a surface: its static part, and the part that moves in the clip."""
 
 
 def add(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
-    """Brings the surface of a take into a scene; what was there of that take is replaced. Returns what was done.
+    """Adds the surface of a take to a scene and replaces an earlier one of the take. Returns the changes as sentences.
 
-    JobError if there is none of the take as it is now, or the shot does not stand in the scene.
+    Raises JobError if the take's current version has no surface, or the shot has no objects in the scene.
     """
     for _ in adding(scene.session_uid, shot, take):
         pass
@@ -39,7 +39,7 @@ def add(scene: bpy.types.Scene, shot: Path, take: str) -> list[str]:
 
 
 def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:
-    """The same for the timer: reading the file, and each mesh, in turns. Keeps nothing of bpy between two turns."""
+    """`add` in steps for the timer: reading the file, then each mesh. Keeps no bpy data between steps."""
     _facts(scene_objects.needed_scene(scene_uid), shot, take)
     folder = contract.TakeFolder(contract.ShotFolder(shot).take(take))
     parts = yield from _reading(folder.surface)
@@ -51,7 +51,7 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
             del mesh
             for fill in (_fill_elements, _fill_faces, _fill_colors) if len(shape.corners) else ():
                 yield None
-                fill(present(named(bpy.data.meshes, meshes[-1])), shape)  # an undo may have taken it
+                fill(present(named(bpy.data.meshes, meshes[-1])), shape)  # an undo may have removed it
         scene = scene_objects.needed_scene(scene_uid)
         facts = _facts(scene, shot, take)
     except BaseException:
@@ -64,7 +64,7 @@ def adding(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress
 
 
 def added_in_turns(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.Progress | None]:
-    """`adding` in a window: an undo step of its own, and a note on the panel."""
+    """`adding` for a window: adds an undo step and a note on the panel."""
     yield from adding(scene_uid, shot, take)
     job_timer.watch_of(shot).notes["freeze"] = [_done(take)]
     job_timer.undo_step("freeze")
@@ -72,7 +72,7 @@ def added_in_turns(scene_uid: int, shot: Path, take: str) -> Iterator[job_timer.
 
 
 def is_made(shot: Path, take: str) -> bool:
-    """True if the take as it is now has a surface."""
+    """True if the current version of the take has a surface."""
     return contract.surface_of_take(contract.TakeFolder(contract.ShotFolder(shot).take(take))) is not None
 
 
@@ -81,7 +81,7 @@ def _done(take: str) -> str:
 
 
 def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
-    """take.json of a take whose surface can be added. JobError says what is missing."""
+    """take.json of a take whose surface can be added. Raises JobError, which names what is missing."""
     facts = inventory.read(shot).takes.get(take)
     if facts is None or not is_made(shot, take):
         raise contract.JobError(f"Take {take} has no surface.", "Make it first.", contract.ExitCode.USAGE)
@@ -93,7 +93,8 @@ def _facts(scene: bpy.types.Scene, shot: Path, take: str) -> dict[str, Any]:
 
 
 def _reading(path: Path) -> Generator[job_timer.Progress, None, list[Shape]]:
-    """The shapes of a surface, `PARTS`, read beside the window: it takes a second. ValueError if it is damaged."""
+    """The shapes of `PARTS`, read in a thread, because it takes a second. Raises ValueError if the surface is
+    damaged."""
     made = surface_shapes.begin(path)
     while not made.done() and not bpy.app.background:
         yield job_timer.Progress("Reading the surface", 0, 1)
@@ -101,8 +102,11 @@ def _reading(path: Path) -> Generator[job_timer.Progress, None, list[Shape]]:
 
 
 def _fill_elements(mesh: bpy.types.Mesh, shape: Shape) -> None:
-    """Vertices, edges and corners, set as attributes: Blender copies those whole, in a millisecond. By the elements'
-    own properties it takes them one by one, 0.1 s for 850,000 corners."""
+    """Adds vertices, edges and corners to a mesh and sets them as attributes.
+
+    Blender copies a whole attribute in a millisecond. Setting the elements' properties instead takes 0.1 s for 850,000
+    corners.
+    """
     vertices: Any = mesh.vertices
     edges: Any = mesh.edges
     loops: Any = mesh.loops
@@ -116,7 +120,7 @@ def _fill_elements(mesh: bpy.types.Mesh, shape: Shape) -> None:
 
 
 def _fill_faces(mesh: bpy.types.Mesh, shape: Shape) -> None:
-    """Faces; smooth, as faces are without an attribute `sharp_face`."""
+    """Adds the faces. Without the attribute `sharp_face` they are smooth."""
     polygons: Any = mesh.polygons
     polygons.add(len(shape.corners))
     polygons.foreach_set("loop_start", np.arange(0, shape.corners.size, 3, dtype=np.int32))
@@ -137,7 +141,7 @@ def _set(mesh: bpy.types.Mesh, attribute: str, field: str, values: np.ndarray) -
 
 
 def _show(scene: bpy.types.Scene, shot: Path, take: str, meshes: list[bpy.types.Mesh], facts: dict[str, Any]) -> None:
-    """Hangs finished meshes on the shot's root as catchers of shadows, in place of the previous ones."""
+    """Parents finished meshes to the shot's root as shadow catchers and replaces the previous ones."""
     remove(scene, shot, take)
     root, entry = present(scene_objects.part(scene, shot, "root")), scene_objects.new(scene, shot)
     stands = placement.in_solve(contract.placement_of(facts))
@@ -149,10 +153,10 @@ def _show(scene: bpy.types.Scene, shot: Path, take: str, meshes: list[bpy.types.
         item = bpy.data.objects.new(mesh.name, mesh)
         present(entry.collection).objects.link(item)
         item.parent, item.matrix_parent_inverse, item.matrix_basis = root, Matrix(), stands
-        # A holdout would hide what is behind people, too, but throw the shadows of people into the render, which the
-        # plate has already, and catch none.
+        # A holdout would also hide objects behind people. But it would cast people's shadows, which the plate already
+        # has, and it would not catch any shadows.
         item.is_shadow_catcher = True
-        # The room's own shadows are in the plate already, and its walls would keep the scene's lights out.
+        # The plate already has the room's shadows, and the room's walls would block the scene's lights.
         item.visible_shadow = part != "room"
         kept = entry.surfaces.add()
         kept.name, kept.object = take, item
@@ -166,14 +170,14 @@ def find(scene: bpy.types.Scene, shot: Path, take: str) -> list[bpy.types.Object
 
 
 def remove(scene: bpy.types.Scene, shot: Path, take: str | None = None) -> bool:
-    """Takes the surface of a take, or of all takes of a shot, out of the file. True if there was one."""
+    """Removes the surface of a take, or of all takes of a shot, from the file. True if there was one."""
     entry = scene_objects.of(scene, shot)
     return entry is not None and scene_objects.remove_kept(scene, entry.surfaces, take)
 
 
 def _material() -> bpy.types.Material:
-    """The material of surfaces: matt in their own colours, and in reflections as bright as they are in the plate. Made
-    once a file."""
+    """The material of surfaces: diffuse in the surface's colours, and in reflections as bright as the plate. One per
+    file."""
     kept = next((m for m in bpy.data.materials if m.get(TAG) == SHOWN_AS), None)
     if kept is not None:
         return kept
@@ -198,5 +202,5 @@ def _material() -> bpy.types.Material:
     tree.links.new(output.inputs["Surface"], mix.outputs[0])
     cycles: Any = getattr(material, "cycles", None)
     if cycles is not None:
-        cycles.emission_sampling = "NONE"  # it lights nothing, so that lights of the scene are not counted twice
+        cycles.emission_sampling = "NONE"  # lights nothing, otherwise the scene's lights would count twice
     return material

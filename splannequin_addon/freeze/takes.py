@@ -1,4 +1,4 @@
-"""Takes of a shot: what they are asked for with, which frames are there, and cameras that are read for them."""
+"""Takes of a shot: their parameters, their complete and missing frames, and the camera readings for them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from ..translations import tr
 from . import own_camera
 
 READING_SECONDS = 0.02
-"""Of a turn of the timer, spent on reading a camera; one frame of a heavy scene may take longer."""
+"""Time per timer step for reading a camera. One frame of a heavy scene may take longer."""
 
 
 def has_chosen(context: bpy.types.Context) -> bool:
-    """True if the shot has the take that is chosen."""
+    """True if the shot has the selected take."""
     scene = scene_in(context)
     folder = selection.shot_folder(scene)
     state = job_timer.watch_of(folder).state if folder else None
@@ -34,11 +34,11 @@ def has_chosen(context: bpy.types.Context) -> bool:
 
 
 class NeedsTake(OperatorBase):
-    """What operators share that work on the chosen take. It stands before their other bases."""
+    """Mixin for operators on the selected take. It must precede their other bases."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a take, and where another base of the operator says so."""
+        """Disabled without a take, and if another base disables the operator."""
         if not has_chosen(context):
             cls.poll_message_set(tr("Freeze first"))
             return False
@@ -47,7 +47,7 @@ class NeedsTake(OperatorBase):
 
 
 def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
-    """What a take is asked for with, from what the artist set."""
+    """Freeze parameters from the scene's settings."""
     props = settings_of(scene)
     return contract.FreezeParams(
         run=props.run_name,
@@ -67,7 +67,7 @@ def params_of(scene: bpy.types.Scene) -> contract.FreezeParams:
 
 
 def keyed_instants(scene: bpy.types.Scene) -> dict[str, float]:
-    """Frame -> t* of a keyed t*, for every frame of the clip and of the scene's range; empty if it is not keyed."""
+    """Frame -> t* if t* has keyframes, for every frame of the clip and of the scene's range; otherwise empty."""
     curve = next((c for c in compat_animation.fcurves(scene) if c.data_path == "splannequin.t_star"), None)
     if curve is None or not settings_of(scene).choose_t_star:
         return {}
@@ -78,9 +78,9 @@ def keyed_instants(scene: bpy.types.Scene) -> dict[str, float]:
 
 
 def freeze_from(scene: bpy.types.Scene, path: contract.CameraPath, step: str = "freeze") -> contract.FreezeParams:
-    """Parameters of a take from a camera path, which is written into the shot. OSError if it cannot be.
+    """Freeze parameters for a camera path, which is written into the shot. Raises OSError if it cannot be written.
 
-    A bake is about a part of the take: where the camera was not looked at now, it stays as it was.
+    A bake reads only part of the path. Its other frames keep their earlier poses.
     """
     folder = begin.needed(scene, step)
     shot = contract.ShotFolder(folder)
@@ -95,14 +95,14 @@ def freeze_from(scene: bpy.types.Scene, path: contract.CameraPath, step: str = "
 
 
 def _asked(scene: bpy.types.Scene, step: str) -> contract.FreezeParams:
-    """What the step freeze or bake asks for by the settings."""
+    """The parameters of the Freeze or Bake step from the scene's settings."""
     params = steps.STEPS[step].params(scene)
     assert isinstance(params, contract.FreezeParams)
     return params
 
 
 def _with_rest(path: contract.CameraPath, old: contract.CameraPath) -> contract.CameraPath:
-    """A camera path, and of an older one of the same size the frames that it lacks."""
+    """A camera path, completed with the missing frames from an older one of the same size."""
     if (path.width, path.height) != (old.width, old.height):
         return path
     frames = {f.frame: f for f in [*old.frames, *path.frames]}
@@ -110,7 +110,7 @@ def _with_rest(path: contract.CameraPath, old: contract.CameraPath) -> contract.
 
 
 def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.FreezeParams | None:
-    """Parameters of a take, from its take.json, to render its missing frames; None if it was never finished."""
+    """Parameters that render a take's missing frames, from its take.json; None if the take was never finished."""
     facts = inventory.read(shot).takes.get(take)
     if facts is None:
         return None
@@ -136,7 +136,7 @@ def take_params(shot: Path, take: str, t_star: int | None = None) -> contract.Fr
 
 
 def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
-    """How a take differs from what Freeze would render now, in one sentence; empty if it is that.
+    """How a take differs from the result of a freeze now, in one sentence; empty if it does not.
 
     Args:
         scene: the scene whose settings are compared.
@@ -162,13 +162,13 @@ def outdated(scene: bpy.types.Scene, take: dict[str, Any]) -> str:
 
 
 def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool:
-    """True if every frame of a finished take is on disk: it can be baked without a backend.
+    """True if every frame of a finished take is on disk, so that a bake needs no backend.
 
     Args:
         shot: the shot folder.
         take: name of the take.
-        frames: only these are requested, as far as the clip or the take's camera has them; None: all between the
-            take's first and last.
+        frames: frames to check; those outside the clip or the take's camera path are ignored. None: all from the take's
+            first to its last.
     """
     facts = inventory.read(shot).takes.get(take)
     if facts is None:
@@ -182,7 +182,7 @@ def complete(shot: Path, take: str, frames: Iterable[int] | None = None) -> bool
 
 
 def may_be_stale(shot: Path, take: str) -> bool:
-    """True if a take's run was trained on after the take was frozen: the backend can tell which frames that changed."""
+    """True if a take's run was trained further after the freeze. The backend can determine which frames changed."""
     facts = inventory.read(shot).takes.get(take, {})
     folder = contract.ShotFolder(shot)
     trained = contract.RunFolder(folder.runs / str(facts.get("run", ""))).checkpoint
@@ -195,11 +195,11 @@ def may_be_stale(shot: Path, take: str) -> bool:
             return contract.file_digest(trained) != frozen
     except (OSError, ValueError):
         return True
-    return trained.stat().st_mtime > record.stat().st_mtime  # frozen by an earlier version, which did not say of what
+    return trained.stat().st_mtime > record.stat().st_mtime  # frozen by an earlier version, which recorded no digest
 
 
 def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
-    """Frames that a take can have: those of its camera's path, or the clip's."""
+    """Frames that a take can have: those of its camera path, or of the clip."""
     path = seen_camera.path_of(shot, facts)
     if os.path.isfile(path):
         return {f.frame for f in contract.CameraPath.load(path).frames}
@@ -208,7 +208,8 @@ def _possible(shot: Path, facts: dict[str, Any]) -> set[int]:
 
 
 def read_camera(scene: bpy.types.Scene, step: str) -> contract.FreezeParams | None:
-    """Parameters of a freeze from the artist's camera, which is sampled in one go; None if none is chosen."""
+    """Parameters of a freeze from the artist's camera, which is sampled without interruption; None if none is
+    selected."""
     name, folder = own_camera.name_of(scene), selection.shot_folder(scene)
     if not name or folder is None:
         return None
@@ -221,7 +222,7 @@ def read_camera(scene: bpy.types.Scene, step: str) -> contract.FreezeParams | No
 
 
 def read_in_turns(scene: bpy.types.Scene, shot: Path, step: str) -> None:
-    """Has the artist's camera read by the timer; then the take is begun, by the step freeze or bake."""
+    """Reads the artist's camera in steps run by the timer, then starts the Freeze or Bake step."""
     job_timer.watch_of(shot).notes.clear()
     turns = own_camera.sample_path(scene, own_camera.name_of(scene), shot, _asked(scene, step).width)
     total = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
@@ -231,9 +232,10 @@ def read_in_turns(scene: bpy.types.Scene, shot: Path, step: str) -> None:
 def reading(
     scene_uid: int, shot: Path, step: str, turns: Generator[int, None, contract.CameraPath], total: int
 ) -> Iterator[job_timer.Progress]:
-    """A camera read by `turns`, `own_camera.sample_path`, for part of a turn of the timer each; then its take begun."""
+    """Reads a camera from `turns` (`own_camera.sample_path`) for a fraction of each timer step, then starts the
+    take."""
     done, path = 0, None
-    with contextlib.closing(turns):  # also when it is cancelled
+    with contextlib.closing(turns):  # also if it is cancelled
         while path is None:
             until = time.monotonic() + READING_SECONDS
             try:

@@ -1,8 +1,8 @@
-"""Scrubbing: the frozen instant drawn over the 3D view by the warm backend, in front of and behind what is there.
+"""Scrubbing: the backend's images of the frozen instant, composited by depth with the objects in the 3D view.
 
-A view asks for what it shows, at a size that is drawn at once; left alone, it asks again, sharper, and then once more,
-made of the plates. What has arrived is drawn until something newer has. Nothing of bpy is kept between two draws but
-the handler.
+A view requests an image of its content at a size that renders immediately. Once the view rests, it requests a sharper
+image, and then one with detail from the plates. The newest image is drawn until the next one arrives. Only the draw
+handler keeps bpy data between draws.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ from . import hidden_points, live
 
 TICK_SECONDS = 1 / 60
 QUICK_PIXELS = 320 * 180
-"""Most pixels of a view while it changes."""
+"""Maximum number of pixels of an image while the view changes."""
 SHARP_PIXELS = 960 * 540
-"""Most pixels once it rests."""
+"""Maximum number of pixels once the view rests."""
 _REST_SECONDS = 0.35
 
 _session: live.Session | None = None
 _handler: Any = None
 _shader: Any = None
 _told: tuple[str, str] | None = None
-"""Why the last session ended, (sentence, hint)."""
+"""(sentence, hint) about the end of the last session, or None."""
 _shown: dict[int, tuple[int, Any, Any]] = {}
-"""View -> (seq of the frame, texture of its colour, of its depth)."""
+"""View -> (seq of the frame, texture of its colour, texture of its depth)."""
 _moved: dict[int, float] = {}
-"""View -> when it last showed something else, monotonic seconds."""
+"""View -> time of its last change, monotonic seconds."""
 _rested: set[int] = set()
-"""Views that have been drawn again since they came to rest."""
+"""Views that were redrawn after they came to rest."""
 
 
 def session() -> live.Session | None:
-    """The live session, if there is one that draws."""
+    """The live session, or None if none is drawing."""
     return _session if _session is not None and _session.open else None
 
 
 def failure() -> tuple[str, str] | None:
-    """Why the last session ended, (sentence, hint); None if it was ended on purpose."""
+    """(sentence, hint) about the failure of the last session; None if it did not fail."""
     return _told
 
 
 def begin(scene: bpy.types.Scene) -> None:
-    """Starts drawing the scene's run. JobError if there is no run, no backend, or no window."""
+    """Starts to draw the scene's run. Raises JobError without a run, a backend or a window."""
     global _session, _handler, _told
     if bpy.app.background:
         raise contract.JobError("There is no view to draw in.", "Use Freeze.", contract.ExitCode.USAGE)
@@ -66,13 +66,13 @@ def begin(scene: bpy.types.Scene) -> None:
     end()
     _told = None
     _session = live.open_session(shot, run, backend.python(), backend.package_root())
-    hidden_points.begin(scene, shot)  # its dots would cover the picture
+    hidden_points.begin(scene, shot)  # the points would cover the image
     _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
     job_timer.pulse(_tick)
 
 
 def end() -> None:
-    """Stops drawing; the backend's process ends and frees what it held."""
+    """Stops drawing. The backend's process ends and frees its memory."""
     global _session, _handler
     if _session is not None:
         _session.close()
@@ -89,7 +89,7 @@ def end() -> None:
 
 
 def instant(scene: bpy.types.Scene) -> float | None:
-    """The frame at which time stands still in the view: the artist's t*, else the best suggestion; None before any."""
+    """Frame number of the drawn instant: the artist's t*, else the best suggestion; None before there is one."""
     props = settings_of(scene)
     if props.choose_t_star:
         return float(props.t_star)
@@ -98,24 +98,25 @@ def instant(scene: bpy.types.Scene) -> float | None:
 
 
 def _suggest(scene: bpy.types.Scene) -> None:
-    """Has an instant that nobody chose be the one that is drawn: what is shown and what is set agree."""
+    """Sets t* to the drawn instant if the artist has not chosen one, so that the panel and the view agree."""
     at, props = instant(scene), settings_of(scene)
     if at is not None and not props.choose_t_star and props.t_star != round(at):
         props.t_star = round(at)
 
 
 def suggestions() -> list[dict[str, Any]]:
-    """Instants worth freezing, best first: frame, seen and sharpness in 0..1; empty before the backend has said."""
+    """Instants worth freezing, best first, with frame, and seen and sharpness in 0..1; empty until the backend sends
+    them."""
     return list(_session.facts.get("suggestions", [])) if _session is not None else []
 
 
 def note() -> str:
-    """Warning of the backend when the session began; empty if of nothing."""
+    """The backend's warning from the start of the session, or empty."""
     return str(_session.facts.get("note", "")) if _session is not None else ""
 
 
 def reason(scene: bpy.types.Scene) -> str:
-    """One sentence about the instant in the view: why it is a good one, or where better ones are."""
+    """Sentence about the drawn instant: why it is a good one, or which ones are suggested."""
     if _session is None or not _session.facts:
         return "The backend is loading the run."
     at = instant(scene)
@@ -134,7 +135,7 @@ def reason(scene: bpy.types.Scene) -> str:
 
 
 def redraw(kinds: tuple[str, ...] = ("WINDOW", "UI")) -> None:
-    """Draws these regions of every 3D view again; without a graphics card each one's drawing is dear."""
+    """Redraws these regions of every 3D view. Without a graphics card each redraw is slow."""
     manager = bpy.context.window_manager
     for window in manager.windows if manager else ():
         for area in window.screen.areas:
@@ -148,7 +149,7 @@ _last_told: tuple[str, ...] = ()
 
 
 def _tick() -> float | None:
-    """Draws again when a frame has arrived, when t* changed, or when a view rests; ends with the session."""
+    """Redraws when a frame has arrived, when t* has changed, or when a view has come to rest. Ends with the session."""
     global _told, _last, _last_told
     if _session is None:
         return None
@@ -158,7 +159,7 @@ def _tick() -> float | None:
         return None
     scenes = selection.scenes_of(_session.shot)
     if not any(settings_of(s).run_name == _session.run for s in scenes):
-        end()  # another file, another shot or another run
+        end()  # another file, shot or run is active
         return None
     for scene in scenes:
         _suggest(scene)
@@ -174,7 +175,7 @@ def _tick() -> float | None:
         ),
     )
     now = time.monotonic()
-    # However late this timer is: without a graphics card one drawing may take longer than many of its turns.
+    # Depends on time, not on the number of ticks: without a graphics card one redraw may last longer than many ticks.
     resting = {v for v, moved in _moved.items() if now - moved > _REST_SECONDS} - _rested
     _rested.update(resting)
     if state != _last or resting:
@@ -188,7 +189,7 @@ def _tick() -> float | None:
 
 
 def _moving(now: float) -> bool:
-    """True while a view changes: the sidebar's sentence can wait until it rests."""
+    """True while a view changes. The sidebar's sentence is then not updated."""
     return any(now - moved < _REST_SECONDS for moved in _moved.values())
 
 
@@ -200,15 +201,15 @@ def view_of(
     t_star: float,
     pixels: int,
 ) -> contract.LiveView | None:
-    """What a view of the scene shows, as the backend is asked for it; None for an orthographic view.
+    """Request for a view's content; None for an orthographic view.
 
     Args:
         scene: the scene whose shot is drawn.
         shot: its shot folder.
         size: width and height of the region in pixels.
-        matrices: world to view, and the projection; Blender's axes.
+        matrices: world-to-view matrix and projection matrix, Blender's axes.
         t_star: frame number at which time stands still.
-        pixels: most pixels to ask for.
+        pixels: maximum number of pixels to request.
     """
     window = np.array(matrices[1])
     if abs(window[3, 3]) > 1e-6:
@@ -220,7 +221,7 @@ def view_of(
 
 
 def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
-    """True if both show the same, at whatever size, made of plates or not."""
+    """True if both requests have the same content, regardless of size and plate detail."""
     instants = [(v.t_star, v.show, v.exposed_like, v.develop) for v in (one, other)]
     if instants[0] != instants[1]:
         return False
@@ -229,7 +230,7 @@ def _same(one: contract.LiveView, other: contract.LiveView) -> bool:
 
 
 def _draw() -> None:
-    """One region's part: ask for what it shows, draw what has arrived."""
+    """Draw handler of a region: requests its content and draws the newest frame."""
     context = bpy.context
     scene, region, view = scene_in(context), context.region, context.region_data
     if _session is None or view is None or selection.shot_folder(scene) != _session.shot:
@@ -242,7 +243,7 @@ def _draw() -> None:
     quick, sharp = (view_of(scene, _session.shot, size, matrices, t_star, p) for p in (QUICK_PIXELS, SHARP_PIXELS))
     if quick is None or sharp is None:
         return
-    # Through the clip's camera the picture stands before the plate, and is exposed like it.
+    # In the clip's camera, the image covers the plate and gets its exposure.
     if view.view_perspective == "CAMERA" and scene.camera == scene_objects.part(scene, _session.shot, "camera"):
         quick.exposed_like = sharp.exposed_like = float(scene.frame_current)
     quick.view = sharp.view = key
@@ -255,7 +256,7 @@ def _draw() -> None:
 
 
 def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:
-    """Asks for the quick view if it shows something new; once that rests for the sharp one, then for its detail."""
+    """Requests the quick view if the content changed. Once it rests, requests the sharp view, then its detail."""
     if _session is None:
         return
     wanted, now = _session.wanted(key), time.monotonic()
@@ -271,7 +272,7 @@ def _ask(key: int, quick: contract.LiveView, sharp: contract.LiveView) -> None:
 
 
 def _paint(key: int, frame: live.Frame, view: bpy.types.RegionView3D, scale: float) -> None:
-    """Draws a frame over the region, each pixel at its own depth."""
+    """Draws a frame over the region, with a depth for each pixel."""
     shader = _shader_of()
     seq, colour, depth = _shown.get(key, (-1, None, None))
     if seq != frame.asked.seq:
@@ -302,7 +303,7 @@ def _buffer(values: np.ndarray) -> Any:
 
 
 def _shader_of() -> Any:
-    """The shader, made at the first draw: there is no GPU context before."""
+    """The shader, compiled at the first draw, because no GPU context exists earlier."""
     global _shader
     if _shader is None:
         between = gpu.types.GPUStageInterfaceInfo("splannequin_frozen")  # pyright: ignore[reportCallIssue]
@@ -314,7 +315,7 @@ def _shader_of() -> Any:
         info.sampler(0, "FLOAT_2D", "colour")
         info.sampler(1, "FLOAT_2D", "range")
         info.fragment_out(0, "VEC4", "painted")
-        if hasattr(info, "depth_write"):  # 4.4 on; OpenGL, which was the rule before, needs no word about it
+        if hasattr(info, "depth_write"):  # 4.4 on; OpenGL, the earlier default, does not need it
             info.depth_write("ANY")
         info.vertex_source("void main() { at = vec2(pos.x, -pos.y) * 0.5 + 0.5; gl_Position = vec4(pos, 0.0, 1.0); }")
         info.fragment_source(
@@ -340,16 +341,16 @@ def _shader_of() -> Any:
 
 @persistent
 def _on_load(*_: object) -> None:
-    """Another file has other scenes."""
+    """Handler: another file was loaded, so scrubbing ends."""
     end()
 
 
 def register() -> None:
-    """Listens to file loads."""
+    """Registers the load handler."""
     bpy.app.handlers.load_post.append(_on_load)
 
 
 def unregister() -> None:
-    """Stops drawing."""
+    """Stops drawing and removes the load handler."""
     end()
     bpy.app.handlers.load_post.remove(_on_load)

@@ -1,1 +1,1 @@
-"""Processes beside Blender: the backend's jobs and what else is started, and the timer that follows them."""
+"""Processes outside Blender: the backend's jobs and other children, and the timer that monitors them."""

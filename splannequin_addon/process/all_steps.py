@@ -1,6 +1,6 @@
-"""What lies between an imported clip and its frozen frames, one step begun when the one before has ended.
+"""Runs all steps from an imported clip to its frozen frames, one after the other.
 
-Nothing of bpy is kept between two turns of the timer: only a shot folder, and names of steps.
+Keeps no bpy data between timer steps, only a shot folder and names of steps.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from ..shot import selection
 from . import backend, job_timer, steps
 
 BUTTONS = {"solve": "solve_camera", "train": "train", "freeze": "freeze"}
-"""Step -> its operator, in the order of the work."""
+"""Step -> its operator, in order of execution."""
 _READ_SECONDS = 5.0
 
 
 @dataclass
 class Chain:
-    """The steps that are begun one after the other for a shot."""
+    """The remaining steps of a shot that are run one after the other."""
 
     ahead: list[str]
-    """Names of the steps still to be begun, in order."""
+    """Names of the steps still to be started, in order."""
     way: contract.WholeWay
-    """How long they take."""
+    """Estimated durations of the steps."""
     step: str = ""
-    """Name of the step at work."""
+    """Name of the running step."""
     began: float = field(default_factory=time.monotonic)
-    """When it began, monotonic seconds."""
+    """Start time of the running step, monotonic seconds."""
 
 
 _chains: dict[Path, Chain] = {}
 _paces: tuple[dict[str, float], float] = ({}, 0.0)
-"""Those of this machine, and when they were read, monotonic seconds."""
+"""(paces of this machine, time when they were read in monotonic seconds)."""
 
 
 def paces() -> dict[str, float]:
-    """As `contract.paces`, of the backend's environment; read every few seconds, since panels ask at every redraw."""
+    """`contract.paces` of the backend's environment. Read every few seconds, because panels ask at every redraw."""
     global _paces
     if not _paces[1] or time.monotonic() - _paces[1] > _READ_SECONDS:
         found: dict[str, float] = {}
@@ -53,7 +53,7 @@ def paces() -> dict[str, float]:
 
 
 def missing(scene: bpy.types.Scene) -> list[str]:
-    """Names of the steps that are still to be done until there are frozen frames; empty before the import."""
+    """Names of the steps that are still needed for frozen frames; empty before the import."""
     folder = selection.shot_folder(scene)
     state = job_timer.watch_of(folder).state if folder is not None else None
     if state is None or not state.frames:
@@ -62,7 +62,7 @@ def missing(scene: bpy.types.Scene) -> list[str]:
 
 
 def begin(scene: bpy.types.Scene, shot: Path) -> None:
-    """Begins the first of the missing steps; the timer begins the others. Headless, all of them are done on return."""
+    """Starts the first missing step; the timer starts the others. Without a window, all steps have ended on return."""
     ahead = missing(scene)
     chain = _chains[shot] = Chain(ahead, contract.WholeWay(_expected(scene, shot, ahead)))
     if not bpy.app.background:
@@ -80,12 +80,12 @@ def begin(scene: bpy.types.Scene, shot: Path) -> None:
 
 
 def stop(shot: Path) -> bool:
-    """Begins no further step of a shot; the one at work goes on. False if none was to be begun."""
+    """Cancels the steps of a shot that have not started. The running step continues. False if no chain was active."""
     return _chains.pop(shot, None) is not None
 
 
 def progress(shot: Path) -> tuple[float, float] | None:
-    """(share that is done, seconds left) of all steps of a shot together; None if they are not done as one."""
+    """(fraction done, seconds left) of all steps of a shot together; None if no chain is active."""
     chain = _chains.get(shot)
     if chain is None:
         return None
@@ -96,7 +96,7 @@ def progress(shot: Path) -> tuple[float, float] | None:
 
 
 def _turn(shot: Path, chain: Chain) -> bool:
-    """Begins the next step if the one before has ended well. False when there is nothing more to look after."""
+    """Starts the next step if the previous one succeeded. False when the chain has ended."""
     if _chains.get(shot) is not chain:
         return False
     watch = job_timer.watch_of(shot)
@@ -104,7 +104,7 @@ def _turn(shot: Path, chain: Chain) -> bool:
         return True
     scenes = selection.scenes_of(shot)
     if not scenes and selection.scenes_with(shot) and not _failed(watch, chain.step):
-        return True  # until the shot is chosen again
+        return True  # until the shot is selected again
     if not scenes or not chain.ahead or _failed(watch, chain.step):
         stop(shot)
         job_timer.redraw()
@@ -115,11 +115,11 @@ def _turn(shot: Path, chain: Chain) -> bool:
 
 
 def _begin_next(chain: Chain, scene: bpy.types.Scene) -> None:
-    """Presses the button of the next step; what keeps it from that, its panel says."""
+    """Runs the operator of the next step. The step's panel shows any error."""
     chain.step, chain.began = chain.ahead.pop(0), time.monotonic()
-    ops: Any = bpy.ops  # ours are not in its types
+    ops: Any = bpy.ops  # our operators are not in the stubs
     window = job_timer.window_of(scene) or next(iter(bpy.context.window_manager.windows), None)
-    with contextlib.suppress(RuntimeError):  # which is how Blender hands on what an operator reports as an error
+    with contextlib.suppress(RuntimeError):  # raised by Blender for errors that an operator reports
         with bpy.context.temp_override(window=window, scene=scene):  # pyright: ignore[reportUnknownMemberType]
             getattr(ops.splannequin, BUTTONS[chain.step])()
 
@@ -130,7 +130,8 @@ def _failed(watch: job_timer.Watch, step: str) -> bool:
 
 
 def _expected(scene: bpy.types.Scene, shot: Path, names: list[str]) -> dict[str, float]:
-    """Seconds that steps take on this machine; none of a step whose settings cannot be read, which its button says."""
+    """Expected seconds of steps on this machine. Steps with unreadable settings are missing; their operators report the
+    error."""
     found: dict[str, float] = {}
     with contextlib.suppress(contract.JobError, OSError, ValueError, KeyError):
         size, pace = contract.ShotSize.of(contract.ShotFolder(shot)), paces()

@@ -1,4 +1,4 @@
-"""Where the backend is: the Python that runs it, and the folder that holds `torch_backend`."""
+"""Location of the backend: its Python interpreter, and the folder that contains `torch_backend`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PYTHON_VARIABLE = "SPLANNEQUIN_BACKEND_PYTHON"
 
 
 def package_root() -> Path:
-    """Folder of the extension: it holds `torch_backend`."""
+    """Folder of the extension, which contains `torch_backend`."""
     return Path(__file__).resolve().parents[2]
 
 
@@ -27,7 +27,7 @@ def venv_python(folder: Path) -> Path:
 
 
 def candidates() -> list[tuple[str, Path]]:
-    """Where the backend's Python may be, in order: (what it is called, path)."""
+    """Possible locations of the backend's Python in order of priority: (description, path)."""
     found: list[tuple[str, Path]] = []
     addon = bpy.context.preferences.addons.get(PACKAGE)
     chosen = getattr(addon.preferences, "backend_python", "") if addon and addon.preferences else ""
@@ -44,21 +44,21 @@ def candidates() -> list[tuple[str, Path]]:
 
 
 def folder() -> Path:
-    """Folder of the backend's environment that is set up from the preferences."""
+    """Folder of the backend environment that the preferences set up."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
     chosen = getattr(addon.preferences, "backend_folder", "") if addon and addon.preferences else ""
     return Path(bpy.path.abspath(chosen)) if chosen else environment.default_folder()
 
 
 def device() -> str:
-    """Where jobs run, as the preferences say: auto, cpu or cuda."""
+    """Device of jobs from the preferences: auto, cpu or cuda."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
     return str(getattr(addon.preferences, "device", "auto")) if addon and addon.preferences else "auto"
 
 
 def python() -> str:
-    """The backend's interpreter. JobError if there is none, or only one that is half-made or was changed, or the chosen
-    one is missing."""
+    """The backend's interpreter. Raises JobError if the chosen one is missing, or if every environment is missing,
+    incomplete or modified."""
     wrong = ""
     for where, path in candidates():
         chosen = where in ("the add-on's preferences", PYTHON_VARIABLE)
@@ -90,7 +90,7 @@ def python() -> str:
 
 
 def _wrong_with(python: Path) -> str:
-    """Why an interpreter's environment cannot be used, a sentence; "" if it can."""
+    """Sentence why an interpreter's environment cannot be used; empty if it can."""
     folder = python.parent.parent
     if environment.half_made(python):
         return f"The backend's set-up has not finished: the environment in {folder} is half-made."
@@ -99,7 +99,7 @@ def _wrong_with(python: Path) -> str:
 
 
 def trouble() -> contract.JobError | None:
-    """Why there is no Python for the backend; None if there is."""
+    """The reason why there is no Python for the backend, or None."""
     try:
         python()
     except contract.JobError as error:
@@ -113,17 +113,18 @@ def available() -> bool:
 
 
 def ask(*words: str) -> children.Question:
-    """Asks the backend something, without waiting. JobError if there is none, or it cannot be started."""
+    """Sends a question to the backend without waiting. Raises JobError without a backend, or if it cannot be
+    started."""
     return children.ask(python(), package_root(), *words)
 
 
 def begin_doctor() -> children.Question:
-    """Asks the backend what it can do, without waiting. JobError as `ask`."""
+    """Asks the backend for its capabilities without waiting. Raises JobError as `ask` does."""
     return ask("doctor")
 
 
 def diagnosis(question: children.Question) -> str:
-    """What it can do, as the JSON that `torch_backend doctor` prints. JobError if it failed."""
+    """The backend's capabilities: the JSON of `torch_backend doctor`. Raises JobError if the command failed."""
     return question.answer(
         "The backend's environment is incomplete: {}.",
         "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
@@ -132,12 +133,12 @@ def diagnosis(question: children.Question) -> str:
 
 
 def doctor(gpu: bool = False) -> str:
-    """`diagnosis`, waited for; of a graphics card that is tested anew if `gpu`."""
+    """Blocking `diagnosis`. With `gpu`, tests the graphics card again."""
     question = ask("doctor", "--gpu") if gpu else begin_doctor()
     question.wait(120.0)
     return diagnosis(question)
 
 
 def start(job: jobs.Job) -> None:
-    """Starts the backend on a job made by `jobs.new_job`. JobError if there is no backend."""
+    """Starts the backend on a job from `jobs.new_job`. Raises JobError without a backend."""
     jobs.start(job, python(), package_root())

@@ -1,4 +1,4 @@
-"""A step begun, followed to its end when blocking, and undone: for buttons, timer and command line alike."""
+"""Starts a step, waits for it, and undoes all steps of a shot. Shared by operators, timer and command line."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from . import backend, jobs, steps
 
 
 def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) -> jobs.Job:
-    """Starts the job behind a step on the scene's shot, detached.
+    """Starts the job of a step on the scene's shot as a detached process.
 
     Raises:
-        contract.JobError: nothing to work on, no backend, or the shot cannot be written.
+        contract.JobError: no shot is selected, there is no backend, or the shot cannot be written.
     """
     selection.look_again()
     params = params or steps.STEPS[step].params(scene)
     folder = needed(scene, step)
-    backend.python()  # before anything is written: without a backend there is nothing to start
+    backend.python()  # fails before anything is written
     try:
         jobs.refuse_second_writer(folder)
         if steps.STEPS[step].makes_shot:
@@ -42,14 +42,14 @@ def begin(scene: bpy.types.Scene, step: str, params: jobs.Params | None = None) 
     try:
         backend.start(job)
     except contract.JobError:
-        shutil.rmtree(job.folder)  # else it would pass for one that is about to start
+        shutil.rmtree(job.folder)  # otherwise it would look like a job about to start
         steps.STEPS[step].ended(job)
         raise
     return job
 
 
 def needed(scene: bpy.types.Scene, step: str) -> Path:
-    """The scene's shot folder, which a step needs to be there unless it makes it. JobError says what to do."""
+    """The scene's shot folder. It must exist unless the step creates it. Raises JobError with a hint."""
     folder = selection.shot_folder(scene)
     if folder is None:
         raise contract.JobError("No shot is chosen.", "Import a clip or choose a shot folder.", contract.ExitCode.USAGE)
@@ -62,9 +62,9 @@ def needed(scene: bpy.types.Scene, step: str) -> Path:
 
 
 def remove_all(scene: bpy.types.Scene, shot: Path) -> list[str]:
-    """Takes everything of a shot out of the file; its folder on disk stays. Returns what was done, in words.
+    """Removes everything of a shot from the file; its folder on disk stays. Returns the changes as sentences.
 
-    What another shot of the scene needs stays: its own things, and the settings of the scene.
+    Objects of the scene's other shots stay. While any other shot has some, the scene's settings stay, too.
     """
     others = [f for f in selection.folders(scene) if f is not None and f != shot]
     others = [f for f in others if any(step.stands(scene, f) for step in steps.STEPS.values())]
@@ -86,17 +86,18 @@ def run(
     params: jobs.Params | None = None,
     on_event: Callable[[contract.Event], None] | None = None,
 ) -> tuple[Any, list[str]]:
-    """A whole step, blocking: for scripts and the command line. Returns the job's result and what changed, in words.
+    """Runs a whole step, blocking, for scripts and the command line. Returns (the job's result, sentences about
+    changes).
 
     Raises:
-        contract.JobError, contract.Cancelled: as the job ended.
+        contract.JobError, contract.Cancelled: the job failed or was cancelled.
     """
     job = begin(scene, step, params)
     return wait(job, on_event), steps.STEPS[step].finish(scene, job)
 
 
 def wait(job: jobs.Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
-    """`jobs.wait`; an import that does not end well leaves no empty shot."""
+    """Waits as `jobs.wait` does. An import that fails leaves no empty shot."""
     try:
         return jobs.wait(job, on_event)
     except (contract.JobError, contract.Cancelled):

@@ -1,7 +1,7 @@
-"""Child processes of Blender, all of them: how they are started, and backends that answer one question. No bpy here.
+"""Starts all child processes of Blender, and defines backend processes that answer one question. No bpy.
 
-Jobs, a set-up and a live session are started here and followed by their own modules; whatever answers once, the doctor,
-an export, ST maps, is a `Question`.
+Jobs, a set-up and a live session are started here, and monitored by other modules. A process with a single answer
+(doctor, export, ST maps) is a `Question`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SCRUBBED = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "PYTHONEXECUTABLE", "_
 
 
 def _detached() -> dict[str, Any]:
-    """What `Popen` needs for a child that outlives this Blender and shows no window."""
+    """`Popen` arguments of a child that outlives this Blender and shows no window."""
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
     return {"start_new_session": True}
@@ -36,14 +36,14 @@ def start(
     environ: Mapping[str, str] | None = None,
     **streams: Any,
 ) -> subprocess.Popen[Any]:
-    """Starts a child of ours. OSError if it cannot be.
+    """Starts a child process. Raises OSError if it cannot be started.
 
     Args:
-        placed: `args` and `cwd`, as `contract.python_child` gives them.
-        package_root: folder that holds `torch_backend`.
-        outlives: it goes on when this Blender ends; else it ends with its standard input.
-        environ: variables beside those of `backend_environ`.
-        streams: `stdin` and so on of `Popen`; without a `stdin` there is none.
+        placed: `args` and `cwd` from `contract.python_child`.
+        package_root: folder that contains `torch_backend`.
+        outlives: the child continues when this Blender ends. Otherwise it ends with its standard input.
+        environ: additional variables to those of `backend_environ`.
+        streams: `stdin` and similar arguments of `Popen`. `stdin` defaults to the null device.
     """
     hidden: dict[str, Any] = {"creationflags": subprocess.CREATE_NO_WINDOW} if sys.platform == "win32" else {}
     return subprocess.Popen(
@@ -56,14 +56,14 @@ def start(
 
 @dataclass
 class Question:
-    """A backend process that answers one question while Blender goes on."""
+    """A backend process that answers one question while Blender continues."""
 
     process: subprocess.Popen[str]
     _told: tuple[str, str] = ("", "")
-    """What it printed on the standard output and error."""
+    """Its standard output and standard error."""
 
     def __post_init__(self) -> None:
-        # Its output is read while it runs: a pipe holds 4 KB on Windows, and a child that prints more blocks.
+        # Read the output while the child runs: a pipe holds 4 KB on Windows, and a child that prints more blocks.
         self._reader = threading.Thread(target=self._listen, name="splannequin answer", daemon=True)
         self._reader.start()
 
@@ -72,27 +72,27 @@ class Question:
 
     @property
     def ended(self) -> bool:
-        """True once it has answered, or failed to."""
+        """True once the process has ended."""
         return not self._reader.is_alive()
 
     def wait(self, seconds: float = 600.0) -> None:
-        """Blocks until it has ended; after `seconds`, or on Ctrl-C, it is ended by force."""
+        """Blocks until the process has ended. After `seconds`, or on Ctrl-C, the process is killed."""
         until = time.monotonic() + seconds
         try:
             while not self.ended and time.monotonic() < until:
-                self._reader.join(0.2)  # a wait without limit cannot be interrupted on Windows
+                self._reader.join(0.2)  # a wait without timeout cannot be interrupted on Windows
         finally:
             if not self.ended:
                 self.process.kill()
         self._reader.join()
 
     def answer(self, failed: str, hint: str = "", code: int | None = None) -> str:
-        """What it printed. JobError with its own sentence if it failed by intention, else with `failed`.
+        """The printed answer. Raises JobError with the backend's message if it failed with one, else with `failed`.
 
         Args:
-            failed: a sentence with `{}` for the last line of what it said.
-            hint: what to do then.
-            code: exit code of that error; None: its own.
+            failed: message with `{}` for the last line of the error output.
+            hint: hint of that error.
+            code: exit code of that error; None: the process's code.
         """
         self._reader.join()
         out, errors = self._told
@@ -107,9 +107,9 @@ class Question:
 
 
 def ask(python: str, package_root: Path, *words: str) -> Question:
-    """Asks the backend something, without waiting: `torch_backend WORDS`. JobError if it cannot be started."""
+    """Runs `torch_backend WORDS` without waiting for the answer. Raises JobError if it cannot be started."""
     piped: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    piped |= {"encoding": "utf-8", "errors": "replace"}  # what a library prints may be of another encoding
+    piped |= {"encoding": "utf-8", "errors": "replace"}  # a library may print in another encoding
     try:
         child = start(contract.python_child(python, "torch_backend", *words), package_root, **piped)
     except OSError as error:
@@ -120,19 +120,19 @@ def ask(python: str, package_root: Path, *words: str) -> Question:
 
 
 def import_beside(name: str) -> None:
-    """Imports a module that the main thread will need, so that it does not wait for the disk then."""
+    """Imports a module in a thread, so that the main thread does not wait for the disk later."""
     threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()
 
 
 def backend_environ(package_root: Path) -> dict[str, str]:
-    """Environment variables of a backend process: this package importable, nothing of Blender's Python."""
+    """Environment variables of a backend process: this package is importable, Blender's Python settings are removed."""
     environ = {k: v for k, v in os.environ.items() if k not in _SCRUBBED}
     environ.update(
         PYTHONPATH=str(package_root),
         PYTHONUTF8="1",
         PYTHONUNBUFFERED="1",
         PYTHONNOUSERSITE="1",
-        PYTHONSAFEPATH="1",  # what a child starts in turn takes no module from where it stands either
-        PYTHONDONTWRITEBYTECODE="1",  # the extension's folder may be read-only, and is not ours to fill
+        PYTHONSAFEPATH="1",  # grandchildren do not import from their working directory either
+        PYTHONDONTWRITEBYTECODE="1",  # the extension's folder may be read-only
     )
     return environ

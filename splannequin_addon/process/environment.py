@@ -1,8 +1,8 @@
-"""Setting the backend up from Blender: a detached child of the launcher, followed through its log. No bpy here.
+"""Sets up the backend from Blender: a detached child runs the launcher and is monitored through its log. No bpy.
 
-The launcher (`splannequin.py setup --backend`) makes the environment, says which step failed, and goes on where it
-stopped when it is started again; it outlives Blender like every job. This file starts it, reads what it said, and takes
-the environment away again.
+The launcher (`splannequin.py setup --backend`) creates the environment and reports which step failed. Started again, it
+resumes where it stopped. Like every job, it outlives Blender. This module starts the launcher, reads its output, and
+removes the environment.
 """
 
 from __future__ import annotations
@@ -28,21 +28,23 @@ SIZE = "about 1.5 GB on disk (6 GB with CUDA)"
 LICENCES = "PyTorch (BSD), COLMAP (BSD), OpenImageIO (Apache), PyAV (LGPL), Warp (Apache) and what they need"
 _STATE = "setup"
 _LOOK_SECONDS = 60.0
-"""Seconds after which an environment's packages are checked again while it is in use; also after a set-up."""
+"""Interval in seconds between checks of a used environment's packages. They are also checked after a set-up."""
 _REMOVED = ".venv-removed-"
-"""Begins the name of an environment that was taken away and is being deleted."""
+"""Name prefix of a removed environment that is being deleted."""
 _SHOWN = 6
 
 
 def default_folder() -> Path:
-    """Where the environment goes: a short path, since packages nest deep and Windows counts 260 characters."""
+    """Default folder of the environment. The path is short, because packages nest deep and Windows limits paths to 260
+    characters."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home()) / "Splannequin"
     return Path.home() / ".splannequin"
 
 
 def sources(system: str = sys.platform) -> str:
-    """Where the packages may come from. Whether a card fits is asked by the launcher: Blender cannot wait."""
+    """Hosts of the packages. Assumes that a graphics card is suitable: only the launcher checks it, because the check
+    would block Blender."""
     index = contract.torch_index(system, nvidia_card(), lambda: True)
     return f"pypi.org, {urllib.parse.urlsplit(index).hostname or index}" if index else "pypi.org"
 
@@ -54,40 +56,40 @@ def nvidia_card() -> bool:
 
 @dataclass
 class SetUp:
-    """A set-up that runs or ended."""
+    """A running or finished set-up."""
 
     folder: Path
-    """Folder that holds the environment."""
+    """Folder that contains the environment."""
     process: subprocess.Popen[bytes] | None = None
     said: list[str] = field(default_factory=list[str])
-    """Last lines of what it said."""
+    """Last lines of its output."""
     failure: str = ""
     """Why the set-up failed; empty if it did not."""
     running: bool = True
-    """Until it has ended."""
+    """True until the set-up has ended."""
 
     @property
     def log(self) -> Path:
-        """What it said, whole."""
+        """File with the whole output of the launcher."""
         return self.folder / _STATE / "said.txt"
 
     @property
     def summary(self) -> Path:
-        """How it ended, as the launcher tells it."""
+        """File in which the launcher records how the set-up ended."""
         return self.folder / _STATE / "summary.json"
 
 
 def start(folder: Path, python: str, package_root: Path, wheels: Path | None = None) -> SetUp:
-    """Starts a set-up in `folder`, or goes on with one that was interrupted.
+    """Starts a set-up in `folder`, or resumes an interrupted one.
 
     Args:
-        folder: holds the environment afterwards.
-        python: a Python that makes the environment; Blender's own will do.
-        package_root: holds `splannequin.py`.
-        wheels: a folder of wheels to install from, in place of the internet.
+        folder: folder for the environment.
+        python: Python interpreter that creates the environment; Blender's interpreter is suitable.
+        package_root: folder that contains `splannequin.py`.
+        wheels: folder of wheels to install from instead of the internet.
 
     Raises:
-        contract.JobError: the folder cannot be written, or Python not started.
+        contract.JobError: the folder cannot be written, or Python cannot be started.
     """
     setup = SetUp(folder)
     environ = {"SPLANNEQUIN_HOME": str(folder.absolute())}
@@ -110,7 +112,7 @@ def start(folder: Path, python: str, package_root: Path, wheels: Path | None = N
 
 
 def poll(setup: SetUp) -> bool:
-    """Reads what was said since; True if something is new."""
+    """Reads new output of a set-up. True if something changed."""
     before = (list(setup.said), setup.running)
     try:
         with open(setup.log, "rb") as log:
@@ -136,31 +138,32 @@ def _why(setup: SetUp, code: int) -> str:
 
 
 def cancel(setup: SetUp) -> None:
-    """Asks a set-up to end; started again, it goes on."""
+    """Terminates a set-up. It resumes when it is started again."""
     if setup.process is not None and setup.process.poll() is None:
         setup.process.terminate()
 
 
 def half_made(python: Path) -> bool:
-    """True of an interpreter whose environment the launcher has begun and not finished; one without notes is trusted.
+    """True if the launcher has started but not finished an interpreter's environment. An environment without the
+    launcher's notes counts as finished.
 
-    As the launcher has it: SETUP_BEGUN stands there while packages are written, SETUP_STAMP once all is there.
+    SETUP_BEGUN exists while packages are written, SETUP_STAMP once everything is complete.
     """
     state = python.parent.parent / contract.SETUP_NOTES
     return state.is_dir() and ((state / contract.SETUP_BEGUN).exists() or not (state / contract.SETUP_STAMP).is_file())
 
 
 _seen: dict[Path, tuple[float, int, list[str]]] = {}
-"""Environment -> when its packages were examined, the time of its stamp then, and those that had changed."""
+"""Environment -> (time of its last check, modification time of its stamp then, changed packages)."""
 
 
 def changed(python: Path) -> list[str]:
-    """Packages of an interpreter's environment that were removed, exchanged or damaged since the launcher set it up."""
+    """Packages of an interpreter's environment that were removed, replaced or damaged since the launcher's set-up."""
     folder = python.parent.parent
     try:
         stamp = os.stat(folder / contract.SETUP_NOTES / contract.SETUP_STAMP).st_mtime_ns
     except OSError:
-        return []  # not of the launcher
+        return []  # not created by the launcher
     when, before, names = _seen.get(folder, (-math.inf, 0, []))
     if before != stamp or time.monotonic() - when > _LOOK_SECONDS:
         names = contract.changed_since_set_up(folder)
@@ -169,7 +172,7 @@ def changed(python: Path) -> list[str]:
 
 
 class AtWork(Exception):
-    """A process runs in an environment that was to be taken away."""
+    """Raised if a process runs in an environment that should be removed."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -177,10 +180,10 @@ class AtWork(Exception):
 
 
 def remove(folder: Path, wait: bool = False) -> bool:
-    """Takes the environment in `folder` away. True if there was one; ValueError if it is not one of ours, AtWork if a
-    process runs in it, whoever started it (as far as the system tells).
+    """Removes the environment in `folder`. True if there was one.
 
-    It is gone at once; its gigabytes are deleted in the background unless asked to `wait`.
+    The environment is renamed at once. A background thread deletes its files, unless `wait` is set.
+    Raises ValueError if Splannequin did not create the environment, and AtWork if any detectable process runs in it.
     """
     environment = folder / ".venv"
     if not environment.is_dir():
@@ -188,11 +191,11 @@ def remove(folder: Path, wait: bool = False) -> bool:
     if not (environment / contract.SETUP_NOTES).is_dir():
         raise ValueError(f"{environment} was not made by Splannequin: it is left alone")
     _nobody_in(environment)
-    # Renamed first: whatever is interrupted, no half of it passes for an environment.
+    # Rename first, so that no partly deleted folder counts as an environment after an interruption.
     renamed = folder / f"{_REMOVED}{uuid.uuid4().hex[:8]}"
     os.replace(environment, renamed)
     try:
-        _nobody_in(environment)  # a process that started since the check knows only the old path
+        _nobody_in(environment)  # a process that started after the check uses the old path
     except AtWork:
         os.replace(renamed, environment)
         raise
@@ -210,13 +213,13 @@ def _nobody_in(environment: Path) -> None:
 
 
 def _empty(folder: Path) -> None:
-    """Deletes removed environments, also those that a Blender that was closed meanwhile left there."""
+    """Deletes removed environments, including those left by a Blender that was closed during a removal."""
     for gone in folder.glob(f"{_REMOVED}*"):
         shutil.rmtree(gone, ignore_errors=True)
 
 
 def findings(facts: str) -> list[str]:
-    """The backend's doctor report (JSON) in sentences for an artist."""
+    """The backend's doctor report (JSON) as sentences for an artist."""
     record = json.loads(facts)
     lines = [f"Python {record['python']}, torch {record['packages'].get('torch')}."]
     if record.get("trains_on") == "cuda":

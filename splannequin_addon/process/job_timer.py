@@ -1,7 +1,7 @@
-"""Follows running jobs from one persistent timer, within a time budget per tick, and keeps what the panel shows.
+"""Monitors running jobs from one persistent timer with a time budget per tick, and stores what the panel shows.
 
-Jobs outlive undo, file load and Blender itself: nothing of bpy is kept here, only shot folders and job folders, and
-the jobs of a shot that is opened are found again in its folder.
+Jobs outlive undo, file load and Blender itself. This module therefore keeps no bpy data, only shot folders and job
+folders. The jobs of an opened shot are found in its folder.
 """
 
 from __future__ import annotations
@@ -28,101 +28,102 @@ from . import backend, children, jobs, steps
 TICK_SECONDS = 0.25
 BUDGET_SECONDS = 0.01
 WORKING_SECONDS = 0.04
-"""Between two turns of work that Blender does itself."""
+"""Interval in seconds between slices of work done in Blender."""
 _LOOK_SECONDS = 1.0
-"""How often the shot folder is examined for changes."""
+"""Interval in seconds between checks of the shot folder for changes."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far work is that Blender does itself."""
+    """Progress of work done in Blender."""
 
     text: str
-    """What is done, a few words with the figures."""
+    """Short description of the work, with numbers."""
     done: int
-    """Of `total`."""
+    """Units done, out of `total`."""
     total: int
     hint: str = ""
-    """How it is stopped, a sentence."""
+    """Sentence that explains how to stop the work; may be empty."""
 
 
 @dataclass
 class Work:
-    """Work that Blender itself does for a step, in slices of the timer."""
+    """Work done in Blender for a step, in slices run by the timer."""
 
     step: str
     """Name of the step."""
     turns: Iterator[Progress | None] | None = None
-    """It is done a turn of the timer at a time, by asking for the next; None if Blender goes on by itself."""
+    """Iterator that does one slice of the work per item; None if Blender continues on its own."""
     progress: Progress | None = None
-    """How far it is, once it tells."""
+    """Latest progress, or None before the first report."""
 
 
 @dataclass
 class Watch:
-    """What is known of one shot folder."""
+    """Known state of one shot folder."""
 
     shot: Path
     """Shot folder."""
     jobs: dict[str, jobs.Job] = field(default_factory=dict[str, jobs.Job])
-    """Newest job of each step, by the step's name."""
+    """Name of a step -> its newest job."""
     state: ShotState | None = None
-    """What the folder holds."""
+    """Content of the folder."""
     stamp: tuple[float, ...] = ()
-    """Of the folder when `state` was read."""
+    """Stamp of the folder when `state` was read."""
     looked: float = 0.0
-    """When the folder was last looked at, monotonic seconds."""
+    """Time of the last check of the folder, monotonic seconds."""
     notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
-    """Step's name -> what the finished step changed in the scene, or why it could not."""
+    """Name of a step -> sentences about its changes to the scene, or why there are none."""
     failures: dict[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
-    """(sentence, hint) of what failed on Blender's side, by the step's name."""
+    """Name of a step -> (sentence, hint) about its failure on Blender's side."""
     work: Work | None = None
-    """What Blender itself is doing for it."""
-    pending: dict[str, jobs.Job] = field(default_factory=dict[str, Any])  # `jobs` is a field here
-    """Jobs that ended well while another shot of the scene was chosen, by the step's name: they wait for this one."""
+    """Work that Blender is doing for the shot."""
+    pending: dict[str, jobs.Job] = field(default_factory=dict[str, Any])  # `jobs` is the field here, not the module
+    """Name of a step -> job that succeeded while no scene had this shot selected. It is applied once the shot is
+    selected."""
     unread: tuple[str, str] | None = None
-    """(sentence, hint) of why the folder could not be read, which is tried again."""
+    """(sentence, hint) about a failure to read the folder, which is tried again; otherwise None."""
     just_ended: str = ""
-    """The step that ended last in this session, until another begins."""
+    """Name of the step that ended last in this session, until another step begins."""
     redraw: bool = False
-    """Something changed outside the timer: draw at its next turn."""
+    """True if something changed outside the timer, so that its next tick must redraw."""
 
     def running(self) -> str | None:
-        """Name of the step at work, if any."""
+        """Name of the running step, or None."""
         if self.work is not None:
             return self.work.step
         return next((step for step, job in self.jobs.items() if not job.ended), None)
 
     def failed(self) -> str | None:
-        """Name of the step that was begun last, if it failed."""
+        """Name of the step that started last, if it failed."""
         last = self.just_ended or max(self.jobs, key=lambda step: self.jobs[step].folder.name, default="")
         job = self.jobs.get(last)
         return last if last in self.failures or (job is not None and job.state == "failed") else None
 
     def fail(self, step: str, error: BaseException) -> None:
-        """Notes why a step failed."""
+        """Stores the reason why a step failed."""
         self.just_ended = step
         self.failures[step] = (getattr(error, "message", str(error)), getattr(error, "hint", ""))
 
 
 _watches: dict[Path, Watch] = {}
 _meanwhile: list[Callable[[], bool]] = []
-"""Callbacks besides those of shots, called until they return that they are done."""
+"""Callbacks that the timer calls each time it examines jobs, until they return False."""
 _pulses: list[Callable[[], float | None]] = []
-"""What is called more often than jobs are examined."""
+"""Callbacks that are called more often than jobs are examined."""
 _jobs_next = 0.0
-"""When jobs are examined again while something pulses, monotonic seconds."""
+"""Time of the next check of jobs while there are pulses, monotonic seconds."""
 _backend: tuple[contract.JobError | None, float] = (None, 0.0)
-"""Why there is no backend, and when that was looked up, monotonic seconds."""
+"""(the reason why there is no backend, time of that check in monotonic seconds)."""
 
 
 def watch_of(shot: Path) -> Watch:
-    """What is known of a shot; its jobs are found again the first time it is requested."""
+    """The state of a shot. The first call finds the shot's existing jobs."""
     watch = _watches.get(shot)
     if watch is None:
         watch = _watches[shot] = Watch(shot)
-        with contextlib.suppress(OSError):  # a path that can be none: `refresh` says so
-            # A step that starts jobs of several kinds shows the newest of them.
+        with contextlib.suppress(OSError):  # an invalid path, which `refresh` reports
+            # A step with several kinds of jobs shows the newest one.
             found = sorted(jobs.latest(shot).values(), key=lambda job: job.folder.name)
             watch.jobs = {steps.step_of(job): job for job in found}
         for job in watch.jobs.values():
@@ -133,13 +134,13 @@ def watch_of(shot: Path) -> Watch:
 
 
 def watches() -> list[Watch]:
-    """All shots that are watched."""
+    """All watched shots."""
     return list(_watches.values())
 
 
 def backend_trouble() -> contract.JobError | None:
-    """Why there is no Python for the backend, None if there is; looked up every few seconds, as drawing asks all the
-    time."""
+    """The reason why there is no Python for the backend, or None. Cached for a few seconds, because panels ask at every
+    redraw."""
     global _backend
     if not _backend[1] or time.monotonic() - _backend[1] > 5 * _LOOK_SECONDS:
         _backend = (backend.trouble(), time.monotonic())
@@ -147,19 +148,19 @@ def backend_trouble() -> contract.JobError | None:
 
 
 def follow(step: str, job: jobs.Job) -> None:
-    """Watches a job that was just started."""
+    """Starts to watch a new job."""
     watch = watch_of(job.shot)
     watch.jobs[step] = job
     watch.just_ended = ""
-    watch.notes.clear()  # what earlier steps said has been read
+    watch.notes.clear()  # the artist has read the notes of earlier steps
     watch.failures.pop(step, None)
     steps.STEPS[step].began(job)
 
 
 def work(shot: Path, step: str, turns: Iterator[Progress | None]) -> None:
-    """Has the timer do work for a step, a turn at a time; what it raises is the step's failure.
+    """Makes the timer do work for a step, one slice per tick. An exception from the work is the step's failure.
 
-    Nothing of bpy may be kept between two turns.
+    The work must keep no bpy data between slices.
     """
     watch = watch_of(shot)
     watch.just_ended = ""
@@ -176,12 +177,12 @@ def stop_work(watch: Watch) -> bool:
     watch.work = None
     if isinstance(turns, Generator):
         turns.close()
-    sequences.forget_ahead()  # pictures read ahead for it may have changed when they are needed
+    sequences.forget_ahead()  # images loaded ahead may be outdated when they are needed
     return True
 
 
 def _work_on(watch: Watch, doing: Work) -> None:
-    """One more turn of what Blender itself does."""
+    """Does one slice of Blender's work for a step."""
     try:
         doing.progress = next(doing.turns or iter(()))
         return
@@ -189,18 +190,18 @@ def _work_on(watch: Watch, doing: Work) -> None:
         pass
     except (contract.JobError, OSError, ValueError, KeyError, RuntimeError) as error:
         watch.fail(doing.step, error)
-    if watch.work is doing:  # its last turn may have begun something else
+    if watch.work is doing:  # the last slice may have started other work
         watch.work = None
         watch.just_ended = doing.step
 
 
 def meanwhile(turn: Callable[[], bool]) -> None:
-    """Has the timer call `turn` at each of its turns, until it returns False."""
+    """Makes the timer call `turn` at each check of jobs until it returns False."""
     _meanwhile.append(turn)
 
 
 def when_answered(question: children.Question, then: Callable[[], None]) -> None:
-    """Calls `then` from the timer once a backend that was asked something has ended."""
+    """Calls `then` from the timer once a backend question has ended."""
 
     def look() -> bool:
         if question.ended:
@@ -213,7 +214,7 @@ def when_answered(question: children.Question, then: Callable[[], None]) -> None
 
 
 def refresh(watch: Watch) -> bool:
-    """Reads the shot folder again if something in it changed. True if it did."""
+    """Reads the shot folder again if it changed. True if the panel must be redrawn."""
     watch.looked, first = time.monotonic(), next(iter(steps.STEPS))
     try:
         stamp = inventory.stamp(watch.shot)
@@ -223,8 +224,7 @@ def refresh(watch: Watch) -> bool:
         watch.state = inventory.read(watch.shot)
         selection.look_again()
     except (OSError, ValueError, KeyError) as error:
-        # Not for good: a network disk that was away for a moment, or a file that was being replaced on Windows, comes
-        # back as it was.
+        # Try again later: a network disk may return, or a file was being replaced on Windows.
         watch.state, watch.stamp = ShotState(watch.shot), ()
         why = getattr(error, "strerror", None) or error
         known = watch.unread
@@ -238,25 +238,25 @@ def refresh(watch: Watch) -> bool:
 
 
 def pulse(turn: Callable[[], float | None]) -> None:
-    """Calls `turn` from the timer, as soon again as it says (seconds), until it says None or is dropped.
+    """Calls `turn` from the timer after the delay in seconds that it returns, until it returns None or is dropped.
 
-    For what is drawn while it changes; jobs are still looked at as often as without.
+    For anything drawn while it changes. Jobs are examined as often as without it.
     """
     drop(turn)
     _pulses.append(turn)
-    if bpy.app.timers.is_registered(tick):  # its next turn may be far for a picture
+    if bpy.app.timers.is_registered(tick):  # the next tick may be too late for an image
         bpy.app.timers.unregister(tick)
         bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
 
 def drop(turn: Callable[[], float | None]) -> None:
-    """Calls it no longer."""
+    """Stops calling `turn`."""
     if turn in _pulses:
         _pulses.remove(turn)
 
 
 def tick() -> float:
-    """One turn of the timer, that of jobs or of what pulses faster; returns the seconds until the next."""
+    """Timer callback: runs pulses and, if due, the check of jobs. Returns the seconds until the next tick."""
     global _jobs_next
     soonest = _pulse()
     if soonest is None:
@@ -267,7 +267,7 @@ def tick() -> float:
 
 
 def _pulse() -> float | None:
-    """Calls what pulses; the least seconds that any of it asks for, None if nothing does."""
+    """Calls all pulses. Returns their smallest delay in seconds, or None without pulses."""
     delays: list[float] = []
     for turn in list(_pulses):
         try:
@@ -283,15 +283,15 @@ def _pulse() -> float | None:
 
 
 def _follow_jobs() -> float:
-    """Reads what jobs wrote, applies those that ended, redraws what shows them; returns when to do so again."""
+    """Reads the output of jobs, applies finished jobs and redraws panels. Returns the seconds until the next check."""
     until = time.monotonic() + BUDGET_SECONDS
     changed = False
     for watch in list(_watches.values()):
         try:
             changed |= _turn(watch, until)
-        except Exception as error:  # whatever it is: an exception would end the timer, and with it every shot's panel
+        except Exception as error:  # an exception would end the timer, and so the updates of every panel
             step, message = watch.running() or next(iter(steps.STEPS)), f"{type(error).__name__}: {error}"
-            if watch.failures.get(step, ("",))[0] != message:  # once, not at every turn
+            if watch.failures.get(step, ("",))[0] != message:  # print it once, not at every tick
                 traceback.print_exc()
             watch.failures[step] = (message, "The console has the details.")
             changed = True
@@ -310,7 +310,7 @@ def _follow_jobs() -> float:
 
 
 def _turn(watch: Watch, until: float) -> bool:
-    """One shot's part of a tick, `until` a time of `time.monotonic`; True if its panel should be drawn again."""
+    """One shot's part of a check, until the `time.monotonic` value `until`. True if its panel must be redrawn."""
     changed, watch.redraw = watch.redraw, False
     for scene in selection.scenes_of(watch.shot):
         changed |= markers.follow(scene)
@@ -335,7 +335,7 @@ def _turn(watch: Watch, until: float) -> bool:
         elif not job.applied and steps.STEPS[step].is_usable(job) and selection.scenes_of(watch.shot):
             refresh(watch)
             _apply(watch, step, job)
-            job.applied = step not in watch.failures  # else it is tried once more at the end
+            job.applied = step not in watch.failures  # otherwise it is tried again when the job ends
             changed = True
     if watch.pending and selection.scenes_of(watch.shot):
         for step, job in watch.pending.items():
@@ -344,14 +344,14 @@ def _turn(watch: Watch, until: float) -> bool:
         changed = True
     if time.monotonic() - watch.looked > _LOOK_SECONDS and time.monotonic() < until:
         if watch.running() is None and not selection.scenes_with(watch.shot):
-            del _watches[watch.shot]  # a path that was typed and left again
+            del _watches[watch.shot]  # a path that was typed and then changed
             return changed
         changed |= refresh(watch)
     return changed
 
 
 def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
-    """A job has ended just now: its scenes are changed, at once, in turns, or when its shot is chosen."""
+    """Applies a job that just ended: at once, in steps, or when its shot is selected."""
     steps.STEPS[step].ended(job)
     watch.just_ended = step
     refresh(watch)
@@ -365,14 +365,14 @@ def _ended(watch: Watch, step: str, job: jobs.Job) -> None:
 
 
 def _told(job: jobs.Job) -> tuple[Any, ...]:
-    """What the panel shows of a job."""
+    """The state of a job that the panel shows."""
     status = job.status
     shown = (status.state, status.stage, round(status.fraction, 2), status.message) if status is not None else ()
     return (shown, len(job.warnings), len(job.history), *job.images.values())
 
 
 def redraw() -> None:
-    """Draws the sidebar of every 3D view again; the view itself, which may be a heavy scene, is left alone."""
+    """Redraws the sidebar of every 3D view. The view itself is not redrawn, because its scene may be heavy."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions if area.type == "VIEW_3D" else ():
@@ -381,8 +381,10 @@ def redraw() -> None:
 
 
 def look_through_camera(window: bpy.types.Window, camera: bpy.types.Object | None = None) -> None:
-    """Turns the window's first 3D view to the scene's camera, where the plate is; or to another one, which the view
-    alone takes, until it is turned again."""
+    """Shows the scene's camera, with the plate, in the window's first 3D view.
+
+    Another `camera` is set as the view's local camera. It stays until the next call without one.
+    """
     for area in window.screen.areas:
         if area.type == "VIEW_3D":
             space: Any = area.spaces.active
@@ -390,31 +392,33 @@ def look_through_camera(window: bpy.types.Window, camera: bpy.types.Object | Non
                 space.use_local_camera, space.camera = True, camera
             elif space.use_local_camera and (
                 space.camera is None or scene_objects.is_plate(space.camera)
-            ):  # or it is gone
+            ):  # or it no longer exists
                 space.use_local_camera = False
             space.region_3d.view_perspective = "CAMERA"
             return
 
 
 def undo_step(step: str) -> None:
-    """Ends an undo step, named after a step of ours, for a change of the scene that no operator's own undo covers."""
+    """Adds an undo step named after a step, for a change of the scene that no operator's undo covers."""
     if not bpy.app.background:
         bpy.ops.ed.undo_push(message=tr(f"Splannequin {steps.STEPS[step].label}"))
 
 
 def _apply(watch: Watch, step: str, job: jobs.Job) -> None:
-    """Lets a job that ended well change the scenes that work on its shot."""
+    """Applies a successful job to the scenes that use its shot."""
     change(watch, step, lambda scene: steps.STEPS[step].finish(scene, job))
 
 
 def window_of(scene: bpy.types.Scene) -> bpy.types.Window | None:
-    """The window that shows a scene, if one does."""
+    """The window that shows a scene, or None."""
     return next((w for w in bpy.context.window_manager.windows if w.scene == scene), None)
 
 
 def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]], only: int = 0) -> None:
-    """Changes the scenes that work on a shot, or the one of them whose `session_uid` is `only`: as one undo step each
-    in a window. Notes what was changed or why not."""
+    """Changes all scenes that use a shot, or only the one with the `session_uid` `only`.
+
+    Each change in a window is one undo step. Stores sentences about the changes, or the error.
+    """
     for scene in [s for s in selection.scenes_of(watch.shot) if only in (0, s.session_uid)]:
         window = window_of(scene)
         try:
@@ -432,7 +436,7 @@ def change(watch: Watch, step: str, how: Callable[[bpy.types.Scene], list[str]],
 
 
 def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
-    """`_apply` for a job that had ended before its shot was chosen."""
+    """`_apply` for a job that ended before its shot was selected."""
     sentence = steps.STEPS[step].late(job)
     if sentence:
         watch.notes[step] = [sentence]
@@ -442,7 +446,7 @@ def _apply_late(watch: Watch, step: str, job: jobs.Job) -> None:
 
 @persistent
 def _on_load(*_: object) -> None:
-    """Another file: its shots are examined afresh; running jobs go on and are found again."""
+    """Handler: another file was loaded. Its shots are examined again; running jobs continue and are found again."""
     markers.forget()
     sequences.forget_ahead()
     for shot in [s for s, w in _watches.items() if w.running() is None]:
@@ -454,7 +458,7 @@ def _on_load(*_: object) -> None:
 
 
 def forget() -> None:
-    """Drops all that is known; the shots' folders tell it again when asked."""
+    """Clears all stored state. It is read again from the shots' folders when needed."""
     _watches.clear()
     _meanwhile.clear()
     _pulses.clear()
@@ -462,13 +466,13 @@ def forget() -> None:
 
 @persistent
 def _on_undo(*_: object) -> None:
-    """What steps said that they changed in the scene may not be so any more."""
+    """Handler: clears the notes about scene changes, which undo may have reverted."""
     for watch in _watches.values():
         watch.notes.clear()
 
 
 def register() -> None:
-    """Starts the timer (in a window: headless Blender has none) and listens to file loads and undo."""
+    """Starts the timer, except in background mode, and registers the handlers for load and undo."""
     bpy.app.handlers.load_post.append(_on_load)
     for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
         handlers.append(_on_undo)
@@ -477,7 +481,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Undoes `register`. Running jobs go on."""
+    """Undoes `register`. Running jobs continue."""
     if bpy.app.timers.is_registered(tick):
         bpy.app.timers.unregister(tick)
     bpy.app.handlers.load_post.remove(_on_load)

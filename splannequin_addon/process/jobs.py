@@ -1,6 +1,7 @@
-"""Jobs of the backend as Blender sees them: start a detached child, follow its files, cancel it, find it again.
+"""The backend's jobs from Blender's point of view: starts a detached child, reads its files, cancels it, finds it
+again.
 
-No bpy here: the job folder is all the state there is, so that any Blender that opens the shot sees the same.
+No bpy. The job folder holds all state, so that every Blender that opens the shot sees the same.
 """
 
 from __future__ import annotations
@@ -22,62 +23,62 @@ from ...torch_backend import contract
 from . import children
 
 _LAST_WORD_SECONDS = 10.0
-"""How long a job's process is waited for after it told its end."""
+"""Maximum time to wait for a job's process after its last status."""
 _START_SECONDS = 30.0
-"""A job without a status this long after it was made never started."""
+"""Age after which a job without a status counts as never started."""
 _LOG_LINES = 6
 _FIRST_LOOK_SECONDS = 1.0
-"""Seconds that the events of a rediscovered job are read in one go."""
+"""Maximum time to read the events of a rediscovered job without interruption."""
 _KILL_SECONDS = 20.0
-"""A job that has not ended this long after it was asked to is ended by force on a second request."""
+"""Time after a cancel request from which a second request kills the job."""
 _LONGEST_SECONDS = 1e7
-"""What is said to take longer is not told."""
+"""Longer time estimates are not shown."""
 _LONGEST_REQUEST = 1 << 24
-"""Bytes of a request that are read; one with a t* for each of 100,000 frames takes a fifth."""
+"""Maximum bytes read of a request. A request with a t* for each of 100,000 frames has a fifth of this size."""
 _SILENT_SECONDS = 10 * contract.HEARTBEAT_SECONDS
-"""A job of an older backend is presumed dead after this long without a sign of life."""
+"""Seconds without a heartbeat after which a job of an older backend counts as dead."""
 
 
 @dataclass
 class Job:
-    """A job that this Blender follows. Holds paths and what was read so far."""
+    """A job that this Blender monitors. Holds paths and the data read so far."""
 
     folder: Path
     """Job folder, shot/jobs/<id>."""
     kind: str
-    """import, solve, train or freeze."""
+    """A key of `contract.PARAMS`, such as import, solve, train or freeze."""
     params: dict[str, Any] = field(default_factory=dict[str, Any])
     """Parameters of the request."""
     process: subprocess.Popen[bytes] | None = None
-    """The child, if this Blender started it."""
+    """The child process if this Blender started it, else None."""
     status: contract.Status | None = None
     """Last status read."""
     read_to: int = 0
     """Bytes of events.jsonl read so far."""
     warnings: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    """(sentence, hint) the job wants the artist to know."""
+    """(sentence, hint) of each warning for the artist."""
     metrics: dict[str, Any] = field(default_factory=dict[str, Any])
-    """Latest figures of the job, by name."""
+    """Latest metrics of the job, by name."""
     history: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])
-    """(seconds of training, dB on frames kept out) as they came."""
+    """(seconds of training, dB on held-out frames) in order of arrival."""
     images: dict[str, str] = field(default_factory=dict[str, str])
-    """Latest picture by label: path."""
+    """Label -> path of the latest image."""
     result: Any = None
-    """What the job answered in its `done` event."""
+    """Result in the job's `done` event."""
     end: tuple[str, _Words] | None = None
-    """State and last words of the job, as its events tell them."""
+    """Final state and message of the job according to its events."""
     cameras_known: bool = False
-    """It is a solve that has written the shot's cameras, and may still run."""
+    """True for a solve that has written the shot's cameras, even if it still runs."""
     applied: bool = False
-    """The scene has what the job made, although it may still run."""
+    """True if the job's result is in the scene, even if the job still runs."""
     over: bool = False
-    """It had ended before this Blender met it: what it made is there, and nothing follows from its end."""
+    """True if the job had ended before this Blender first read it. Its result exists already and is not applied."""
     scene_uid: int = 0
-    """`session_uid` of the scene from which this Blender started the job; 0 of one that was found again."""
+    """`session_uid` of the scene from which this Blender started the job; 0 for a rediscovered job."""
     blend: str = ""
     """Name of the .blend from which the job was started; empty if unknown."""
     beat: tuple[float, float] | None = None
-    """Last sign of life of a job of another computer, and when it was first seen, monotonic seconds."""
+    """(last heartbeat of a job on another computer, monotonic seconds when it was first seen), or None."""
 
     @property
     def shot(self) -> Path:
@@ -86,7 +87,7 @@ class Job:
 
     @property
     def ended(self) -> bool:
-        """True once the job will write nothing more and all it wrote is read."""
+        """True once the job has ended and its whole output has been read."""
         return self.status is not None and self.status.ended
 
     @property
@@ -105,26 +106,26 @@ Params = (
     | contract.LightParams
     | contract.CombineParams
 )
-"""What a job may be asked for; `contract.PARAMS` by kind."""
+"""Parameters of a job. `contract.PARAMS` lists them by kind."""
 
 
 def kind_of(params: Params) -> str:
-    """Kind of the job that takes these parameters."""
+    """Kind of the job with these parameters."""
     return next(kind for kind, cls in contract.PARAMS.items() if isinstance(params, cls))
 
 
 def new_job(shot: Path, kind: str, params: Params) -> Job:
-    """Makes a job folder in `shot` with its request. `params` is the kind's dataclass of `contract.PARAMS`."""
+    """Creates a job folder in `shot` with its request. `params` is the kind's dataclass of `contract.PARAMS`."""
     return Job(contract.new_job(shot, kind, params), kind, dataclasses.asdict(params))
 
 
 def start(job: Job, python: str, package_root: Path) -> None:
-    """Starts the backend on a job, detached: it outlives this Blender.
+    """Starts the backend on a job as a detached process, which outlives this Blender.
 
     Args:
-        job: a job made by `new_job`.
+        job: a job from `new_job`.
         python: interpreter of the backend's environment.
-        package_root: folder that holds `torch_backend`.
+        package_root: folder that contains `torch_backend`.
 
     Raises:
         contract.JobError: the interpreter cannot be started.
@@ -142,17 +143,17 @@ def start(job: Job, python: str, package_root: Path) -> None:
 
 
 def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
-    """Reads what the job wrote since the last poll, for at most about `budget_seconds`; returns the new events.
+    """Reads the job's new output for at most about `budget_seconds`. Returns the new events.
 
-    A child that died without a last word is given one: its status is rewritten as failed, with the end of its log.
+    If the child died without a final status, its status is rewritten as failed, with the end of its log.
     """
     until = time.monotonic() + budget_seconds
     status = _read_status(job.folder) or job.status
     events, all_read = _read_events(job, until)
     if status is not None and status.ended and not all_read:
-        return events  # ended, but not told yet: the next poll reads the rest
+        return events  # the job has ended, but the next poll must read its remaining events
     if (status is None or not status.ended) and not is_alive(job, status):
-        status = _read_status(job.folder) or status  # it may have ended between the two reads above
+        status = _read_status(job.folder) or status  # the job may have ended between the two reads above
         events += _read_events(job, until + 1.0)[0]
         if status is None or not status.ended:
             status = _declare_dead(job, status)
@@ -161,7 +162,7 @@ def poll(job: Job, budget_seconds: float = 0.01) -> list[contract.Event]:
 
 
 def _last_words(job: Job, status: contract.Status | None) -> contract.Status | None:
-    """The end that a job told in its events and could not write into its status: its shot was moved or deleted."""
+    """The final status from the job's events, if the job could not write it because its shot was moved or deleted."""
     if job.end is None:
         return None
     now = time.time()
@@ -175,8 +176,8 @@ def _last_words(job: Job, status: contract.Status | None) -> contract.Status | N
 def is_alive(job: Job, status: contract.Status | None) -> bool:
     """True if the job's process still works on it, or may be about to.
 
-    A process that is only stopped, as by a computer that slept, is alive whatever its last sign of life. One of
-    another computer is alive as long as the shot's lock is its: that can be taken away there, or by hand.
+    A process that is only stopped, for example by a sleeping computer, is alive regardless of its heartbeat. A job on
+    another computer is alive as long as it holds the shot's lock, which can be removed on that computer or by hand.
     """
     if job.process is not None:
         return job.process.poll() is None
@@ -186,19 +187,22 @@ def is_alive(job: Job, status: contract.Status | None) -> bool:
         return _holds(job) or not _silent(job, status)
     if status.host or (status.process_started and sys.platform == "linux"):
         return contract.runs_still(status.pid, status.process_started)
-    return time.time() - status.heartbeat < _SILENT_SECONDS  # from an older backend, that did not say where it ran
+    return time.time() - status.heartbeat < _SILENT_SECONDS  # an older backend did not record its host
 
 
 def refuse_second_writer(shot: Path) -> None:
-    """JobError, with what runs, since when, where and what to do, if a job writes into the shot or is about to."""
+    """Raises JobError if a job writes into the shot or is about to.
+
+    For the holder of the lock, the message names the job, its start and its host.
+    """
     try:
         writer = contract.read_writer(shot)
     except (OSError, ValueError):
-        writer = None  # a damaged lock: the backend says so
+        writer = None  # the backend reports a damaged lock
     if writer is not None and writer.works() and not contract.gives_back(shot, writer):
         raise contract.busy(shot, writer)
     for job in latest(shot).values():
-        is_local = job.status is None or job.status.host in ("", contract.computer_name())  # others have the lock
+        is_local = job.status is None or job.status.host in ("", contract.computer_name())  # others hold the lock
         if is_local and not job.ended and is_alive(job, job.status):
             raise contract.JobError(
                 f"A step of {shot.name} is still running.", "Wait for it or cancel it.", contract.ExitCode.USAGE
@@ -206,7 +210,7 @@ def refuse_second_writer(shot: Path) -> None:
 
 
 def _holds(job: Job) -> bool:
-    """True if the shot's lock is the job's, or cannot be read."""
+    """True if the job holds the shot's lock, or if the lock cannot be read."""
     try:
         writer = contract.read_writer(job.shot)
     except (OSError, ValueError):
@@ -215,7 +219,8 @@ def _holds(job: Job) -> bool:
 
 
 def _silent(job: Job, status: contract.Status) -> bool:
-    """True if a job gave no sign of life while we watched: another computer's clock may be wrong, its beats are not."""
+    """True if a job's heartbeat has not changed while this Blender watched. Does not rely on another computer's
+    clock."""
     now = time.monotonic()
     if job.beat is None or job.beat[0] != status.heartbeat:
         job.beat = (status.heartbeat, now)
@@ -223,15 +228,15 @@ def _silent(job: Job, status: contract.Status) -> bool:
 
 
 def cancel(job: Job) -> None:
-    """Asks the job to stop with a checkpoint; asked again after `_KILL_SECONDS`, ends it by force.
+    """Requests that the job stops with a checkpoint. A second request after `_KILL_SECONDS` kills it.
 
-    JobError if it should be ended by force and cannot be told from other processes beyond doubt: those stay.
+    Raises JobError instead of killing if the job's process cannot be identified with certainty.
     """
     flag = job.folder / contract.CANCEL_FILE
     try:
-        os.close(os.open(flag, os.O_WRONLY | os.O_CREAT | os.O_EXCL))  # whatever lies there, also a link, is left alone
+        os.close(os.open(flag, os.O_WRONLY | os.O_CREAT | os.O_EXCL))  # any existing file or link is left alone
     except FileNotFoundError:
-        return  # the shot was moved or deleted, which ends the job too
+        return  # the shot was moved or deleted, which ends the job, too
     except FileExistsError:
         since = flag.lstat().st_mtime
         if contract.disk_time(job.folder) - since > _KILL_SECONDS and is_alive(job, job.status):
@@ -239,11 +244,11 @@ def cancel(job: Job) -> None:
 
 
 def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> Any:
-    """Blocks until the job has ended; returns its result. Ctrl-C asks it to stop and waits for its checkpoint.
+    """Blocks until the job has ended and returns its result. Ctrl-C requests a stop and waits for the checkpoint.
 
     Raises:
-        contract.JobError: it failed; the sentence, hint and exit code are the job's own.
-        contract.Cancelled: it was cancelled.
+        contract.JobError: the job failed. The message, hint and exit code come from the job.
+        contract.Cancelled: the job was cancelled.
     """
     while not job.ended:
         try:
@@ -254,7 +259,7 @@ def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> 
         except KeyboardInterrupt:
             cancel(job)
     if job.process is not None:
-        # The job releases the shot's lock after its last status; on a busy machine the next step would find it locked.
+        # The job releases the shot's lock after its last status. On a busy machine the next step could find it locked.
         with contextlib.suppress(subprocess.TimeoutExpired):
             job.process.wait(_LAST_WORD_SECONDS)
     raise_if_failed(job)
@@ -262,7 +267,7 @@ def wait(job: Job, on_event: Callable[[contract.Event], None] | None = None) -> 
 
 
 def raise_if_failed(job: Job) -> None:
-    """JobError or Cancelled if the ended job did not finish its work."""
+    """Raises JobError or Cancelled if the ended job did not succeed."""
     status = job.status
     if status is None or status.state == "done":
         return
@@ -273,7 +278,7 @@ def raise_if_failed(job: Job) -> None:
 
 
 def open_job(folder: Path) -> Job | None:
-    """A job from its folder; None if its request cannot be read, or is none."""
+    """A job from its folder; None if its request is unreadable or invalid."""
     try:
         data = contract.read_json(folder / contract.REQUEST_FILE, _LONGEST_REQUEST)
         contract.check_version(data, "job request")
@@ -285,10 +290,10 @@ def open_job(folder: Path) -> Job | None:
 
 
 def latest(shot: Path) -> dict[str, Job]:
-    """The newest job of each kind in a shot, polled once: those that run are found again here."""
+    """The newest job of each kind in a shot, polled once. Also finds running jobs again."""
     found: dict[str, Job] = {}
     jobs_folder = contract.ShotFolder(shot).jobs
-    # A link would lead to the jobs of another shot, where nothing is written.
+    # A link would lead to the jobs of another shot, into which this add-on must not write.
     is_own = shot.is_dir() and not contract.is_link(jobs_folder)
     folders = sorted(jobs_folder.glob("*/"), key=lambda p: p.name, reverse=True) if is_own else []
     for folder in folders:
@@ -305,13 +310,13 @@ def latest(shot: Path) -> dict[str, Job]:
             job.over = status is not None and status.ended
             poll(job, _FIRST_LOOK_SECONDS)
         except (OSError, ValueError):
-            continue  # files that another hand broke: the one before it is asked
+            continue  # files damaged from outside: use the previous job instead
         found[kind] = job
     return found
 
 
 def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
-    """Last lines of the job's log; empty if it has none."""
+    """Last lines of the job's log; empty without a log."""
     try:
         with contract.open_regular(folder / contract.LOG_FILE) as log:
             log.seek(0, os.SEEK_END)
@@ -323,7 +328,7 @@ def log_tail(folder: Path, lines: int = _LOG_LINES) -> list[str]:
 
 
 def _read_status(folder: Path) -> contract.Status | None:
-    """The status as it stands; None before there is one. ValueError if the file is not one of ours."""
+    """The current status; None if there is none yet. Raises ValueError if the file is not a job status."""
     try:
         data = contract.read_json(folder / contract.STATUS_FILE, contract.SHORT_JSON)
     except OSError:
@@ -339,7 +344,7 @@ def _read_status(folder: Path) -> contract.Status | None:
 
 
 def _read_events(job: Job, until: float) -> tuple[list[contract.Event], bool]:
-    """New whole lines of events.jsonl, and whether they were all read. A line that is no event is passed over."""
+    """(new complete lines of events.jsonl as events, whether all were read). Skips lines that are not events."""
     events: list[contract.Event] = []
     try:
         with contextlib.closing(contract.read_lines(job.folder / contract.EVENTS_FILE, job.read_to)) as lines:
@@ -351,7 +356,7 @@ def _read_events(job: Job, until: float) -> tuple[list[contract.Event], bool]:
                 if time.monotonic() > until:
                     return events, False
     except OSError:
-        pass  # not there yet
+        pass  # the file does not exist yet
     return events, True
 
 
@@ -393,7 +398,7 @@ class _End:
 _EVENT_DATA: dict[str, type] = {
     "warning": _Words, "error": _Words, "metric": _Figures, "image": _Picture, "done": _End,
 }  # fmt: skip
-"""What an event has to hold to be trusted; those of other types are only handed on."""
+"""Type of event -> its required fields. Events of other types are only passed on."""
 
 
 def _take_in(job: Job, event: contract.Event) -> None:
@@ -446,14 +451,14 @@ def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
 
 
 def _keep(job: Job, status: contract.Status) -> contract.Status:
-    """Writes the status of a job that can no longer do so; what another computer writes is not ours to correct."""
+    """Writes the final status of a job that cannot do so itself. A job of another computer keeps its file."""
     if status.host in ("", contract.computer_name()):
         contract.write_json(job.folder / contract.STATUS_FILE, dataclasses.asdict(status), parents=False)
     return status
 
 
 def _age(folder: Path) -> float:
-    """Seconds since a job was made, by the clock of its disk: another computer may have made it."""
+    """Age of a job in seconds, by the clock of its disk, because another computer may have created it."""
     now, made = time.time(), 0.0
     with contextlib.suppress(OSError):
         now = contract.disk_time(folder)
@@ -463,9 +468,9 @@ def _age(folder: Path) -> float:
 
 
 def _kill(job: Job) -> None:
-    """Ends the job's process and its children: our own child, or what is the job's beyond doubt; else JobError."""
+    """Kills the job's process and its children. Raises JobError if the process cannot be identified with certainty."""
     if job.process is not None:
-        pid = job.process.pid  # ours until it is waited for: the system gives its number to no other
+        pid = job.process.pid  # the system reuses the id only after we wait for the child
     else:
         status = job.status
         if status is None or status.host not in ("", contract.computer_name()):
@@ -483,9 +488,9 @@ def _kill(job: Job) -> None:
         if os.getpgid(pid) == pid:
             os.killpg(pid, signal.SIGKILL)
         else:
-            os.kill(pid, signal.SIGKILL)  # in somebody else's group
+            os.kill(pid, signal.SIGKILL)  # in another process's group
     except ProcessLookupError:
-        return  # it ended by itself in the meantime
+        return  # it has ended in the meantime
 
 
 def _not_ours(message: str) -> contract.JobError:

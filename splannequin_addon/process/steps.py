@@ -1,7 +1,7 @@
-"""What a step is, and which there are: each room of a step hands in one object, and nothing else asks for its name.
+"""Base class of a step, and the registry of steps. Each step's package provides one object.
 
-Buttons, timer, panel and command line ask the object: what the backend is asked for, what its answer changes in the
-scene, what the panel says, what is removed with a shot. Whoever adds a step adds a room (see CONTRIBUTING.md).
+This object defines the backend request, the changes to the scene, the panel's content, and the removal of a shot.
+Operators, timer, panel and command line use it. A new step is a new package (see CONTRIBUTING.md).
 """
 
 from __future__ import annotations
@@ -22,124 +22,127 @@ if TYPE_CHECKING:
 
 @dataclass
 class View:
-    """What a step shows of itself."""
+    """State of a step for the panel."""
 
     done: bool
-    """It has been done."""
+    """True if the step has been done."""
     ready: bool
-    """What it needs is there."""
+    """True if all requirements of the step are met."""
     state: list[str] = field(default_factory=list[str])
-    """What there is, in short lines, the most important first: the panel shows two, and the others in a fold."""
+    """Short sentences about the result, most important first. The panel shows two, the others in a sub-panel."""
     advice: str = ""
-    """One sentence: what comes next."""
+    """Sentence about the next action; may be empty."""
     brief: str = ""
-    """The result in one or two words, for the header of a step that is folded."""
+    """The result in one or two words, for the header of a collapsed step."""
     is_unfinished: bool = False
-    """It has been done, but the scene lacks its result."""
+    """True if the step has been done but the scene lacks its result."""
 
 
 class Part(Protocol):
-    """A module that Blender has to be told of beside the classes."""
+    """A module with its own registration in Blender, besides the classes."""
 
     def register(self) -> None:
-        """When the add-on is switched on."""
+        """Called when the add-on is enabled."""
 
     def unregister(self) -> None:
-        """When it is switched off."""
+        """Called when the add-on is disabled."""
 
 
 class Panel(Protocol):
-    """What draws a step in the tab."""
+    """Draws a step in the sidebar tab."""
 
     def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_at_hand: bool) -> None:
-        """Its header, and its body while it is open; `is_at_hand` if it is the step to work on."""
+        """Draws the header, and the body if it is open. `is_at_hand` marks the step to work on."""
 
 
 class Step:
-    """One of the five; made once by its room."""
+    """One of the five steps, created once by its package."""
 
     name: ClassVar[str]
-    """Identifier."""
+    """Identifier of the step."""
     label: ClassVar[str]
     """Name on the panel."""
     kind: ClassVar[str]
-    """Kind of the job behind it."""
+    """Kind of the step's job."""
     also: ClassVar[tuple[str, ...]] = ()
-    """Other kinds of jobs that its panel starts."""
+    """Other kinds of jobs that the step's panel starts."""
     button: ClassVar[str]
-    """What the button says."""
+    """Label of the operator's button."""
     again: ClassVar[str]
-    """What the button says once the step is done."""
+    """Label of the button once the step is done."""
     needs: ClassVar[str] = ""
-    """What to do before, in a sentence; empty if nothing."""
+    """Sentence about what to do first; may be empty."""
     makes_shot: ClassVar[bool] = False
-    """It begins with a shot folder that is not there yet."""
+    """True if the step creates the shot folder."""
     panel: ClassVar[Panel]
-    """Draws it in the tab."""
+    """Draws the step in the sidebar tab."""
     classes: ClassVar[tuple[type, ...]] = ()
-    """Its operators, in the order in which they are registered."""
+    """Operators of the step in order of registration."""
     parts: ClassVar[tuple[Part, ...]] = ()
-    """Modules of its room with a `register` and an `unregister` of their own."""
+    """Modules of the step's package with their own `register` and `unregister`."""
 
     def params(self, scene: bpy.types.Scene) -> jobs.Params:
-        """The backend's parameters, from what the artist set. JobError names what is missing."""
+        """The backend's parameters from the artist's settings. Raises JobError, which names what is missing."""
         raise NotImplementedError
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
-        """What the panel shows of it, as the shot stands."""
+        """Panel state of the step for the shot's current state."""
         raise NotImplementedError
 
     def in_turns(self, scene: bpy.types.Scene, shot: Path) -> Iterator[Any] | None:
-        """What the timer does in turns before it begins the job itself; None if the job can begin at once."""
+        """Iterator with work that the timer does in steps and that then starts the job; None if the job can start at
+        once."""
         return None
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """What a finished job changes in the scene; returns it in words."""
+        """Applies a finished job to the scene. Returns the changes as sentences."""
         return []
 
     def is_usable(self, job: jobs.Job) -> bool:
-        """True if a job that still runs has left all that `finish` needs: the scene gets it at once."""
+        """True if a running job has already written everything that `finish` needs. The scene then gets it at once."""
         return False
 
     def arrive(self, scene: bpy.types.Scene, job: jobs.Job) -> bool:
-        """Has the timer do the work of `finish` in turns, in a window. False if that is not needed."""
+        """Starts the work of `finish` in steps run by the timer, in a window. False if that is not needed."""
         return False
 
     def late(self, job: jobs.Job) -> str:
-        """Sentence, instead of `finish`, about a job that ended before its shot was chosen; empty: it is finished."""
+        """Sentence to show, instead of `finish`, for a job that ended before its shot was selected; empty to call
+        `finish`."""
         return ""
 
     def began(self, job: jobs.Job) -> None:
-        """Its job was started."""
+        """Called when the step's job was started."""
 
     def ended(self, job: jobs.Job) -> None:
-        """Its job has ended, well or not."""
+        """Called when the step's job has ended, with or without success."""
 
     def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
-        """What a window shows once a finished job has changed its scene."""
+        """Sets up a window's view after a finished job has changed its scene."""
 
     def log(self, job: jobs.Job) -> Path | None:
-        """The log of a job that has something in it, None without."""
+        """The first non-empty log of a job, or None."""
         return next((log for log in self.logs(job) if _written(log)), None)
 
     def logs(self, job: jobs.Job) -> list[Path]:
-        """Where a job's words may stand, its own first."""
+        """Possible log files of a job, its own first."""
         return [job.folder / contract.LOG_FILE]
 
     def in_use(self, shot: Path, folder: Path) -> str:
-        """Why a run or take of a shot cannot be removed now, in words; empty if it can."""
+        """The reason why a run or take of a shot cannot be deleted now; empty if it can."""
         return ""
 
     def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
-        """True if something of a shot is in the scene."""
+        """True if the scene has objects or settings of a shot."""
         return False
 
     def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
-        """Takes what it made for a shot out of the scene, but what `others`, shots too, need; says what was done."""
+        """Removes the step's results for a shot from the scene, except those that the shots `others` need. Returns the
+        changes."""
         return []
 
     def scaled(self, scene: bpy.types.Scene, shot: Path) -> list[str]:
-        """Follows a shot that was scaled in the scene; returns what was changed, in words."""
+        """Updates the scene after a shot was scaled. Returns the changes as sentences."""
         return []
 
 
@@ -151,16 +154,17 @@ def _written(log: Path) -> bool:
 
 
 STEPS: dict[str, Step] = {}
-"""The steps in order, by name. `registration.py` fills it."""
+"""Name -> step, in order. `registration.py` fills it."""
 
 
 def add(step: Step) -> None:
-    """Makes a step known, after those that are."""
+    """Appends a step to `STEPS`."""
     STEPS[step.name] = step
 
 
 def step_of(job: jobs.Job) -> str:
-    """Name of the step that a job found in a shot folder belongs to: Freeze and Bake ask for the same kind."""
+    """Name of the step that a job belongs to. Read from the job's folder, because Freeze and Bake use the same kind of
+    job."""
     noted = _noted(job, contract.STEP_FILE)
     names = [s.name for s in STEPS.values() if job.kind in (s.kind, *s.also)]
     return noted if noted in names else names[0]
@@ -177,7 +181,7 @@ def blend_of(job: jobs.Job) -> str:
 
 
 def _noted(job: jobs.Job, name: str) -> str:
-    """What Blender wrote into a job's folder; empty of a job that was started from the backend's command line."""
+    """A note that Blender wrote into a job's folder; empty for a job started by the backend's command line."""
     try:
         with contract.open_regular(job.folder / name) as file:
             return file.read(1024).decode("utf-8", "replace")

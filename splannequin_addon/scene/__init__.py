@@ -1,1 +1,1 @@
-"""Blender's scene: its settings, picture sequences, paths, and changes of it that are whole or nothing."""
+"""Blender's scene: its settings, image sequences, paths, and transactions."""

@@ -1,7 +1,6 @@
-"""Camera axes and lenses: the only place where they are converted.
+"""Camera axes and lenses: the only module that converts them.
 
-OpenCV (x right, y down, z forward; viewmat world-to-camera) against Blender (x right, y up, looking along -z; camera to
-world).
+OpenCV: x right, y down, z forward; viewmat world-to-camera. Blender: x right, y up, looking along -z; camera-to-world.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ if TYPE_CHECKING:
     from mathutils import Matrix
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenCV camera axes to Blender's, and back."""
+"""Converts OpenCV camera axes to Blender's, and back."""
 SENSOR_MM = 36.0
-"""Width given to the camera's sensor. Only its ratio to the focal length matters."""
+"""Sensor width in mm of our cameras. Only its ratio to the focal length matters."""
 
 
 def camera_to_world(viewmat: np.ndarray) -> np.ndarray:
-    """Blender's camera matrices from rigid OpenCV ones.
+    """Blender's camera matrices from rigid OpenCV view matrices.
 
     Args:
         viewmat: world-to-camera, OpenCV axes, [..., 4, 4] float64.
@@ -33,7 +32,7 @@ def camera_to_world(viewmat: np.ndarray) -> np.ndarray:
     viewmat = np.asarray(viewmat, dtype=np.float64)
     turned = np.swapaxes(viewmat[..., :3, :3], -1, -2)
     result = np.zeros_like(viewmat)
-    # No LAPACK: on a busy machine its threads keep Blender's main thread waiting for milliseconds, once per frame.
+    # Does not use LAPACK: on a busy machine its threads block Blender's main thread for milliseconds, once per frame.
     result[..., :3, :3] = turned
     result[..., :3, 3] = -(turned * viewmat[..., None, :3, 3]).sum(-1)
     result[..., 3, 3] = 1.0
@@ -54,15 +53,15 @@ def lens_from_k(k: tuple[float, float, float, float], width: int, height: int) -
         height: image height in pixels.
     """
     fx, fy, cx, cy = k
-    # Shift is counted in widths of the picture, also down, where a pixel that is not square is fx / fy high.
+    # Shifts are fractions of the image width, also vertically, where the pixel height is fx / fy.
     return fx * SENSOR_MM / width, (width / 2 - cx) / width, (cy - height / 2) * (fx / fy) / width
 
 
 def pixel_aspect(k: tuple[float, float, float, float]) -> tuple[float, float]:
-    """(pixel_aspect_x, pixel_aspect_y) of a render that shows fx and fy as they are; Blender wants both >= 1."""
+    """(pixel_aspect_x, pixel_aspect_y) of a render with focal lengths fx and fy. Blender requires both >= 1."""
     fx, fy = k[0], k[1]
     ratio = fx / fy
-    if abs(ratio - 1.0) < 5e-4:  # half a pixel over a thousand
+    if abs(ratio - 1.0) < 5e-4:  # less than half a pixel in a thousand
         return 1.0, 1.0
     return (1.0, ratio) if ratio > 1.0 else (1.0 / ratio, 1.0)
 
@@ -70,14 +69,14 @@ def pixel_aspect(k: tuple[float, float, float, float]) -> tuple[float, float]:
 def in_solve(
     view_matrix: Matrix, window_matrix: Matrix, placed: np.ndarray, scale: float, size: tuple[int, int]
 ) -> tuple[list[float], list[float]]:
-    """(viewmat, K) in solve units of what a view shows.
+    """(viewmat, K) of a view in solve units.
 
     Args:
         view_matrix: world to view, Blender's axes, [4, 4].
         window_matrix: perspective projection, [4, 4].
-        placed: where the solve stands in the world, [4, 4] float64.
+        placed: placement of the solve in the world, [4, 4] float64.
         scale: scene units per solve unit.
-        size: width and height of the picture in pixels.
+        size: width and height of the image in pixels.
 
     Returns:
         viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
@@ -89,7 +88,7 @@ def in_solve(
 
 
 def k_from_window(window_matrix: Matrix, size: tuple[int, int]) -> list[float]:
-    """fx, fy, cx, cy in pixels, pixel centres at +0.5, of a perspective projection [4, 4] onto a picture of `size`."""
+    """fx, fy, cx, cy in pixels, pixel centres at +0.5, of a perspective projection [4, 4] onto an image of `size`."""
     (width, height), window = size, np.array(window_matrix, dtype=np.float64)
     return [
         0.5 * width * window[0, 0],

@@ -1,4 +1,4 @@
-"""Pictures of a folder that are called by their frame numbers. No bpy."""
+"""Images of a folder that are named by their frame numbers. No bpy."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ...torch_backend import contract
 
 
 def frame_numbers(folder: Path, suffix: str = ".exr") -> list[int]:
-    """Numbers of the frames in a folder, ascending; empty if there is no such folder."""
+    """Frame numbers in a folder, ascending; empty if the folder does not exist."""
     if not folder.is_dir():
         return []
     found = (contract.frame_number(p.stem) for p in folder.iterdir() if p.suffix == suffix)

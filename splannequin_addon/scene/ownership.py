@@ -1,11 +1,11 @@
-"""What marks a data-block, node or object as ours, and an output path."""
+"""Names that mark our data-blocks, nodes and objects, and names of output files."""
 
 from __future__ import annotations
 
 TAG = "splannequin"
 MATTE_SHOT = "splannequin_matte_shot"
-"""Property of an image that a motion matte is painted on: its shot's folder, as a .blend holds it."""
+"""Property of an image with a painted motion matte: the shot folder in the form stored in a .blend."""
 BAKES = "bake"
-"""Folder in a shot that takes are rendered into, if the scene names no other."""
+"""Default folder of bakes inside a shot."""
 DIGITS = "######"
-"""Name of the pictures that a bake makes: their frame."""
+"""File name pattern of baked images: the frame number."""

@@ -1,4 +1,4 @@
-"""Paths as a .blend holds them."""
+"""Paths in the form stored in a .blend."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ import bpy
 
 
 def blend_path(path: Path) -> str:
-    """`path` as a .blend should hold it: relative to the file if it is saved and on the same drive."""
+    """`path` in the form stored in a .blend: relative to the file if it is saved and on the same drive."""
     absolute = os.path.abspath(path)
     return relative(absolute, os.path.dirname(bpy.data.filepath)) if bpy.data.filepath else absolute
 
 
 def relative(path: str, base: str) -> str:
-    """An absolute path as a .blend in the folder `base` should hold it; as it is on another drive. With slashes, which
-    every system reads."""
+    """An absolute path in the form stored in a .blend in the folder `base`. A path on another drive stays absolute.
+
+    Relative paths use slashes, which every system accepts.
+    """
     try:
         return bpy.path.relpath(path, start=base).replace(os.sep, "/")
     except ValueError:  # another drive on Windows
@@ -24,10 +26,10 @@ def relative(path: str, base: str) -> str:
 
 
 def same(one: str, other: str) -> bool:
-    """True if two absolute paths are one as the system writes them: on Windows `c:` is `C:`."""
+    """True if two absolute paths are equal by the system's rules: on Windows `c:` is `C:`."""
     return os.path.normcase(one) == os.path.normcase(other)
 
 
 def absolute(path: str) -> str:
-    """A path of the settings, absolute; empty if there is none."""
+    """The absolute form of a path from the settings; empty for an empty one."""
     return os.path.abspath(bpy.path.abspath(path)) if path else ""

@@ -1,4 +1,4 @@
-"""A change of the scene that fails leaves it as it was."""
+"""Restores the scene if a change to it fails."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .. import compat
 from ..access import settings_of
 
 _KINDS = ("objects", "cameras", "meshes", "collections", "node_groups", "actions", "images", "textures")
-"""Kinds of data-blocks that are made here; users before what they use."""
+"""Kinds of data-blocks that this add-on creates. Users precede the data that they use."""
 _SETTINGS = {
     "render": (
         "resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y", "fps", "fps_base",
@@ -22,14 +22,14 @@ _SETTINGS = {
     "scene": ("frame_start", "frame_end", "frame_current"),
     "layer": ("use_pass_z",),
 }  # fmt: skip
-"""What a step may set, by owner."""
+"""Owner -> settings that a step may change."""
 
 
 @contextlib.contextmanager
 def scene_of(scene: bpy.types.Scene) -> Generator[None, None, None]:
-    """Within it, a change is whole or nothing: if it raises, what it made is removed and what it set is set back.
+    """Context manager that makes a change all or nothing: an exception removes new data and restores settings.
 
-    What it took away is not brought back: that has to come last, when nothing can fail any more.
+    Removed data does not come back. Remove data last, when nothing else can fail.
     """
     existing = {kind: {block.session_uid for block in getattr(bpy.data, kind)} for kind in _KINDS}
     names = [(owner, name) for owner, names in _SETTINGS.items() for name in names]

@@ -1,7 +1,7 @@
-"""Whether an image or a movie clip shows some footage, however its path is spelled.
+"""Checks whether an image or a movie clip shows given footage, however its path is written.
 
-Files are the same if the system says so (links, other case, another mount), or if they are copies of each other.
-Sequences are the same if their files are: which of them a path names says nothing.
+Two files are equal if the system says so (links, letter case, another mount) or if their contents are equal. Two
+sequences are equal if their files are. It does not matter which file of a sequence a path names.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ import bpy
 from ...torch_backend import contract
 
 _NUMBER = re.compile(r"(.*?)(\d+|#+|@+|%0?\d*d)([^\d#@%]*)", re.DOTALL)
-"""Name of a picture of a sequence. Its number is the last one, as Blender has it: `plate.v001.0005.exr` is frame 5."""
+"""File name of an image in a sequence. As in Blender, the last number counts: `plate.v001.0005.exr` is frame 5."""
 
 
 def shows(data: bpy.types.Image | bpy.types.MovieClip | None, footage: Iterable[Path]) -> bool:
-    """True if a data-block shows one of these: a video, a folder of pictures, or a picture or the pattern of a
-    sequence. A still picture of a sequence is not the sequence."""
+    """True if a data-block shows one of these: a video, a folder of images, or an image or pattern of a sequence.
+
+    A single still image of a sequence does not count.
+    """
     if data is None or not data.filepath:
         return False
     path = Path(os.path.abspath(bpy.path.abspath(data.filepath, library=data.library)))
@@ -32,7 +34,7 @@ def shows(data: bpy.types.Image | bpy.types.MovieClip | None, footage: Iterable[
 
 
 def _same_file(one: Path, other: Path, by_content: bool) -> bool:
-    """True if two paths lead to one file, or, if content counts, to two copies of it."""
+    """True if two paths lead to the same file, or, with `by_content`, to equal copies."""
     if _place(one) == _place(other):
         return True
     try:
@@ -42,12 +44,12 @@ def _same_file(one: Path, other: Path, by_content: bool) -> bool:
         if not by_content or not (one.is_file() and other.is_file()) or sizes[0] != sizes[1] or not sizes[0]:
             return False
         return contract.file_digest(one) == contract.file_digest(other)
-    except (OSError, ValueError):  # one of them is not there, or cannot be read
+    except (OSError, ValueError):  # one of the files is missing or unreadable
         return False
 
 
 def _same_sequence(one: Path, other: Path) -> bool:
-    """True if two paths name pictures of one sequence, or of two copies of it."""
+    """True if two paths name images of the same sequence, or of equal copies."""
     if _folder_of(one, other):
         return True
     first, second = _pictures(one), _pictures(other)
@@ -58,19 +60,19 @@ def _same_sequence(one: Path, other: Path) -> bool:
     common = sorted(first[2].keys() & second[2].keys())
     if not common:
         return False
-    # Several, far apart: the first frames of two clips may both be black.
+    # Compare several frames that are far apart: the first frames of two clips may both be black.
     looked_at = {common[0], common[len(common) // 2], common[-1]}
     return all(_same_file(first[2][n], second[2][n], by_content=True) for n in looked_at)
 
 
 def _folder_of(picture: Path, folder: Path) -> bool:
-    """True if a folder is that of a picture: footage is chosen by its folder where that holds one sequence alone."""
+    """True if `folder` is an image's folder. A folder with a single sequence can be selected as footage."""
     return folder.is_dir() and _same_file(picture.parent, folder, by_content=False)
 
 
 def _pictures(path: Path) -> tuple[Path, tuple[str, str], dict[int, Path]] | None:
-    """Folder, (name before the number, name after it), and pictures by number of the sequence that a picture or a
-    pattern names; None if there is no number in it."""
+    """(folder, (name before the number, name after it), number -> image) of the sequence that an image or pattern
+    names; None if the name has no number."""
     found = _NUMBER.fullmatch(path.name)
     if found is None:
         return None
@@ -83,13 +85,13 @@ def _pictures(path: Path) -> tuple[Path, tuple[str, str], dict[int, Path]] | Non
                 digits = name[len(before) : len(name) - len(after)]
                 if name.startswith(before) and name.endswith(after) and digits.isdecimal():
                     numbered[int(digits)] = path.parent / entry.name
-    except (OSError, ValueError):  # the folder is gone: the name is all there is
+    except (OSError, ValueError):  # the folder is missing: only the name is known
         pass
     return path.parent, (before, after), numbered
 
 
 def _place(path: Path) -> str:
-    """Normal form of a path, as far as the system can tell without opening the file."""
+    """Normal form of a path, without opening the file."""
     try:
         return os.path.normcase(os.path.realpath(path))
     except (OSError, ValueError):
@@ -97,13 +99,13 @@ def _place(path: Path) -> str:
 
 
 def first_number(clip: bpy.types.MovieClip) -> int:
-    """Our number of what a clip calls its frame 1."""
+    """Splannequin's frame number of a movie clip's first frame."""
     number = _file_number(Path(bpy.path.abspath(clip.filepath))) if clip.source == "SEQUENCE" else 1
     return number + clip.frame_offset
 
 
 def _file_number(path: Path) -> int:
-    """Frame number of a picture among its neighbours, as the import reads it; 1 if its name has none."""
+    """Frame number of an image among its neighbours, as the import reads it; 1 if its name has none."""
     try:
         names = os.listdir(path.parent)
     except OSError:

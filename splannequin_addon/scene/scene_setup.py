@@ -1,4 +1,4 @@
-"""Settings of the scene that a shot needs, changed only with consent, said in words, and taken back on removal."""
+"""Scene settings that a shot needs. They are changed only with consent, reported, and restored on removal."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ _SHOTS = {
                "fps_base"),
     "scene": ("frame_start", "frame_end"),
 }  # fmt: skip
-"""Settings that each shot of a scene has its own of, by owner; first before last."""
+"""Owner -> settings of which each shot of a scene has its own values; the first frame precedes the last."""
 NEUTRAL_VIEWS = ("Standard", "Un-tone-mapped")
-"""Views that show colours as they are: Blender's own, that of the ACES configurations."""
+"""View transforms that leave colours unchanged: Blender's, and that of ACES configurations."""
 NEUTRAL_VIEW = {"look": "None", "exposure": 0.0, "gamma": 1.0, "use_curve_mapping": False, "use_white_balance": False}
-"""The other settings of a view that shows colours as they are. Blender before 4.3 has no white balance."""
+"""Other settings of a view that leaves colours unchanged. Blender before 4.3 has no white balance."""
 
 
 def untouched(scene: bpy.types.Scene) -> bool:
-    """True if size, rate and range of the scene are those of a new file: nothing of the artist's would be lost."""
+    """True if the scene has a new file's size, rate and range, so that changing them loses no work."""
     render = scene.render
     size = (render.resolution_x, render.resolution_y) == (1920, 1080)
     return size and render.fps == 24 and (scene.frame_start, scene.frame_end) == (1, 250)
 
 
 def fitted(scene: bpy.types.Scene) -> bool:
-    """True if `fit_clip` has changed the scene before: it is ours to fit again."""
+    """True if `fit_clip` has changed the scene before, and may therefore change it again."""
     before = json.loads(scene.get(_BEFORE, "{}"))
     return "resolution_x" in before.get("render", {}) or "frame_start" in before.get("scene", {})
 
@@ -54,15 +54,15 @@ def fit_clip(
     k: tuple[float, float, float, float] | None = None,
     over: bool = True,
 ) -> list[str]:
-    """Gives the scene the clip's size, rate and range; returns what was changed, in words.
+    """Sets the scene's size, rate and range to the clip's. Returns the changes as sentences.
 
     Args:
         scene: the scene.
-        size: width and height in pixels; None leaves them.
-        fps: frames per second; 0 leaves the scene's.
+        size: width and height in pixels; None keeps the scene's.
+        fps: frames per second; 0 keeps the scene's.
         frames: first and last frame, inclusive.
-        k: fx, fy, cx, cy, for the pixel aspect; None leaves it.
-        over: also what the artist has changed since it was set here.
+        k: fx, fy, cx, cy, for the pixel aspect; None keeps the scene's.
+        over: also overwrite settings that the artist has changed since they were set here.
     """
     render = scene.render
     changes: list[str] = []
@@ -88,7 +88,7 @@ def fit_clip(
 
 
 def kept(scene: bpy.types.Scene) -> str:
-    """Size, rate and range as they stand, and what of them was set here, as JSON: for `put_back`."""
+    """JSON with the scene's size, rate and range, and the values of them set by this module. Input of `put_back`."""
     ours = json.loads(scene.get(_OURS, "{}"))
     now = {owner: {name: getattr(_owner(scene, owner), name) for name in names} for owner, names in _SHOTS.items()}
     set_here = {o: {n: v for n, v in ours.get(o, {}).items() if n in names} for o, names in _SHOTS.items()}
@@ -96,7 +96,7 @@ def kept(scene: bpy.types.Scene) -> str:
 
 
 def put_back(scene: bpy.types.Scene, was: str) -> None:
-    """Sets size, rate and range as `kept` told them; nothing in a scene where none of them was ever set here."""
+    """Restores size, rate and range from `kept`. Does nothing if this module never set them in the scene."""
     if not was or not fitted(scene):
         return
     stored = json.loads(was)
@@ -113,10 +113,10 @@ def put_back(scene: bpy.types.Scene, was: str) -> None:
 
 
 def keep_plate_colours(scene: bpy.types.Scene) -> list[str]:
-    """Sets the view transform so that pictures leave as they came in; returns what was changed, in words.
+    """Sets the view transform so that rendered images keep the plate's colours. Returns the changes as sentences.
 
-    Blender's default view (AgX) is made for renders and would change every plate. Dithering is noise on the last bit.
-    JobError if the colour configuration has no such view.
+    Blender's default view (AgX) is designed for renders and would change every plate. Dithering adds noise to the last
+    bit. Raises JobError if the colour configuration has no such view.
     """
     changes: list[str] = []
     if not keeps_plate_colours(scene):
@@ -132,9 +132,9 @@ def keep_plate_colours(scene: bpy.types.Scene) -> list[str]:
 
 
 def note(scene: bpy.types.Scene, text: str) -> list[str]:
-    """Has rendered files say a text in their metadata, as Blender's Note; returns what was changed, in words.
+    """Writes a text into the metadata of rendered files, as Blender's Note. Returns the changes as sentences.
 
-    A note of the artist's own stays. Without a text one that was made here goes.
+    The artist's note stays. An empty text removes a note that was set here.
     """
     render = scene.render
     ours = json.loads(scene.get(_OURS, "{}")).get("render", {}).get("stamp_note_text")
@@ -148,12 +148,12 @@ def note(scene: bpy.types.Scene, text: str) -> list[str]:
 
 
 def _neutral(view: Any) -> str:
-    """Name of the view that shows colours as they are. JobError if there is none for the display that is chosen."""
+    """Name of the view that leaves colours unchanged. Raises JobError if the selected display has none."""
     was = view.view_transform
     for name in (was, *NEUTRAL_VIEWS):
         try:
             view.view_transform = name
-        except TypeError:  # what an enumeration says to a value it lacks; which ones it has, it does not tell
+        except TypeError:  # the enumeration lacks the value; Blender offers no list of its values
             continue
         view.view_transform = was
         if name in NEUTRAL_VIEWS:
@@ -166,7 +166,7 @@ def _neutral(view: Any) -> str:
 
 
 def render_cg(scene: bpy.types.Scene) -> list[str]:
-    """Has the scene rendered on a transparent film with a depth pass; returns what was changed, in words."""
+    """Sets up the scene to render with a transparent film and a depth pass. Returns the changes as sentences."""
     changes: list[str] = []
     if not scene.render.film_transparent:
         _set(scene, "render", {"film_transparent": True})
@@ -178,7 +178,7 @@ def render_cg(scene: bpy.types.Scene) -> list[str]:
 
 
 def keeps_plate_colours(scene: bpy.types.Scene) -> bool:
-    """True if pictures leave the scene with the colours they came in with."""
+    """True if rendered images keep the plate's colours."""
     view: Any = present(scene.view_settings)
     return view.view_transform in NEUTRAL_VIEWS and all(
         getattr(view, name, value) == value for name, value in NEUTRAL_VIEW.items()
@@ -186,9 +186,10 @@ def keeps_plate_colours(scene: bpy.types.Scene) -> bool:
 
 
 def restore(scene: bpy.types.Scene) -> bool:
-    """Takes back the settings that were changed here, but what the artist has changed since. True if there was one.
+    """Restores the settings that were changed here, except those that the artist has changed since. True if there were
+    any.
 
-    Settings that belong together (a size, a rate, a range) are taken back together or not at all.
+    Settings that belong together (size, rate, range) are restored together or not at all.
     """
     stored = scene.get(_BEFORE)
     if not stored:
@@ -206,7 +207,7 @@ def restore(scene: bpy.types.Scene) -> bool:
 
 
 def _touched(scene: bpy.types.Scene) -> dict[str, set[str]]:
-    """What was set here and is different now, with what belongs together with it, by owner: the artist's."""
+    """Owner -> settings that were set here and changed by the artist since, with the settings that belong to them."""
     found: dict[str, set[str]] = {}
     for owner, set_here in json.loads(scene.get(_OURS, "{}")).items():
         touched = {n for n, v in set_here.items() if not _same(getattr(_owner(scene, owner), n), v)}
@@ -227,7 +228,7 @@ def _owner(scene: bpy.types.Scene, name: str) -> Any:
 
 
 def _set(scene: bpy.types.Scene, owner: str, values: dict[str, Any]) -> None:
-    """Changes settings; keeps in the scene what they were (unless that is kept already) and what they became."""
+    """Changes settings. Stores in the scene their first values from before (only once) and their new values."""
     target = _owner(scene, owner)
     before, ours = (json.loads(scene.get(key, "{}")) for key in (_BEFORE, _OURS))
     was = {name: getattr(target, name) for name in values}
@@ -240,7 +241,7 @@ def _set(scene: bpy.types.Scene, owner: str, values: dict[str, Any]) -> None:
 
 
 def render_size(scene: bpy.types.Scene) -> tuple[int, int]:
-    """Pixels that a render of the scene has."""
+    """Width and height of the scene's render in pixels."""
     render = scene.render
     share = render.resolution_percentage
     return render.resolution_x * share // 100, render.resolution_y * share // 100

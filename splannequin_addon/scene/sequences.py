@@ -1,4 +1,4 @@
-"""Picture sequences as data-blocks: ours have a mark, are found again by their path, and can be read ahead."""
+"""Image sequences as data-blocks. Ours are tagged, reused by path, and can be loaded ahead of use."""
 
 from __future__ import annotations
 
@@ -15,38 +15,39 @@ from . import paths
 from .ownership import TAG
 
 Encoding = str | tuple[float, ...]
-"""How a file's numbers are meant, as `compat.colour_space` has it."""
+"""Encoding of a file's values, in the form that `compat.colour_space` accepts."""
 _ahead: set[str] = set()
-"""Files that `read` and `read_numbers` have just had read: the next time that they are loaded they are taken as they
-are."""
+"""Files that `read` and `read_numbers` have just loaded. The next load function uses them without a reload."""
 
 
 def forget_ahead() -> None:
-    """Drops what is known of pictures read ahead: another file has others."""
+    """Clears the record of images loaded ahead. Call it when another file is loaded."""
     _ahead.clear()
 
 
 def read(
     path: Path, name: str, encoding: Encoding, first: int, last: int, opaque: bool = False, shift: int = 0
 ) -> None:
-    """Has a picture of a sequence read, whose frames go from `first` to `last`: a node does it for the frame that it
-    shows. `opaque`: see `load_sequence`; `shift`: see `show_sequence`."""
+    """Loads an image of a sequence with the frames `first` to `last`, by showing it in a temporary node.
+
+    `opaque`: see `load_sequence`; `shift`: see `show_sequence`.
+    """
     _ahead.discard(os.path.abspath(path))
     shown_size(load_sequence(path, name, encoding, opaque), first, last, shift)
     _ahead.add(os.path.abspath(path))
 
 
 def read_numbers(path: Path, name: str) -> None:
-    """Has a picture of numbers read, as `read` does."""
+    """Loads an image of numbers, as `read` does for colours."""
     _ahead.discard(os.path.abspath(path))
     size_of(load_numbers(path, name))
     _ahead.add(os.path.abspath(path))
 
 
 def shown_size(image: bpy.types.Image, first: int, last: int, shift: int = 0) -> tuple[int, int]:
-    """Width and height of the pictures of a sequence, which `show_sequence` would show so, as a node shows them.
+    """Width and height of a sequence's images in a node set up by `show_sequence`; (0, 0) for multilayer images.
 
-    (0, 0) of those with several layers. A sequence that no node shows has none.
+    Blender knows no size of a sequence that no node shows.
     """
     reader = bpy.data.node_groups.new("Splannequin Reader", "CompositorNodeTree")
     try:
@@ -59,20 +60,19 @@ def shown_size(image: bpy.types.Image, first: int, last: int, shift: int = 0) ->
 def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = False) -> bpy.types.Image:
     """An image sequence or a video as a data-block, reused by path.
 
-    `opaque`: its colours are taken as they stand in the file, whatever its alpha is.
-
-    ValueError if the colour configuration has no such encoding, RuntimeError if Blender cannot read the file.
+    With `opaque`, the file's alpha is ignored and its colours are used unchanged. Raises ValueError if the colour
+    configuration lacks the encoding, and RuntimeError if Blender cannot read the file.
     """
     wanted = os.path.abspath(path)
     for image in bpy.data.images:
         if image.get(TAG) and paths.same(paths.absolute(image.filepath), wanted):
-            compat.set_image_colour(image, encoding)  # another import may have made it of other light
+            compat.set_image_colour(image, encoding)  # another import may have used another encoding
             _make_opaque(image, opaque)
             if wanted not in _ahead:
                 image.reload()
             _ahead.discard(wanted)
             return image
-    compat.colour_space(encoding)  # before anything is made: a configuration may have none
+    compat.colour_space(encoding)  # fails before anything is created if the configuration lacks the space
     image = bpy.data.images.load(contract.regular_file(wanted, None))
     image.name = name
     if image.source != "MOVIE":
@@ -85,13 +85,13 @@ def load_sequence(path: Path, name: str, encoding: Encoding, opaque: bool = Fals
 
 
 def _make_opaque(image: bpy.types.Image, opaque: bool) -> None:
-    """Sets it once and at first: a change has Blender read the picture again."""
+    """Sets the alpha mode only if it differs, because each change makes Blender load the image again."""
     if opaque and image.alpha_mode != "NONE":
         image.alpha_mode = "NONE"
 
 
 def load_numbers(path: Path, name: str) -> bpy.types.Image:
-    """A picture of numbers, not colours, as a data-block, reused by path."""
+    """An image of numbers instead of colours as a data-block, reused by path."""
     wanted = os.path.abspath(path)
     for known in bpy.data.images:
         if known.get(TAG) and paths.same(paths.absolute(known.filepath), wanted):
@@ -108,7 +108,7 @@ def load_numbers(path: Path, name: str) -> bpy.types.Image:
 
 
 def relative_images() -> None:
-    """Makes the paths of our images relative to the .blend, once it has a place."""
+    """Makes the paths of our images relative to the .blend, once it has a path."""
     for image in bpy.data.images:
         if image.get(TAG) and image.filepath:
             image.filepath = paths.blend_path(Path(bpy.path.abspath(image.filepath)))

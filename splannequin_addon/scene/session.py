@@ -1,6 +1,7 @@
-"""What is kept of the artist's data-blocks between two turns of the timer: their number in this session of Blender.
+"""Identifies the artist's data-blocks between two timer steps by their number in this Blender session.
 
-It survives renaming and undo, and no other file that is loaded has it; a name may be another's by then.
+The number survives renaming and undo, and is not reused when another file is loaded. A name may belong to another
+data-block by then.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ _Block = TypeVar("_Block", bound=bpy.types.ID)
 
 
 def scene_of(uid: int) -> bpy.types.Scene | None:
-    """The scene of this number, whatever it is called now; None if it is gone."""
+    """The scene with this number; None if it no longer exists."""
     return of(bpy.data.scenes, uid)
 
 
 def of(blocks: bpy.types.bpy_prop_collection[_Block], uid: int) -> _Block | None:
-    """The one of some data-blocks that has this number; None if it is gone."""
+    """The data-block with this number; None if it no longer exists."""
     return next((block for block in blocks if block.session_uid == uid), None)

@@ -1,1 +1,1 @@
-"""A shot, its folder as Blender sees it, and what was made for it in a scene."""
+"""A shot: its folder from Blender's point of view, and its objects in a scene."""

@@ -1,4 +1,4 @@
-"""What a checkpoint of the backend says about itself, read without the backend. No bpy: a file in, plain values out."""
+"""Facts stored in a checkpoint of the backend, read without the backend. No bpy: file in, plain values out."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from . import file_cache
 
 
 def facts(path: Path) -> dict[str, Any]:
-    """The facts that the backend stored in a checkpoint, read from the file's header; empty if there is none. Not to be
-    changed: they are remembered."""
+    """The facts in a checkpoint's header; empty if there are none. The result is cached: do not modify it."""
     try:
         return file_cache.of(path, _facts)
     except OSError:
@@ -29,7 +28,10 @@ def _facts(path: Path) -> dict[str, Any]:
 
 
 def paused(run: Path) -> dict[str, Any] | None:
-    """Of a run that has a checkpoint and is not finished: at which `iteration` of `end`, `preset` and `config`."""
+    """Progress of an unfinished run with a checkpoint; None for any other run.
+
+    The keys are `iteration`, `end`, `preset`, `config` and `depth_source`.
+    """
     header = facts(RunFolder(run).checkpoint)
     try:
         config = header["config"]
@@ -44,7 +46,7 @@ def paused(run: Path) -> dict[str, Any] | None:
 
 
 def depth_source(run: Path) -> str:
-    """Absolute path of the depth maps that a run was trained with; empty without."""
+    """Absolute path of the depth maps that a run was trained with; empty without depth maps."""
     depth: object = facts(RunFolder(run).checkpoint).get("depth")
     source = cast("dict[str, Any]", depth).get("source") if isinstance(depth, dict) else None
     return source if isinstance(source, str) and os.path.isabs(source) and source.isprintable() else ""
@@ -56,7 +58,10 @@ class _Count:
 
 
 def anew(run: Path) -> dict[str, Any] | None:
-    """Of a run that is trained anew, paused or at work: as `paused`, of the training that was saved last."""
+    """Progress of a run's repeated training, from its newest checkpoint; None if there is none.
+
+    The keys are those of `paused`, and `folder`.
+    """
     saved = sorted(RunFolder(run).next.glob(f"*/{contract.CHECKPOINT_FILE}"), key=_saved)
     progress = paused(saved[-1].parent) if saved else None
     return None if progress is None else {**progress, "folder": saved[-1].parent}
@@ -70,7 +75,7 @@ def _saved(path: Path) -> float:
 
 
 def extension(run: Path) -> dict[str, int] | None:
-    """Of steps that were begun to be added to a finished run: how many of `steps` are `done`."""
+    """Progress of additional steps for a finished run: `done` of `steps`; None if there are none."""
     folder = RunFolder(run)
     if not folder.extension.is_file():
         return None
@@ -87,7 +92,7 @@ def extension(run: Path) -> dict[str, int] | None:
 
 
 def params_of(config: dict[str, Any]) -> dict[str, Any]:
-    """Fields of `contract.TrainParams` that ask for the run of a stored `config` again, whatever it was begun with."""
+    """Fields of `contract.TrainParams` that reproduce the run of a stored `config`, whatever command started it."""
     anchors = config.get("supervision", {})
     return {
         "preset": config["preset"], "method": config["method"], "host": config.get("host", "hexplane"),
@@ -98,7 +103,7 @@ def params_of(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def other_cameras(shot: Path, run: Path) -> bool:
-    """True if the shot was solved again, with another result, after the run was trained."""
+    """True if the shot was solved again with another result after the run was trained."""
     cameras, folder = contract.ShotFolder(shot).cameras, RunFolder(run)
     try:
         trained_on = file_cache.of(folder.config, contract.read_json)["solve"]
@@ -108,5 +113,5 @@ def other_cameras(shot: Path, run: Path) -> bool:
 
 
 def _key(cameras: Path) -> str:
-    """What a run notes of the solve it was trained on."""
+    """Key of a solve, as stored in a run that was trained on it."""
     return contract.content_key(contract.read_json(cameras))

@@ -1,5 +1,7 @@
-"""What was read of a shot's files, kept until they change: the panel asks every second while a shot grows, and the
-files of a long one are long. No bpy."""
+"""Cache of data read from a shot's files, valid until they change. No bpy.
+
+The panel asks every second while a shot grows, and the files of a long shot are large.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +13,18 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 _MOST = 512
-"""Files that are remembered: the runs and takes of a few shots."""
+"""Maximum number of cached results, enough for the runs and takes of a few shots."""
 _known: OrderedDict[tuple[Any, ...], tuple[tuple[int, ...], Any]] = OrderedDict()
 
 
 def of(path: Path, read: Callable[..., T], *words: Hashable) -> T:
-    """`read(path, *words)`, remembered while file or folder is what it was: same file, same length, same times.
+    """`read(path, *words)`, cached while the file or folder keeps its inode, size and times.
 
-    All callers share the value: do not modify it. What `read` raises is not remembered.
+    All callers share the value: do not modify it. Exceptions from `read` are not cached.
 
     Args:
-        path: a file, or a folder if only the names in it count.
-        read: a function of a module, called with the path and `words`, which can be hashed.
+        path: a file, or a folder if only the names in it matter.
+        read: a module-level function, called with the path and the hashable `words`.
     """
     stat = os.stat(path)
     stamp = (stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)

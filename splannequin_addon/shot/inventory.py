@@ -1,4 +1,4 @@
-"""What a shot folder holds, as the panel tells it. No bpy: files in, plain values out."""
+"""The content of a shot folder, for the panel. No bpy: files in, plain values out."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ from .shot_state import ShotState
 
 
 def create(folder: Path, name: str = "") -> None:
-    """Makes an empty shot folder, or checks the one that is there. ValueError on one from a newer Splannequin;
-    JobError where other files lie there."""
+    """Creates an empty shot folder, or checks an existing one.
+
+    Raises ValueError for a shot from a newer Splannequin, and JobError if the folder holds other files.
+    """
     path = ShotFolder(folder).info_path
     if os.path.lexists(path):
         _typed(_Info, path)
@@ -35,7 +37,7 @@ def create(folder: Path, name: str = "") -> None:
 
 
 def read(folder: Path) -> ShotState:
-    """The state of the shot in a folder; an empty state if there is none. ValueError on a broken or newer file."""
+    """The state of the shot in a folder; empty if there is none. Raises ValueError for a damaged or newer file."""
     state, paths = ShotState(folder), ShotFolder(folder)
     if not paths.info_path.is_file():
         return state
@@ -75,20 +77,21 @@ def read(folder: Path) -> ShotState:
 
 
 def stamp(folder: Path) -> tuple[float, ...]:
-    """Changes when something in the shot did: cheap to ask for on every tick."""
+    """A value that changes whenever the shot changes. Cheap enough for every tick."""
     paths = ShotFolder(folder)
     parts = (paths.info_path, paths.listing, paths.solve_record, paths.motion, paths.runs, paths.takes, paths.jobs)
     deep = [p for place in (paths.runs, paths.takes) if place.is_dir() for p in place.iterdir()]
     places = (contract.RunFolder(run).next for run in deep)
     anew = [p for place in places if place.is_dir() for p in place.iterdir()]
-    # Windows dates no folder of a FAT or exFAT disk, as memory cards and portable disks are, when its files change.
+    # On FAT and exFAT disks (memory cards, portable disks), Windows does not update a folder's time when its files
+    # change.
     files = [place / name for place in [*deep, *anew] for name in _TOLD]
     files += [contract.TakeFolder(place).mattes_record for place in deep]
     return tuple(_mtime(p) for p in [*parts, *deep, *anew, *files])
 
 
 def mattes(take: contract.TakeFolder) -> dict[str, list[int]]:
-    """Name -> frames at which it was lassoed, of the mattes of a take; none if its record cannot be read."""
+    """Name -> frames with a lasso, for each matte of a take; empty if the record cannot be read."""
     found: dict[str, list[int]] = {}
     for row in lassos(take):
         found.setdefault(row["name"], []).append(row["frame"])
@@ -96,7 +99,7 @@ def mattes(take: contract.TakeFolder) -> dict[str, list[int]]:
 
 
 def lassos(take: contract.TakeFolder) -> list[dict[str, Any]]:
-    """Lassos of a take, as its mattes.json has them: name, frame, polygon; none if it cannot be read."""
+    """Lassos of a take from its mattes.json (name, frame, polygon); empty if it cannot be read."""
     if not take.mattes_record.is_file():
         return []
     try:
@@ -113,7 +116,7 @@ def _lassos(path: Path) -> list[dict[str, Any]]:
 
 
 def _is_lasso(row: object) -> bool:
-    """True of what names a matte as ours are named, a frame and a polygon."""
+    """True for a dict with a valid matte name, a frame and a polygon."""
     if not isinstance(row, dict):
         return False
     name, frame, polygon = (cast("dict[str, Any]", row).get(key) for key in ("name", "frame", "polygon"))
@@ -127,19 +130,19 @@ def _is_lasso(row: object) -> bool:
 
 
 def _is_unfinished(motion: Path) -> bool:
-    """True if a search for what moves was begun and not ended."""
+    """True if the search for motion has started but not ended."""
     return (motion / contract.MOTION_UNFINISHED_FILE).is_file() and not (motion / contract.MOTION_FILE).is_file()
 
 
 def plate_range(folder: Path) -> tuple[int, int] | None:
-    """First and last number of the undistorted plates, None before the solve."""
+    """First and last frame number of the undistorted plates; None before the solve."""
     found = (contract.frame_number(p.stem) for p in ShotFolder(folder).frames.glob(f"*{contract.PICTURE}"))
     numbers = [number for number in found if number is not None]
     return (min(numbers), max(numbers)) if numbers else None
 
 
 def picture_of(shot: Path, frame: int) -> str:
-    """Digest of the picture that a frame of a shot has; empty if the import noted none."""
+    """Digest of the image at a frame of a shot; empty if the import stored none."""
     try:
         return file_cache.of(ShotFolder(shot).listing, _digests).get(frame, "")
     except (OSError, ValueError):
@@ -147,9 +150,9 @@ def picture_of(shot: Path, frame: int) -> str:
 
 
 def floor(shot: Path) -> tuple[list[float], float] | None:
-    """The floor that the solve found (torch_backend/cameras/floor.py); None if it found none, or did not look.
+    """(normal, height) of the floor that the solve found (torch_backend/cameras/floor.py); None without a floor.
 
-    OSError without a solve; ValueError if its file is damaged.
+    Raises OSError without a solve, and ValueError if its file is damaged.
     """
     file = ShotFolder(shot).solve_record
     found = contract.read_json(file).get("floor")
@@ -165,27 +168,27 @@ def floor(shot: Path) -> tuple[list[float], float] | None:
 
 
 def solve_world(shot: Path) -> str:
-    """What the coordinates of the solve are: `contract.SCENE_WORLD`, or empty for a world of the solve's own.
+    """The world of the solve's coordinates: `contract.SCENE_WORLD`, or empty for the solve's arbitrary world.
 
-    OSError without a solve; ValueError if its file is damaged.
+    Raises OSError without a solve, and ValueError if its file is damaged.
     """
     return contract.SCENE_WORLD if contract.read_json(ShotFolder(shot).solve_record).get("world") else ""
 
 
 def burnt_in(shot: Path) -> Path | None:
-    """Mask of what the import found to be burnt into the clip; None if it found nothing."""
+    """Mask of the burnt-in graphics that the import found in the clip; None if it found none."""
     mask = ShotFolder(shot).burnt_in
     return mask if mask.is_file() else None
 
 
 def missing_frames(shot: Path, take: str, frames: Iterable[int]) -> list[int]:
-    """Those of some frames that a take lacks."""
+    """The frames among `frames` that a take lacks."""
     existing = set(numbered.frame_numbers(ShotFolder(shot).takes / take))
     return [n for n in frames if n not in existing]
 
 
 def _listed(path: Path) -> tuple[int, str, list[str], str, int]:
-    """Of frames.json: how many frames there are, and `beside`, `read_as`, `timecode` and `shift` of `ShotState`."""
+    """Values of frames.json: the number of frames, and `beside`, `read_as`, `timecode` and `shift` of `ShotState`."""
     listing = _read_typed(path, _Listing, contract.LONGEST_JSON)
     read_as = [contract.printable(line, 300) for line in listing["read_as"][:_MOST_SENTENCES] if isinstance(line, str)]
     return (
@@ -198,20 +201,21 @@ def _listed(path: Path) -> tuple[int, str, list[str], str, int]:
 
 
 def _digests(path: Path) -> dict[int, str]:
-    """Frame number -> digest of its picture, of frames.json."""
+    """Frame number -> digest of its image, from frames.json."""
     rows = _read_typed(path, _Listing, contract.LONGEST_JSON)["frames"]
     found = [cast("dict[str, Any]", row) for row in rows if isinstance(row, dict)]
     return {row["frame"]: str(row.get("digest", "")) for row in found if isinstance(row.get("frame"), int)}
 
 
 def _frame_count(take: Path, told: float) -> int:
-    """Frames in a take's folder. `told`: when take.json was written, which may be all that a change is known by."""
+    """Number of frames in a take's folder. `told` is the time of take.json; it is part of the cache key, because the
+    folder's own time may not change."""
     with os.scandir(take) as entries:
         return sum(1 for entry in entries if entry.name.endswith(contract.LAYERS))
 
 
 def _history(path: Path) -> list[tuple[float, float]]:
-    """(seconds, dB on frames kept out) of a run's metrics.jsonl; what cannot be read is passed over."""
+    """(seconds, dB on held-out frames) from a run's metrics.jsonl. Unreadable lines are skipped."""
     points: list[tuple[float, float]] = []
     try:
         with contextlib.closing(contract.read_lines(path)) as lines:
@@ -236,7 +240,7 @@ def _measured(line: bytes) -> tuple[float, float] | None:
 
 @dataclass
 class _Info:
-    """Of shot.json."""
+    """Fields of shot.json."""
 
     name: str = ""
     source: str = ""
@@ -250,7 +254,7 @@ class _Info:
 
 @dataclass
 class _Listing:
-    """Of frames.json."""
+    """Fields of frames.json."""
 
     frames: list[Any]
     beside: str = ""
@@ -261,7 +265,7 @@ class _Listing:
 
 @dataclass
 class _Solve:
-    """Of solve.json, and of the result in it."""
+    """Fields of solve.json and of its `result`."""
 
     quality: str = ""
     interpolated: int = 0
@@ -271,7 +275,7 @@ class _Solve:
 
 @dataclass
 class _Run:
-    """Of summary.json."""
+    """Fields of summary.json."""
 
     run: str = ""
     preset: str = "preview"
@@ -283,7 +287,7 @@ class _Run:
 
 @dataclass
 class _Take:
-    """Of take.json."""
+    """Fields of take.json."""
 
     take: str
     run: str
@@ -299,11 +303,11 @@ class _Take:
     overscan: float = 0.0
     shutter: float = 0.0
     frames_in_all: int = 0
-    """Frames that the take can have; 0 of a take from before this was noted."""
+    """Number of frames that the take can have; 0 for a take of an earlier version."""
     t_star_asked: int | None = None
-    """t* as requested, which `t_star_frame` may be near; None: suggested, or not noted."""
+    """Requested t*, from which `t_star_frame` may differ; None if t* was suggested or not stored."""
     combined: dict[str, Any] = field(default_factory=dict[str, Any])
-    """Of a take that was put together: `base`, and `things`, matte to take."""
+    """For a combined take: `base`, and `things` (matte -> take)."""
 
     def __post_init__(self) -> None:
         numbers = [*self.margin, *self.t_star_per_frame.values()]
@@ -312,9 +316,9 @@ class _Take:
 
 
 def _typed(kind: type, path: Path) -> dict[str, Any]:
-    """A file of the shot, what the dataclass `kind` names in it checked and completed. ValueError says what is wrong.
+    """A file of the shot, with the fields of the dataclass `kind` checked and completed.
 
-    OSError if there is none.
+    Raises ValueError, which names the fault, and OSError if the file is missing.
     """
     return dict(file_cache.of(path, _read_typed, kind))
 
@@ -346,15 +350,15 @@ def _believed(kind: type, data: dict[str, Any]) -> dict[str, Any]:
 
 _MOST_SENTENCES = 4
 _LARGEST = 1 << 31
-"""Blender's whole numbers end there."""
+"""Limit of Blender's integers."""
 _TOLD = (contract.SUMMARY_FILE, contract.CHECKPOINT_FILE, contract.EXTENSION_FILE, contract.TAKE_FILE)
-"""In the folders of runs and takes: what the panel tells of them."""
+"""Files in the folders of runs and takes that the panel reports on."""
 _LONGEST_HISTORY = 1 << 24
-"""Bytes of a run's measurements that are read; 100,000 take as much."""
+"""Maximum bytes read of a run's metrics, enough for 100,000 measurements."""
 
 
 def _named(kind: type, folder: Path, file: str, damaged: dict[str, str]) -> dict[str, dict[str, Any]]:
-    """Name -> file of every folder that has it; of those that cannot be believed, in `damaged` why not."""
+    """Name -> content of `file`, for every folder with a valid one. `damaged` gets name -> reason for invalid ones."""
     found: dict[str, dict[str, Any]] = {}
     for name in _names(folder, file):
         try:
@@ -365,7 +369,7 @@ def _named(kind: type, folder: Path, file: str, damaged: dict[str, str]) -> dict
 
 
 def _names(folder: Path, file: str) -> list[str]:
-    """Folders that have the file; not one that is about to take another's place, or whose name cannot be shown."""
+    """Names of the folders with the file. Skips temporary folders and names that cannot be displayed."""
     found = {p.parent.name for p in folder.glob(f"*/{file}")}
     return sorted(name for name in found if name.isprintable() and not name.startswith("."))
 

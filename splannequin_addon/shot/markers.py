@@ -1,4 +1,4 @@
-"""The marker "t*" on the timeline: dragging it sets the instant, setting the instant moves it."""
+"""The marker "t*" on the timeline. The marker and the instant t* follow each other."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
 
 NAME = "t*"
 _known: dict[int, tuple[int, int]] = {}
-"""`session_uid` of a scene -> (frame of the marker, t*) when they last agreed."""
+"""`session_uid` of a scene -> (frame of the marker, t*) when the two last agreed."""
 
 
 def toggle(scene: bpy.types.Scene) -> bool:
-    """Puts the marker on the timeline, or takes it away. True if it is there now."""
+    """Adds the marker to the timeline, or removes it. True if it was added."""
     if remove(scene):
         return False
     scene.timeline_markers.new(NAME, frame=settings_of(scene).t_star)
@@ -24,7 +24,7 @@ def toggle(scene: bpy.types.Scene) -> bool:
 
 
 def remove(scene: bpy.types.Scene) -> bool:
-    """Takes the marker away. True if there was one."""
+    """Removes the marker. True if there was one."""
     _known.pop(scene.session_uid, None)
     marker = named(scene.timeline_markers, NAME)
     if marker is None:
@@ -34,7 +34,7 @@ def remove(scene: bpy.types.Scene) -> bool:
 
 
 def follow(scene: bpy.types.Scene) -> bool:
-    """Lets whichever of marker and t* changed last lead. True if something was changed."""
+    """Synchronises marker and t*: the one that changed last sets the other. True if something was changed."""
     marker, props = named(scene.timeline_markers, NAME), settings_of(scene)
     if marker is None or marker.frame == props.t_star:
         if marker is not None:
@@ -50,5 +50,5 @@ def follow(scene: bpy.types.Scene) -> bool:
 
 
 def forget() -> None:
-    """Forgets the markers of all scenes, since another file was loaded."""
+    """Clears the stored markers of all scenes. Call it when another file is loaded."""
     _known.clear()

@@ -1,4 +1,4 @@
-"""Where a shot stands in its scene, written into the shot folder for what leaves it: splats and cameras."""
+"""The placement of a shot in its scene, written into the shot folder for exported splats and cameras."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from . import scene_objects
 
 
 def placement_in(scene: bpy.types.Scene, shot: Path) -> contract.Placement | None:
-    """The placement of a shot's solve by its root, z up; None if the scene has no root of it, or there is no solve.
+    """The placement of a shot's solve, from its root, z up; None without a root in the scene or without a solve.
 
-    A root that was stretched or mirrored by hand gives its turn, its place and its mean scale.
+    For a root that was stretched or mirrored by hand, uses its rotation, location and mean scale.
     """
     root, cameras = scene_objects.placed_root(scene, shot), contract.ShotFolder(shot).cameras
     if root is None or not cameras.is_file():
         return None
     place, turn, stretch = root.matrix_world.decompose()
     scale = sum(abs(value) for value in stretch) / 3.0
-    # In float64: in single precision a large scale would fail the test for a uniform scale.
+    # Uses float64: in single precision a large scale would fail the test for a uniform scale.
     matrix = np.eye(4)
     matrix[:3, :3] = scale * _orthonormal(np.array(turn.to_matrix(), dtype=np.float64))
     matrix[:3, 3] = place[:]
@@ -32,19 +32,20 @@ def placement_in(scene: bpy.types.Scene, shot: Path) -> contract.Placement | Non
 
 
 def write(scene: bpy.types.Scene, shot: Path) -> None:
-    """Writes the placement of a shot into its folder, if it stands in the scene. OSError if it cannot be written."""
+    """Writes the placement of a shot into its folder, if the scene has its root. Raises OSError if it cannot be
+    written."""
     placement = placement_in(scene, shot)
     if placement is not None:
         contract.write_json(contract.ShotFolder(shot).placement, placement.to_json(), parents=False)
 
 
 def in_solve(placement: contract.Placement) -> Matrix:
-    """The inverse of a placement: what stands in a scene's units, under a root that is the solve's."""
+    """The inverse of a placement: converts scene coordinates to solve coordinates, for objects under the root."""
     return Matrix(np.array(placement.scene_from_solve).reshape(4, 4).tolist()).inverted()
 
 
 def _orthonormal(turn: np.ndarray) -> np.ndarray:
-    """The columns of a rotation [3, 3], square to each other in float64 (Gram and Schmidt)."""
+    """A rotation [3, 3] with columns made orthonormal in float64 (Gram-Schmidt)."""
     x = turn[:, 0] / np.sqrt((turn[:, 0] ** 2).sum())
     y = turn[:, 1] - x * (x * turn[:, 1]).sum()
     y = y / np.sqrt((y**2).sum())

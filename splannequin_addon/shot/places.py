@@ -1,8 +1,8 @@
-"""Where clip, shot folder and what was made from it lie: a folder that is moved as a whole goes on working.
+"""Locations of the clip, the shot folder and its results. A folder that is moved as a whole keeps working.
 
-The settings keep paths relative to the .blend once it is saved, as Blender keeps its own. Those of older files, which
-kept them whole, are searched for beside the .blend when it is opened. A shot folder that was here and is gone is told
-from one that is still to be made, and can be located.
+Settings store paths relative to the .blend once it is saved, as Blender does. Older files stored absolute paths. When
+such a file is opened, missing paths are searched for near the .blend. A missing shot folder can be located. The panel
+distinguishes it from a folder that has not been created yet.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ from . import inventory, scene_objects, selection
 from .shot_state import ShotState
 
 _SETTINGS = ("clip", "shot_path", "cameras_path", "st_map", "lut", "ignore_path", "people_path", "shot_seen")
-"""Settings of a shot that hold a path."""
+"""Settings of a shot that are paths."""
 _OUTPUT = "filepath"
-"""Of a scene's render settings: the output path, which may be ours."""
+"""Property of the scene's render settings: the output path, which may be ours."""
 _saving: list[str] = []
-"""Paths of `_holders` as they were before the save, to restore them after it."""
+"""Paths of `_holders` from before the save, to be restored after it."""
 
 
 def source_of(state: ShotState) -> str:
-    """The footage that a shot was imported from, where it is now: as it was named, or beside the shot, with which it
-    was moved. Empty if it is in neither place."""
+    """The current location of the footage that a shot was imported from: as stored, or next to the moved shot.
+
+    Empty if the footage is in neither place.
+    """
     named, beside = str(state.info.get("source", "")), state.beside
     candidates = [Path(named), state.folder.parent / re.split(r"[\\/]", named)[-1]]
     if beside:
@@ -42,10 +44,10 @@ def source_of(state: ShotState) -> str:
 
 
 def locate(scene: bpy.types.Scene, folder: Path) -> None:
-    """Makes `folder` the scene's shot, in place of one that was moved or renamed: what was made from that stays.
+    """Makes `folder` the scene's shot and replaces one that was moved or renamed. The shot's objects in the scene stay.
 
     Raises:
-        contract.JobError: there is no shot in it.
+        contract.JobError: the folder contains no shot.
     """
     try:
         state = inventory.read(folder)
@@ -73,7 +75,7 @@ def locate(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _there(path: Path) -> bool:
-    """True if footage is there: a file, a folder of pictures, or a pattern in a folder that is there."""
+    """True if footage exists: a file, a folder of images, or a pattern in an existing folder."""
     return path.exists() or (contract.is_pattern(path.name) and path.parent.is_dir())
 
 
@@ -88,18 +90,18 @@ def _holders() -> Iterator[tuple[Any, str]]:
 
 
 def _outside() -> Iterator[tuple[Any, str]]:
-    """`_holders` beside our settings: output paths, the artist's too, and images that are painted on."""
+    """`_holders` outside our settings: output paths, including the artist's, and painted images."""
     yield from ((scene.render, _OUTPUT) for scene in bpy.data.scenes)
     yield from ((i, MATTE_SHOT) for i in bpy.data.images if not i.library and isinstance(i.get(MATTE_SHOT), str))
 
 
 def _get(owner: bpy.types.bpy_struct, name: str) -> str:
-    """A path that an owner holds."""
+    """The path in an owner's property."""
     return str(owner[name] if isinstance(owner, bpy.types.Image) else getattr(owner, name))
 
 
 def _set(owner: bpy.types.bpy_struct, name: str, path: str) -> None:
-    """Has it hold another."""
+    """Sets the path in an owner's property."""
     if isinstance(owner, bpy.types.Image):
         owner[name] = path
     else:
@@ -107,20 +109,22 @@ def _set(owner: bpy.types.bpy_struct, name: str, path: str) -> None:
 
 
 def _rendered_of(path: Path) -> Path | None:
-    """The shot whose take an output path of ours is for; None of the artist's own."""
+    """The shot of an output path of ours; None for the artist's path."""
     ours = path.name == DIGITS and len(path.parents) > 2 and path.parents[1].name == BAKES
     return path.parents[2] if ours else None
 
 
 def _relative(path: str, base: str) -> str:
-    """`path` as a .blend in the folder `base` should hold it."""
+    """`path` in the form stored in a .blend in the folder `base`."""
     return paths.relative(path, base) if path and base else path
 
 
 @persistent
 def _before_save(file: object = "", *_: object) -> None:
-    """Paths become relative to where the file is being saved; with Blender's *Relative Paths* off only those that were
-    relative to where it was."""
+    """Handler: makes paths relative to the folder of the save.
+
+    Without Blender's *Relative Paths*, changes only paths that were relative before.
+    """
     _saving.clear()
     if not isinstance(file, str) or not file:  # the startup file
         return
@@ -129,14 +133,14 @@ def _before_save(file: object = "", *_: object) -> None:
         path = _get(owner, name)
         _saving.append(path)
         if name == _OUTPUT and not _known(Path(paths.absolute(path)), name):
-            continue  # the artist's
+            continue  # the artist's path
         if path and (all_of_them or path.startswith("//")):
             _set(owner, name, _relative(paths.absolute(path), os.path.dirname(os.path.abspath(file))))
 
 
 @persistent
 def _after_save(file: str = "", *_: object) -> None:
-    """A copy was saved, or nothing was: in the open file the paths stay as they were."""
+    """Handler: restores the paths of the open file after a copy was saved, or after a save failed."""
     if file and _saving and os.path.abspath(file) != bpy.data.filepath:
         for (owner, name), path in zip(_holders(), _saving, strict=True):
             _set(owner, name, path)
@@ -145,7 +149,7 @@ def _after_save(file: str = "", *_: object) -> None:
 
 @persistent
 def _after_load(*_: object) -> None:
-    """What an older file names by its whole path, and is not there, is searched for beside the .blend."""
+    """Handler: searches near the .blend for missing files that an older .blend stores with absolute paths."""
     if not bpy.data.filepath:
         return
     _read_backslashes()
@@ -164,7 +168,8 @@ def _after_load(*_: object) -> None:
 
 
 def _read_backslashes() -> None:
-    """Relative paths of a file that was saved on Windows get slashes elsewhere, as Blender reads its own."""
+    """Converts relative paths of a file saved on Windows to slashes on other systems, as Blender does with its
+    paths."""
     if os.sep == "\\":
         return
     for owner, name in _holders():
@@ -178,7 +183,7 @@ def _read_backslashes() -> None:
 
 
 def _slashed(path: str) -> str:
-    """A relative path with slashes. Other paths, and names of existing files, stay: a file name may hold
+    """A relative path with slashes. Other paths and existing files stay unchanged: a file name may contain
     backslashes."""
     if not path.startswith("//") or "\\" not in path or os.path.lexists(paths.absolute(path)):
         return path
@@ -186,7 +191,7 @@ def _slashed(path: str) -> str:
 
 
 def _known(path: Path, name: str) -> bool:
-    """True if what the setting `name` is about is there; of a clip its shot is enough."""
+    """True if the file or folder of the setting `name` exists. For a clip, its shot is sufficient."""
     try:
         if name in ("clip", "cameras_path", "st_map", "lut", "ignore_path", "people_path"):
             return _there(path) or (name == "clip" and contract.ShotFolder(selection.beside(path)).info_path.is_file())
@@ -205,7 +210,8 @@ _HANDLERS = (
 
 
 def register() -> None:
-    """Listens to saving and loading; before the job timer, which looks at the shots of a file once it is loaded."""
+    """Registers the handlers. Must run before the job timer's registration, because its load handler examines the
+    shots."""
     for name, handler in _HANDLERS:
         getattr(bpy.app.handlers, name).append(handler)
 

@@ -1,7 +1,7 @@
-"""Objects that were added to a scene for a shot, kept as pointers in the scene.
+"""Objects that were added to a scene for a shot, stored as pointers in the scene.
 
-A mark on an object would travel with its copies: what the artist duplicates would pass for ours, and be removed. A
-pointer follows the one object through renaming, undo, saving and a full copy of the scene.
+A tag on an object would be copied with it: an artist's duplicate would count as ours and be removed. A pointer follows
+one object through renaming, undo, saving and a full copy of the scene.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ..properties import BoolProperty, CollectionProperty, FloatProperty, Items,
 from ..scene import paths, session
 
 PARTS = ("root", "camera", "points")
-"""Our objects of a shot."""
+"""Names of a shot's objects."""
 
 
 class SPLANNEQUIN_PG_splats(bpy.types.PropertyGroup):
@@ -75,47 +75,48 @@ def name_of(shot: Path) -> str:
 
 
 def of(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made | None:
-    """What was made for a shot, None if nothing was. Never writes: drawing asks."""
+    """The entry of a shot's objects, or None. Never writes, because it is called while drawing."""
     for entry in settings_of(scene).made:
         if entry.name != name_of(shot):
             continue
         folder = os.path.abspath(paths.absolute(entry.folder))
-        # Of another path: another shot of the same name, unless it was moved here since.
+        # A different path is another shot of the same name, unless the shot was moved here since.
         if paths.same(folder, os.path.abspath(shot)) or not os.path.isdir(folder):
             return entry
     return None
 
 
 def new(scene: bpy.types.Scene, shot: Path) -> SPLANNEQUIN_PG_made:
-    """`of`, made if it is not there."""
+    """The entry of a shot's objects, created if missing."""
     entry = of(scene, shot) or settings_of(scene).made.add()
     entry.name, entry.folder = name_of(shot), paths.blend_path(shot)
     return entry
 
 
 def drop(scene: bpy.types.Scene, shot: Path) -> None:
-    """Forgets a shot; what it points to stays."""
+    """Removes the entry of a shot. Its objects stay."""
     entry = of(scene, shot)
     if entry is not None:
         settings_of(scene).made.remove(list(settings_of(scene).made).index(entry))
 
 
 def part(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | None:
-    """One of `PARTS`, or the plate, if the scene still has it."""
+    """One of `PARTS`, or the plate; None if the scene no longer has it."""
     entry = of(scene, shot)
     item = getattr(entry, name) if entry is not None else None
     return item if item is not None and named(scene.objects, item.name) == item else None
 
 
 def keep_camera(scene: bpy.types.Scene) -> None:
-    """Remembers the scene's camera, before a shot's takes its place."""
+    """Stores the scene's camera before a shot's camera replaces it."""
     camera = scene.camera
     if camera is not None and camera not in [entry.camera for entry in settings_of(scene).made]:
         settings_of(scene).camera_before = camera
 
 
 def give_camera_back(scene: bpy.types.Scene) -> None:
-    """Where the scene's camera went with a shot: another shot's takes its place, or the one before all of them."""
+    """Sets the camera of a scene whose camera was removed with a shot: another shot's, or the one from before all
+    shots."""
     held = settings_of(scene)
     if scene.camera is None:
         others = [entry.camera for entry in held.made] + [held.camera_before]
@@ -125,14 +126,14 @@ def give_camera_back(scene: bpy.types.Scene) -> None:
 
 
 def tidy(scene: bpy.types.Scene) -> None:
-    """Lets go of what the artist deleted: the pointer would keep it in the file, out of sight."""
+    """Clears pointers to objects that the artist deleted. The pointers would keep them invisibly in the file."""
     before = settings_of(scene).camera_before
     if before is not None and not _stands(before, [scene.objects]):
         settings_of(scene).camera_before = None
     for entry in settings_of(scene).made:
         if entry.collection is not None and entry.collection not in scene.collection.children_recursive:
             entry.collection = None
-        own = [entry.collection.objects] if entry.collection is not None else []  # few, and most of ours lie there
+        own = [entry.collection.objects] if entry.collection is not None else []  # short list, most of our objects
         for name in (*PARTS, "plate"):
             item = getattr(entry, name)
             if item is not None and not _stands(item, [*own, scene.objects]):
@@ -145,16 +146,20 @@ def tidy(scene: bpy.types.Scene) -> None:
 
 
 def _stands(item: bpy.types.Object, among: list[bpy.types.bpy_prop_collection[bpy.types.Object]]) -> bool:
-    """True if a scene has an object, looked for by its name `among` some first: every turn of the timer asks, and
-    `users_scene` copies the list of all objects of every scene, which may be tens of thousands."""
+    """True if any scene has an object. Searches by name in the collections `among` first.
+
+    Called at every tick. `users_scene` copies the list of all objects of every scene, which may be tens of thousands.
+    """
     return any(named(objects, item.name) == item for objects in among) or bool(item.users_scene)
 
 
 def remove_kept(
     scene: bpy.types.Scene, kept: Items[SPLANNEQUIN_PG_splats | SPLANNEQUIN_PG_surface], take: str | None
 ) -> bool:
-    """Takes the objects of a take, or of all takes, out of a list of them and out of the file. True if there were some.
-    What stands in other scenes alone stays in the file."""
+    """Removes the objects of a take, or of all takes, from a list and from the file. True if there were any.
+
+    Objects that are only in other scenes stay in the file.
+    """
     is_found = False
     for index in reversed(range(len(kept))):
         if take is not None and kept[index].name != take:
@@ -174,24 +179,25 @@ def remove_kept(
 def placed_root(
     scene: bpy.types.Scene, shot: Path, graph: bpy.types.Depsgraph | None = None
 ) -> bpy.types.Object | None:
-    """The shot's root if the scene has it; as it stands by `graph`, without which it is as a window last showed it."""
+    """The shot's root if the scene has it, evaluated by `graph`. Without `graph` it has the state last shown in a
+    window."""
     root = part(scene, shot, "root")
     return root if root is None or graph is None else root.evaluated_get(graph)
 
 
 def depth_scale(scene: bpy.types.Scene, shot: Path, graph: bpy.types.Depsgraph | None = None) -> float:
-    """Scene units per solve unit: the mean scale of the shot's root, 1 without one."""
+    """Scene units per solve unit: the mean scale of the shot's root, or 1 without a root."""
     root = placed_root(scene, shot, graph)
     return float(sum(root.matrix_world.to_scale()[:]) / 3.0) if root else 1.0
 
 
 def is_plate(camera: bpy.types.Object) -> bool:
-    """True of a camera that shows a clip until it is solved, whichever shot's."""
+    """True for a camera of any shot that shows its clip until the solve."""
     return any(entry.plate == camera for scene in bpy.data.scenes for entry in settings_of(scene).made)
 
 
 def needed_scene(scene_uid: int) -> bpy.types.Scene:
-    """The scene of this number. JobError if it is gone."""
+    """The scene with this number. Raises JobError if it no longer exists."""
     scene = session.scene_of(scene_uid)
     if scene is None:
         raise contract.JobError("The scene is not there any more.", "", contract.ExitCode.USAGE)
@@ -199,6 +205,6 @@ def needed_scene(scene_uid: int) -> bpy.types.Scene:
 
 
 def check_root(scene: bpy.types.Scene, shot: Path) -> None:
-    """JobError if the shot does not stand in the scene."""
+    """Raises JobError if the scene lacks the shot's root."""
     if part(scene, shot, "root") is None:
         raise contract.JobError("The solve is not in this scene.", "Load the camera first.", contract.ExitCode.USAGE)

@@ -1,4 +1,4 @@
-"""Cameras in the solve's coordinates: what a view of the scene shows, and what a take was seen from."""
+"""Cameras in the solve's coordinates: of a view of the scene, and of a take."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def in_solve(
     height: int,
     graph: bpy.types.Depsgraph | None = None,
 ) -> tuple[list[float], list[float]]:
-    """(viewmat, K) in solve units of what a view of the scene shows.
+    """(viewmat, K) of a view of the scene in solve units.
 
     Args:
-        scene: the scene, in which the shot's root says where the solve stands.
+        scene: the scene. The shot's root in it defines the placement of the solve.
         shot: shot folder.
         view_matrix: world to view, Blender's axes, [4, 4].
         window_matrix: perspective projection, [4, 4].
-        width: of the picture in pixels.
-        height: of the picture in pixels.
-        graph: where the root stands by it; None: in the window's scene, which is the scene then.
+        width: width of the image in pixels.
+        height: height of the image in pixels.
+        graph: dependency graph that evaluates the root; None: the state in the window, which must show the scene.
 
     Returns:
         viewmat: 16 floats, world-to-camera, row-major, OpenCV axes.
@@ -51,7 +51,7 @@ def in_solve(
 def sampled(
     scene: bpy.types.Scene | None, name: str, shot: Path, number: int, size: tuple[int, int]
 ) -> contract.CameraFrame:
-    """A camera at one frame, as `sample_path` reads it; without a name the scene's own, as markers switch it."""
+    """A camera at one frame in solve units; with an empty name, the scene's active camera, as markers switch it."""
     stands, window, graph = evaluated(scene, name, number, size)
     view = stands.normalized().inverted()
     scene = present(scene)
@@ -65,21 +65,21 @@ def evaluated(
     size: tuple[int, int],
     hint: str = "Choose another camera to freeze from.",
 ) -> tuple[Matrix, Matrix, bpy.types.Depsgraph]:
-    """A camera of a scene at a frame, which the scene shows then.
+    """A camera of a scene, evaluated at a frame. Sets the scene to that frame.
 
     Args:
-        scene: the scene; None: it is gone.
-        name: of the camera object; empty: the scene's own, as markers switch it.
-        number: of the frame.
-        size: width and height in pixels of the picture; its pixels have the aspect of the scene's.
-        hint: what to do if it is no perspective camera of the scene.
+        scene: the scene; None if it no longer exists.
+        name: name of the camera object; empty: the active camera, as markers switch it.
+        number: frame number.
+        size: width and height of the image in pixels, with the scene's pixel aspect.
+        hint: hint of the error if it is not a perspective camera of the scene.
 
     Returns:
-        Camera-to-world as it is evaluated, Blender's camera axes, [4, 4]; perspective projection, [4, 4]; and the
-        dependency graph that both are of.
+        Evaluated camera-to-world matrix, Blender's camera axes, [4, 4]; perspective projection, [4, 4]; and the
+            dependency graph of both.
 
     Raises:
-        contract.JobError: the camera is gone, is no perspective camera, or is not evaluated.
+        contract.JobError: the camera no longer exists, is not a perspective camera, or is not evaluated.
     """
     if scene is not None:
         scene.frame_set(number)
@@ -91,7 +91,7 @@ def evaluated(
             hint,
             contract.ExitCode.USAGE,
         )
-    # The context's may be another scene's, where the camera stands still.
+    # The context's view layer may belong to another scene, where the camera does not move.
     graph = present(_layer(scene, camera).depsgraph)
     seen = camera.evaluated_get(graph)
     if not seen.is_evaluated:
@@ -107,7 +107,7 @@ def evaluated(
 
 @contextlib.contextmanager
 def frame_kept(scene_uid: int) -> Generator[None]:
-    """Within it the scene of this number may show other frames; at the end it shows the one that it did."""
+    """Context manager that restores the current frame of the scene with this number at the end."""
     scene = session.scene_of(scene_uid)
     before = (scene.frame_current, scene.frame_subframe) if scene is not None else None
     try:
@@ -119,14 +119,14 @@ def frame_kept(scene_uid: int) -> Generator[None]:
 
 
 def _layer(scene: bpy.types.Scene, camera: bpy.types.Object) -> bpy.types.ViewLayer:
-    """A view layer of the scene in which a camera moves: the context's, if it is one of them, else the first."""
+    """A view layer of the scene with a camera: the context's if possible, else the first."""
     layers = [layer for layer in scene.view_layers if named(layer.objects, camera.name) == camera]
     shown = bpy.context.view_layer
     return next((layer for layer in layers if layer == shown), (layers or list(scene.view_layers))[0])
 
 
 def path_of(shot: Path, facts: dict[str, Any]) -> str:
-    """File of the camera path that a take was seen from: as it was named, or in the shot, if that was moved since."""
+    """File of a take's camera path: as stored, or in the shot if the shot was moved since."""
     named = str(facts.get("camera_path", ""))
     moved = contract.ShotFolder(shot).camera_path(str(facts.get("take", "")))
     return str(moved) if named and not os.path.isfile(named) and os.path.isfile(moved) else named

@@ -1,8 +1,8 @@
-"""Several shots in one scene. The scene's settings are those of the chosen shot; the others wait in a list.
+"""Several shots in one scene. The scene's settings are those of the selected shot; the other shots are in a list.
 
-The list is empty while there is one shot. The item of the chosen one is behind: its values stand in the scene's
-settings, where everything looks for them, and are put back when another is chosen. So are the scene's own size, rate
-and range, where a shot has set them.
+With a single shot the list is empty. The list item of the selected shot is outdated. Its current values are in the
+scene's settings, and are copied back when another shot is selected. The same applies to the scene's size, rate and
+range, if a shot has set them.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from . import scene_objects, source
 from .shot_state import ShotState
 
 _T_STAR = "splannequin.t_star"
-"""Data path of the one setting that can be keyed."""
+"""Data path of the only setting that can have keyframes."""
 _ITEMS_OWN = ("rna_type", "name", "scene_settings")
-"""What an item of the list has beside a shot's settings."""
+"""Properties of a list item that are not settings of a shot."""
 _LOOK_SECONDS = 1.0
 _switching = False
 _beside: dict[Path, tuple[float, Path]] = {}
-"""Clip -> when its shot folder was looked up, monotonic seconds, and the folder."""
+"""Clip -> (time of the lookup in monotonic seconds, shot folder)."""
 
 
 def names() -> list[str]:
-    """Settings that belong to a shot."""
+    """Names of the settings that belong to a shot."""
     held: Any = bpy.types.Scene.bl_rna.properties["splannequin"]
     rna = held.fixed_type.properties["shots"].fixed_type
     return [one.identifier for one in rna.properties if one.identifier not in _ITEMS_OWN]
 
 
 def folder_of(one: OneShot) -> Path | None:
-    """Shot folder that settings name; None while neither it nor a clip is chosen."""
+    """Shot folder of the settings; None if neither a folder nor a clip is selected."""
     if one.shot_path:
         return Path(os.path.abspath(bpy.path.abspath(one.shot_path)))
     if not one.clip:
@@ -49,7 +49,7 @@ def folder_of(one: OneShot) -> Path | None:
 
 
 def beside(clip: Path) -> Path:
-    """`contract.shot_beside`, looked up once a second, since drawing asks all the time."""
+    """Cached `contract.shot_beside`, looked up once a second, because it is called at every redraw."""
     found = _beside.get(clip)
     if found is None or time.monotonic() - found[0] > _LOOK_SECONDS:
         found = _beside[clip] = (time.monotonic(), contract.shot_beside(clip, source.is_of))
@@ -57,12 +57,12 @@ def beside(clip: Path) -> Path:
 
 
 def look_again() -> None:
-    """Makes the next call of `beside` look at the disk: a shot may have been imported since."""
+    """Clears the cache of `beside`, because a shot may have been imported."""
     _beside.clear()
 
 
 def settings(scene: bpy.types.Scene) -> list[OneShot]:
-    """Settings of all shots of a scene, in the order of the list; those of the chosen shot are the scene's own."""
+    """Settings of all shots of a scene in list order. The scene holds the settings of the selected shot."""
     held = settings_of(scene)
     return [held if i == held.loaded_shot else item for i, item in enumerate(held.shots)] or [held]
 
@@ -73,7 +73,7 @@ def folders(scene: bpy.types.Scene) -> list[Path | None]:
 
 
 def labels(scene: bpy.types.Scene) -> list[str]:
-    """What the shots of a scene are called: as their folders, with their parent folder where two names are equal."""
+    """Display names of a scene's shots: the folder names, with the parent folder where two names are equal."""
     found = folders(scene)
     called = [scene_objects.name_of(folder) if folder is not None else "New shot" for folder in found]
     return [
@@ -85,7 +85,8 @@ def labels(scene: bpy.types.Scene) -> list[str]:
 
 
 def _apart(folder: Path, among: list[Path | None]) -> str:
-    """The shortest end of a folder's parent path that no other of `among` has; all of it if they are the same."""
+    """The shortest end of a folder's parent path that differs from all others in `among`; the whole path if there is
+    none."""
     others = [other.parent.parts for other in among if other is not None and other != folder]
     parts = folder.parent.parts
     for count in range(1, len(parts)):
@@ -95,18 +96,18 @@ def _apart(folder: Path, among: list[Path | None]) -> str:
 
 
 def add(scene: bpy.types.Scene) -> None:
-    """Appends a shot with settings as at first, and chooses it."""
+    """Appends a shot with default settings and selects it."""
     held = settings_of(scene)
     if not len(held.shots):
         _copy(held, held.shots.add())
         held.loaded_shot = 0
     held.shots.add()
-    held.active_shot = len(held.shots) - 1  # this calls `choose`
+    held.active_shot = len(held.shots) - 1  # the update callback calls `choose`
     choose(scene, held.active_shot)
 
 
 def choose(scene: bpy.types.Scene, index: int) -> None:
-    """Puts the settings of a shot in place of the chosen one's, and makes its camera the scene's if it is there."""
+    """Selects a shot: its settings replace the scene's, and its camera, if loaded, becomes the active camera."""
     held = settings_of(scene)
     if not len(held.shots):
         return
@@ -127,7 +128,7 @@ def choose(scene: bpy.types.Scene, index: int) -> None:
 
 
 def remove(scene: bpy.types.Scene, index: int) -> None:
-    """Takes a shot off the list, with its keys of t*; a neighbour is chosen in its place. Needs two or more."""
+    """Removes a shot and its t* keyframes from the list and selects a neighbour. Requires two or more shots."""
     held = settings_of(scene)
     if index == held.loaded_shot:
         choose(scene, index + 1 if index + 1 < len(held.shots) else index - 1)
@@ -146,12 +147,12 @@ def _path(index: int) -> str:
 
 
 def is_switching() -> bool:
-    """True while the settings of one shot are being put in place of another's."""
+    """True while the settings of the selected shot are being replaced."""
     return _switching
 
 
 def _copy(one: OneShot, other: OneShot) -> None:
-    """Copies the settings of a shot; those that were never set stay so."""
+    """Copies the settings of a shot. Unset properties stay unset."""
     global _switching
     _switching = True
     try:
@@ -165,7 +166,7 @@ def _copy(one: OneShot, other: OneShot) -> None:
 
 
 def _rename(scene: bpy.types.Scene, paths: Mapping[str, str]) -> None:
-    """Has the scene's F-curves and drivers lead elsewhere, all at once."""
+    """Changes data paths of the scene's F-curves and drivers, all at once."""
     drivers = scene.animation_data.drivers if scene.animation_data is not None else ()
     for curve in [*compat_animation.fcurves(scene), *drivers]:
         if curve.data_path in paths:
@@ -173,22 +174,22 @@ def _rename(scene: bpy.types.Scene, paths: Mapping[str, str]) -> None:
 
 
 def shot_folder(scene: bpy.types.Scene) -> Path | None:
-    """Folder of the scene's shot, of several the chosen one; None while neither it nor a clip is chosen."""
+    """Folder of the scene's selected shot; None if neither a folder nor a clip is selected."""
     return folder_of(settings_of(scene))
 
 
 def scenes_of(shot: Path) -> list[bpy.types.Scene]:
-    """Scenes of the file that work on a shot: of several, it is the chosen one. Not those linked from another file."""
+    """Scenes of the file with this shot selected. Excludes scenes linked from another file."""
     return [s for s in bpy.data.scenes if not library_of(s) and shot_folder(s) == shot]
 
 
 def scenes_with(shot: Path) -> list[bpy.types.Scene]:
-    """Scenes of the file that have a shot, chosen or not. Not those linked from another file."""
+    """Scenes of the file with this shot, selected or not. Excludes scenes linked from another file."""
     return [s for s in bpy.data.scenes if not library_of(s) and shot in folders(s)]
 
 
 def missing(scene: bpy.types.Scene, state: ShotState | None) -> bool:
-    """True if the scene's shot was there before, and its folder is gone now."""
+    """True if the scene's shot existed before and its folder is missing now."""
     folder = folder_of(settings_of(scene))
     if folder is None or (state is not None and state.info):
         return False
@@ -196,7 +197,7 @@ def missing(scene: bpy.types.Scene, state: ShotState | None) -> bool:
 
 
 def see(scene: bpy.types.Scene, state: ShotState | None) -> None:
-    """Remembers that the scene's shot is there, so that it can be missed."""
+    """Records that the scene's shot exists, so that `missing` can detect its loss."""
     folder, held = folder_of(settings_of(scene)), settings_of(scene)
     is_shot = folder is not None and state is not None and state.frames and state.folder == folder
     if folder is not None and is_shot and paths.absolute(held.shot_seen) != str(folder):

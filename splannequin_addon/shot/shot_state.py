@@ -1,4 +1,4 @@
-"""How far a shot has come. Plain values."""
+"""The progress of a shot as plain values."""
 
 from __future__ import annotations
 
@@ -11,44 +11,44 @@ from ...torch_backend import contract
 
 @dataclass
 class ShotState:
-    """How far a shot has come."""
+    """The progress of a shot."""
 
     folder: Path
     """Shot folder."""
     info: dict[str, Any] = field(default_factory=dict[str, Any])
     """shot.json; empty if there is no shot."""
     frames: int = 0
-    """Imported frames, 0 before the import."""
+    """Number of imported frames, 0 before the import."""
     read_as: list[str] = field(default_factory=list[str])
-    """How the footage was read, in sentences; empty for one of an earlier version."""
+    """Sentences about how the footage was read; empty for a shot of an earlier version."""
     beside: str = ""
-    """Where the footage lay seen from the shot folder, when it was imported; empty if that is not known."""
+    """Path of the footage relative to the shot folder at the time of the import; empty if unknown."""
     shift: int = 0
-    """Number of a frame in the shot minus its number in the footage."""
+    """Frame number in the shot minus frame number in the footage."""
     timecode: str = ""
-    """SMPTE timecode of the first frame; empty if the footage carries none."""
+    """SMPTE timecode of the first frame; empty if the footage has none."""
     solve: dict[str, Any] = field(default_factory=dict[str, Any])
     """solve.json; empty before the solve."""
     lacks_motion: bool = False
-    """The search for what moves has not ended."""
+    """True if the search for motion has not ended."""
     runs: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
-    """Trained runs: name -> summary.json, with `history`, `preview`, `extension`, `anew` (see `checkpoints`) and
-    `other_cameras` added."""
+    """Trained runs: name -> summary.json, with added `history`, `preview`, `extension`, `anew` (see `checkpoints`),
+    `depth_source` and `other_cameras`."""
     unfinished: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
-    """Runs that have a checkpoint and no summary, paused or at work: name -> what `checkpoints.paused` tells, with
-    `history`, `preview`, `anew` and `other_cameras` added."""
+    """Paused or running runs with a checkpoint and no summary: name -> `checkpoints.paused`, with added `history`,
+    `preview`, `anew` and `other_cameras`."""
     takes: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
-    """Frozen takes: name -> take.json, with `frame_count` added."""
+    """Frozen takes: name -> take.json, with added `frame_count` and `mattes`."""
     damaged: dict[str, dict[str, str]] = field(default_factory=lambda: {"run": {}, "take": {}})
-    """Runs and takes whose files are not what we write: kind -> name -> what is wrong, in a sentence."""
+    """Runs and takes with damaged files: kind -> name -> sentence about the fault."""
 
     def listed(self, kind: str) -> list[str]:
-        """Names of all runs or takes (`kind` "run" or "take"), damaged ones too, as they are shown."""
+        """Names of all runs or takes (`kind` "run" or "take"), including damaged ones, in display order."""
         whole = {*self.runs, *self.unfinished} if kind == "run" else {*self.takes}
         return sorted(whole | {*self.damaged[kind]})
 
     def timecode_at(self, frame: int) -> str:
-        """Timecode of a frame of the clip; empty if the footage carries none, or cannot be counted."""
+        """Timecode of a frame of the clip; empty if the footage has none, or if the frame rate is below 1."""
         fps = float(self.info.get("fps", 0.0))
         counts = bool(self.timecode) and round(fps) >= 1
         return contract.later(self.timecode, frame - self.frame_range[0], fps) if counts else ""

@@ -1,4 +1,4 @@
-"""Which footage a shot was imported from. No bpy."""
+"""The footage that a shot was imported from. No bpy."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from . import file_cache
 
 
 def named(folder: Path) -> str:
-    """The footage that the shot in a folder was imported from, as it was named; empty without one, or if nothing tells
-    (yet)."""
+    """Stored path of the footage that the shot in a folder was imported from; empty if unknown."""
     return _told(ShotFolder(folder).info_path, "source", contract.SHORT_JSON)
 
 
 def is_of(folder: Path, clip: str | Path) -> bool | None:
-    """`contract.is_imported_from`, by what is remembered of the shot's files."""
+    """Cached `contract.is_imported_from`."""
     return contract.is_imported_from(folder, clip, _told)
 
 
 def _told(file: Path, name: str, longest: int) -> str:
-    """Value that a file of the shot has under a name; empty if it cannot be read. The step that needs the file says
-    why."""
+    """Value under a name in a file of the shot; empty if the file cannot be read. The step that needs it reports
+    errors."""
     try:
         return file_cache.of(file, _read, name, longest)
     except (OSError, ValueError):

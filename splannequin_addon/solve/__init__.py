@@ -1,1 +1,1 @@
-"""The step Solve: where the camera was, and what moves."""
+"""The Solve step: the camera's motion, and what moves in the clip."""

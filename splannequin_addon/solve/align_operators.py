@@ -1,7 +1,8 @@
-"""Floor, origin and scale of a shot in the scene, from points that are clicked in a 3D view.
+"""Aligns a shot in the scene (floor, origin, scale) by points that are clicked in a 3D view.
 
-A click takes the sparse point of the solve that is seen nearest to it. Every other event is passed on, so the view can
-be turned meanwhile. The same operators take the places of selected objects, for what no point lies on.
+A click selects the sparse point of the solve whose projection is nearest. All other events are passed on, so that the
+view can be rotated in between. Instead of clicks, the operators also accept the locations of selected objects, for
+places without points.
 """
 
 from __future__ import annotations
@@ -26,51 +27,51 @@ from ..translations import tr
 from . import alignment, cameras, points, scale
 
 REACH_PIXELS = 18.0
-"""How far from the mouse a point may be seen, at a user interface scale of 1."""
+"""Maximum distance in pixels between the mouse and a point's projection, at a user interface scale of 1."""
 
 
 @dataclass
 class Picking:
-    """Points being clicked, one shot's, in one window."""
+    """State of the selection of a shot's points in a window."""
 
     shot: Path
     """Shot folder."""
     xyz: np.ndarray
-    """All its points, [P, 3] float32, solve units."""
+    """All points of the shot, [P, 3] float32, solve units."""
     wanted: int
-    """Number of points that the operator asks for."""
+    """Number of points that the operator needs."""
     picked: list[int] = field(default_factory=list[int])
-    """Those that were clicked, indices into `xyz`."""
+    """Clicked points as indices into `xyz`."""
     under: int = -1
-    """The one under the mouse, -1 if none."""
+    """Index of the point under the mouse, or -1."""
     handler: Any = None
-    """Of the drawing."""
+    """Draw handler of the points."""
 
 
 _picking: Picking | None = None
 
 
 def picking() -> Picking | None:
-    """What is being clicked at the moment."""
+    """The point selection in progress, or None."""
     return _picking
 
 
 def _shot_of(scene: bpy.types.Scene) -> Path:
-    """The scene's shot; `poll` has seen to it that there is one."""
+    """The scene's shot, which `poll` has checked."""
     shot = selection.shot_folder(scene)
     assert shot is not None
     return shot
 
 
 def _centres(scene: bpy.types.Scene, shot: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Where the camera was and its upward directions, [F, 3] each, world."""
+    """Camera positions and upward directions of the shot, [F, 3] each, world."""
     poses = axes.poses(contract.CameraPath.load(contract.ShotFolder(shot).cameras))
     poses = np.array(present(cameras.find(scene, shot, "EMPTY")).matrix_world, dtype=np.float64) @ poses
     return poses[:, :3, 3], poses[:, :3, 1]
 
 
 class _Aligns(OperatorBase):
-    """What the three share: clicks or selected objects, then a change of the root."""
+    """Base class of the three operators: takes clicks or selected objects, then changes the root."""
 
     count = 0
     asked = ""
@@ -80,7 +81,7 @@ class _Aligns(OperatorBase):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without the solve in the scene."""
+        """Disabled without the solve in the scene."""
         shot = selection.shot_folder(scene_in(context))
         if shot is None or cameras.find(scene_in(context), shot, "EMPTY") is None:
             cls.poll_message_set(tr("Load the camera of this shot first"))
@@ -89,21 +90,21 @@ class _Aligns(OperatorBase):
 
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        """Another tooltip for the button that takes selected objects."""
+        """Tooltip of the button for selected objects."""
         return "The same from the places of the selected objects, such as empties" if properties.selected else ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Has points clicked, unless they are given or selected objects are to be taken."""
+        """Starts the clicking, unless `places` is set or selected objects are used."""
         if self.selected or self.properties.is_property_set("places"):
             return self.ready(context)
         return self._begin(context)
 
     def ready(self, context: bpy.types.Context) -> Outcome:
-        """What follows once the points are there."""
+        """Continues once the points are known."""
         return self.execute(context)
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Moves the root."""
+        """Applies the change to the root."""
         scene, shot = scene_in(context), _shot_of(scene_in(context))
         context.view_layer.update()
         try:
@@ -118,11 +119,11 @@ class _Aligns(OperatorBase):
         return {"FINISHED"}
 
     def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
-        """The change [4, 4] for the points' places [count, 3], world."""
+        """The change [4, 4] for the points [count, 3], world."""
         raise NotImplementedError
 
     def _places(self, context: bpy.types.Context, shot: Path) -> np.ndarray:
-        """The points as they were clicked, else the places of the selected objects, [count, 3], world."""
+        """The clicked points, or else the locations of the selected objects, [count, 3], world."""
         if self.properties.is_property_set("places"):
             return np.array(self.places, dtype=np.float64).reshape(self.count, 3)
         ours = [cameras.find(scene_in(context), shot, kind) for kind in ("EMPTY", "CAMERA", "MESH")]
@@ -152,10 +153,10 @@ class _Aligns(OperatorBase):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """A click takes a point, Backspace gives the last one back, Esc or the right button ends it."""
+        """Handles events: a click selects a point, Backspace removes the last one, Esc or the right button cancels."""
         picked = _picking
         root = cameras.find(scene_in(context), self._mine.shot, "EMPTY")
-        if picked is None or picked is not self._mine or root is None:  # another took over, or the shot was removed
+        if picked is None or picked is not self._mine or root is None:  # superseded, or the shot was removed
             if picked is self._mine:
                 self.cancel(context)
             return {"CANCELLED"}
@@ -198,18 +199,18 @@ class _Aligns(OperatorBase):
         return self.picked(context)
 
     def picked(self, context: bpy.types.Context) -> Outcome:
-        """What follows the last click."""
+        """Continues after the last click."""
         return self.execute(context)
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Ends the clicking; Blender calls it, too, when another file is opened."""
+        """Ends the clicking. Blender also calls this when another file is opened."""
         if _picking is self._mine:
             stop()
         if context.workspace is not None:
             context.workspace.status_text_set(None)
 
     def _tell(self, context: bpy.types.Context) -> None:
-        """What to do, in the status bar."""
+        """Shows instructions in the status bar."""
         if _picking is None:
             return
         done = f"{len(_picking.picked)} of {_picking.wanted}"
@@ -247,7 +248,7 @@ class SPLANNEQUIN_OT_align_floor(_Aligns, bpy.types.Operator):
     selected = _SELECTED
 
     def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
-        """Lays them into z = 0."""
+        """The change that moves the points into z = 0."""
         return alignment.level(places, *_centres(scene, shot))
 
 
@@ -264,7 +265,7 @@ class SPLANNEQUIN_OT_align_origin(_Aligns, bpy.types.Operator):
     selected = _SELECTED
 
     def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
-        """Moves it to the origin."""
+        """The change that moves the point to the origin."""
         return alignment.to_origin(places[0])
 
 
@@ -291,11 +292,11 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
     )
 
     def change(self, scene: bpy.types.Scene, shot: Path, places: np.ndarray) -> np.ndarray:
-        """One factor for all axes."""
+        """The change that scales all axes by the same factor."""
         return alignment.scaled(places, self.distance)
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Moves the root; from now on the scale is known."""
+        """Applies the change to the root and marks the shot's scale as known."""
         outcome = super().execute(context)
         entry = scene_objects.of(scene_in(context), _shot_of(scene_in(context)))
         if outcome == {"FINISHED"} and entry is not None:
@@ -303,13 +304,13 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
         return outcome
 
     def picked(self, context: bpy.types.Context) -> Outcome:
-        """Asks for the distance, in a call of its own: this one is still busy with the mouse."""
-        ops: Any = bpy.ops  # ours are not in its types
+        """Asks for the distance in a new operator call, because this call still handles mouse events."""
+        ops: Any = bpy.ops  # our operators are not in the stubs
         ops.splannequin.align_scale("INVOKE_DEFAULT", places=list(self.places))
         return {"CANCELLED"}
 
     def ready(self, context: bpy.types.Context) -> Outcome:
-        """Asks for the distance, with what it is now."""
+        """Asks for the distance, starting with the current one."""
         try:
             one, other = self._places(context, _shot_of(scene_in(context)))
         except contract.JobError as error:
@@ -321,7 +322,7 @@ class SPLANNEQUIN_OT_align_scale(_Aligns, bpy.types.Operator):
 
 
 def view_under(window: bpy.types.Window, x: int, y: int) -> tuple[Any, Any] | None:
-    """(region, RegionView3D) of the 3D view under a place of a window in pixels; None beside it or over its sidebar."""
+    """(region, RegionView3D) of the 3D view at a window position in pixels; None outside or over its sidebar."""
     for area in window.screen.areas:
         if area.type != "VIEW_3D":
             continue
@@ -348,7 +349,7 @@ def _redraw(window: bpy.types.Window) -> None:
 
 
 def _draw() -> None:
-    """The points that were clicked, with their numbers, and the one under the mouse; in one region of a 3D view."""
+    """Draw handler: draws the clicked points with their numbers, and the point under the mouse, in a region."""
     context = bpy.context
     root = cameras.find(scene_in(context), _picking.shot, "EMPTY") if _picking is not None else None
     if _picking is None or root is None or context.region_data is None:
@@ -371,7 +372,7 @@ def _draw() -> None:
 
 
 def _dot(at: tuple[float, float], radius: float, colour: tuple[float, float, float, float]) -> None:
-    """A disc: large points are not drawn alike everywhere."""
+    """Draws a disc as triangles, because not every system draws large points in the same way."""
     turns = np.linspace(0.0, 2.0 * np.pi, 17)
     rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) * radius + at
     corners = np.concatenate([np.insert(rim[i : i + 2], 0, at, axis=0) for i in range(16)])
@@ -382,7 +383,7 @@ def _dot(at: tuple[float, float], radius: float, colour: tuple[float, float, flo
 
 
 def draw(layout: bpy.types.UILayout) -> None:
-    """The three buttons; beside each the one that takes selected objects."""
+    """Draws the three buttons, each with a second button for selected objects."""
     column = layout.column(align=True)
     for operator in ("align_floor", "align_origin", "align_scale"):
         row = column.row(align=True)
@@ -391,7 +392,7 @@ def draw(layout: bpy.types.UILayout) -> None:
 
 
 def register() -> None:
-    """Nothing is being clicked yet."""
+    """Does nothing: there is no clicking yet."""
 
 
 def unregister() -> None:

@@ -1,7 +1,7 @@
-"""Where a solve stands in the scene: floor, origin and scale by chosen points. Plain numpy, no bpy.
+"""Placement of a solve in the scene: floor, origin and scale from selected points. Plain numpy, no bpy.
 
-A change is a [4, 4] float64 matrix of the world, to be multiplied from the left onto the transform of the shot's root:
-a turn, a shift or one factor for all axes. None of them can make a uniform scale anything else.
+A change is a [4, 4] float64 world matrix: a rotation, a translation or a uniform scale. It is multiplied from the left
+onto the transform of the shot's root. A uniform scale of the root therefore stays uniform.
 """
 
 from __future__ import annotations
@@ -13,28 +13,29 @@ from ...torch_backend.contract import ExitCode, JobError
 
 Floats = NDArray[np.float32] | NDArray[np.float64]
 FLATTEST = 0.02
-"""Sine of the angle between two sides under which three points count as one line."""
+"""Sine of the angle between two sides below which three points count as collinear."""
 
 
 def unit(vectors: Floats) -> NDArray[np.float64]:
-    """Vectors [..., 3] at length 1; those of length 0 stay 0."""
+    """Vectors [..., 3] normalised to length 1. Zero vectors stay 0."""
     vectors = np.asarray(vectors, dtype=np.float64)
     length = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
     return vectors / np.where(length > 0, length, 1.0)
 
 
 def middle(values: Floats) -> NDArray[np.float64]:
-    """The median along the first axis. numpy's own takes 20 ms the first time, for its masked arrays."""
+    """The median along the first axis. Replaces numpy's median, whose first call takes 20 ms to set up masked
+    arrays."""
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=0)
     return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
 
 
 def turn(one: Floats, other: Floats) -> NDArray[np.float64]:
-    """The shortest rotation [3, 3] that brings the direction of `one` to that of `other`, both [3]."""
+    """The shortest rotation [3, 3] from the direction of `one` to that of `other`, both [3]."""
     one, other = unit(one), unit(other)
     axis = np.asarray(np.cross(one, other), dtype=np.float64)
     cosine = float((one * other).sum())
-    if cosine < -1.0 + 1e-12:  # half a turn, about whatever is square to it
+    if cosine < -1.0 + 1e-12:  # a half turn around any perpendicular axis
         square = np.asarray(np.cross(one, np.eye(3)[np.argmin(np.abs(one))]), dtype=np.float64)
         about = unit(square)
         return 2.0 * np.outer(about, about) - np.eye(3)
@@ -44,15 +45,15 @@ def turn(one: Floats, other: Floats) -> NDArray[np.float64]:
 
 
 def level(places: Floats, centres: Floats, ups: Floats) -> NDArray[np.float64]:
-    """The change that lays three points into z = 0 with the cameras above; their middle keeps its x and y.
+    """The change that moves three points into z = 0, with the cameras above. Their mean keeps its x and y.
 
     Args:
-        places: the three, [3, 3], a row each, world.
-        centres: where the camera was, [F, 3], world.
-        ups: its upward directions, [F, 3], world: they decide if it was neither above nor below.
+        places: the points, [3, 3], one per row, world.
+        centres: camera positions, [F, 3], world.
+        ups: the camera's upward directions, [F, 3], world. They decide if the positions lie in the plane of the points.
 
     Raises:
-        JobError: the three lie on a line.
+        JobError: the points are collinear.
     """
     places, centres = np.asarray(places, dtype=np.float64), np.asarray(centres, dtype=np.float64)
     one, other = places[1] - places[0], places[2] - places[0]
@@ -73,17 +74,17 @@ def level(places: Floats, centres: Floats, ups: Floats) -> NDArray[np.float64]:
 
 
 def to_origin(place: Floats) -> NDArray[np.float64]:
-    """The change that moves a point [3] of the world to the world's origin."""
+    """The change that moves a world point [3] to the world's origin."""
     change = np.eye(4)
     change[:3, 3] = -np.asarray(place, dtype=np.float64)
     return change
 
 
 def scaled(places: Floats, distance: float) -> NDArray[np.float64]:
-    """The change that brings two points [2, 3] to a distance; the world's origin, and so the floor, stays.
+    """The change that scales two points [2, 3] to a distance. The world's origin, and so the floor, stays.
 
     Raises:
-        JobError: they are the same point, or the distance is not above 0.
+        JobError: the points are equal, or the distance is not positive.
     """
     places = np.asarray(places, dtype=np.float64)
     now = _length(places[1] - places[0])
@@ -95,14 +96,14 @@ def scaled(places: Floats, distance: float) -> NDArray[np.float64]:
 
 
 def nearest(pixel: tuple[float, float], places: Floats, matrix: Floats, size: tuple[int, int], reach: float) -> int:
-    """Which of some places is seen nearest to a pixel, -1 if none is within reach.
+    """Index of the place whose projection is nearest to a pixel, or -1 if none is within reach.
 
     Args:
-        pixel: x, y from the region's lower left.
+        pixel: x, y from the region's lower left corner.
         places: [P, 3], world.
         matrix: world to clip space of the region, [4, 4].
-        size: of the region in pixels.
-        reach: in pixels.
+        size: width and height of the region in pixels.
+        reach: maximum distance in pixels.
     """
     at, before = seen(places, matrix, size)
     distance = np.where(before, np.hypot(at[:, 0] - pixel[0], at[:, 1] - pixel[1]), np.inf)
@@ -112,7 +113,8 @@ def nearest(pixel: tuple[float, float], places: Floats, matrix: Floats, size: tu
 
 
 def seen(places: Floats, matrix: Floats, size: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Pixels [P, 2] of places [P, 3] in a region, and which of them lie before the view; as `nearest` takes them."""
+    """(pixels [P, 2] of places [P, 3] in a region, which of them lie in front of the view). Arguments as in
+    `nearest`."""
     matrix = np.asarray(matrix, dtype=np.float64)
     clip = np.asarray(places, dtype=np.float64).reshape(-1, 3) @ matrix[:, :3].T + matrix[:, 3]
     before = clip[:, 3] > 1e-9

@@ -1,4 +1,4 @@
-"""What a finished solve changes in the scene."""
+"""Changes to the scene after a solve."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 def load_camera(scene: bpy.types.Scene, shot: Path) -> list[str]:
-    """Brings the solve into the scene. FileNotFoundError if there is none."""
+    """Loads the solve into the scene. Raises FileNotFoundError without a solve."""
     state = inventory.read(shot)
     selection.see(scene, state)
     is_new = cameras.find(scene, shot, "EMPTY") is None
     entry, size = scene_objects.of(scene, shot), scene_objects.depth_scale(scene, shot)
     is_other = not is_new and entry is not None and entry.world != inventory.solve_world(shot)
     with rollback.scene_of(scene):
-        motion_overlay.hide(scene, shot)  # it is of the previous mattes
+        motion_overlay.hide(scene, shot)  # it shows the previous mattes
         camera = cameras.build(scene, shot)
         notes = scale.guess_scale(scene, shot, is_new or is_other)
         if is_other and abs(scene_objects.depth_scale(scene, shot) / size - 1.0) > 1e-6:

@@ -1,7 +1,7 @@
-"""Cameras of Alembic, FBX and USD files, read by Blender's own importers in a Blender of its own.
+"""Cameras of Alembic, FBX and USD files, read by Blender's importers in a separate Blender process.
 
-A file may hold gigabytes, and an importer may crash over a damaged one: neither reaches the artist's Blender, and
-nothing has to be removed from it. The child starts with factory settings, and scripts in files do not run.
+A file may be gigabytes large, and an importer may crash on a damaged file. The separate process protects the artist's
+Blender from both, and from leftover data. It starts with factory settings, and scripts in files do not run.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from ..shot import inventory, seen_camera
 from . import camera_samples
 
 KINDS = {".abc": "Alembic", ".fbx": "FBX", ".usd": "USD", ".usda": "USD", ".usdc": "USD", ".usdz": "USD"}
-"""Suffix of a file -> its format."""
+"""File suffix -> format."""
 MOST_FRAMES = 100_000
-"""Largest number of frames that are read from a file."""
+"""Maximum number of frames read from a file."""
 LONGEST_SECONDS = 1800.0
 """Time limit for reading a file."""
 _FILM_SLACK = 0.02
@@ -37,20 +37,20 @@ _NO_GEOMETRY = (
 
 
 def is_one(path: str) -> bool:
-    """True if a path is of a file whose cameras Blender reads."""
+    """True if the file has a format whose cameras Blender reads."""
     return Path(path).suffix.lower() in KINDS
 
 
 def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
-    """Starts a second Blender that writes the camera of a file into a shot; does not wait.
+    """Starts a second Blender that writes the camera of a file into a shot, without waiting.
 
     Args:
-        scene: the scene, whose pixel aspect is used.
+        scene: the scene, for its pixel aspect.
         file: the file.
-        shot: shot folder; its clip says how many frames a second of the file has.
+        shot: shot folder. The rate of its clip converts the file's time to frames.
 
     Raises:
-        contract.JobError: the file or the shot is not there, or no Blender can be started.
+        contract.JobError: the file or the shot does not exist, or Blender cannot be started.
     """
     if not file.is_file():
         raise contract.JobError(f"{file} does not exist.", "Choose another file.", contract.ExitCode.SOLVE)
@@ -68,7 +68,7 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
     words = ["--", json.dumps(wanted)]
     if bpy.app.binary_path:
         quiet = ("--background", "--factory-startup", "--disable-autoexec", "-noaudio")
-        fails = ("--python-exit-code", str(int(contract.ExitCode.INTERNAL)))  # else a script that raises ends well
+        fails = ("--python-exit-code", str(int(contract.ExitCode.INTERNAL)))  # otherwise a failed script exits with 0
         words = [bpy.app.binary_path, *quiet, *fails, "--python", script, *words]
     else:  # Blender as a module
         words = [sys.executable, "-P", script, *words]
@@ -86,13 +86,13 @@ def begin(scene: bpy.types.Scene, file: Path, shot: Path) -> children.Question:
 
 
 def written(asked: children.Question, file: Path, shot: Path) -> Path:
-    """The transforms.json that the second Blender wrote. JobError with that Blender's sentence if it wrote none."""
+    """The transforms.json from the second Blender. Raises JobError with that Blender's message if it failed."""
     asked.answer(f"Blender could not read {file.name}: {{}}", "Import the file, and choose Scene Camera.")
     return contract.ShotFolder(shot).tracking
 
 
 def read_now(scene: bpy.types.Scene, file: Path, shot: Path) -> Path:
-    """`begin` and `written`, waited for."""
+    """`begin` and `written`, with waiting."""
     question = begin(scene, file, shot)
     question.wait(LONGEST_SECONDS)
     return written(question, file, shot)
@@ -102,7 +102,7 @@ def read_now(scene: bpy.types.Scene, file: Path, shot: Path) -> Path:
 
 
 def main(words: str) -> int:
-    """Reads the camera that `begin` requests, in the second Blender; returns an exit code."""
+    """Runs in the second Blender: reads the camera that `begin` requests. Returns an exit code."""
     wanted = json.loads(words)
     try:
         scene = _new_file(wanted["size"], wanted["fps"], wanted["aspect"])
@@ -119,7 +119,7 @@ def main(words: str) -> int:
 
 
 def _new_file(size: tuple[int, int], fps: float, aspect: tuple[float, float]) -> bpy.types.Scene:
-    """The scene of an empty file with the clip's rate and size: importers convert time by the rate, and the lens in
+    """The scene of an empty file with the clip's rate and size. Importers convert time by the rate, and the lens in
     pixels depends on the size."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.data.scenes[0]
@@ -131,15 +131,15 @@ def _new_file(size: tuple[int, int], fps: float, aspect: tuple[float, float]) ->
 
 
 def read(scene: bpy.types.Scene, file: Path, size: tuple[int, int]) -> dict[str, Any]:
-    """The first camera of a file that moves, as the content of a transforms.json.
+    """The first moving camera of a file, as the content of a transforms.json.
 
     Args:
-        scene: an empty one, which takes the whole file.
+        scene: an empty scene, into which the whole file is imported.
         file: the file.
         size: width and height in pixels of the clip's frames.
 
     Raises:
-        contract.JobError: the file cannot be read, or holds no perspective camera that moves.
+        contract.JobError: the file cannot be read, or has no moving perspective camera.
     """
     _import(file)
     cameras = sorted((o for o in scene.objects if o.type == "CAMERA"), key=lambda o: o.name)
@@ -147,7 +147,7 @@ def read(scene: bpy.types.Scene, file: Path, size: tuple[int, int]) -> dict[str,
         raise contract.JobError(f"{file.name} holds no camera.", "Choose another file.", contract.ExitCode.SOLVE)
     for camera in [c for c in cameras if camera_of(c).type == "PERSP"]:
         data = camera_of(camera)
-        if data.sensor_fit == "AUTO":  # a file states the film back, whose width is that of the pictures
+        if data.sensor_fit == "AUTO":  # files store the film back, whose width is the images' width
             data.sensor_fit = "HORIZONTAL"
         frames = _frames_of(scene, camera)
         if len(frames) > MOST_FRAMES:
@@ -175,7 +175,7 @@ def _sample(scene: bpy.types.Scene, name: str, number: int, size: tuple[int, int
 
 
 def _frames_of(scene: bpy.types.Scene, camera: bpy.types.Object) -> range:
-    """Frames of a camera: those of its keys, or of the whole file where Blender reads its motion from the file."""
+    """Frames of a camera: the range of its keyframes, or of the whole file if a constraint reads the motion from it."""
     span, owner = camera_samples.keyed(camera), camera
     spans = [span] if span is not None else []
     while owner is not None:
@@ -188,7 +188,7 @@ def _frames_of(scene: bpy.types.Scene, camera: bpy.types.Object) -> range:
 
 
 def _choice(file: Path, camera: bpy.types.Object, count: int) -> list[tuple[str, str]]:
-    """Note about the camera that was chosen of several, as (sentence, hint)."""
+    """Note, as (sentence, hint), about which of several cameras was used; empty for a single camera."""
     if count == 1:
         return []
     return [
@@ -202,7 +202,7 @@ def _choice(file: Path, camera: bpy.types.Object, count: int) -> list[tuple[str,
 def _film_back(
     scene: bpy.types.Scene, file: Path, camera: bpy.types.Object, size: tuple[int, int]
 ) -> list[tuple[str, str]]:
-    """(sentence, hint) of a film back of another shape than the frames."""
+    """Note, as (sentence, hint), about a film back whose aspect ratio differs from the frames; empty if it does not."""
     data, render = camera_of(camera), scene.render
     shape = size[0] * render.pixel_aspect_x / (size[1] * render.pixel_aspect_y)
     if abs(data.sensor_width / data.sensor_height / shape - 1.0) <= _FILM_SLACK:
@@ -217,7 +217,7 @@ def _film_back(
 
 
 def _import(file: Path) -> None:
-    """Has Blender's importer read a file into the scene. JobError if there is none, or if it refuses."""
+    """Imports a file into the scene with Blender's importer. Raises JobError without an importer, or if it fails."""
     kind = KINDS[file.suffix.lower()]
     reader = {"Alembic": _alembic, "FBX": _fbx, "USD": _usd}[kind]()
     if reader is None:
@@ -228,14 +228,14 @@ def _import(file: Path) -> None:
         )
     try:
         done = reader(str(file))
-    except Exception as error:  # the importer of FBX is written in Python, and meets damaged files in its own ways
+    except Exception as error:  # the Python FBX importer raises arbitrary exceptions for damaged files
         raise _refused(file, str(error)) from error
     if "FINISHED" not in done:
         raise _refused(file, "")
 
 
 def _refused(file: Path, said: str) -> contract.JobError:
-    """The error for a file that an importer did not take, with what it said unless that is a traceback."""
+    """The error for a file that an importer refused, with the importer's message unless it is a traceback."""
     first = next((line for line in said.splitlines() if line.strip()), "").removeprefix("Error: ").strip().rstrip(".")
     why = (
         contract.printable(first, 200) if first and "Traceback" not in first else "it is damaged, or of another format"
@@ -264,7 +264,7 @@ def _usd() -> Callable[[str], Any] | None:
 
 
 def _fbx() -> Callable[[str], Any] | None:
-    """Blender's FBX importer: the C++ one (4.5 and later) or the Python one. Both start at the file's time 0."""
+    """Blender's FBX importer: the C++ one (4.5 and later) or the Python one. Both map the file's time 0 to frame 0."""
     wm: Any = bpy.ops.wm
     if "fbx_import" in dir(wm):
         return lambda path: wm.fbx_import(filepath=path, anim_offset=0.0)
@@ -281,7 +281,7 @@ def _fbx() -> Callable[[str], Any] | None:
 
 
 def _correct_rate() -> None:
-    """Moves all keys to where a file's rate puts them: the importer in Python takes the rate of 23.976 for 24."""
+    """Rescales all keyframes to the file's rate, because the Python importer treats a rate of 23.976 as 24."""
     base = bpy.data.scenes[0].render.fps_base
     actions: Any = bpy.data.actions
     for curve in [curve for action in actions for curve in action.fcurves]:

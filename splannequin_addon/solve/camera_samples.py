@@ -1,4 +1,4 @@
-"""Samples of an animated camera, and the transforms.json that holds them in the world of a Blender scene."""
+"""Samples of an animated camera, and the transforms.json that stores them in the world of a Blender scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 ANOTHER = "Choose a camera that moves as the clip's did."
 """Hint for a camera that cannot be the clip's."""
 _STILL = 1e-6
-"""Largest change of a pose's numbers, relative to its position, of a still camera: Blender's matrices are float32."""
+"""Largest change in a still camera's matrix elements, relative to its position, because Blender's matrices are
+float32."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +31,16 @@ class Sample:
     number: int
     """Frame number."""
     stands: np.ndarray
-    """Camera-to-world, [4, 4] float64, Blender's camera axes, rigid but for shear and mirroring."""
+    """Camera-to-world, [4, 4] float64, Blender's camera axes. The axes have length 1, but may be sheared or
+    mirrored."""
     K: tuple[float, ...]
     """fx, fy, cx, cy in pixels, pixel centres at +0.5."""
 
 
 def frames_of(shot: Path) -> tuple[list[int], tuple[int, int]]:
-    """Frame numbers of an imported shot, ascending, and width and height of its frames in pixels.
+    """(frame numbers of an imported shot in ascending order, (width, height) of its frames in pixels).
 
-    JobError without them.
+    Raises JobError if the shot is not imported.
     """
     try:
         listing = contract.read_json(contract.ShotFolder(shot).listing)
@@ -52,10 +54,10 @@ def sample_of(number: int, matrix: Matrix, window: Matrix, size: tuple[int, int]
     """A camera at a frame.
 
     Args:
-        number: of the frame.
+        number: frame number.
         matrix: camera-to-world, Blender's camera axes, [4, 4]; its scale does not matter.
         window: perspective projection, [4, 4].
-        size: width and height of the picture in pixels.
+        size: width and height of the image in pixels.
     """
     stands = np.array(matrix, dtype=np.float64)
     stands[:3, :3] /= np.maximum(np.sqrt((stands[:3, :3] ** 2).sum(axis=0)), 1e-30)
@@ -70,7 +72,7 @@ def moves(samples: Sequence[Sample]) -> bool:
 
 
 def keyed(camera: bpy.types.Object) -> tuple[float, float] | None:
-    """First and last frame of the keys of a camera, its lens and its parents; None without any."""
+    """First and last frame of the keyframes of a camera, its lens and its parents; None without keyframes."""
     spans: list[tuple[float, float]] = []
     owner: bpy.types.Object | None = camera
     while owner is not None:
@@ -81,7 +83,7 @@ def keyed(camera: bpy.types.Object) -> tuple[float, float] | None:
 
 
 def _spans(data: bpy.types.AnimData | None) -> list[tuple[float, float]]:
-    """First and last frame of the action and of each strip of some animation."""
+    """(first, last) frame of the action and of each NLA strip of animation data."""
     if data is None:
         return []
     action: Any = data.action
@@ -90,11 +92,11 @@ def _spans(data: bpy.types.AnimData | None) -> list[tuple[float, float]]:
 
 
 def without_ends(samples: Sequence[Sample], span: tuple[float, float] | None) -> list[Sample]:
-    """Samples without those at both ends at which the camera stands still: it was not tracked there.
+    """Samples without those at both ends where the camera does not move, because it was not tracked there.
 
     Args:
-        samples: by frame; the camera moves between some of them.
-        span: first and last frame of its keys, which all stay; None: it is moved by something else.
+        samples: samples in frame order, with some motion between them.
+        span: first and last keyframe; samples in this range stay. None: the camera has no keyframes.
     """
     first, last = 0, len(samples) - 1
     while _alike(samples[first], samples[first + 1]) and not (span and samples[first].number >= span[0]):
@@ -105,7 +107,7 @@ def without_ends(samples: Sequence[Sample], span: tuple[float, float] | None) ->
 
 
 def _alike(one: Sample, other: Sample) -> bool:
-    """True if a camera is identical at two frames to the last bit, as where no key moves it."""
+    """True if a camera is bitwise identical at two frames, as between frames without motion."""
     return one.K == other.K and bool((one.stands == other.stands).all())
 
 
@@ -115,13 +117,13 @@ def transforms(
     is_numbered_as_shot: bool = False,
     notes: Sequence[tuple[str, str]] = (),
 ) -> dict[str, Any]:
-    """Samples of a camera as the content of a transforms.json in the world of a scene.
+    """Content of a transforms.json for samples of a camera in the world of a scene.
 
     Args:
-        samples: by frame.
-        size: width and height in pixels of the pictures that the lens is of.
-        is_numbered_as_shot: frame numbers are those of the shot; else the backend matches them.
-        notes: (sentence, hint) for the artist.
+        samples: samples in frame order.
+        size: width and height in pixels of the images that K refers to.
+        is_numbered_as_shot: the frame numbers are the shot's. Otherwise the backend matches them.
+        notes: (sentence, hint) of each note for the artist.
     """
     lenses: list[dict[str, Any]] = [dict(zip(("fl_x", "fl_y", "cx", "cy"), s.K, strict=True)) for s in samples]
     shared: dict[str, Any] = {}
@@ -145,7 +147,7 @@ def transforms(
 
 
 def write(shot: Path, data: dict[str, Any]) -> Path:
-    """Writes a transforms.json into a shot, where the solve takes it from. OSError if it cannot be written."""
+    """Writes a transforms.json into a shot for the solve. Raises OSError if it cannot be written."""
     file = contract.ShotFolder(shot).tracking
     contract.ShotFolder(shot).own(file.parent)
     contract.write_json(file, data, parents=False)
@@ -153,5 +155,5 @@ def write(shot: Path, data: dict[str, Any]) -> Path:
 
 
 def whole_frames(span: tuple[float, float]) -> range:
-    """The whole frames of a span of time; times in seconds are rounded where files are written."""
+    """Whole frames in a span of time. Tolerates rounding, because files store rounded times in seconds."""
     return range(math.ceil(span[0] - 0.01), math.floor(span[1] + 0.01) + 1)

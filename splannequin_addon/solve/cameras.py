@@ -1,7 +1,7 @@
-"""The solve in Blender: an animated camera with the plate behind it, and points.
+"""The solve in Blender: an animated camera with the plate in the background, and points.
 
-They arrive under one Empty that carries the solve-to-scene transform: moving it moves camera and points together, and
-depth is brought to scene units through it.
+An Empty, the root, is the parent of both and carries the solve-to-scene transform. Moving it moves camera and points
+together, and its scale converts depth to scene units.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from ..shot import inventory, scene_objects
 from . import alignment, guesses
 
 _LENS = ("lens", "shift_x", "shift_y")
-"""Properties of a camera that are keyed where the lens changes."""
+"""Properties of camera data that get keyframes if the lens changes."""
 _NO_REACH = (1e6, 1e-6)
-"""Clip distances of a camera that has still to be given some."""
+"""Initial clip distances of a new camera: an empty range, which `_reach` extends."""
 _PARTS = {"EMPTY": "root", "CAMERA": "camera", "MESH": "points"}
-"""Kind of our objects -> which of `made.PARTS` it is, and last word of the name it is made with."""
+"""Type of our objects -> attribute of the shot's entry, see `scene_objects.PARTS`."""
 
 
 def scene_from_solve(
     path: contract.CameraPath, points: np.ndarray, floor: tuple[Sequence[float], float] | None = None
 ) -> np.ndarray:
-    """A first guess of the solve-to-scene transform: floor at z = 0, cameras upright, shot around the origin.
+    """Initial solve-to-scene transform: floor at z = 0, cameras upright, shot around the origin.
 
-    Without a floor the cameras' mean up is taken for up, and what is lowest for the floor.
+    Without a floor, the mean of the cameras' up directions is up, and the lowest points are the floor.
 
     Args:
         path: the solved cameras, solve units.
         points: sparse points, [P, 3], solve units.
-        floor: (normal, height) of the points x of the floor: normal . x = height; None if it is not known.
+        floor: (normal, height) of the floor, with normal . x = height for its points x; None if unknown.
 
     Returns:
         [4, 4] float64, rotation and translation, no scale.
@@ -65,14 +65,14 @@ def scene_from_solve(
 
 
 def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
-    """Brings the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
+    """Loads the solve of a shot into the scene: collection, root Empty, animated camera with plate, point cloud.
 
-    What an earlier call made for the same shot shows the new solve from then on: the objects stay, with all that the
-    artist hung on them, led to them or set in them. So does the root's transform, unless the solve is the first in the
-    scene's world, or the first in one of its own again.
+    Objects from an earlier call for the same shot are updated to the new solve. They keep their children, links and
+    settings. The root keeps its transform, unless the solve's coordinates changed between the scene's world and an
+    arbitrary world.
 
     Args:
-        scene: the scene to build in; its camera is set, nothing else of it is changed.
+        scene: the scene. Of its settings, only the active camera is changed.
         shot: shot folder with a finished solve.
 
     Returns:
@@ -80,19 +80,19 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
 
     Raises:
         FileNotFoundError: there is no solve.
-        ValueError: a file of it is broken, or Blender cannot show the plate. The scene is then as it was.
+        ValueError: a file of the solve is damaged, or Blender cannot show the plate. The scene is then unchanged.
     """
     path = contract.CameraPath.load(contract.ShotFolder(shot).cameras)
     xyz, rgb = points_of(shot)
     floor, unsolved = inventory.floor(shot), guesses.ranges(path, guesses.solved(shot, path))
     name = scene_objects.name_of(shot)
     with rollback.scene_of(scene):
-        # All that can fail comes before what is there is changed.
+        # Everything that can fail comes before changes to existing objects.
         world, size, plate = inventory.solve_world(shot), _extent(path), _plate(shot)
         stands = np.eye(4) if world else scene_from_solve(path, xyz, floor)
         mesh = _point_mesh(f"{name} points", xyz, rgb)
         kept = {n: item for n in ("camera", "points") if (item := _editable(scene, shot, n)) is not None}
-        _clear(scene, shot, but=("root", *kept))  # what the artist hung on the root, and where it stands, stays
+        _clear(scene, shot, but=("root", *kept))  # the root stays, with its children and transform
         root = _root(scene, shot, stands, size)
         if present(scene_objects.of(scene, shot)).world != world:
             present(scene_objects.of(scene, shot)).world = world
@@ -113,19 +113,19 @@ def build(scene: bpy.types.Scene, shot: Path) -> bpy.types.Object:
 
 
 def _editable(scene: bpy.types.Scene, shot: Path, name: str) -> bpy.types.Object | None:
-    """The camera or the points of a shot, if they are there and not linked from another file."""
+    """The camera or the points of a shot; None if missing or linked from another file."""
     item = scene_objects.part(scene, shot, name)
     return item if item is not None and not library_of(item) and not library_of(present(item.data)) else None
 
 
 def _root(scene: bpy.types.Scene, shot: Path, stands: np.ndarray, size: float) -> bpy.types.Object:
-    """The root of a shot, in its collection; both are made if they are not there.
+    """The root of a shot in its collection. Both are created if missing.
 
     Args:
         scene: the scene.
         shot: shot folder.
-        stands: where a new root is put, [4, 4].
-        size: of that root.
+        stands: transform of a new root, [4, 4].
+        size: display size of a new root.
     """
     name, entry = scene_objects.name_of(shot), scene_objects.new(scene, shot)
     collection = entry.collection
@@ -140,13 +140,13 @@ def _root(scene: bpy.types.Scene, shot: Path, stands: np.ndarray, size: float) -
         root.empty_display_size = size
         collection.objects.link(root)
     for item in (scene_objects.part(scene, shot, "camera"), scene_objects.part(scene, shot, "points")):
-        if item is not None and item.parent is None:  # the root that it hung on was deleted
+        if item is not None and item.parent is None:  # its previous root was deleted
             item.parent, item.matrix_parent_inverse = root, Matrix()
     return root
 
 
 def _place(scene: bpy.types.Scene, shot: Path, root: bpy.types.Object, items: Sequence[bpy.types.Object]) -> None:
-    """Puts new objects of a shot into the scene, under its root."""
+    """Adds new objects of a shot to the scene, under its root."""
     collection = present(present(scene_objects.of(scene, shot)).collection)
     for item in items:
         collection.objects.link(item)
@@ -154,7 +154,7 @@ def _place(scene: bpy.types.Scene, shot: Path, root: bpy.types.Object, items: Se
 
 
 def _new_camera(name: str, size: float) -> bpy.types.Object:
-    """A camera without keys or plate, in no scene yet."""
+    """A camera without keyframes or plate, not yet in a scene."""
     data = bpy.data.cameras.new(f"{name} camera")
     data.display_size = max(size * 0.5, 0.05)
     data.clip_start, data.clip_end = _NO_REACH
@@ -162,16 +162,16 @@ def _new_camera(name: str, size: float) -> bpy.types.Object:
 
 
 def _new_points(name: str, mesh: bpy.types.Mesh) -> bpy.types.Object:
-    """The sparse points as an object, in no scene yet."""
+    """The sparse points as an object, not yet in a scene."""
     cloud = bpy.data.objects.new(f"{name} points", mesh)
     mesh.name = cloud.name
     cloud.hide_render = cloud.hide_select = True
-    cloud.display_type = "BOUNDS"  # Blender draws loose points black, whatever their colour: points.py draws them
+    cloud.display_type = "BOUNDS"  # Blender draws loose points in black, so solve/points.py draws them in colour
     return cloud
 
 
 def _exchange_mesh(cloud: bpy.types.Object, mesh: bpy.types.Mesh) -> None:
-    """Shows other points by the same object, in the materials of those before. A copy of the artist's keeps its own."""
+    """Replaces an object's mesh and keeps the materials. An artist's copy of the object keeps the old mesh."""
     old = mesh_of(cloud)
     if old == mesh:
         return
@@ -185,15 +185,15 @@ def _exchange_mesh(cloud: bpy.types.Object, mesh: bpy.types.Mesh) -> None:
 
 
 def find(scene: bpy.types.Scene, shot: Path, kind: str) -> bpy.types.Object | None:
-    """Our object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points). Never a copy that
-    the artist made of it."""
+    """An object of a shot in a scene: kind is "EMPTY" (the root), "CAMERA" or "MESH" (the points). Never an artist's
+    copy."""
     return scene_objects.part(scene, shot, _PARTS[kind])
 
 
 def remove(scene: bpy.types.Scene, shot: Path) -> bool:
-    """Takes everything that `build` made out of the file. True if there was something.
+    """Removes everything that `build` made from the file. True if there was something.
 
-    Objects that the artist parented to the root or put into the collection keep their place in the scene.
+    Objects that the artist parented to the root or put into the collection keep their location in the scene.
     """
     if scene_objects.of(scene, shot) is None:
         return False
@@ -206,7 +206,7 @@ def remove(scene: bpy.types.Scene, shot: Path) -> bool:
 
 
 def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> None:
-    """Removes what was built for a shot, except for the named parts and, with them, the collection."""
+    """Removes the objects of a shot, except for the named parts. With any named part, the collection also stays."""
     entry = scene_objects.of(scene, shot)
     if entry is None:
         return
@@ -237,13 +237,13 @@ def _clear(scene: bpy.types.Scene, shot: Path, but: tuple[str, ...] = ()) -> Non
 
 
 def _animate(camera: bpy.types.Object, path: contract.CameraPath) -> None:
-    """Keys the camera on the clip's own frame numbers, straight between keys."""
+    """Sets keyframes of the camera at the clip's frame numbers, with linear interpolation."""
     frames, lenses = [frame.frame for frame in path.frames], lenses_of(path)
     key_path(camera, frames, axes.poses(path), lenses, (path.width, path.height), guesses.key_types(path))
 
 
 def lenses_of(path: contract.CameraPath) -> np.ndarray:
-    """Focal length in mm, shift_x and shift_y of every frame of a path, [F, 3] float64, as `axes.lens_from_k`."""
+    """Focal length in mm, shift_x and shift_y of every frame of a path, [F, 3] float64, from `axes.lens_from_k`."""
     found = [axes.lens_from_k((f.K[0], f.K[1], f.K[2], f.K[3]), path.width, path.height) for f in path.frames]
     return np.array(found, dtype=np.float64).reshape(-1, 3)
 
@@ -256,14 +256,14 @@ def key_path(
     size: tuple[int, int],
     types: Sequence[str] = (),
 ) -> None:
-    """Keys where a camera stands and, if it changes, its lens, straight between keys.
+    """Sets keyframes of a camera's pose and, if it changes, its lens, with linear interpolation.
 
     Args:
-        camera: a camera object; keys that it has of these are replaced.
+        camera: a camera object. Its existing keyframes of pose and lens are replaced.
         frames: [F] ascending frame numbers.
         poses: camera-to-world, [F, 4, 4], Blender's camera axes, in the world of the camera's parent.
         lenses: [F, 3], see `lenses_of`.
-        size: width and height of its pictures in pixels.
+        size: width and height of the images in pixels.
         types: [F] types of the keys, see `compat_animation.set_keys`.
     """
     data, (width, height) = camera_of(camera), size
@@ -274,7 +274,7 @@ def key_path(
     turns: list[tuple[float, ...]] = []
     for matrix in poses.tolist():
         location, rotation, _ = Matrix(matrix).decompose()
-        if before is not None and before.dot(rotation) < 0:  # q and -q turn alike, but keys would go the long way
+        if before is not None and before.dot(rotation) < 0:  # q and -q are equal, but keyframes would take the long way
             rotation.negate()
         before = rotation
         places.append(location[:])
@@ -293,7 +293,7 @@ def key_path(
 
 
 def _plate(shot: Path) -> tuple[bpy.types.Image, int, int] | None:
-    """The undistorted plate as a data-block, its first and last frame; None without one."""
+    """(undistorted plate as an image, its first frame, its last frame); None without a plate."""
     span = inventory.plate_range(shot)
     path = contract.ShotFolder(shot).plate(span[0]) if span is not None else None
     if span is None or path is None or not path.is_file():
@@ -302,8 +302,10 @@ def _plate(shot: Path) -> tuple[bpy.types.Image, int, int] | None:
 
 
 def _show_plate(data: bpy.types.Camera, plate: tuple[bpy.types.Image, int, int] | None) -> None:
-    """The undistorted plate behind the camera, fitting the sensor; frame n of the scene shows file n. What the artist
-    has behind the camera besides, and how ours is shown there, stays."""
+    """Shows the undistorted plate as the camera's background, fitted to the sensor. Scene frame n shows file n.
+
+    The artist's other background images, and the display settings of an existing plate, stay.
+    """
     background = next((b for b in data.background_images if b.image is not None and b.image.get(TAG)), None)
     old = background.image if background is not None else None
     if plate is not None:
@@ -322,9 +324,9 @@ def _show_plate(data: bpy.types.Camera, plate: tuple[bpy.types.Image, int, int] 
 
 
 def points_of(shot: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Sparse points of the solve: xyz [P, 3] float32 in solve units, rgb [P, 3] uint8; empty without them.
+    """Sparse points of the solve: xyz [P, 3] float32 in solve units, rgb [P, 3] uint8; empty without points.
 
-    ValueError if they cannot be read.
+    Raises ValueError if the points cannot be read.
     """
     file = contract.ShotFolder(shot).points
     if not file.is_file():
@@ -363,12 +365,12 @@ def _extent(path: contract.CameraPath) -> float:
 
 
 def _reach(data: bpy.types.Camera, start: float, end: float) -> None:
-    """Has a camera show what lies between these distances, and what it showed before."""
+    """Extends a camera's clip range to include these distances."""
     data.clip_start, data.clip_end = min(start, data.clip_start), max(end, data.clip_end)
 
 
 def _clip(path: contract.CameraPath, xyz: np.ndarray) -> tuple[float, float]:
-    """Clip distances that show every point from everywhere on the path."""
+    """Clip distances that include every point from everywhere on the path."""
     if not len(xyz):
         return 0.01, 1000.0
     reach = float(np.linalg.norm(xyz - alignment.middle(xyz), axis=1).max()) + _extent(path)

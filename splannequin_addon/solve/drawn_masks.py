@@ -1,4 +1,4 @@
-"""A mask drawn in Blender's Movie Clip or Image editor, rendered to pictures over the clip's frames for the backend."""
+"""Renders a mask drawn in Blender's Movie Clip or Image editor to an image per frame of the clip, for the backend."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..shot import inventory, places
 
 
 def render(mask: bpy.types.Mask, shot: Path, kind: str) -> Path:
-    """`in_turns`, all at once."""
+    """Runs `in_turns` without interruption."""
     turns = in_turns(mask.session_uid, mask.name, shot, kind)
     while True:
         try:
@@ -32,14 +32,12 @@ def render(mask: bpy.types.Mask, shot: Path, kind: str) -> Path:
 
 
 def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple[int, int], None, Path]:
-    """Renders a mask for every frame of an imported shot, a frame a turn; yields how many are done, and of how many.
+    """Renders a mask for every frame of an imported shot, one frame per step. Yields (frames done, total frames).
 
-    Returns the folder, SHOT/masks/KIND, with a picture for each. What it held stays until all of them are there.
-
-    A frame of the scene is that of the clip which the Movie Clip editor shows there. Without a movie clip of the
-    shot's footage in this file the scene's frames are the clip's own. Nothing of bpy is kept between two turns.
-
-    JobError if the shot is not imported, the mask is gone, or a picture was not written.
+    Returns the folder, SHOT/masks/KIND, with one image per frame. Its earlier content stays until all images are
+    rendered. The Movie Clip editor defines which clip frame a scene frame shows. If this file has no movie clip of the
+    shot's footage, scene frames equal clip frames. Keeps no bpy data between steps. Raises JobError if the shot is not
+    imported, the mask no longer exists, or an image was not written.
     """
     folder = contract.ShotFolder(shot)
     try:
@@ -68,8 +66,8 @@ def in_turns(mask_uid: int, name: str, shot: Path, kind: str) -> Generator[tuple
 
 
 def _beside(into: Path, pid: int) -> Path:
-    """Where a process makes the pictures of a folder: not in it, since what is killed leaves some. Its name says whose
-    they are."""
+    """Temporary folder next to `into` for a process's images. A killed process leaves it behind; its name identifies
+    the process."""
     return into.with_name(f".{into.name}-{_here()}-{pid}-{int(contract.process_start(pid))}-{uuid.uuid4().hex[:8]}")
 
 
@@ -77,22 +75,23 @@ _BESIDE = re.compile(r"\.[a-z]+-([0-9a-f]{8})-([0-9]{1,10})-([0-9]{1,20})-[0-9a-
 
 
 def _here() -> str:
-    """Digest of this computer's name, for the name of a folder."""
+    """Digest of this computer's name, for folder names."""
     return hashlib.sha256(contract.computer_name().encode()).hexdigest()[:8]
 
 
 def _tidy(masks: Path) -> None:
-    """Removes what Blenders of this computer that were killed while they rendered a mask left in a shot."""
+    """Removes temporary folders in a shot that were left by killed Blender processes of this computer."""
     if contract.is_link(masks):
         return
     left = [(folder, _BESIDE.fullmatch(folder.name)) for folder in masks.glob(".*")]
     for folder, match in left:
         if match and match[1] == _here() and not contract.runs_still(int(match[2]), float(match[3])):
-            shutil.rmtree(folder, ignore_errors=True)  # a link is left alone
+            shutil.rmtree(folder, ignore_errors=True)  # does not follow links
 
 
 def _render_one(mask_uid: int, name: str, size: tuple[int, int], file: Path, frame: int) -> None:
-    """A mask at a frame of the scene, as a picture. JobError if it is gone, or the picture was not written."""
+    """Renders a mask at a scene frame to an image file. Raises JobError if the mask no longer exists or the file is not
+    written."""
     mask = session.of(bpy.data.masks, mask_uid)
     if mask is None:
         raise contract.JobError(f"The mask {name} is gone.", "Choose another mask.", contract.ExitCode.USAGE)
@@ -110,12 +109,12 @@ def _render_one(mask_uid: int, name: str, size: tuple[int, int], file: Path, fra
 
 @contextlib.contextmanager
 def _stage(mask: bpy.types.Mask, size: tuple[int, int]) -> Generator[bpy.types.Scene]:
-    """A scene of its own, gone afterwards, whose compositor shows the mask alone."""
+    """Context manager with a temporary scene whose compositor shows only the mask."""
     scene = bpy.data.scenes.new("Splannequin Mask")
     camera: Any = bpy.data.objects.new("Splannequin Mask", bpy.data.cameras.new("Splannequin Mask"))
     try:
         scene.collection.objects.link(camera)
-        scene.camera = camera  # nothing is rendered through it, but Blender asks for one
+        scene.camera = camera  # Blender requires a camera, although it renders nothing
         tree = compat.new_compositor_tree(scene, "Splannequin Mask")
         compat.enable_compositor(scene)
         node: Any = tree.nodes.new("CompositorNodeMask")
@@ -125,8 +124,8 @@ def _stage(mask: bpy.types.Mask, size: tuple[int, int]) -> Generator[bpy.types.S
         render.resolution_x, render.resolution_y, render.resolution_percentage = *size, 100
         compat.set_png(render.image_settings)
         render.dither_intensity = 0.0
-        with contextlib.suppress(TypeError):  # an OCIO configuration of the artist's own may have no such view
-            # Half of the mask is half of the picture's values, which is where the solve cuts: AgX makes 0.2 of it half.
+        with contextlib.suppress(TypeError):  # a custom OCIO configuration may lack this view
+            # A mask value of 0.5 must stay 0.5, which is the solve's threshold. AgX would map 0.2 to 0.5.
             view: Any = present(scene.view_settings)
             view.view_transform = "Raw"
         yield scene
@@ -139,9 +138,9 @@ def _stage(mask: bpy.types.Mask, size: tuple[int, int]) -> Generator[bpy.types.S
 
 
 def _shift(folder: contract.ShotFolder) -> int:
-    """What to add to a frame number of the shot to get the scene's frame at which its movie clip shows it."""
+    """Offset from a frame number of the shot to the scene frame at which its movie clip shows it."""
     state = inventory.read(folder.root)
-    named = (str(state.info.get("source", "")), places.source_of(state))  # where it was, and where it is
+    named = (str(state.info.get("source", "")), places.source_of(state))  # stored and current location
     sources = [Path(path) for path in named if os.path.isabs(path)]
     shown = next((clip for clip in bpy.data.movieclips if same_footage.shows(clip, sources)), None)
     if shown is None:

@@ -1,8 +1,8 @@
-"""Cameras from elsewhere and for elsewhere, on Blender's side.
+"""Import and export of cameras on Blender's side.
 
-In: a file that the backend reads is handed on as it is; what Blender's own tracker solved, a camera of the scene, and
-the camera of a file that Blender reads are written as a nerfstudio transforms.json, whose camera axes are Blender's.
-Out: the backend writes.
+Import: a file that the backend reads is passed on unchanged. Other cameras are written as a nerfstudio transforms.json,
+whose camera axes are Blender's. They come from Blender's tracker, from the scene, or from a file that Blender reads.
+Export: the backend writes the files.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from ..shot import scene_objects
 from . import camera_file, camera_samples, scene_camera
 
 LEAST_TRACKED = 8
-"""Least number of solved frames of a tracked camera."""
+"""Minimum number of solved frames of a tracked camera."""
 _READING_SECONDS = 0.02
-"""Seconds of each turn of the timer that are spent on sampling a camera of the scene."""
+"""Time per timer step for sampling a camera of the scene."""
 
 
 def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> contract.SolveParams:
-    """Parameters of the solve from the artist's settings; writes cameras that Blender reads into the shot.
+    """Solve parameters from the artist's settings. Writes cameras that Blender reads into the shot.
 
     Args:
         scene: the scene.
-        shot: shot folder, None without one.
-        is_read: the cameras that `reads_in_turns` is about are written already, or will be.
+        shot: shot folder, or None.
+        is_read: the caller writes cameras for which `reads_in_turns` is True.
 
-    JobError names what is missing. OSError if the shot cannot be written.
+    Raises JobError, which names what is missing, and OSError if the shot cannot be written.
     """
     props = settings_of(scene)
     params = contract.SolveParams(camera_model=props.camera_model, retry=props.retry)
     params.focal_mm = _said(props.focal_mm)
     if params.focal_mm:
         params.sensor_mm, params.refine_focal = _said(props.sensor_mm), props.refine_focal
-    if props.st_map and props.cameras_from == "SOLVE":  # others bring their own lens
+    if props.st_map and props.cameras_from == "SOLVE":  # imported cameras have their own lens
         params.st_map = os.path.abspath(bpy.path.abspath(props.st_map))
         params.st_map_way, params.st_map_layer = props.st_map_way, props.st_map_layer.strip()
     if props.cameras_from == "FILE":
@@ -74,7 +74,7 @@ def params(scene: bpy.types.Scene, shot: Path | None, is_read: bool = False) -> 
 
 
 def _imported(shot: Path | None) -> Path:
-    """The shot folder, with a backend to read what will be written into it. JobError without either."""
+    """The shot folder, after a check that the shot and a backend exist. Raises JobError otherwise."""
     if shot is None or not contract.ShotFolder(shot).info_path.is_file():
         raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
     backend.python()
@@ -82,7 +82,7 @@ def _imported(shot: Path | None) -> Path:
 
 
 def _scene_camera(scene: bpy.types.Scene) -> str:
-    """Name of the chosen camera of the scene. JobError without one that can be the clip's."""
+    """Name of the selected camera of the scene. Raises JobError if it is missing or shows only the plate."""
     camera = settings_of(scene).scene_camera
     if camera is None or scene_objects.is_plate(camera):
         raise contract.JobError(
@@ -94,14 +94,14 @@ def _scene_camera(scene: bpy.types.Scene) -> str:
 
 
 def has_file_for_blender(asked: contract.SolveParams) -> bool:
-    """True if a solve is asked to take the cameras of a file that Blender reads."""
+    """True if the solve parameters name a file whose cameras Blender reads."""
     return camera_file.is_one(asked.cameras)
 
 
 def with_file_read(scene: bpy.types.Scene, asked: contract.SolveParams, shot: Path) -> contract.SolveParams:
-    """Solve parameters of a command line. Cameras of a file that Blender reads are written into the shot first.
+    """Solve parameters of a command line. First writes cameras of a file that Blender reads into the shot.
 
-    JobError if they cannot be.
+    Raises JobError if this fails.
     """
     if not has_file_for_blender(asked):
         return asked
@@ -110,15 +110,15 @@ def with_file_read(scene: bpy.types.Scene, asked: contract.SolveParams, shot: Pa
 
 
 def reads_in_turns(scene: bpy.types.Scene) -> bool:
-    """True if cameras are chosen that Blender reads for longer than a turn of the timer."""
+    """True if the selected cameras take Blender more than one timer step to read."""
     props = settings_of(scene)
     return props.cameras_from == "SCENE" or (props.cameras_from == "FILE" and camera_file.is_one(props.cameras_path))
 
 
 def read_in_turns(scene: bpy.types.Scene, shot: Path) -> Iterator[job_timer.Progress]:
-    """Writes such cameras into the shot, a part of a turn of the timer each. Nothing of bpy is kept between two.
+    """Writes the cameras of `reads_in_turns` into the shot in steps. Keeps no bpy data between steps.
 
-    JobError and OSError as `params`.
+    Raises JobError and OSError as `params` does.
     """
     if settings_of(scene).cameras_from == "SCENE":
         turns = scene_camera.write_in_turns(scene, _scene_camera(scene), _imported(shot))
@@ -132,13 +132,13 @@ def read_in_turns(scene: bpy.types.Scene, shot: Path) -> Iterator[job_timer.Prog
         while not question.ended and time.monotonic() - began < camera_file.LONGEST_SECONDS:
             yield job_timer.Progress(f"Reading the cameras of {file.name}", 0, 1)
     finally:
-        if not question.ended:  # given up
+        if not question.ended:  # cancelled or timed out
             question.process.kill()
     camera_file.written(question, file, folder)
 
 
 def _sampled(turns: Iterator[tuple[int, int]]) -> Iterator[job_timer.Progress]:
-    """The frames of a camera read, as many a turn as there is time for."""
+    """Reads as many frames of a camera per step as the time limit allows."""
     with contextlib.closing(turns):  # pyright: ignore[reportArgumentType]  -- a generator, which may be given up
         for done, total in turns:
             until = time.monotonic() + _READING_SECONDS
@@ -148,17 +148,17 @@ def _sampled(turns: Iterator[tuple[int, int]]) -> Iterator[job_timer.Progress]:
 
 
 def _said(value: float) -> float:
-    """A number as it was typed: Blender's has 32 bits, and 23.976 becomes 23.9759998."""
+    """A number as typed: Blender's float has 32 bits, so that 23.976 becomes 23.9759998."""
     return float(f"{value:.7g}")
 
 
 def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
     """The solved camera of a movie clip as the content of a transforms.json.
 
-    Frames are named by the number that Splannequin counts by: the file's own in a sequence, 1 for a video's first.
+    Frames have Splannequin's numbers: the file's number in a sequence, or counted from 1 in a video.
 
     Raises:
-        contract.JobError: no clip, no solved camera, or a lens that cannot be told in that format.
+        contract.JobError: there is no clip or no solved camera, or the format does not support the lens.
     """
     if clip is None:
         raise contract.JobError(
@@ -184,15 +184,15 @@ def transforms(clip: bpy.types.MovieClip | None) -> dict[str, Any]:
                 "transform_matrix": [list(row[:]) for row in camera.matrix],
             }
             for camera in cameras
-            if first + camera.frame > 0  # an offset may begin before the footage does
+            if first + camera.frame > 0  # an offset may start before the footage
         ],
     }
 
 
 def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:
-    """A clip's lens in nerfstudio's words. JobError for a distortion model that has none there.
+    """A clip's lens as fields of a nerfstudio transforms.json. Raises JobError for an unsupported distortion model.
 
-    Blender's polynomial model is the radial part of OpenCV's; its pixels count from below.
+    Blender's polynomial model is the radial part of OpenCV's. Its pixel rows are counted from the bottom.
     """
     camera, (width, height) = present(present(clip.tracking).camera), size_of(clip)
     model = camera.distortion_model
@@ -220,7 +220,7 @@ def lens(clip: bpy.types.MovieClip) -> dict[str, Any]:
 
 
 def begin_export(words: contract.ExportWords) -> children.Question:
-    """Has the backend write a shot's cameras or splats for other programs, without waiting.
+    """Makes the backend export a shot's cameras or splats for other programs, without waiting.
 
     Raises:
         contract.JobError: there is no backend, or it cannot be started.
@@ -229,6 +229,6 @@ def begin_export(words: contract.ExportWords) -> children.Question:
 
 
 def exported(asked: children.Question, folder: Path) -> str:
-    """What an export has done, in words. JobError with the backend's own sentence if it failed."""
+    """Sentence about a finished export. Raises JobError with the backend's message if it failed."""
     asked.answer("{}")
     return f"Written to {folder}"

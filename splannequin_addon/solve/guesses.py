@@ -1,7 +1,7 @@
-"""Frames whose camera the solve did not find: their keys have a colour of their own, their ranges a marker each.
+"""Marks frames whose camera the solve did not find: with coloured keyframes, and with a timeline marker per range.
 
-Timeline markers hold no properties, so which ones are ours is kept beside the shot, by name and frame: one that the
-artist renamed or moved is the artist's from then on.
+Timeline markers have no custom properties, so the shot's entry stores the name and frame of ours. A marker that the
+artist renamed or moved no longer counts as ours.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ if TYPE_CHECKING:
     import bpy
 
 KEY_TYPES = {"localised": "JITTER", "interpolated": "EXTREME"}
-"""Source of a camera's frame -> type of its keys, which has a colour in the dope sheet and on the timeline: green for
-localised (not in the solve, but placed against it), pink for a guess between neighbours. All others are plain keys."""
+"""Source of a frame's camera -> type of its keyframes, which sets their colour in the dope sheet and timeline. Green:
+localised against the solve but not part of it. Pink: interpolated between neighbours. All others are plain
+keyframes."""
 
 
 def key_types(path: contract.CameraPath) -> list[str]:
-    """Type of the keys of every frame of a path."""
+    """Keyframe type of every frame of a path."""
     return [KEY_TYPES.get(frame.source, "KEYFRAME") for frame in path.frames]
 
 
 def ranges(path: contract.CameraPath, solved: set[int]) -> list[tuple[int, int]]:
-    """Ranges (first, last), inclusive, of frames that should have been solved and have a guessed camera.
+    """Ranges (first, last), inclusive, of frames with a guessed camera that should have been solved.
 
     Args:
         path: the solved cameras.
-        solved: frames that the solve was to find. One that a frame step left out has not failed; it is told together
-            with those beside it that have.
+        solved: frames that the solve should find. Frames skipped by a frame step only appear in a range with a failed
+            frame.
     """
     found: list[list[int]] = []
     after = False
@@ -48,7 +49,7 @@ def ranges(path: contract.CameraPath, solved: set[int]) -> list[tuple[int, int]]
 
 
 def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) -> None:
-    """Puts a marker where each such range begins, which are `ranges`. After `made.new`."""
+    """Adds a marker at the start of each range from `ranges`. Call it after `scene_objects.new`."""
     entry = present(scene_objects.of(scene, shot))
     others = [e for e in settings_of(scene).made if e != entry]
     put: list[list[str | int]] = []
@@ -60,7 +61,7 @@ def mark(scene: bpy.types.Scene, shot: Path, unsolved: list[tuple[int, int]]) ->
 
 
 def unmark(scene: bpy.types.Scene, shot: Path) -> bool:
-    """Takes those markers away, but what the artist renamed or moved. True if there was one."""
+    """Removes these markers, except those that the artist renamed or moved. True if there were any."""
     entry, is_changed = scene_objects.of(scene, shot), False
     marks: list[tuple[str, int]] = json.loads(entry.marks or "[]") if entry is not None else []
     for name, frame in marks:
@@ -74,7 +75,7 @@ def unmark(scene: bpy.types.Scene, shot: Path) -> bool:
 
 
 def told(result: dict[str, Any]) -> str:
-    """How many cameras of a solve are guesses, in words; empty if none. `result` is that of solve.json."""
+    """Sentence about the number of guessed cameras of a solve; empty if there are none. `result` is from solve.json."""
     guessed, total = result.get("interpolated", 0), result.get("frames", 0)
     if not guessed:
         return ""
@@ -82,7 +83,7 @@ def told(result: dict[str, Any]) -> str:
 
 
 def solved(shot: Path, path: contract.CameraPath) -> set[int]:
-    """Frames that the solve was to find; all of them if nothing says otherwise."""
+    """Frames that the solve should find; all frames unless the import's record excludes some."""
     listing = contract.ShotFolder(shot).listing
     left_out: set[int] = set()
     if listing.is_file():

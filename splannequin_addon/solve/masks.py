@@ -1,4 +1,4 @@
-"""What the solve is told of masks, by what the artist chose: a file, the clip's alpha, or a mask drawn in Blender."""
+"""Mask parameters of the solve from the artist's settings: a file, the clip's alpha, or a mask drawn in Blender."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from ..shot import selection
 from . import drawn_masks, exchange
 
 LABELS = {"ignore": "Ignore", "people": "People"}
-"""Kind of mask -> its name on the panel."""
+"""Kind of mask -> its label on the panel."""
 _WORDS = {"NONE": "", "ALPHA": contract.MASK_ALPHA, "FOUND": contract.MASK_FOUND}
-"""Choice in the panel -> the backend's word for it, for choices that are not files."""
+"""Choice on the panel -> the backend's keyword, for choices that are not files."""
 
 
 def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolveParams:
-    """What the solve is asked for, from what the artist set. Drawn masks and cameras of the scene are written into the
-    shot first, unless they are `rendered` or will be.
+    """Solve parameters from the artist's settings. Writes drawn masks and cameras of the scene into the shot first.
 
-    JobError names what is not chosen, or cannot be written.
+    With `rendered`, the caller writes these files. Raises JobError, which names a missing choice or a file that cannot
+    be written.
     """
     shot = selection.shot_folder(scene)
     params = exchange.params(scene, shot, rendered)
@@ -32,7 +32,7 @@ def params(scene: bpy.types.Scene, rendered: bool = False) -> contract.SolvePara
 
 
 def drawn(scene: bpy.types.Scene) -> dict[str, bpy.types.Mask]:
-    """Kind of mask -> the one that was drawn in Blender and is chosen for it."""
+    """Kind of mask -> the drawn mask that is selected for it."""
     held = settings_of(scene)
     chosen = {kind: getattr(held, f"{kind}_drawn") for kind in contract.MASK_KINDS if _is_drawn(scene, kind)}
     return {kind: mask for kind, mask in chosen.items() if mask is not None}
@@ -52,7 +52,7 @@ def _source(scene: bpy.types.Scene, shot: Path | None, kind: str, rendered: bool
     if chosen == "DRAWN" and mask is not None:
         if shot is None:
             raise contract.JobError("There is no shot yet.", "Import the clip first.", contract.ExitCode.USAGE)
-        backend.python()  # before anything is written: without a backend nothing would read it
+        backend.python()  # fails before anything is written
         return str(contract.ShotFolder(shot).drawn_masks(kind) if rendered else drawn_masks.render(mask, shot, kind))
     raise contract.JobError(
         f"Nothing is chosen for the mask {LABELS[kind]}.",

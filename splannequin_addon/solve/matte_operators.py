@@ -1,4 +1,4 @@
-"""The buttons of the motion matte: show it, paint it, keep or clear what was painted."""
+"""Operators of the motion matte: show it, paint on it, save or clear the paint."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from . import mattes, motion_overlay
 
 
 def _in_editor(context: bpy.types.Context, image: bpy.types.Image, mode: str) -> Any | None:
-    """Shows an image in an Image Editor, the one in this window first, else in a new window; None without windows."""
+    """Shows an image in an Image Editor of this window, else of another one, else in a new window. None in background
+    mode."""
     if bpy.app.background:
         return None
     windows = sorted(context.window_manager.windows, key=lambda window: window != context.window)
@@ -35,11 +36,11 @@ def _in_editor(context: bpy.types.Context, image: bpy.types.Image, mode: str) ->
 
 
 class _Matte(OperatorBase):
-    """What the operators share: off without a solve, the shot of the scene, errors in words."""
+    """Base class of the operators: disabled without a solve, gets the scene's shot, reports errors."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a solve."""
+        """Disabled without a solve."""
         folder = selection.shot_folder(scene_in(context))
         state = job_timer.watch_of(folder).state if folder else None
         if state is None or not state.solve:
@@ -48,7 +49,7 @@ class _Matte(OperatorBase):
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Does it; a refusal is reported."""
+        """Runs `act`; reports an error."""
         shot = selection.shot_folder(scene_in(context))
         if shot is None:
             return {"CANCELLED"}
@@ -60,7 +61,7 @@ class _Matte(OperatorBase):
         return {"FINISHED"}
 
     def act(self, context: bpy.types.Context, shot: Path) -> str:
-        """What it does; returns what was done, for people."""
+        """Does the operator's work. Returns a sentence about it."""
         raise NotImplementedError
 
 
@@ -73,7 +74,7 @@ class SPLANNEQUIN_OT_show_motion(_Matte, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def act(self, context: bpy.types.Context, shot: Path) -> str:
-        """Loads the mattes as a sequence."""
+        """Loads the mattes as an image sequence."""
         image, first, last = mattes.load_sequence(shot)
         space = _in_editor(context, image, "VIEW")
         if space is not None:
@@ -89,7 +90,8 @@ class SPLANNEQUIN_OT_motion_over_plate(_Matte, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def act(self, context: bpy.types.Context, shot: Path) -> str:
-        """Shows or hides it; in a window, frames that have still to be tinted are, one a turn of the timer."""
+        """Shows or hides the overlay. In a window, missing tinted frames are first written by the timer, one per
+        step."""
         scene = scene_in(context)
         if motion_overlay.hide(scene, shot):
             return "The plate is shown as it is."
@@ -104,7 +106,7 @@ class SPLANNEQUIN_OT_motion_over_plate(_Matte, bpy.types.Operator):
 
 
 def _tint(shot: Path, turns: Iterator[tuple[int, int]], scene_uid: int) -> Iterator[job_timer.Progress]:
-    """Tints the frames that are left, a frame a turn, then shows them."""
+    """Tints the remaining frames, one per step, then shows them."""
     for done, total in turns:
         yield job_timer.Progress(f"Tinting the motion, frame {done} of {total}", done, total)
     job_timer.change(
@@ -121,7 +123,7 @@ class SPLANNEQUIN_OT_paint_motion(_Matte, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def act(self, context: bpy.types.Context, shot: Path) -> str:
-        """Makes the image to paint on."""
+        """Creates the image to paint on."""
         frame = scene_in(context).frame_current
         _in_editor(context, mattes.paint_image(shot, frame), "PAINT")
         return f"Paint on frame {frame}, then press Save Paint."
@@ -135,7 +137,7 @@ class SPLANNEQUIN_OT_save_motion(_Matte, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def act(self, context: bpy.types.Context, shot: Path) -> str:
-        """Writes the current frame's image."""
+        """Saves the current frame's image."""
         frame = scene_in(context).frame_current
         image = mattes.find_image(shot, frame)
         if image is None:
@@ -154,14 +156,14 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks first: what is removed from disk does not come back with undo."""
+        """Asks for confirmation, because undo does not restore deleted files."""
         return context.window_manager.invoke_confirm(
             self, event, title="Delete the painted matte of this frame from disk?",
             message="What the solve found holds again. This cannot be undone.", confirm_text="Remove", icon="WARNING",
         )  # fmt: skip
 
     def act(self, context: bpy.types.Context, shot: Path) -> str:
-        """Removes the current frame's file."""
+        """Deletes the current frame's file."""
         frame = scene_in(context).frame_current
         try:
             gone = mattes.clear_paint(shot, frame)
@@ -175,7 +177,7 @@ class SPLANNEQUIN_OT_clear_motion(_Matte, bpy.types.Operator):
 
 
 def draw(layout: bpy.types.UILayout, is_over_plate: bool) -> None:
-    """The buttons."""
+    """Draws the buttons of the motion matte."""
     name = "splannequin.motion_over_plate"
     layout.operator(name, icon=icons.of(name), depress=is_over_plate)
     row = layout.row(align=True)

@@ -1,8 +1,8 @@
-"""The motion matte in Blender: what the solve found to move, shown in the Image Editor, and painted over by the artist.
+"""The motion matte in Blender: the solve's result, shown in the Image Editor, with the artist's paint.
 
-Black stands still, white moves, grey is not known. What is painted lies in the shot, SHOT/motion_paint/NNNNNN.png, and
-goes before what the solve finds, now and after another one. Until it is saved there, the .blend keeps it: an image is
-packed, for Blender saves no pixels of one that was generated.
+Black is still, white moves, grey is unknown. Saved paint is in the shot, SHOT/motion_paint/NNNNNN.png, and takes
+precedence over the results of this and later solves. Unsaved paint is kept in the .blend: the image is packed, because
+Blender does not save the pixels of a generated image.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from ..shot import inventory, scene_objects
 from . import motion_overlay
 
 _FRAME = "splannequin_matte"
-"""Property of the images that are painted on: frame number. `MATTE_SHOT` is another."""
+"""Property of a painted image: frame number. `MATTE_SHOT` is the property for its shot."""
 _PICTURE = "splannequin_picture"
-"""Another: digest of the picture that the frame had. Another clip may have been imported into the shot since."""
+"""Property of a painted image: digest of the frame's image, to detect that another clip was imported since."""
 MOVING_TINT = (255, 64, 0)
-"""Tint, sRGB, of what moves."""
+"""Tint of moving pixels, sRGB."""
 UNKNOWN_TINT = (64, 128, 255)
-"""Tint of what is not known."""
+"""Tint of unknown pixels, sRGB."""
 _OPAQUE = 150
-"""Of what surely moves, of 255: the plate is seen through it."""
+"""Alpha of moving pixels, 0..255, so that the plate remains visible."""
 _FAINT = 70
-"""Of what is not known."""
+"""Alpha of unknown pixels, 0..255."""
 
 
 def found_file(shot: Path, frame: int) -> Path:
-    """Where the solve keeps the matte of a frame."""
+    """Path of the solve's matte of a frame."""
     return contract.ShotFolder(shot).matte(frame)
 
 
 def painted_file(shot: Path, frame: int) -> Path:
-    """Where the painted one is kept."""
+    """Path of the painted matte of a frame."""
     return contract.ShotFolder(shot).painted_matte(frame)
 
 
 def load_sequence(shot: Path) -> tuple[Any, int, int]:
-    """The found mattes as an image sequence, and their first and last frame. JobError if there are none."""
+    """(image sequence of the solve's mattes, first frame, last frame). Raises JobError without mattes."""
     frames = sorted(int(p.stem) for p in contract.ShotFolder(shot).motion.glob("*.png") if p.stem.isdecimal())
     if not frames:
         raise no_matte(shot)
@@ -60,15 +60,15 @@ def load_sequence(shot: Path) -> tuple[Any, int, int]:
 
 
 def no_matte(shot: Path) -> contract.JobError:
-    """The sentence for a shot that was solved before there were mattes."""
+    """The error for a shot that was solved before mattes existed."""
     message = f"{scene_objects.name_of(shot)} has no motion matte here."
     return contract.JobError(message, "Solve the camera again: its last part finds it.", contract.ExitCode.USAGE)
 
 
 def paint_image(shot: Path, frame: int) -> bpy.types.Image:
-    """An image to paint the matte of a frame on: the one there is, else a copy of the painted or the found matte.
+    """An image to paint the matte of a frame on: the existing one, else a copy of the painted matte or the solve's.
 
-    JobError if the frame has neither, or a file of it cannot be read.
+    Raises JobError if the frame has no matte, or if a file cannot be read.
     """
     image = find_image(shot, frame)
     if image is not None:
@@ -85,7 +85,8 @@ def paint_image(shot: Path, frame: int) -> bpy.types.Image:
 
 
 def matte_pixels(shot: Path, frame: int) -> np.ndarray:
-    """The matte of a frame as it stands in the shot, [H, W, 4] float32, bottom row first; JobError as `paint_image`."""
+    """The matte of a frame from the shot's files, [H, W, 4] float32, bottom row first. Raises JobError as
+    `paint_image`."""
     path = next((p for p in (painted_file(shot, frame), found_file(shot, frame)) if p.is_file()), None)
     if path is None:
         raise contract.JobError(
@@ -103,7 +104,7 @@ def matte_pixels(shot: Path, frame: int) -> np.ndarray:
 
 
 def _fill(image: bpy.types.Image, pixels: np.ndarray) -> None:
-    """Gives an image pixels, and packs them."""
+    """Sets and packs an image's pixels."""
     height, width = pixels.shape[:2]
     if image.source != "GENERATED":
         image.source = "GENERATED"
@@ -115,12 +116,12 @@ def _fill(image: bpy.types.Image, pixels: np.ndarray) -> None:
 
 
 def find_image(shot: Path, frame: int) -> bpy.types.Image | None:
-    """The image that the matte of a frame is painted on, if this file has one and its pixels are there."""
+    """The image with the painted matte of a frame, or None if this file has none with pixels."""
     return next((i for i in bpy.data.images if _is_of(i, shot, frame) and not _lost(i)), None)
 
 
 def _is_of(image: bpy.types.Image, shot: Path, frame: int) -> bool:
-    # Earlier files have no digest: their images are trusted.
+    # Images of earlier files have no digest and are accepted.
     return _of(image) == (os.path.abspath(shot), frame) and image.get(_PICTURE) in (
         None,
         inventory.picture_of(shot, frame),
@@ -128,13 +129,16 @@ def _is_of(image: bpy.types.Image, shot: Path, frame: int) -> bool:
 
 
 def _lost(image: bpy.types.Image) -> bool:
-    """True if nothing of what was painted is in an image: its file is gone, or it was not packed when it was saved, as
-    none was at first, and has come back black."""
+    """True if an image has lost its paint, and is black or empty.
+
+    The cause is a missing file, or an earlier version that saved the image without packing it.
+    """
     return image.source == "GENERATED" or not all(size_of(image))
 
 
 def _of(image: bpy.types.Image) -> tuple[str, int] | None:
-    """Shot folder and frame of an image that a matte is painted on; of no other file's, which cannot be changed."""
+    """(shot folder, frame) of an image with a painted matte; None for other images and for linked ones, which are
+    read-only."""
     frame, folder = image.get(_FRAME), image.get(MATTE_SHOT)
     if image.library or not isinstance(frame, int) or not isinstance(folder, str):
         return None
@@ -142,9 +146,9 @@ def _of(image: bpy.types.Image) -> tuple[str, int] | None:
 
 
 def save_paint(image: bpy.types.Image) -> Path:
-    """Writes an image of `paint_image` into its shot, whole or not at all, and makes it an image of that file.
+    """Writes an image of `paint_image` into its shot atomically, and makes it an image of that file.
 
-    JobError if it cannot be written.
+    Raises JobError if it cannot be written.
     """
     known = _of(image)
     if known is None:
@@ -164,13 +168,13 @@ def save_paint(image: bpy.types.Image) -> Path:
     image.filepath_raw, image.file_format = paths.blend_path(path), "PNG"
     image.source = "FILE"
     if image.packed_file is not None:
-        image.unpack(method="REMOVE")  # else it would be read again from there
+        image.unpack(method="REMOVE")  # otherwise Blender would read the packed data again
     image.reload()
     return path
 
 
 def clear_paint(shot: Path, frame: int) -> bool:
-    """Removes the painted matte of a frame from the shot; True if there was one. The image stays in the file."""
+    """Deletes the painted matte of a frame from the shot. True if there was one. The image stays in the file."""
     path = painted_file(shot, frame)
     if contract.is_link(path.parent) or not path.is_file():
         return False
@@ -179,7 +183,7 @@ def clear_paint(shot: Path, frame: int) -> bool:
 
 
 def packed(pixels: np.ndarray) -> bytes:
-    """A PNG of [H, W, C] float32 in 0 to 1, top row first: grey, 8 bits, with alpha if any of it is transparent."""
+    """PNG data of [H, W, C] float32 in 0..1, top row first: 8-bit grey, with alpha if any pixel is transparent."""
     channels = pixels.shape[2]
     planes = [pixels[..., : 3 if channels >= 3 else 1].mean(2)]
     if channels in (2, 4) and (pixels[..., -1] < 1.0).any():
@@ -188,7 +192,7 @@ def packed(pixels: np.ndarray) -> bytes:
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """A PNG of [H, W, C] uint8, top row first: grey, grey and alpha, colour, or colour and alpha."""
+    """PNG data of [H, W, C] uint8, top row first: grey, grey and alpha, RGB, or RGB and alpha."""
     height, width, channels = pixels.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
 
@@ -201,14 +205,14 @@ def png(pixels: np.ndarray) -> bytes:
 
 
 def _pixels(path: Path) -> np.ndarray:
-    """A picture file as [H, W, 4] float32 as stored, bottom row first. JobError if it cannot be read."""
+    """Stored values of an image file, [H, W, 4] float32, bottom row first. Raises JobError if it cannot be read."""
     announced = contract.png_size(path)
-    if announced[0] * announced[1] > contract.MOST_PIXELS:  # Blender would ask for all of its memory
+    if announced[0] * announced[1] > contract.MOST_PIXELS:  # Blender would try to allocate all of it
         message = f"{path} is {announced[0]} x {announced[1]} pixels, or says so."
         raise contract.JobError(message, "Remove it, or make it smaller.", contract.ExitCode.USAGE)
     image = bpy.data.images.load(contract.regular_file(path))
     try:
-        image.alpha_mode = "CHANNEL_PACKED"  # nothing is multiplied
+        image.alpha_mode = "CHANNEL_PACKED"  # no premultiplication
         width, height = size_of(image)
         if not (width and height):
             raise contract.JobError(f"{path} cannot be read.", "Remove it.", contract.ExitCode.USAGE)
@@ -220,25 +224,25 @@ def _pixels(path: Path) -> np.ndarray:
 
 
 def write(path: Path, data: bytes) -> None:
-    """Writes beside `path`, fsyncs, renames over it. OSError, also if its folder is a link to elsewhere."""
+    """Writes a file atomically. Raises OSError, also if its folder is a link."""
     if contract.is_link(path.parent):
         raise NotADirectoryError(20, "its folder is a link", str(path))
     contract.write_atomic(path, data, parents=False)
 
 
-# What follows shows mattes over the plate. A matte is grey and has no alpha, so it is written once more as tint and
-# alpha, and again when it has changed.
+# The rest of this module shows mattes over the plate. A matte is grey without alpha, so it is also written as a file
+# with tint and alpha, and again after it has changed.
 
 
 def overlay_folder(shot: Path) -> Path:
-    """Where the tinted frames of a shot lie."""
+    """Folder of a shot's tinted frames."""
     return contract.ShotFolder(shot).motion / "overlay"
 
 
 def tint_in_turns(shot: Path) -> Iterator[tuple[int, int]]:
-    """Writes the tinted frames that are not there or older than their mattes; yields how many are done, of how many.
+    """Writes tinted frames that are missing or older than their mattes. Yields (frames done, total frames).
 
-    JobError if the shot has no mattes, or a file cannot be read or written.
+    Raises JobError if the shot has no mattes, or if a file cannot be read or written.
     """
     numbers = numbered.frame_numbers(contract.ShotFolder(shot).motion, contract.PICTURE)
     if not numbers:
@@ -260,7 +264,8 @@ def tint_in_turns(shot: Path) -> Iterator[tuple[int, int]]:
 
 
 def tinted(matte: np.ndarray) -> np.ndarray:
-    """[H, W, 4] uint8 tint and alpha of a matte [H, W] in 0 to 1: still below a tenth, unknown around a half."""
+    """[H, W, 4] uint8 tint and alpha of a matte [H, W] in 0..1: moving above 0.75, unknown above 0.35, otherwise
+    still."""
     moves, unknown = matte > 0.75, (matte > 0.35) & (matte <= 0.75)
     picture = np.zeros((*matte.shape, 4), np.uint8)
     picture[..., :3] = np.where(unknown[..., None], np.array(UNKNOWN_TINT, np.uint8), np.array(MOVING_TINT, np.uint8))
@@ -269,9 +274,9 @@ def tinted(matte: np.ndarray) -> np.ndarray:
 
 
 def show_over_plate(scene: bpy.types.Scene, shot: Path) -> list[str]:
-    """Puts the tinted frames before the plate, in the view through the shot's camera; returns what was done, in words.
+    """Shows the tinted frames over the plate in the view of the shot's camera. Returns the changes as sentences.
 
-    JobError without frames or camera.
+    Raises JobError without frames or camera.
     """
     camera = scene_objects.part(scene, shot, "camera")
     folder = overlay_folder(shot)
@@ -295,7 +300,7 @@ def show_over_plate(scene: bpy.types.Scene, shot: Path) -> list[str]:
 
 
 def _is_newer(file: Path, shot: Path, number: int) -> bool:
-    """True if a tinted frame was written after its mattes, found and painted."""
+    """True if a tinted frame was written after its mattes (the solve's and the painted one)."""
     sources = [found_file(shot, number), painted_file(shot, number)]
     try:
         return file.stat().st_mtime_ns > max(p.stat().st_mtime_ns for p in sources if p.is_file())
@@ -305,25 +310,25 @@ def _is_newer(file: Path, shot: Path, number: int) -> bool:
 
 @persistent
 def _before_save(*_: object) -> None:
-    """What was painted since is packed, too."""
+    """Handler: packs images that were painted on since the last save."""
     for image in bpy.data.images:
         if _of(image) is not None and image.is_dirty:
-            with contextlib.suppress(RuntimeError):  # nothing keeps the file from being saved
+            with contextlib.suppress(RuntimeError):  # saving must not fail because of it
                 image.pack()
 
 
 @persistent
 def _after_load(*_: object) -> None:
-    """An image of an older file shows the matte of its shot instead of black."""
+    """Handler: an image from an older file shows the matte of its shot instead of black."""
     for image in bpy.data.images:
         known = _of(image)
         if known is not None and image.source == "GENERATED":
-            with contextlib.suppress(contract.JobError, RuntimeError):  # Paint Motion will say why
+            with contextlib.suppress(contract.JobError, RuntimeError):  # Paint Motion reports the error
                 _fill(image, matte_pixels(Path(known[0]), known[1]))
 
 
 def register() -> None:
-    """Listens to saving and loading."""
+    """Registers the handlers for save and load."""
     bpy.app.handlers.save_pre.append(_before_save)
     bpy.app.handlers.load_post.append(_after_load)
 

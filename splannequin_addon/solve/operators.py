@@ -1,4 +1,4 @@
-"""The button Solve, the camera in the scene, and what other programs get of a solve: cameras and ST maps."""
+"""Operators of the Solve step: the solve, loading its camera, and exports of cameras and ST maps."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a solve."""
+        """Disabled without a solve."""
         folder = selection.shot_folder(scene_in(context))
         state = job_timer.watch_of(folder).state if folder else None
         if state is None or not state.solve:
@@ -59,7 +59,7 @@ class SPLANNEQUIN_OT_export_cameras(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Has the backend write; in a window the panel tells when it is done."""
+        """Starts the export in the backend. With a window, the panel reports when it is done."""
         shot = selection.shot_folder(scene_in(context))
         if shot is None or not self.directory:
             self.report({"ERROR"}, "No folder was given")
@@ -95,7 +95,7 @@ class SPLANNEQUIN_OT_solve_camera(step_operator.StepOperator, bpy.types.Operator
     step = "solve"
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Runs the step. In a window drawn masks are rendered and cameras read a frame per turn of the timer."""
+        """Runs the step. In a window, the timer first renders drawn masks and reads cameras, one frame per step."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         turns = steps.STEPS[self.step].in_turns(scene, folder) if folder is not None else None
@@ -113,7 +113,7 @@ class SPLANNEQUIN_OT_load_camera(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Builds camera and points."""
+        """Builds the camera and the points."""
         outcome = step_operator.edit(self, context, "solve", arrival.load_camera)
         if outcome == {"FINISHED"} and context.window is not None:
             job_timer.look_through_camera(context.window)
@@ -134,7 +134,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off without a solve, while a step runs, and while the maps are being written."""
+        """Disabled without a solve, while a step runs, and while the maps are being written."""
         folder = selection.shot_folder(scene_in(context))
         watch = job_timer.watch_of(folder) if folder else None
         if watch is None or watch.state is None or not watch.state.solve:
@@ -149,7 +149,7 @@ class SPLANNEQUIN_OT_write_stmaps(bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Starts the backend; headless, waits for it."""
+        """Starts the backend. Without a window, waits for it."""
         folder = selection.shot_folder(scene_in(context))
         if folder is None:
             return {"CANCELLED"}
@@ -179,7 +179,7 @@ writing: set[Path] = set()
 
 
 def follow_stmaps(shot: Path, asked: children.Question) -> None:
-    """Tells of a shot's ST maps on the panel once they are written."""
+    """Reports on the panel when a shot's ST maps are written."""
 
     def written() -> None:
         writing.discard(shot)
@@ -190,7 +190,7 @@ def follow_stmaps(shot: Path, asked: children.Question) -> None:
 
 
 def tell(shot: Path, say: Callable[[], list[str]]) -> None:
-    """Puts what the backend answered, as `say` tells it or why it cannot, where the panel of the step shows it."""
+    """Shows the backend's answer, from `say`, or its error on the panel of the step."""
     watch = job_timer.watch_of(shot)
     watch.notes.pop("solve", None)
     try:
@@ -200,11 +200,11 @@ def tell(shot: Path, say: Callable[[], list[str]]) -> None:
 
 
 def register() -> None:
-    """Nothing is being written yet."""
+    """Does nothing: no maps are being written yet."""
 
 
 def unregister() -> None:
-    """Stops waiting. A backend that is writing finishes by itself."""
+    """Stops waiting. A backend that is writing maps finishes independently."""
     writing.clear()
 
 

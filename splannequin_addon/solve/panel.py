@@ -1,4 +1,4 @@
-"""The panel of the step Solve."""
+"""The panel of the Solve step."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from . import align_operators, cameras, matte_operators, motion_overlay, scale
 
 
 def can_load_camera(running: str | None) -> bool:
-    """True unless a step runs that makes another solve; the others leave this one as it is."""
+    """True unless a step is running that replaces the solve."""
     return running not in ("import", "solve")
 
 
 class SolvePanel(step_panel.StepPanel):
-    """Step 2: where the camera was."""
+    """Step 2: camera solve."""
 
     title = "2  Solve"
     step = "solve"
@@ -27,7 +27,7 @@ class SolvePanel(step_panel.StepPanel):
     folds = "camera"
 
     def draw_body(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The step's body, and where the solve stands in the scene."""
+        """The step's body, masks, motion matte and alignment."""
         super().draw_body(context, layout)
         watch = self._watch(context)
         body = step_panel.sub_panel(layout, "camera_masks", "Masks")
@@ -50,10 +50,10 @@ class SolvePanel(step_panel.StepPanel):
             align_operators.draw(body)
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The lens, where cameras come from, and where they go."""
+        """The lens, the source of the cameras, and exports."""
         props = settings_of(scene_in(context))
         row = layout.row()
-        row.enabled = not (props.st_map and props.cameras_from == "SOLVE")  # the map is the lens
+        row.enabled = not (props.st_map and props.cameras_from == "SOLVE")  # the map defines the lens
         row.prop(props, "camera_model")
         layout.prop(props, "focal_mm")
         if props.focal_mm > 0.0:
@@ -76,7 +76,7 @@ class SolvePanel(step_panel.StepPanel):
             layout.operator(name, icon=icons.of(name))
 
     def _masks(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """What is ignored, and what alone may move."""
+        """The masks of ignored and of moving areas."""
         scene = scene_in(context)
         props, shot = settings_of(scene), selection.shot_folder(scene)
         if props.ignore_from in ("NONE", "FOUND") and shot is not None and inventory.burnt_in(shot) is not None:

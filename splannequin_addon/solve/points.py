@@ -1,5 +1,6 @@
-"""The sparse points of a solve in their own colours. Blender draws a mesh's loose points black in solid view, so the
-object shows its bounds only, and as long as its eye is open its points are drawn here.
+"""Draws the sparse points of a solve in their colours. Blender's solid view draws loose points in black.
+
+The object therefore shows only its bounds. This module draws its points while the object is visible.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from ..process import children
 from ..shot import scene_objects, selection
 
 _SIZE = 3.0
-"""Pixels of a point."""
+"""Size of a point in pixels."""
 _handler: Any = None
 _kept: tuple[Any, ...] = ()
 """(key of the mesh, shader, batch) of the points drawn last."""
 
 
 def coloured(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Places [P, 3] and colours [P, 4] sRGB of a cloud's mesh, float32."""
+    """(locations [P, 3], sRGB colours [P, 4]) of a point cloud's mesh, float32."""
     places = np.empty(3 * len(mesh.vertices), np.float32)
     vertices: Any = mesh.vertices
     vertices.foreach_get("co", places)
@@ -38,7 +39,7 @@ def coloured(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw() -> None:
-    """One 3D view's part."""
+    """Draw handler of a 3D view."""
     global _kept
     context = bpy.context
     if context.space_data is None or not context.space_data.overlay.show_overlays:
@@ -75,15 +76,15 @@ def _first_shader(names: tuple[str, ...]) -> Any:
 
 
 def register() -> None:
-    """Draws from now on, where there is a window."""
+    """Registers the draw handler, except in background mode."""
     global _handler
     if not bpy.app.background:
         _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
-        children.import_beside("zipfile")  # numpy does to open a solve's points: 0.2 s from a cold disk
+        children.import_beside("zipfile")  # needed by numpy to open a solve's points: 0.2 s from a cold disk
 
 
 def unregister() -> None:
-    """Draws no more."""
+    """Removes the draw handler."""
     global _handler, _kept
     if _handler is not None:
         bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")

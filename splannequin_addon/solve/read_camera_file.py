@@ -1,4 +1,4 @@
-"""Runs `camera_file.main` in a Blender of its own: as a script, which nobody imports.
+"""Script that runs `camera_file.main` in a separate Blender process.
 
 blender --background --factory-startup --python read_camera_file.py -- JSON
 python read_camera_file.py -- JSON
@@ -14,7 +14,7 @@ from pathlib import Path
 
 
 def main() -> int:
-    """Loads the package without registering it; returns the exit code of `camera_file.main`."""
+    """Loads the package without registering it. Returns the exit code of `camera_file.main`."""
     script = Path(__file__).resolve().parents[1] / "run_in_bpy.py"
     spec = importlib.util.spec_from_file_location("_splannequin_run_in_bpy", script)
     assert spec is not None and spec.loader is not None
@@ -28,4 +28,4 @@ def main() -> int:
 if __name__ == "__main__":
     code = main()
     sys.stderr.flush()
-    os._exit(code)  # Blender has nothing to save, and as a module may crash over what it frees at the end
+    os._exit(code)  # skip the clean-up: nothing to save, and bpy as a module may crash in it

@@ -1,4 +1,4 @@
-"""How large a shot stands in the scene: moving it, and a first guess of its scale from the camera's height."""
+"""The scale of a shot in the scene: applies changes, and estimates the scale from the camera's height."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from ..shot import inventory, scene_objects
 from . import alignment
 
 HAND_HEIGHT = 1.5
-"""Height in metres at which a camera is mostly held by somebody who stands."""
+"""Typical height in metres of a handheld camera of a standing person."""
 STEADY = 0.5
-"""Most that the height of such a camera varies, as a share of it: from the eyes to the waist."""
+"""Maximum variation of such a camera's height, as a fraction of the height: from eye to waist level."""
 
 
 def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
-    """Moves a shot's root by a change of the world as `alignment` makes them; returns what else was changed, in words.
+    """Applies a world change from `alignment` to a shot's root. Returns the further changes as sentences.
 
     Args:
         scene: the scene.
-        shot: shot folder; its root is there.
-        change: [4, 4], multiplied onto the root from the left.
+        shot: shot folder; the scene has its root.
+        change: [4, 4], multiplied onto the root's matrix from the left.
     """
     root, before = present(scene_objects.part(scene, shot, "root")), scene_objects.depth_scale(scene, shot)
     scale = root.scale[:]
     uniform = max(scale) - min(scale) <= 1e-5 * max(scale)
     root.matrix_world = Matrix((change @ np.array(root.matrix_world, dtype=np.float64)).tolist())
-    if uniform:  # to the last bit, whatever the decomposition left
+    if uniform:  # removes rounding errors of the matrix decomposition
         root.scale = [sum(root.scale[:]) / 3.0] * 3
     bpy.context.view_layer.update()
     grown = scene_objects.depth_scale(scene, shot) / before
@@ -49,32 +49,32 @@ def move(scene: bpy.types.Scene, shot: Path, change: np.ndarray) -> list[str]:
 
 
 def scaled(scene: bpy.types.Scene, shot: Path) -> bool:
-    """True if the artist has set the shot's scale: by Set Scale, or on its root. A guessed scale does not count."""
+    """True if the artist has set the shot's scale, by Set Scale or on its root. An estimated scale does not count."""
     entry = scene_objects.of(scene, shot)
     unscaled = guessed_scale(scene, shot) or 1.0
     return (entry is not None and entry.scaled) or abs(scene_objects.depth_scale(scene, shot) / unscaled - 1.0) > 1e-4
 
 
 def guessed_scale(scene: bpy.types.Scene, shot: Path) -> float:
-    """Scene units per solve unit that `guess_scale` gave a shot; 0 if it gave none."""
+    """Scene units per solve unit that `guess_scale` estimated for a shot; 0 if it did not."""
     entry = scene_objects.of(scene, shot)
     return entry.guessed_scale if entry is not None else 0.0
 
 
 def guess_scale(scene: bpy.types.Scene, shot: Path, is_new: bool) -> list[str]:
-    """Scales a shot so that its camera is as high above the floor as people hold one; returns what changed, in words.
+    """Scales a shot so that its camera has a typical handheld height above the floor. Returns the changes as sentences.
 
-    A scale that somebody gave stays, and so does a shot that stood in the scene without a guess. Without a floor a
-    guess of an earlier solve is taken back.
+    A scale set by the artist stays, and so does an existing shot without an estimate. If the new solve has no floor, an
+    earlier estimate is undone.
 
     Args:
         scene: the scene.
-        shot: shot folder; its root is there.
-        is_new: the root was made just now.
+        shot: shot folder; the scene has its root.
+        is_new: the root is new.
     """
     entry = present(scene_objects.of(scene, shot))
     if is_new:
-        entry.scaled, entry.guessed_scale = entry.world == contract.SCENE_WORLD, 0.0  # the scene's own is no guess
+        entry.scaled, entry.guessed_scale = entry.world == contract.SCENE_WORLD, 0.0  # its scale is known
     before = entry.guessed_scale
     if scaled(scene, shot) or not (is_new or before):
         return []
@@ -90,9 +90,9 @@ def guess_scale(scene: bpy.types.Scene, shot: Path, is_new: bool) -> list[str]:
 
 
 def height_of_camera(shot: Path) -> float | None:
-    """Median height of a shot's camera over the floor that the solve found, solve units.
+    """Median height of a shot's camera above the solve's floor, solve units.
 
-    None without a floor, or if the camera rises and sinks too much to be held by somebody who stands.
+    None without a floor, or if the height varies too much for a standing person's camera.
     """
     floor = inventory.floor(shot)
     if floor is None:

@@ -1,6 +1,6 @@
-"""An animated camera of a Blender scene as the cameras of a clip: sampled, and written as a transforms.json.
+"""An animated camera of a Blender scene as the camera of a clip: sampled, and written as a transforms.json.
 
-The world of the file is the scene's, so that what is solved with it stands where the camera stands.
+The file uses the scene's world, so that the solve is placed where the camera is.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
     import bpy
 
 _ASPECT_SLACK = 0.01
-"""Of the ratio of width to height: what rounding to whole pixels may change."""
+"""Maximum relative difference of aspect ratios, to allow for rounding to whole pixels."""
 
 
 def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[tuple[int, int], None, Path]:
-    """Samples a camera at every frame of a shot, a frame a turn; yields how many are done, and of how many.
+    """Samples a camera at every frame of a shot, one frame per step. Yields (frames done, total frames).
 
-    Frame n of the scene is frame n of the clip. Returns SHOT/tracking/transforms.json. Frames before the camera's
-    first key and after its last, where it stands still, are left out. Nothing of bpy is kept between two turns, and
-    the scene's frame is put back.
+    Frame n of the scene is frame n of the clip. Returns SHOT/tracking/transforms.json. Frames without motion before the
+    first and after the last keyframe are left out. Keeps no bpy data between steps and restores the scene's current
+    frame.
 
     Args:
-        scene: the scene, whose pixel aspect is used.
-        name: of the camera object.
+        scene: the scene, for its pixel aspect.
+        name: name of the camera object.
         shot: shot folder.
 
     Raises:
-        contract.JobError: the shot is not imported, the scene renders another shape than its frames, or the camera is
-            gone, is no perspective camera or does not move.
+        contract.JobError: the shot is not imported, or the render's aspect ratio differs from the frames. Also if the
+            camera is missing, is not a perspective camera or does not move.
     """
     uid, (numbers, size) = scene.session_uid, camera_samples.frames_of(shot)
     _refuse_other_shape(scene, size)
@@ -60,7 +60,7 @@ def write_in_turns(scene: bpy.types.Scene, name: str, shot: Path) -> Generator[t
 
 
 def _refuse_other_shape(scene: bpy.types.Scene, size: tuple[int, int]) -> None:
-    """JobError if a scene renders pictures of another shape: its cameras are of those pictures."""
+    """Raises JobError if the render's aspect ratio differs from the clip's, because the camera's view depends on it."""
     width, height = scene_setup.render_size(scene)
     if abs((width / height) / (size[0] / size[1]) - 1.0) > _ASPECT_SLACK:
         raise contract.JobError(

@@ -1,4 +1,4 @@
-"""What the artist sets for the solve."""
+"""Settings of the solve."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ MASK_SOURCES = [
     ("ALPHA", "Alpha", "The alpha of the clip, if it has one: ignored is what is transparent, people are opaque"),
     ("DRAWN", "Drawn", "A mask of this file, drawn over the clip in the Movie Clip editor"),
 ]
-"""Where a mask may come from. In the order that .blend files keep: new ones go last."""
+"""Sources of a mask. The order is stored in .blend files: append new ones."""
 BURNT_IN = ("FOUND", "Burnt In", "A logo or a caption, if the import found one burnt into the clip; else nothing")
-"""Where the mask of what is ignored may come from besides."""
+"""Additional source of the mask of ignored areas."""
 
 
 class SolveSettings:
-    """The lens of a shot, where its cameras come from, and what is masked."""
+    """The lens of a shot, the source of its cameras, and its masks."""
 
     camera_model = EnumProperty(
         **contract.panel(contract.SolveParams, "camera_model"),

@@ -1,4 +1,4 @@
-"""The step Solve: what it asks the backend for, what its end changes, and what the panel says of it."""
+"""The Solve step: its backend request, the changes when it ends, and its texts on the panel."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from . import (
 
 
 class Solve(Step):
-    """Where the camera was, and what moves."""
+    """Finds the camera's motion, and what moves in the clip."""
 
     name = "solve"
     label = "Solve"
@@ -50,16 +50,17 @@ class Solve(Step):
     parts = (points, align_operators, operators, mattes)
 
     def params(self, scene: bpy.types.Scene) -> contract.SolveParams:
-        """The lens, where cameras come from, and what is masked."""
+        """Solve parameters: the lens, the source of the cameras, and the masks."""
         return masks.params(scene)
 
     def in_turns(self, scene: bpy.types.Scene, shot: Path) -> Iterator[Any] | None:
-        """Renders drawn masks and reads cameras first, if any are chosen that Blender has to."""
+        """Work before the solve: renders drawn masks and reads cameras. None if there are none that Blender must
+        process."""
         has_work = masks.drawn(scene) or exchange.reads_in_turns(scene)
         return solve_in_turns(scene.session_uid, shot) if has_work else None
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
-        """Camera: how good the solve is."""
+        """Panel state of Solve: the quality of the solve."""
         if state is None or not state.frames:
             return View(False, False, [], self.needs)
         if not state.solve:
@@ -75,33 +76,33 @@ class Solve(Step):
         return View(True, True, lines, "", brief)
 
     def is_usable(self, job: jobs.Job) -> bool:
-        """The cameras are there while the search for motion goes on."""
+        """True as soon as the cameras are written, while the search for motion continues."""
         return job.cameras_known
 
     def finish(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """Camera, plate and points come into the scene."""
+        """Loads camera, plate and points into the scene."""
         return arrival.load_camera(scene, job.shot)
 
     def look(self, window: bpy.types.Window, scene: bpy.types.Scene, shot: Path) -> None:
-        """Through the solved camera."""
+        """Looks through the solved camera."""
         job_timer.look_through_camera(window)
 
     def logs(self, job: jobs.Job) -> list[Path]:
-        """The job's own log, and what COLMAP said."""
+        """The job's log, and COLMAP's log."""
         return [*super().logs(job), contract.ShotFolder(job.shot).colmap_log]
 
     def stands(self, scene: bpy.types.Scene, shot: Path) -> bool:
-        """True if camera, points or plate of a shot are in the scene."""
+        """True if the scene has an entry for the shot's objects."""
         return scene_objects.of(scene, shot) is not None
 
     def remove(self, scene: bpy.types.Scene, shot: Path, others: list[Path]) -> list[str]:
-        """Takes camera, points and plate out of the file."""
+        """Removes camera, points and plate from the file."""
         plate.remove(scene, shot)
         return ["Camera and points were removed."] if cameras.remove(scene, shot) else []
 
 
 def solve_in_turns(scene_uid: int, shot: Path) -> Iterator[job_timer.Progress | None]:
-    """The drawn masks of a scene rendered and its cameras read, a frame a turn of the timer; then its solve begun."""
+    """Renders the drawn masks of a scene and reads its cameras, one frame per step, then starts its solve."""
     chosen = _chosen(scene_uid)
     scene = session.scene_of(scene_uid)
     if scene is not None and exchange.reads_in_turns(scene):
@@ -112,7 +113,7 @@ def solve_in_turns(scene_uid: int, shot: Path) -> Iterator[job_timer.Progress | 
         now = None
         with contextlib.closing(drawn_masks.in_turns(mask_uid, name, shot, kind)) as turns:
             while True:
-                while bpy.app.is_job_running("RENDER"):  # the artist's own comes first: Blender renders one at a time
+                while bpy.app.is_job_running("RENDER"):  # wait for the artist's render: Blender runs one at a time
                     yield now
                 progress = next(turns, None)
                 if progress is None:
@@ -130,8 +131,8 @@ def solve_in_turns(scene_uid: int, shot: Path) -> Iterator[job_timer.Progress | 
 
 
 def _chosen(scene_uid: int) -> dict[str, tuple[int, str]]:
-    """Kind of mask -> (`session_uid`, name) of what `masks.drawn` says of a scene; what will be refused is refused
-    before anything is rendered."""
+    """Kind of mask -> (`session_uid`, name) from `masks.drawn` of a scene. Raises errors of `masks.params` before any
+    render."""
     scene = session.scene_of(scene_uid)
     if scene is None:
         return {}

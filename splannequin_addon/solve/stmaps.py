@@ -1,4 +1,4 @@
-"""ST maps of the solve's lens: the backend writes them beside Blender. No bpy."""
+"""ST maps of the solve's lens, written by the backend. No bpy."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from ..process import backend, children
 
 
 def begin(shot: Path, width: int = 0) -> children.Question:
-    """Has the maps of a solved shot written into its solve folder, without waiting.
+    """Makes the backend write the maps of a solved shot into its solve folder, without waiting.
 
     Args:
         shot: shot folder.
-        width: of the maps in pixels; 0: the working frames'.
+        width: width of the maps in pixels; 0: the working frames' width.
 
     Raises:
         contract.JobError: there is no backend, or it cannot be started.
@@ -23,12 +23,12 @@ def begin(shot: Path, width: int = 0) -> children.Question:
 
 
 def answer(asked: children.Question) -> dict[str, Any]:
-    """Where the maps are, their size, and what the lens needs. JobError if they were not written."""
+    """Paths and size of the maps, and the overscan that the lens needs. Raises JobError if they were not written."""
     return dict(json.loads(asked.answer("The ST maps were not written: {}")))
 
 
 def sentences(facts: dict[str, Any]) -> list[str]:
-    """What was written, for people."""
+    """Sentences about the written maps."""
     undistort, redistort = Path(facts["undistort"]), Path(facts["redistort"])
     across, down = facts["overscan_percent"]
     lines = [f"{undistort.name} and {redistort.name} are in {undistort.parent}."]

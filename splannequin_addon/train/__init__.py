@@ -1,1 +1,1 @@
-"""The step Train: learning the scene."""
+"""The Train step: learns the scene."""

@@ -1,4 +1,4 @@
-"""What a preset costs on this machine, from what the shot's own runs took. No bpy."""
+"""Training times of presets on this machine, estimated from the shot's runs. No bpy."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from ..shot.shot_state import ShotState
 
 @dataclass(frozen=True)
 class Cost:
-    """What training with a preset comes to."""
+    """Cost of a training with a preset."""
 
     preset: str
     """preview, standard or final."""
     width: int
-    """Width in pixels of the training images; 0: the working frames', of which nothing is known yet."""
+    """Width in pixels of the training images; 0 before the import, if it is the width of the working frames."""
     steps: int
     """Training steps."""
     seconds: float | None
-    """How long it takes; None if nothing was timed yet."""
+    """Estimated duration; None without any measured time."""
     measured: bool
-    """A run of this preset was timed; else `seconds` is based on pixels and steps of another's."""
+    """True if a run of this preset was timed, False if `seconds` is scaled from another run's pixels and steps."""
 
 
 def costs(state: ShotState | None, pace: float | None = None) -> tuple[list[Cost], dict[str, Any] | None]:
-    """The cost of every preset, and the run that it was estimated from, None if the shot has none that was timed.
+    """(cost of every preset, run that the estimate is based on, or None without a timed run).
 
-    Without such a run it is estimated from `pace`, that of this machine's earlier trainings (`contract.paces`).
+    Without such a run, the estimate uses `pace` of this machine's earlier trainings (`contract.paces`).
     """
     timed = sorted((r for r in state.runs.values() if _per_step(r)), key=_size) if state is not None else []
-    # Where nothing may move a step is several times as fast.
+    # A step of a static run is several times faster.
     timed = [run for run in timed if run.get("method") != "static"] or timed
     across = state.size[0] if state is not None else 0
     rows: list[Cost] = []
@@ -40,7 +40,7 @@ def costs(state: ShotState | None, pace: float | None = None) -> tuple[list[Cost
         width = min(width, across) if across else width
         same = [run for run in timed if run.get("preset") == preset]
         if preset == "final" and same and same[-1].get("device") == "cuda":
-            width = same[-1]["width_px"]  # a card's may be finer than the working frames
+            width = same[-1]["width_px"]  # on a graphics card it may exceed the working frames' width
         own = [run for run in same if run.get("width_px") == width]
         nearest = own[-1:] or timed[-1:]
         seconds = None
@@ -55,12 +55,12 @@ def costs(state: ShotState | None, pace: float | None = None) -> tuple[list[Cost
 
 
 def _size(run: dict[str, Any]) -> tuple[int, int]:
-    """Sort key of runs: the time of a larger and longer run predicts that of other runs best."""
+    """Sort key of runs: larger and longer runs give better estimates for other runs."""
     return run["width_px"], run["iterations"]
 
 
 def _per_step(run: dict[str, Any]) -> float:
-    """Seconds a step of a run took; 0 if its figures do not tell."""
+    """Seconds per step of a run; 0 if its figures are missing."""
     spent, steps, width = run.get("train_seconds"), run.get("iterations"), run.get("width_px")
     if not all(isinstance(n, int | float) and n > 0 for n in (spent, steps, width)):
         return 0.0

@@ -1,4 +1,4 @@
-"""The button Train, and the buttons of the list of runs."""
+"""Operators of the Train step: the training, and the list of runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class SPLANNEQUIN_OT_pick_run(pick_operators.Pick, bpy.types.Operator):
     name = StringProperty(name="Run", description="Name of the run", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Sets the run's name, and the preset that it was trained with."""
+        """Sets the scene's run and the preset it was trained with."""
         state = pick_operators.known(context)[1]
         run = state.runs.get(self.name) or state.unfinished.get(self.name)
         if run is None:

@@ -1,4 +1,4 @@
-"""The panel of the step Train."""
+"""The panel of the Train step."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TrainPanel(step_panel.StepPanel):
     folds = "train"
 
     def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The preset; what the button will do to the run that is there."""
+        """The preset, and what the button will do to an existing run."""
         props = settings_of(scene_in(context))
         watch, plan = self._watch(context), self._plan(context)
         self._presets(context, layout, watch.state if watch is not None else None)
@@ -39,7 +39,7 @@ class TrainPanel(step_panel.StepPanel):
             wrap(layout, context, plan.words, "PAUSE" if self._paused(context) else "INFO")
 
     def _presets(self, context: bpy.types.Context, layout: bpy.types.UILayout, state: ShotState | None) -> None:
-        """A button for each preset: how large, how many steps, how long on this machine."""
+        """A button for each preset, with its width, steps and duration on this machine."""
         props, pace = settings_of(scene_in(context)), all_steps.paces().get("train")
         rows, basis = estimates.costs(state, pace)
         column = layout.column(align=True)
@@ -49,7 +49,8 @@ class TrainPanel(step_panel.StepPanel):
         names = {name: label for name, label, _ in PRESETS}
         for row in rows:
             columns = cells(column.row(align=True), _PRESET_WIDTHS)
-            label = tr(names[row.preset])  # ours: Blender's own word for Final is too long for the column in German
+            # Our translation: Blender's German word for Final is too long for the column.
+            label = tr(names[row.preset])
             columns[0].prop_enum(props, "preset", row.preset, text=label, translate=False)
             spent = "-" if row.seconds is None else contract.duration(row.seconds) + ("" if row.measured else " ?")
             for place, text in zip(columns[1:], (str(row.width or "-"), f"{row.steps / 1000:g}k", spent), strict=True):
@@ -80,7 +81,7 @@ class TrainPanel(step_panel.StepPanel):
         return self._plan(context).kind in ("resume", "extension")
 
     def draw_body(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The step's body, and the training in pictures."""
+        """The step's body, runs, and images of the training."""
         super().draw_body(context, layout)
         watch = self._watch(context)
         if watch is None or watch.state is None:
@@ -95,7 +96,7 @@ class TrainPanel(step_panel.StepPanel):
             picture, points = run.get("preview"), run.get("history", [])
         else:
             return
-        shown = "train_pictures" if going else "train_pictures_kept"  # each is folded or not by itself
+        shown = "train_pictures" if going else "train_pictures_kept"  # separate folding states
         body = step_panel.sub_panel(layout, shown, "Progress", folded=not going)
         if body is None:
             return
@@ -115,7 +116,7 @@ class TrainPanel(step_panel.StepPanel):
             )
 
     def _runs(self, context: bpy.types.Context, layout: bpy.types.UILayout, state: ShotState) -> None:
-        """All runs of the shot, to compare and pick."""
+        """The list of all runs of the shot, for comparison and selection."""
         if not state.listed("run"):
             return
         body = step_panel.sub_panel(layout, "runs", "Runs")

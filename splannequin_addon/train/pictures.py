@@ -1,5 +1,6 @@
-"""Small pictures in the panel: what the training sees by now, and its error over time. Kept as previews, not images:
-nothing of them is in the artist's file.
+"""Small images on the panel: the training's preview, and its error over time.
+
+They are stored as previews, so that the artist's file contains no images of them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _collection: Any = None
 
 
 def icon_of(path: Path) -> int:
-    """Icon of a picture file, 0 if there is none. It is read once: call `forget` after the file is rewritten."""
+    """Icon of an image file; 0 if it does not exist. It is loaded once: call `forget` after the file is rewritten."""
     if _collection is None:
         return 0
     name = str(path)
@@ -30,7 +31,7 @@ def icon_of(path: Path) -> int:
 
 
 def plot(points: Sequence[tuple[float, float]]) -> int:
-    """Icon of a curve through (seconds, dB), 0 for fewer than two points."""
+    """Icon of a curve through (seconds, dB); 0 for fewer than two points."""
     if _collection is None or len(points) < 2:
         return 0
     name = f"plot {len(points)} {points[0]} {points[-1]}"
@@ -43,7 +44,7 @@ def plot(points: Sequence[tuple[float, float]]) -> int:
 
 
 def curve(points: Sequence[tuple[float, float]], size: tuple[int, int]) -> np.ndarray:
-    """[H, W, 4] float32, last row on top: a polyline through the points, scaled to fill the picture, on dark ground."""
+    """[H, W, 4] float32, last row on top: a polyline through the points, scaled to the image, on a dark background."""
     width, height = size
     picture = np.zeros((height, width, 4), np.float32)
     picture[...] = (0.11, 0.11, 0.11, 1.0)
@@ -62,26 +63,26 @@ def curve(points: Sequence[tuple[float, float]], size: tuple[int, int]) -> np.nd
 
 
 def forget() -> None:
-    """Drops all pictures: a run that is trained anew writes others under the same names."""
+    """Removes all images. A repeated training writes new ones under the same names."""
     if _collection is not None:
         _collection.clear()
 
 
 def _make_room() -> None:
-    """Forgets the oldest pictures: a long training would keep hundreds."""
+    """Removes all images if there are too many. A long training would keep hundreds."""
     if len(_collection) >= _KEPT:
         _collection.clear()
 
 
 def register() -> None:
-    """Makes the collection."""
+    """Creates the collection, except in background mode."""
     global _collection
     if not bpy.app.background:
         _collection = bpy.utils.previews.new()
 
 
 def unregister() -> None:
-    """Drops it."""
+    """Removes the collection."""
     global _collection
     if _collection is not None:
         bpy.utils.previews.remove(_collection)

@@ -1,4 +1,4 @@
-"""What the artist sets for the training."""
+"""Settings of the training."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     import bpy
 
 PRESETS: list[tuple[str, str, str]] = contract.panel(contract.TrainParams, "preset")["items"]
-"""(identifier, name, tooltip) of each."""
+"""(identifier, name, tooltip) of each preset."""
 
 
 def runs_of(props: bpy.types.bpy_struct) -> list[tuple[str, str]]:
-    """(name, what it is) of the runs of the shot that `props` names, for the field's list."""
+    """(name, description) of each run of the shot that `props` belongs to, for the field's search list."""
     folder = selection.shot_folder(scene_holding(props))
     state = job_timer.watch_of(folder).state if folder else None
     runs = state.runs.items() if state is not None else ()
@@ -35,7 +35,7 @@ def _third_of(steps: int) -> int:
 
 
 def _preset_chosen(props: TrainSettings, context: bpy.types.Context) -> None:
-    """More steps are a third of the preset's unless the artist says otherwise."""
+    """Update callback: resets the number of additional steps to a third of the preset's steps."""
     props.extend_steps = _third_of(contract.PRESET_STEPS[props.preset])
 
 

@@ -1,4 +1,4 @@
-"""The step Train: what it asks the backend for, and what the panel says of it."""
+"""The Train step: its backend request, and its texts on the panel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Train(Step):
-    """Learning the scene and what moves in it."""
+    """Learns the scene and its motion."""
 
     name = "train"
     label = "Train"
@@ -31,14 +31,14 @@ class Train(Step):
     parts = (pictures,)
 
     def params(self, scene: bpy.types.Scene) -> contract.TrainParams:
-        """The preset, or how a run that is there goes on."""
+        """Training parameters for a new run, or for the next part of an existing run."""
         props, folder = settings_of(scene), selection.shot_folder(scene)
         state = inventory.read(folder) if folder is not None else None
         depth = paths.absolute(props.depth)
         return training.params(state, props.run_name, props.preset, props.extend_steps, backend.device(), depth)
 
     def view(self, scene: bpy.types.Scene, state: ShotState | None) -> View:
-        """Train: how good the run is."""
+        """Panel state of Train: the quality of the run."""
         if state is None or not state.solve:
             return View(False, False, [], self.needs)
         run = state.runs.get(settings_of(scene).run_name)
@@ -55,7 +55,7 @@ class Train(Step):
         return View(True, True, lines, "", verdict.word.capitalize() if verdict else "")
 
     def began(self, job: jobs.Job) -> None:
-        """A run that is trained anew writes other pictures under the same names."""
+        """Removes cached images. A repeated training writes new ones under the same names."""
         pictures.forget()
 
 

@@ -1,4 +1,4 @@
-"""What the Train button will do: begin, go on where it was paused, add steps, or begin anew. No bpy."""
+"""The effect of the Train button: start, resume, add steps, or start again. No bpy."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from ..shot.shot_state import ShotState
 
 @dataclass(frozen=True)
 class Plan:
-    """What pressing the button comes to."""
+    """Effect of the Train button."""
 
     kind: str
-    """train, resume, extension (go on with steps that were begun to be added), extend, or anew."""
+    """train, resume, extension (resume the addition of steps), extend, or anew."""
     button: str
-    """What the button says."""
+    """Label of the button."""
     words: str
-    """What will happen, in a sentence; empty if that needs no saying."""
+    """Sentence about the effect; empty if the label is sufficient."""
 
 
 def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Plan:
-    """The effect of pressing Train: what happens to the run of that name with this preset.
+    """The effect of the Train button on the run of this name with this preset.
 
-    `depth` is the absolute path of the depth maps that are chosen; empty: those of the run, if it has any.
+    `depth` is the absolute path of the selected depth maps. If empty, the run's depth maps are used, if it has any.
     """
     finished = state.runs.get(run) if state is not None else None
     paused = state.unfinished.get(run) if state is not None else None
@@ -60,7 +60,7 @@ def plan(state: ShotState | None, run: str, preset: str, depth: str = "") -> Pla
 
 
 def _goes_on(told: dict[str, Any], preset: str, depth: str) -> bool:
-    """True if a run is being trained anew with a preset and these depth maps, on the cameras that the shot has."""
+    """True if the run's repeated training has this preset, these depth maps and the shot's current cameras."""
     anew = told.get("anew")
     return (
         anew is not None and anew["preset"] == preset and not anew["other_cameras"] and _same_depth(anew, depth)
@@ -68,17 +68,17 @@ def _goes_on(told: dict[str, Any], preset: str, depth: str) -> bool:
 
 
 def _same_depth(told: dict[str, Any], depth: str) -> bool:
-    """True if a run has these depth maps, or none are chosen."""
+    """True if a run has these depth maps, or if none are selected."""
     return not depth or os.path.normcase(told.get("depth_source", "")) == os.path.normcase(depth)
 
 
 def params(
     state: ShotState | None, run: str, preset: str, steps: int, device: str, depth: str = ""
 ) -> contract.TrainParams:
-    """What the backend is asked for; `steps` is how many are added if the run is finished, `depth` as in `plan`."""
+    """Training parameters. `steps` are added if the run is finished. `depth` is as in `plan`."""
     kind = plan(state, run, preset, depth).kind
     if state is not None and kind == "resume":
-        # Its own settings, not the panel's: a run that was begun on the command line goes on too.
+        # Use the run's settings, not the panel's, so that a run started on the command line also resumes.
         stored = state.runs.get(run) or state.unfinished[run]
         begun = stored["anew"] if _goes_on(stored, preset, depth) else stored
         settings = checkpoints.params_of(begun["config"])
@@ -93,12 +93,11 @@ def params(
 
 
 def history(told: dict[str, Any], now: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """(seconds, dB) of a run, or of the one that will take its place, what a job measures `now` after what is known
-    from before it."""
+    """(seconds, dB) of a run, or of the training that will replace it: stored points, then the job's `now`."""
     before = (told.get("anew") or told).get("history", [])
     return [point for point in before if not now or point[0] < now[0][0]] + list(now)
 
 
 def preview(told: dict[str, Any], now: str | None) -> Path | None:
-    """Latest picture of a run, or of the one that will take its place: what a job wrote `now`, else one of before."""
+    """Latest preview image of a run, or of the training that will replace it: the job's `now`, else a stored one."""
     return Path(now) if now else (told.get("anew") or told).get("preview")

@@ -1,1 +1,1 @@
-"""What the steps' panels and operators share, the menu, the preferences."""
+"""Shared code of the steps' panels and operators, the menu, and the preferences."""

@@ -1,8 +1,8 @@
-"""Which steps of the panel are open: the step at hand, and those that the artist opened.
+"""Open steps of the panel: the step to work on, and those that the artist opened.
 
-Blender stores whether a registered panel is open, and lets no script change it. A layout panel can take that from a
-property instead. The properties here store nothing: each is computed from the shot whenever the panel is drawn. A step
-that the artist opens or closes stays so until it would be so without them.
+Blender stores whether a registered panel is open, and no script can change it. A layout panel can instead use a
+property. The properties in this module store nothing: each is computed from the shot whenever the panel is drawn. A
+step that the artist opens or closes keeps that state until it equals the computed one.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from ..properties import BoolProperty
 from ..shot import selection
 
 _chosen: dict[tuple[int, Path | None, str], bool] = {}
-"""(`session_uid` of the scene, shot folder, step) -> whether the artist left it open."""
+"""(`session_uid` of the scene, shot folder, step) -> open state set by the artist."""
 
 
 def at_hand(scene: bpy.types.Scene) -> str:
-    """Name of the step to work on: the one that runs or was the last to fail, else the first with work left."""
+    """Name of the step to work on: the running or last failed step, else the first unfinished one."""
     folder = selection.shot_folder(scene)
     watch = job_timer.watch_of(folder) if folder is not None else None
     names = list(steps.STEPS)
@@ -36,7 +36,7 @@ def at_hand(scene: bpy.types.Scene) -> str:
 
 
 def is_open(scene: bpy.types.Scene, step: str) -> bool:
-    """True if the panel shows a step's body: it is at hand, has just ended, or the artist opened it."""
+    """True if the panel shows a step's body: it is the step to work on, has just ended, or the artist opened it."""
     folder = selection.shot_folder(scene)
     watch = job_timer.watch_of(folder) if folder is not None else None
     by_itself = step == at_hand(scene) or (watch is not None and watch.just_ended == step)
@@ -65,7 +65,7 @@ def _property(step: str) -> bool:
 
 
 class Folds:
-    """Whether each step is open, as properties `is_STEP_open` of a scene's settings."""
+    """Open state of each step, as properties `is_STEP_open` of a scene's settings."""
 
     is_import_open = _property("import")
     is_solve_open = _property("solve")

@@ -1,4 +1,4 @@
-"""Blender's own icons for our buttons, the same in the panel and in the menu. All are in every version from 4.2 on."""
+"""Blender icons of our operators, for panel and menu. All exist in every version since 4.2."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ OF: dict[str, Icon] = {
     "splannequin.use_clip": "FILE_MOVIE",
     "splannequin.use_movie_clip": "TRACKER",
 }
-"""Operator -> icon."""
+"""Operator -> name of its icon."""
 
 
 def of(operator: str) -> Icon:
-    """Icon of an operator, NONE if it has none."""
+    """Icon of an operator, or NONE."""
     return OF.get(operator, "NONE")

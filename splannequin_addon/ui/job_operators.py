@@ -1,4 +1,4 @@
-"""Plumbing of running jobs: cancel, see the log."""
+"""Operators for running jobs: cancel, run all steps, open the log."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class SPLANNEQUIN_OT_cancel(bpy.types.Operator):
             return {"FINISHED"}
         render = watch.work if watch is not None else None
         if watch is not None and render is not None and render.turns is None and not bpy.app.is_job_running("RENDER"):
-            watch.work = None  # it ended, and nothing said so
+            watch.work = None  # the render has ended without a handler call
             return {"FINISHED"}
         job = watch.jobs.get(self.step or watch.running() or "") if watch else None
         if job is None or job.ended:
-            if ended:  # between two steps
+            if ended:  # between two steps of a chain
                 return {"FINISHED"}
             self.report({"WARNING"}, "Nothing is running")
             return {"CANCELLED"}
@@ -64,7 +64,7 @@ class SPLANNEQUIN_OT_all_steps(step_operator.StepOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off before the import, while a step runs, and when all are done."""
+        """Disabled before the import, while a step runs, and when all steps are done."""
         if not super().poll(context):
             return False
         if not all_steps.missing(scene_in(context)):
@@ -73,7 +73,7 @@ class SPLANNEQUIN_OT_all_steps(step_operator.StepOperator, bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Begins the first of them; headless, does all of them."""
+        """Starts the first missing step. Without a window, runs all missing steps."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         if folder is None:
@@ -97,14 +97,14 @@ class SPLANNEQUIN_OT_open_log(bpy.types.Operator):
     step = StringProperty(name="Step", description="Name of the step", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Opens it."""
+        """Opens the log."""
         folder = selection.shot_folder(scene_in(context))
         job = job_timer.watch_of(folder).jobs.get(self.step) if folder else None
         log = steps.STEPS[self.step].log(job) if job is not None else None
         if log is None:
             self.report({"WARNING"}, "There is no log")
             return {"CANCELLED"}
-        if sys.platform.startswith("linux") and shutil.which("xdg-open") is None:  # Blender would only print that
+        if sys.platform.startswith("linux") and shutil.which("xdg-open") is None:  # Blender would only print an error
             self.report({"WARNING"}, tr(f"No viewer was found (xdg-open is missing). The log is {log}"))
             return {"CANCELLED"}
         bpy.ops.wm.path_open(filepath=str(log))

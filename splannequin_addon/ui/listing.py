@@ -1,4 +1,4 @@
-"""Runs and takes of a shot side by side, to compare and to pick one. Drawn from what the job timer keeps."""
+"""Lists of a shot's runs and takes, for comparison and selection. Drawn from the job timer's stored state."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     import bpy
 
 _RUN_HEAD = ("Run", "dB", "Size", "Move", "Time")
-_RUN_WIDTHS = (0.23, 0.19, 0.18, 0.2, 0.2)  # a sidebar of Blender's own width shows all of it
+_RUN_WIDTHS = (0.23, 0.19, 0.18, 0.2, 0.2)  # fits the sidebar's default width
 _TAKE_HEAD = ("Take", "t*", "Frames", "Run")
 _TAKE_WIDTHS = (0.3, 0.18, 0.24, 0.28)
 
 
 def run_rows(state: ShotState) -> list[tuple[str, ...]]:
-    """(name, dB on frames kept out, Gaussians, share that moves, time trained) of every run, as shown.
+    """(name, dB on held-out frames, Gaussians, moving fraction, training time) of every run, as displayed.
 
-    Of one that is not finished (name, how far it came), of one that cannot be read (name, that it is damaged).
+    An unfinished run has (name, progress), a damaged run (name, "damaged").
     """
     rows: list[tuple[str, ...]] = []
     for name in state.listed("run"):
@@ -48,7 +48,7 @@ def run_rows(state: ShotState) -> list[tuple[str, ...]]:
 
 
 def take_rows(state: ShotState) -> list[tuple[str, ...]]:
-    """(name, t*, frames on disk, run) of every take, as shown; of one that cannot be read (name, "damaged")."""
+    """(name, t*, frames on disk, run) of every take, as displayed; a damaged take has (name, "damaged")."""
     rows: list[tuple[str, ...]] = []
     for name in state.listed("take"):
         take = state.takes.get(name)
@@ -61,7 +61,7 @@ def take_rows(state: ShotState) -> list[tuple[str, ...]]:
 
 
 def duration(seconds: float | None) -> str:
-    """A training time in few letters: "45s", "3m", "1.5h"."""
+    """A training time in short form: "45s", "3m", "1.5h"."""
     if seconds is None:
         return "-"
     if seconds < 90:
@@ -70,7 +70,8 @@ def duration(seconds: float | None) -> str:
 
 
 def draw(layout: bpy.types.UILayout, kind: str, state: ShotState, chosen: str) -> None:
-    """Rows of the runs or takes (`kind` "run" or "take"), the `chosen` one marked; a click on a name picks it."""
+    """Draws rows of the runs or takes (`kind` "run" or "take"), with `chosen` highlighted. A click on a name selects
+    it."""
     rows, head, widths = (
         (run_rows(state), _RUN_HEAD, _RUN_WIDTHS) if kind == "run" else (take_rows(state), _TAKE_HEAD, _TAKE_WIDTHS)
     )
@@ -90,11 +91,10 @@ def draw(layout: bpy.types.UILayout, kind: str, state: ShotState, chosen: str) -
 
 
 def remove(shot: Path, folder: Path, wait: bool) -> None:
-    """Removes a folder of a shot: gone at once; its files are deleted in the background unless asked to `wait`.
+    """Removes a folder of a shot. It disappears at once; a thread deletes its files, unless `wait` is set.
 
-    What lies behind a link is not the shot's: of a folder that is one, only the link is removed.
-    OSError if it cannot be moved away, because a file of it is open elsewhere (Windows) or protected, or lies behind a
-    link itself.
+    If the folder is a link, only the link is removed, because its target is not part of the shot. Raises OSError if the
+    folder cannot be moved: a file is open elsewhere (Windows) or protected, or the parent is a link.
     """
     if contract.is_link(folder.parent):
         raise OSError(errno.EPERM, f"{folder.parent.name} is a link to another folder: remove it there", str(folder))
@@ -113,5 +113,6 @@ def remove(shot: Path, folder: Path, wait: bool) -> None:
 
 
 def _empty(trash: Path) -> None:
-    """Deletes what lies in the trash, what an earlier Blender left there too. Links are removed, and never followed."""
+    """Deletes the content of the trash, including leftovers of an earlier Blender. Links are removed, but not
+    followed."""
     shutil.rmtree(trash, ignore_errors=True)

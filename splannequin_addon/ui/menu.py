@@ -1,4 +1,4 @@
-"""The menu Render > Splannequin. What Blender's search (F3) finds is what stands in a menu: all our operators do."""
+"""The menu Render > Splannequin. It contains all operators, because Blender's search (F3) only finds menu entries."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _GROUPS = (
     ("set_up", "check_backend", "remove_backend"),
     ("locate_shot", "remove_shot"),
 )
-"""Names of operators in the order of the work; those that are named nowhere come last."""
+"""Names of operators in order of use. Operators that are missing here come last."""
 _ELSEWHERE = {"use_movie_clip"}
-"""In a menu of the editor that it needs."""
+"""Operators that are only in the menu of the editor they need."""
 
 
 def searchable() -> set[str]:
-    """Names of the operators that can be called without being told what for: all but the internal ones."""
-    ops: Any = bpy.ops  # ours are not in its types
+    """Names of the operators that need no arguments: all except internal ones."""
+    ops: Any = bpy.ops  # our operators are not in the stubs
     names = dir(ops.splannequin)
     return {n for n in names if "INTERNAL" not in getattr(bpy.types, f"SPLANNEQUIN_OT_{n}").bl_options}
 
 
 def entries() -> Iterator[list[str]]:
-    """Names of the operators in the menu, a list per group."""
+    """Names of the operators in the menu, one list per group."""
     left = searchable() - _ELSEWHERE
     for group in _GROUPS:
         yield [name for name in group if name in left]
@@ -47,7 +47,7 @@ class SPLANNEQUIN_MT_shot(bpy.types.Menu):
     bl_label = "Splannequin"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Every operator, in the order of the work."""
+        """Draws every operator in order of use."""
         first = True
         for group in entries():
             if group and not first:
@@ -68,12 +68,12 @@ def _in_clip(self: bpy.types.Menu, context: bpy.types.Context) -> None:
 
 
 def _hung() -> list[tuple[Any, Callable[[bpy.types.Menu, bpy.types.Context], None]]]:
-    """Menus of Blender's, and what draws our entries in them."""
+    """Pairs of (Blender menu, function that draws our entries in it)."""
     return [(bpy.types.TOPBAR_MT_render, _in_render), (bpy.types.CLIP_MT_clip, _in_clip)]
 
 
 def register() -> None:
-    """Registers the menu and hangs it into Blender's."""
+    """Registers the menu and adds it to Blender's menus."""
     bpy.utils.register_class(SPLANNEQUIN_MT_shot)
     for menu, draw in _hung():
         menu.append(draw)

@@ -1,4 +1,4 @@
-"""What picking and removing runs and takes of a shot share."""
+"""Base classes of operators that select and remove runs and takes of a shot."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from . import listing
 
 
 def known(context: bpy.types.Context) -> tuple[job_timer.Watch | None, Any]:
-    """The shot's watch and what its folder holds."""
+    """(the shot's watch, content of its folder)."""
     folder = selection.shot_folder(scene_in(context))
     watch = job_timer.watch_of(folder) if folder else None
     return watch, watch.state if watch else None
 
 
 class Pick(OperatorBase):
-    """What picking a run and picking a take share."""
+    """Base class of the operators that select a run or a take."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off while a step of this shot runs: what it works on is named by the settings."""
+        """Disabled while a step of this shot runs, because the step uses the names in the settings."""
         watch, state = known(context)
         if watch is None or state is None:
             cls.poll_message_set(tr("No shot is chosen: import a clip first"))
@@ -39,14 +39,14 @@ class Pick(OperatorBase):
 
 
 class Remove(Pick):
-    """What removing a run and removing a take share: a question, a refusal in words, the folder gone."""
+    """Base class of the operators that remove a run or a take: asks for confirmation and deletes its folder."""
 
     kind = ""
     question = ""
     warning = ""
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks first: what is removed from disk does not come back with undo."""
+        """Asks for confirmation, because undo does not restore deleted files."""
         return context.window_manager.invoke_confirm(
             self, event, title=self.question, message=self.warning, confirm_text="Remove", icon="WARNING"
         )
@@ -57,13 +57,13 @@ class Remove(Pick):
         name: str = self.name
         if watch is None or state is None:
             return {"CANCELLED"}
-        # Only what is listed, whose names come from the folder itself: any other may lead to somewhere else.
+        # Accept only listed names, which come from the folder. Any other name could lead to another location.
         folder = watch.shot / f"{self.kind}s" / name
         exists = name in state.listed(self.kind)
         refusal = _in_use(watch.shot, folder) if exists else f"This shot has no {self.kind} {name!r}"
         if not refusal:
             try:
-                jobs.refuse_second_writer(watch.shot)  # also one that was started from a command line
+                jobs.refuse_second_writer(watch.shot)  # includes writers started from a command line
                 listing.remove(watch.shot, folder, wait=bpy.app.background)
             except contract.JobError as error:
                 refusal = f"{error.message} {error.hint}"
@@ -78,5 +78,5 @@ class Remove(Pick):
 
 
 def _in_use(shot: Path, folder: Path) -> str:
-    """Why a run or take cannot be removed now, as any of the steps says; empty if it can."""
+    """The reason why a run or take cannot be removed now, from any step; empty if it can."""
     return next(filter(None, (step.in_use(shot, folder) for step in steps.STEPS.values())), "")

@@ -1,4 +1,4 @@
-"""The add-on's preferences: the backend's environment, set up, checked, repaired and removed from here."""
+"""The add-on's preferences: set-up, check, repair and removal of the backend's environment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..translations import tr
 from .sentences import wrap
 
 _INSET = 150
-"""Pixels beside a sentence in the preferences: the page's margins and the boxes that it stands in."""
+"""Horizontal space in pixels that is not available to text: the page's margins and boxes."""
 _DIALOG = 640
 """Width of the dialog in pixels."""
 _setup: environment.SetUp | None = None
@@ -54,13 +54,13 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
     )
 
     def draw(self, context: bpy.types.Context) -> None:
-        """What is used, its set-up, the device."""
+        """Draws the backend in use, its set-up and the device."""
         layout = layout_of(self)
         try:
             has_backend = bool(backend.python())
             self._say(layout, f"In use: {backend.python()}", "CHECKMARK")
         except contract.JobError as error:
-            if not busy():  # it is about to be there
+            if not busy():  # a set-up is running
                 column = layout.column(align=True)
                 column.alert = True
                 self._say(column, error.message, "ERROR")
@@ -106,7 +106,7 @@ class SPLANNEQUIN_preferences(bpy.types.AddonPreferences):
             self._say(box, _OFFLINE, "ERROR")
 
     def _say(self, layout: bpy.types.UILayout, text: str, icon: Icon = "NONE") -> None:
-        """A sentence in as many lines as the page is wide for: Blender sets it in by the boxes around it."""
+        """Draws a sentence, wrapped to the width of the page."""
         wrap(layout, bpy.context, text, icon, margin=_INSET)
 
 
@@ -117,14 +117,14 @@ _OFFLINE = (
 
 
 def _wheels() -> Path | None:
-    """The folder of wheels to install from; None for the internet."""
+    """The folder of wheels to install from; None to download."""
     addon = bpy.context.preferences.addons.get(backend.PACKAGE)
     chosen = str(getattr(addon.preferences, "backend_wheels", "")) if addon and addon.preferences else ""
     return Path(bpy.path.abspath(chosen)) if chosen else None
 
 
 def _is_offline() -> bool:
-    """True if a set-up needs the internet and Blender may not go there."""
+    """True if a set-up needs the internet but Blender has no online access."""
     return not bpy.app.online_access and _wheels() is None
 
 
@@ -134,7 +134,7 @@ def busy() -> bool:
 
 
 def running_setup() -> environment.SetUp | None:
-    """The set-up that runs."""
+    """The running set-up, or None."""
     return _setup if busy() else None
 
 
@@ -153,15 +153,15 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """One at a time."""
+        """Disabled while a set-up runs."""
         return not busy()
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks first."""
+        """Asks for confirmation."""
         return context.window_manager.invoke_props_dialog(self, width=_DIALOG, confirm_text="Install")
 
     def draw(self, context: bpy.types.Context) -> None:
-        """What is asked: what is fetched from where, how it is checked, and to be let online."""
+        """Draws the downloads, their sources and checks, and the option to allow online access."""
         column = layout_of(self).column(align=True)
         wheels = _wheels()
         size, places = environment.SIZE, environment.sources()
@@ -182,7 +182,7 @@ class SPLANNEQUIN_OT_set_up(bpy.types.Operator):
                 column.prop(self, "allow_online")
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Starts it; headless, waits for its end."""
+        """Starts the set-up. Without a window, waits for its end."""
         global _setup
         if _is_offline() and self.allow_online and not bpy.app.online_access_override:
             context.preferences.system.use_online_access = True
@@ -215,7 +215,7 @@ class SPLANNEQUIN_OT_cancel_setup(bpy.types.Operator):
     bl_options = {"INTERNAL"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Asks it to end."""
+        """Terminates the set-up."""
         if _setup is not None:
             environment.cancel(_setup)
         return {"FINISHED"}
@@ -229,7 +229,7 @@ class SPLANNEQUIN_OT_check_backend(bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Runs the backend's doctor beside Blender; headless, waits for it."""
+        """Starts the backend's doctor. Without a window, waits for it."""
         _findings[:] = ["Checking the backend."]
         try:
             question = backend.begin_doctor()
@@ -256,11 +256,11 @@ class SPLANNEQUIN_OT_remove_backend(bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks first."""
+        """Asks for confirmation."""
         return context.window_manager.invoke_confirm(self, event)
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Deletes it, unless somebody is at work with it."""
+        """Deletes the environment, unless it is in use."""
         if busy():
             self.report({"ERROR"}, "The environment stays: it is being set up")
             return {"CANCELLED"}
@@ -290,11 +290,11 @@ def _at_work(pid: int) -> str:
 
 
 _checks: list[children.Question] = []
-"""Doctors that were asked and have not answered."""
+"""Doctor questions without an answer."""
 
 
 def _take_in(asked: children.Question) -> None:
-    """What a doctor said is shown."""
+    """Shows the result of a doctor question."""
     if asked in _checks:
         _checks.remove(asked)
     try:
@@ -305,13 +305,13 @@ def _take_in(asked: children.Question) -> None:
 
 
 def _follow_setup() -> bool:
-    """A turn of the timer while a set-up runs; one that ended well is checked."""
+    """Timer callback while a set-up runs. Checks the backend after a successful set-up."""
     if _setup is None:
         return False
     if environment.poll(_setup):
         _redraw()
     if not _setup.running and not _setup.failure:
-        ops: Any = bpy.ops  # ours are not in its types
+        ops: Any = bpy.ops  # our operators are not in the stubs
         ops.splannequin.check_backend()
     return _setup.running
 
@@ -333,13 +333,13 @@ _CLASSES = (
 
 
 def register() -> None:
-    """Registers the preferences and their buttons."""
+    """Registers the preferences and their operators."""
     for cls in _CLASSES:
         bpy.utils.register_class(cls)
 
 
 def unregister() -> None:
-    """Undoes `register`. A set-up that runs goes on."""
+    """Undoes `register`. A running set-up continues."""
     _checks.clear()
     for cls in reversed(_CLASSES):
         bpy.utils.unregister_class(cls)

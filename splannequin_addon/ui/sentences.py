@@ -1,4 +1,4 @@
-"""Sentences drawn in as many lines as there is room for, and rows of a table: Blender cuts what is too long."""
+"""Draws sentences with line breaks, and rows of tables. Blender truncates long labels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import bpy
 
 _LETTER = 6.2
-"""Pixels of a letter on average, at a user interface scale of 1."""
+"""Average width of a letter in pixels, at a user interface scale of 1."""
 _UNIT = re.compile(r"(?<=\d) (?=(%|px|dB|fps|s|min|h|[KMG]B)(?!\w))")
 _BOUND = "\N{NO-BREAK SPACE}"
 
@@ -26,15 +26,15 @@ def wrap(
     margin: int = 50,
     width: int = 0,
 ) -> None:
-    """A sentence, in the interface's language, in as many lines as it asks for.
+    """Draws a sentence in the interface's language, wrapped to the available width.
 
     Args:
-        layout: where it is drawn.
-        context: tells the region.
+        layout: layout to draw in.
+        context: context with the region.
         text: the sentence in English.
-        icon: before its first line.
-        margin: pixels beside it that are taken.
-        width: of all in pixels, 0: the region's; a dialog has its own.
+        icon: icon before the first line.
+        margin: horizontal space in pixels that is not available.
+        width: total width in pixels, for a dialog; 0: the region's width.
     """
     room = (width or context.region.width / context.preferences.system.ui_scale) - margin
     room -= 25 if icon != "NONE" else 0
@@ -45,13 +45,13 @@ def wrap(
 
 
 def lines(text: str, letters: int) -> list[str]:
-    """A text in lines of at most this many letters, one at least; a figure stays with its unit."""
+    """Lines of a text with at most this many letters, at least one line. A number stays with its unit."""
     found = textwrap.wrap(_UNIT.sub(_BOUND, text), letters) or [""]
     return [line.replace(_BOUND, " ") for line in found]
 
 
 def cells(line: bpy.types.UILayout, widths: tuple[float, ...]) -> list[bpy.types.UILayout]:
-    """Parts of a row, as wide as `widths` say, which sum to 1."""
+    """Parts of a row with relative widths, which sum to 1."""
     parts: list[bpy.types.UILayout] = []
     left = 1.0
     for width in widths[:-1]:

@@ -1,4 +1,4 @@
-"""The list of a scene's shots at the top of the tab: choose, add, remove."""
+"""The sidebar panel: the list of a scene's shots, the button for all steps, and the five steps."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SPLANNEQUIN_UL_shots(bpy.types.UIList):
         active: str,
         index: int,
     ) -> None:
-        """Name, and whether a step of it runs."""
+        """Draws a shot's name, with an icon that shows whether a step is running."""
         one = selection.settings(scene_in(context))[index]
         folder = selection.folder_of(one)
         running = job_timer.watch_of(folder).running() if folder is not None else None
@@ -53,14 +53,14 @@ class SPLANNEQUIN_OT_shot_add(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off while the chosen shot has no clip: it is a new one."""
+        """Disabled while the selected shot has no clip, because it is new."""
         if selection.shot_folder(scene_in(context)) is None:
             cls.poll_message_set(tr("Choose a clip for this shot first"))
             return False
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Adds and chooses it."""
+        """Adds a shot and selects it."""
         selection.add(scene_in(context))
         return {"FINISHED"}
 
@@ -81,18 +81,18 @@ class SPLANNEQUIN_OT_shot_remove(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """On for one of several."""
+        """Enabled with two or more shots."""
         if len(settings_of(scene_in(context)).shots) < 2:
             cls.poll_message_set(tr("This is the only shot of the scene"))
             return False
         return True
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Asks what is to be done with its things."""
+        """Asks whether to remove the shot's objects."""
         return context.window_manager.invoke_props_dialog(self)
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Removes it."""
+        """Removes the selected shot from the list."""
         scene = scene_in(context)
         folder = selection.shot_folder(scene)
         if self.things and selection.folders(scene).count(folder) > 1:
@@ -117,7 +117,7 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
     filter_folder = BoolProperty(name="Folders", description="Show folders", default=True, options={"HIDDEN"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Outcome:
-        """Has the folder chosen, beginning where it was."""
+        """Opens the file browser at the folder's last location."""
         folder = selection.shot_folder(scene_in(context))
         if folder is not None:
             existing = next((p for p in folder.parents if p.is_dir()), None)
@@ -126,7 +126,7 @@ class SPLANNEQUIN_OT_locate_shot(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Takes it, if there is a shot in it."""
+        """Sets the folder if it contains a shot."""
         try:
             places.locate(scene_in(context), Path(paths.absolute(self.directory)))
         except contract.JobError as error:
@@ -145,16 +145,16 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
     bl_category = "Splannequin"
 
     def draw_header(self, context: bpy.types.Context) -> None:
-        """Name of the chosen shot."""
+        """Draws the name of the selected shot."""
         chosen = settings_of(scene_in(context)).loaded_shot
         layout_of(self).label(text=selection.labels(scene_in(context))[chosen], icon="FILE_MOVIE", translate=False)
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
-        """A button that begins another one."""
+        """Draws the button that adds a shot."""
         layout_of(self).operator("splannequin.shot_add", text="", icon="ADD", emboss=False)
 
     def draw(self, context: bpy.types.Context) -> None:
-        """The list of shots once there are several, what does all steps as one, and each step."""
+        """Draws the list of several shots, the button for all steps, and each step."""
         layout = layout_of(self)
         if len(settings_of(scene_in(context)).shots) > 1:
             self._list(context, layout)
@@ -164,7 +164,7 @@ class SPLANNEQUIN_PT_shots(bpy.types.Panel):
             step.panel.draw(context, layout, name == at_hand)
 
     def _all_steps(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """All that is left to do until frames are frozen, as one button, and then as one bar."""
+        """Draws the button that runs all remaining steps up to the freeze, or their progress."""
         folder, ahead = selection.shot_folder(scene_in(context)), all_steps.missing(scene_in(context))
         if folder is None:
             return

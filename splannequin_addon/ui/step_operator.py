@@ -1,6 +1,6 @@
-"""What the five buttons share.
+"""Base class of the steps' operators, and `edit` for operators that change the scene.
 
-Headless, a button's `execute` blocks until the work is done; in a window the timer follows it.
+Without a window, `execute` blocks until the work is done. In a window, the timer monitors the work.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from ..translations import tr
 
 
 class StepOperator(OperatorBase):
-    """What the five share: begin the job, then wait for it or have it followed."""
+    """Base class of the steps' operators: starts the job, then waits for it or lets the timer monitor it."""
 
     step = ""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Off while a step of this shot runs."""
+        """Disabled while a step of this shot runs."""
         folder = selection.shot_folder(scene_in(context))
         if folder is not None and job_timer.watch_of(folder).running():
             cls.poll_message_set(tr("A step of this shot is running"))
@@ -32,7 +32,7 @@ class StepOperator(OperatorBase):
         return True
 
     def execute(self, context: bpy.types.Context) -> Outcome:
-        """Runs the step; says in words what keeps it from that."""
+        """Runs the step; reports an error."""
         try:
             return self.perform(context)
         except contract.Cancelled:
@@ -46,7 +46,7 @@ class StepOperator(OperatorBase):
         return {"CANCELLED"}
 
     def perform(self, context: bpy.types.Context) -> Outcome:
-        """Begins the job, and waits for it where nothing follows it. What it raises `execute` tells."""
+        """Starts the job. Without a window, waits for it. `execute` reports exceptions."""
         scene = scene_in(context)
         job = begin.begin(scene, self.step, self.params(scene))
         job_timer.follow(self.step, job)
@@ -58,11 +58,11 @@ class StepOperator(OperatorBase):
         return {"FINISHED"}
 
     def params(self, scene: bpy.types.Scene) -> jobs.Params | None:
-        """What the job is asked for; None: what the scene's settings say."""
+        """Parameters of the job; None to use the scene's settings."""
         return None
 
     def after(self, scene: bpy.types.Scene, job: jobs.Job) -> list[str]:
-        """What follows the job when blocking; returns what changed, in words."""
+        """Work after the job in blocking mode. Returns the changes as sentences."""
         return steps.STEPS[self.step].finish(scene, job)
 
 
@@ -72,7 +72,7 @@ def edit(
     step: str,
     change: Callable[[bpy.types.Scene, Path], list[str]],
 ) -> Outcome:
-    """Runs a change of the scene; says what was done or why not."""
+    """Runs a change of the scene. Reports the changes or the error."""
     folder = selection.shot_folder(scene_in(context))
     if folder is None:
         operator.report({"ERROR"}, "No shot is chosen: import a clip first")

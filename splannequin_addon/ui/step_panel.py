@@ -1,8 +1,7 @@
-"""The sidebar tab "Splannequin" in the 3D view: five steps in order, each with its state and what comes next.
+"""The sidebar tab "Splannequin" in the 3D view: five steps in order, with state and next action.
 
-All of it is one panel of Blender's, in which each step is a layout panel that `folds` opens and closes.
-
-Drawing only reads what the job timer keeps; it touches the disk when a shot is met for the first time.
+The tab is one Blender panel. Each step is a layout panel in it, which `folds` opens and closes. Drawing only reads the
+job timer's stored state. It reads the disk only for a new shot.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from . import icons
 from .sentences import wrap
 
 _LINES = 2
-"""Lines of a step's state that are always shown; the others are in a fold, so that the tab fits a 1080p screen."""
+"""Lines of a step's state that are always shown. The others are in a sub-panel, so that the tab fits a 1080p screen."""
 
 
 class StepPanel:
-    """What the five panels share. State, settings, one button, progress with Cancel, what comes next."""
+    """Base class of the five panels: state, settings, one button, progress with Cancel, next action."""
 
     title = ""
-    """On the step's header."""
+    """Title in the step's header."""
     is_at_hand = False
-    """It is the step to work on, while it is drawn."""
+    """True while this step is drawn as the one to work on."""
     step = ""
     operator = ""
     folds = ""
-    """Names of the foldable sub-panels in .blend files, which store their state."""
+    """Name prefix of the sub-panels in .blend files, which store their folding state."""
 
     def _watch(self, context: bpy.types.Context) -> job_timer.Watch | None:
         folder = selection.shot_folder(scene_in(context))
@@ -52,10 +51,10 @@ class StepPanel:
         return steps.STEPS[self.step].view(scene_in(context), watch.state if watch else None)
 
     def draw(self, context: bpy.types.Context, layout: bpy.types.UILayout, is_at_hand: bool) -> None:
-        """The step's header, and its body while it is open; what comes next only of the step that is at hand."""
+        """Draws the step's header, and its body if open. The next action appears only for the step to work on."""
         self.is_at_hand = is_at_hand
         parts = layout.panel_prop(settings_of(scene_in(context)), f"is_{self.step}_open")
-        header, body = cast("tuple[bpy.types.UILayout, bpy.types.UILayout | None]", parts)  # None while it is folded
+        header, body = cast("tuple[bpy.types.UILayout, bpy.types.UILayout | None]", parts)  # None while it is collapsed
         view = self._view(context)
         header.label(text=self.title, icon=self._icon(context, view))
         if body is not None:
@@ -67,7 +66,7 @@ class StepPanel:
             brief.label(text=tr(view.brief), translate=False)
 
     def _icon(self, context: bpy.types.Context, view: steps.View) -> Icon:
-        """An icon for the state: a tick, at work, failed, next, or not yet."""
+        """Icon for the state: running, failed, done, ready, or not ready."""
         watch = self._watch(context)
         job = watch.jobs.get(self.step) if watch else None
         if watch and watch.running() == self.step:
@@ -81,7 +80,7 @@ class StepPanel:
         return icon
 
     def draw_body(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """What the step shows while it is open."""
+        """Draws the body of the open step."""
         watch, view = self._watch(context), self._view(context)
         self.draw_trouble(context, layout)
         for line in view.state[:_LINES]:
@@ -108,16 +107,16 @@ class StepPanel:
             self.draw_advanced(context, body)
 
     def draw_trouble(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """Draws what prevents the step, with the button that helps."""
+        """Draws problems that prevent the step, with an operator that solves them."""
 
     def draw_always(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """What stays in reach while a step runs."""
+        """Draws controls that stay enabled while a step runs."""
 
     def draw_settings(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The settings that an artist needs."""
+        """Draws the main settings."""
 
     def draw_advanced(self, context: bpy.types.Context, layout: bpy.types.UILayout) -> None:
-        """The settings that need no touching."""
+        """Draws settings that rarely need changes."""
 
     def _button(
         self, context: bpy.types.Context, layout: bpy.types.UILayout, view: steps.View, running: str | None
@@ -128,7 +127,7 @@ class StepPanel:
         row.operator(self.operator, text=self._label(context, view), icon=icons.of(self.operator))
 
     def _label(self, context: bpy.types.Context, view: steps.View) -> str:
-        """What the button says."""
+        """Label of the button."""
         step = steps.STEPS[self.step]
         return step.again if view.done else step.button
 
@@ -157,7 +156,7 @@ class StepPanel:
     def _own_progress(
         self, layout: bpy.types.UILayout, context: bpy.types.Context, now: job_timer.Progress | None
     ) -> None:
-        """How far work is that Blender does itself."""
+        """Draws the progress of work done in Blender."""
         if now is None:
             layout.progress(factor=0.0, type="BAR", text=tr("Starting"))
             return
@@ -168,7 +167,7 @@ class StepPanel:
     def _outcome(
         self, context: bpy.types.Context, layout: bpy.types.UILayout, watch: job_timer.Watch | None, said: list[str]
     ) -> None:
-        """What went wrong, or what was changed, unless it was `said` above."""
+        """Draws the error or the changes of the last job, without warnings in `said`."""
         if watch is None:
             return
         job = watch.jobs.get(self.step)
@@ -192,22 +191,22 @@ class StepPanel:
             wrap(layout, context, note, "DOT")
 
     def _paused(self, context: bpy.types.Context) -> bool:
-        """True if the panel says already that what was stopped can go on."""
+        """True if the panel already explains how to resume a stopped job."""
         return False
 
 
 def started_elsewhere(job: jobs.Job) -> bool:
-    """True if a job is known to have been asked for in another .blend than is open."""
+    """True if a job was started from another .blend than the open one."""
     return job.blend not in ("", os.path.basename(bpy.data.filepath))
 
 
 def unsaid(warnings: list[tuple[str, str]], said: list[str]) -> list[str]:
-    """A job's warnings as lines, without those that the step's state tells anyway, as it does a verdict."""
+    """A job's warnings as lines, without those that the step's state already shows."""
     return [f"{message} {hint}".strip() for message, hint in warnings if message not in said]
 
 
 def sub_panel(layout: bpy.types.UILayout, name: str, label: str, folded: bool = True) -> Any | None:
-    """A part of a panel that can be folded away, `folded` at first; None while it is."""
+    """A collapsible part of a panel, initially collapsed if `folded`; None while it is collapsed."""
     header, body = layout.panel(f"splannequin_{name}", default_closed=folded)
     header.label(text=label)
     return body
