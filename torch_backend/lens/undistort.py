@@ -25,7 +25,7 @@ class Undistorter:
     """
 
     def __init__(self, where: NDArray[np.float32]) -> None:
-        """`where` is [H, W, 2]: x and y in input pixels, centres at +0.5. Outside of the input, its border is repeated."""
+        """`where` is [H, W, 2]: x and y in input pixels, centres at +0.5. Outside of the input, the border repeats."""
         if where.ndim != 3 or where.shape[2] != 2:
             raise ValueError(f"the map should be [H, W, 2], got {where.shape}")
         self.height, self.width = where.shape[:2]
