@@ -115,8 +115,7 @@ def read_model(folder: Path) -> ColmapModel:
 
     Raises:
         FileNotFoundError: the folder holds no model.
-        ValueError: a file is damaged or truncated, or has a camera model missing in `MODELS`. The message names the
-            file.
+        ValueError: a file is damaged or truncated, or has an unknown camera model. The message names the file.
     """
     files = model_files(folder)
     if not files:

@@ -22,7 +22,7 @@ BELOW = 0.05
 NEAR = 0.01
 """Largest distance of an inlier from the plane, as a share of the points' median distance from the cameras."""
 _TRIES, _LOOKED_AT, _FINAL, _ALL = 5000, 400, 12, 3000
-"""Number of triples drawn; of points in the first scoring; of planes scored on all points; of points used at most."""
+"""Number of random triples; points for the first scoring; planes scored on all points; maximum number of points."""
 
 
 def floor_of(path: CameraPath, points: NDArray[Any]) -> dict[str, Any] | None:

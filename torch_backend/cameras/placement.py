@@ -109,7 +109,7 @@ def camera_to_world(viewmats: NDArray[Any]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera described by focal length, sensor size and shift in mm, as Blender, USD and Nuke store it."""
+    """A pinhole camera described by focal length, sensor size and lens shift, as in Blender, USD and Nuke."""
 
     focal_mm: float
     """Focal length in mm for a sensor `SENSOR_MM` wide."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def rotation_to_quat(rotation: NDArray[Any]) -> NDArray[np.float64]:
-    """The unit quaternion wxyz with w >= 0 of a [3, 3] rotation.
+    """The unit quaternion wxyz (w >= 0) of a [3, 3] rotation.
 
     Uses the best conditioned of the four formulas of Shepperd (1978).
     """

@@ -24,7 +24,7 @@ BLUR_RATIO = 0.7
 _LOG_BLACK, _LOG_WHITE = 0.06, 0.9
 """Minimum and maximum luma of a log clip: Canon Log has black at 0.073."""
 _LOG_SATURATION = 0.25
-"""Largest difference of the channels in a log clip. Measured: 0.20 in a log clip, 0.31 to 0.58 in three others."""
+"""Largest difference of the channels in a log clip. Measured: 0.20 in log, 0.31 to 0.58 in three display clips."""
 TARGET_SOLVED = 68
 MAX_STEP_SECONDS = 0.4
 

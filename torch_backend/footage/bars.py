@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 _LEAST_FRAMES = 12
 """Minimum number of pictures for a decision."""
 _LEAST, _MOST = 0.012, 0.45
-"""Minimum and maximum size of one bar, as a share of the picture's side. Cameras cause thinner borders."""
+"""Minimum and maximum size of one bar, as a share of the picture's side. Thinner borders are camera artefacts."""
 _FLAT = 6.0
 """Largest difference of a bar's pixel from the bar's colour, in steps of 255. Compression causes no more."""
 _FLAT_SHARE = 0.7
@@ -25,8 +25,8 @@ _FLAT_SHARE = 0.7
 _STEP = 14.0
 """Minimum difference between bar and picture at the border, in steps of 255."""
 _STEP_SHARE = 0.4
-"""Minimum share of the border's length with this difference, inside minus outside, in nearly every frame. Measured in
-three compressed clips: 0.67 to 0.99 with added bars; at most 0.06 without, underexposed to clipped blacks."""
+"""Minimum share of the border with a difference of `_STEP` just inside it, less that share just outside. Measured in
+three compressed clips: 0.67 to 0.99 with added bars, at most 0.06 if underexposed until blacks clip."""
 _OFTEN = 0.9
 """Minimum share of frames that agree."""
 _SMOOTH = 0.45

@@ -22,8 +22,8 @@ _LEAST_FRAMES, _LEAST_WIDTH = 12, 160
 _EDGE = 2.0
 """Minimum median gradient of an edge, in steps of 255 per pixel."""
 _ALIKE, _OFTEN = 0.5, 0.75
-"""Largest difference of a frame's gradient from the median, as a share of it; minimum share of such frames. Measured
-in three real and five synthetic clips: at most half of the frames agree on a scene edge, all on a logo."""
+"""Largest relative difference of a frame's gradient from the median; minimum share of frames within it. Measured in
+three real and five synthetic clips: at most half of the frames agree on a scene edge, all on the edge of a logo."""
 _SCENE_OFTEN = 0.35
 """Largest median share of frames that agree on a scene edge. Above it, the camera hardly moves, and an overlay cannot
 be detected."""

@@ -27,7 +27,7 @@ LINEAR_KNEE = np.float32(0.04045 / 12.92)
 
 
 def srgb_to_linear(x: ArrayLike) -> NDArray[np.float32]:
-    """Display-referred sRGB to scene-linear, any shape, float32 out; 0..1 maps to 0..1.
+    """Converts display-referred sRGB of any shape to scene-linear float32; 0..1 maps to 0..1.
 
     Values beyond about 1.2e16 overflow to infinity (their linear value does not fit float32).
     """
@@ -40,7 +40,7 @@ def srgb_to_linear(x: ArrayLike) -> NDArray[np.float32]:
 
 
 def linear_to_srgb(x: ArrayLike) -> NDArray[np.float32]:
-    """Scene-linear to display-referred sRGB, any shape, float32 out; the inverse of `srgb_to_linear`.
+    """Converts scene-linear values of any shape to display-referred sRGB float32; the inverse of `srgb_to_linear`.
 
     A round trip has a relative error of 1e-6 below 16 and 1e-5 up to 1e38.
     """
@@ -53,7 +53,7 @@ def linear_to_srgb(x: ArrayLike) -> NDArray[np.float32]:
 
 
 def linear_to_srgb8(x: ArrayLike) -> NDArray[np.uint8]:
-    """Scene-linear to 8-bit sRGB, clipped to 0..1 and rounded, any shape. NaN becomes 0."""
+    """Converts scene-linear values of any shape to 8-bit sRGB, clipped to 0..1 and rounded. NaN becomes 0."""
     encoded = np.nan_to_num(linear_to_srgb(x), nan=0.0)
     return (np.clip(encoded, 0.0, 1.0) * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
 
@@ -154,7 +154,7 @@ def light_of_chromaticities(values: Sequence[float] | None) -> str:
 
 
 def cineon_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Cineon log (printing density, 10 bits as 0..1) to scene-linear: black at code 95 is 0, white at 685 is 1.
+    """Converts Cineon log (printing density, 10 bits as 0..1) to scene-linear: code 95 (black) to 0, 685 (white) to 1.
 
     Kodak's conversion: 0.002 density per code, negative gamma 0.6.
     """
@@ -164,7 +164,7 @@ def cineon_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def pq_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """SMPTE ST 2084 to linear light, 1 at `DIFFUSE_WHITE_NITS`."""
+    """Converts SMPTE ST 2084 to linear light, 1 at `DIFFUSE_WHITE_NITS`."""
     m1, m2, c1, c2, c3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
     root = np.power(np.clip(x, 0.0, 1.0).astype(np.float64), 1.0 / m2)
     nits = 10000.0 * np.power(np.maximum(root - c1, 0.0) / (c2 - c3 * root), 1.0 / m1)
@@ -172,7 +172,7 @@ def pq_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def hlg_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """BT.2100 HLG [..., 3] to the linear light of a display of 1000 cd/m2, 1 at `DIFFUSE_WHITE_NITS`."""
+    """Converts BT.2100 HLG [..., 3] to the linear light of a display of 1000 cd/m2, 1 at `DIFFUSE_WHITE_NITS`."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     x = np.clip(x, 0.0, 1.0)
     upper = np.exp((np.maximum(x, np.float32(0.5)) - np.float32(c)) / np.float32(a)) + np.float32(b)

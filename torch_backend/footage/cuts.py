@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from .continuity import Features, Link, link, sure_features
 
 SUSPICIOUS = 0.35
-"""Overlap of two frames by quick features, relative to that of their neighbours, below which SIFT features are used."""
+"""SIFT features decide if the overlap of two frames by quick features, relative to their neighbours, is below this."""
 APART = 0.13
-"""Largest overlap by SIFT features, relative to that of the neighbours, at which two frames show different scenes.
+"""Largest overlap of different scenes by SIFT features, relative to the overlap of neighbouring frames.
 Measured: 0.20 to 1.5 in the fastest parts of three handheld clips, darkened, noisy, flickering and blurred. 0.01 to
 0.083 at cuts, including cuts to mirrored pictures and to other views of one room."""
 _LEAST_LEVEL = 20
@@ -40,8 +40,8 @@ _ALIKE = 0.06
 _NEAR = 0.2
 """Largest shift of the picture, as a share of its width, at which two frames around a third one must overlap."""
 _WIPED = 0.1
-"""Matches between the frames around a wipe, over the matches of the frame between with the poorer of the two.
-Measured: 0.04 and 0.05; 0.15 if somebody walks through the picture, 0.29 and more in handheld clips with noise."""
+"""Largest ratio for a wipe: matches between the frames before and after, over the fewer of the mixed frame's matches
+with either. Measured: 0.04 and 0.05; 0.15 if somebody walks past, 0.29 and more in handheld clips with noise."""
 _MIXED = 0.4
 """The limit of `_WIPED` for a dissolve, which has uncertain matches but must also be a sum of the two pictures."""
 _LEAST_COMMON = 10

@@ -42,8 +42,8 @@ def unmarked_fields(container: Any, stream: Any) -> str:
     """Field order ("tff", "bff") of frames that are combed but not marked as interlaced; else empty.
 
     Runs FFmpeg's idet filter at the beginning and in the middle. A frame woven from two fields of different instants
-    shows combing at moving edges. Measured: idet reports no frame of three progressive clips as combed, nine of ten in
-    an interlaced clip, and two of five in film on tape (3:2).
+    shows combing at moving edges. Share of frames that idet reported as combed: none in three progressive clips, nine
+    of ten in an interlaced clip, two of five in film on tape (3:2).
     """
     combed: Counter[str] = Counter()
     for spot in (0.0, 0.5):

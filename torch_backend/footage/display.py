@@ -6,7 +6,7 @@ encoding adds a shoulder to the extended sRGB curve s, from 0.8 on:
     bent(s) = 0.8 + r ln(1 + (s - 0.8) / r)        s = 0.8 + r (exp((bent - 0.8) / r) - 1)
 
 The slope at 0.8 is continuous, and light 64 lies just below 1. Between light 0.6 and 64, half a step of 16 bits is at
-most 4e-4 of the light; half a step of 8 bits is up to a tenth.
+most 4e-4 of the light; half a step of 8 bits is up to a tenth of it.
 
 Code that resamples such pictures (resizing, undistortion) does so in extended sRGB, as for plates. With the shoulder, a
 kernel that rings by a twentieth would make the rim of a lamp three times as bright.

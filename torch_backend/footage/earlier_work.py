@@ -42,8 +42,8 @@ class EarlierWork:
     def may_be_same(self, settings: Mapping[str, Any], info: SourceInfo) -> bool:
         """True if an import with these settings may yield the same pictures. Only decoding gives certainty.
 
-        `settings` and `info` use the shot's frame numbers. Imports of the same pictures may have different keys: an
-        explicit range of all frames, a repackaged file, an import by an earlier version.
+        `settings` and `info` use the shot's frame numbers. Two imports of the same pictures may have different keys,
+        for example if one names the full range, reads a repackaged file, or is by an earlier version.
         """
         if not self.record or info.last is None:
             return bool(self.record)

@@ -137,7 +137,7 @@ def _planes(frame: av.VideoFrame, coding: Coding) -> list[NDArray[np.float32]]:
 def _scaled(frame: av.VideoFrame, coding: Coding, kind: str, *, keeps_range: bool = False) -> av.VideoFrame:
     codes = ColorRange.JPEG if coding.is_full else ColorRange.MPEG
     if coding.matrix != RGB:
-        frame.color_range = codes  # may differ from the tag
+        frame.color_range = codes  # the coding may differ from the frame's tag
     matrix = None if coding.matrix == RGB else Colorspace(coding.matrix)
     into = codes if keeps_range else None
     return frame.reformat(

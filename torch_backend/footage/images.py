@@ -52,7 +52,7 @@ _MADE_BY = {
 
 
 def error_of(source: Any = oiio) -> str:
-    """The pending error of OpenImageIO or of one of its objects. Clears the error."""
+    """Returns and clears the pending error of OpenImageIO or of one of its objects."""
     try:
         text = source.geterror()
     except UnicodeDecodeError:  # the message quotes bytes of a damaged file
@@ -203,7 +203,7 @@ def _weights(size: int, new_size: int, lobes: int) -> SparseMatrix:
 WORKING_LINES = 720
 """Default maximum height of working frames of landscape footage, in pixels."""
 WORKING_AREA = 1280 * WORKING_LINES
-"""Default maximum area of working frames of portrait and square footage, in pixels: that of 16:9 landscape footage."""
+"""Default maximum area of working frames of portrait and square footage, in pixels: the area of a 16:9 frame."""
 
 
 def working_size(width: int, height: int, requested_height: int) -> tuple[int, int]:

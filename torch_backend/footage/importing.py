@@ -434,7 +434,7 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
 def _tell_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], report: Reporter) -> dict[str, float]:
     """The entry of frames.json for bars found in pictures [h, w]. Warns the artist.
 
-    Each side includes the mixed lines, and is a share of the frame's height or width.
+    The value of each side is a share of the frame's height or width, and includes the mixed lines.
     """
     h, w = shape
     width, height = (int(side) for side in record["source_size"])

@@ -20,7 +20,7 @@ from .images import error_of
 from .sources import footage_error
 
 _CONFIG = "ocio://default"
-"""Configuration for OpenImageIO, which loads one although a table needs none. Loads twice as fast as the studio
+"""Configuration for OpenImageIO, which loads one although a table needs none. It loads twice as fast as the studio
 configuration."""
 _MOST_BYTES = 64 << 20
 """Maximum size of a file: about that of a cube of 129 steps, the largest that OpenColorIO reads."""

@@ -37,11 +37,12 @@ _HALF = 0.5
 _SHAPE = 0.01
 """Relative tolerance of a mask's aspect ratio, because sizes are rounded."""
 _MOST_PIXELS = 1 << 25
-"""Maximum pixels of a mask that is larger than the footage. As floats, it takes 0.5 GB."""
+"""Maximum number of pixels of a mask that is larger than the footage. As floats, it takes 0.5 GB."""
 _ALL = 0.98
 """Largest covered share of the picture at which a solve is possible."""
 _BLACK, _MATTE = 0.1, 0.95
-"""Tolerance of black and white; minimum share of black and white pixels in a colour that is itself a matte."""
+"""A colour is a matte itself if the share `_MATTE` of its pixels is within `_BLACK` of black or white, with some of
+both."""
 _BRIGHTNESS, _ALPHA, _BOTH = "brightness", "alpha", "both"
 """Channels that define the mask."""
 _Picture = tuple[int | None, NDArray[np.float32], NDArray[np.float32] | None]
@@ -134,7 +135,7 @@ class _Reading:
         return made
 
     def _covered(self, grey: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Covered pixels [H, W] bool at the working size, from a picture [h, w] in 0..1. JobError as `_check_shape`."""
+        """Covered pixels [H, W] bool at the working size of a picture [h, w] in 0..1. Raises as `_check_shape` does."""
         h, w = grey.shape
         self._check_shape(w, h)
         small = cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA if w > self.size[0] else cv2.INTER_LINEAR)

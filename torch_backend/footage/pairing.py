@@ -50,8 +50,8 @@ def pair(pictures: Sequence[int], counted: Counted, needs_all: bool = False, may
     """Assigns a picture to each frame.
 
     Criteria for a numbering, in this order: pictures and frames match exactly; few pictures lie outside of the clip;
-    enough frames have a picture. In a tie, the shot's numbers win, then the footage's numbers. Exception: pictures
-    numbered from 0 count from 0 if the footage begins at 1.
+    enough frames have a picture. In a tie, the shot's numbers win, then the footage's numbers. Exception: if the
+    footage begins at 1, picture 0 belongs to its first frame.
 
     Args:
         pictures: numbers of the pictures, ascending.
@@ -64,7 +64,7 @@ def pair(pictures: Sequence[int], counted: Counted, needs_all: bool = False, may
     frames, first = counted.frames, pictures[0]
     steps = [0, counted.shift]
     clip = counted.clip or (frames[0], frames[-1])
-    # Pictures may have an independent count if it starts at 0 or 1, or if it misses most frames but has their length.
+    # Pictures may count independently if they start at 0 or 1, or if few numbers match a frame but the total matches.
     strange = 2 * len(set(pictures) & set(frames)) < len(frames)
     as_many = len(pictures) in (len(frames), clip[1] - clip[0] + 1)
     may_count_anew = may_shift and (first in (0, 1) or (strange and as_many))

@@ -64,8 +64,8 @@ class Plates:
     def __init__(self, shot: Shot, size: tuple[int, int] | None = None, keep: int = 0) -> None:
         """`size`: width and height in pixels; None: those of the source. `keep`: maximum number of cached plates.
 
-        The default, 0, caches the plates for a frozen frame and the next one: the frame itself, two before and two
-        after it at every other frame, and t*. Large plates are limited to `_KEPT_BYTES`, but at least three are
+        The default, 0, caches the plates for a frozen frame and the next one: the frame itself, the second and the
+        fourth frame before and after it, and t*. Large plates are limited to `_KEPT_BYTES`, but at least three are
         cached. Raises JobError (FOOTAGE, SOLVE) if the shot is not imported and solved.
         """
         load_cameras(shot)
@@ -231,7 +231,7 @@ class Plates:
         except (OSError, ValueError):
             return True  # there is nothing to compare
         width, height = self._working
-        if self._display.bends:  # as the import made it
+        if self._display.bends:  # convert as the import did
             if picture.dtype != np.float16:
                 return False
             small = plate_encoding.display(self._display.codes_of(picture, width, height))

@@ -170,7 +170,7 @@ class VideoSource:
             return "Blender shows an animated picture as a still one"
         if self._aspect != 1:
             return "its pixels are not square"
-        if orientation is None or orientation.is_mirrored:  # Blender 5 turns mirrored pictures instead
+        if orientation is None or orientation.is_mirrored:  # Blender 5 rotates instead of mirroring
             return f"its header says that it is {orientation.words if orientation else 'turned or stretched'}"
         if not self._is_first_stream:
             return "it has several video streams, of which other programs show another"

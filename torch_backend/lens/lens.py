@@ -41,7 +41,7 @@ focal length ends outside of this range."""
 LEAST_DEG, MOST_DEG = 8.0, 150.0
 """Angles of view outside of this range are an error: 257 mm, 4.8 mm."""
 _MOST_STRETCH = 2.0
-"""Largest plausible ratio of a corner's distances from the middle with and without distortion, or of the inverse."""
+"""Largest plausible factor by which the distortion moves a corner away from the middle, or towards it."""
 
 
 def view_deg(width: int, height: int, focal: float) -> float:

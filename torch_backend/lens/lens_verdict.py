@@ -209,7 +209,7 @@ def bends_of(model: str, params: Sequence[float]) -> list[float]:
 
 
 def _fisheye_curve(params: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(angles from the axis, 0 to 180 degrees in radians; image radius of each, in focal lengths)."""
+    """(angles from the axis in radians, 0 to pi; image radius of each, in focal lengths)."""
     angle = np.linspace(0.0, np.pi, _SAMPLES)
     square = angle * angle
     k = params[4:8]

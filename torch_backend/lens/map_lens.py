@@ -1,7 +1,7 @@
 """The lens of an ST map as a polynomial: maps pixels both ways, for any picture size, also past the map's edge.
 
 A map samples a smooth function, often with the rounding of 16-bit floats. It often ends at the border of the
-undistorted picture, but redistortion needs coordinates beyond. Therefore a polynomial in x and y replaces the map.
+undistorted picture, but redistortion reads beyond that border. Therefore a polynomial in x and y replaces the map.
 `map_reading` fits the lowest degree that matches every sample, in the direction that needs the lower degree. Most lens
 models are such polynomials in one direction, and extrapolate past the edge as the lens does. The code uses numpy only,
 in float64.
@@ -28,7 +28,7 @@ _NODE_PX, _LEAST_NODES = 8.0, 40
 """Spacing in pixels of the grid on which the inverse is solved; minimum number of intervals along a side."""
 _MOST_STEPS = 60
 _DONE_PX, _WRONG_PX = 1e-9, 1e-6
-"""Largest error over all pixels at which Newton's method stops; and above which it has failed."""
+"""Errors in pixels: below the first, Newton's method stops; above the second, it has failed."""
 _BEYOND = 0.5
 """Margin around the polynomial's box for the inversion, as a share of the box."""
 _NONE_PX = 1e-3
@@ -102,7 +102,7 @@ def exponents(degree: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def fitted(points: NDArray[np.float64], values: NDArray[np.float64], degree: int, box: Sequence[float]) -> Polynomial:
-    """The polynomial of a degree that maps `points` [N, 2] to `values` [N, 2], by least squares."""
+    """Least-squares fit of a polynomial of total degree `degree` that maps `points` [N, 2] to `values` [N, 2]."""
     whole = Polynomial(degree, (box[0], box[1], box[2], box[3]), ())
     left, above = whole._vanders(points[:, 0], points[:, 1])  # pyright: ignore[reportPrivateUsage]
     x, y = exponents(degree)
@@ -267,7 +267,7 @@ class MapLens:
 def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) -> MapLens:
     """The same lens with the widest window whose pixels all lie within the original frames.
 
-    A window that nearly equals the map's whole picture is set to exactly that, so that the pixels of both coincide.
+    If the window nearly equals the map's whole picture, it becomes the whole picture, so that the pixels coincide.
 
     Args:
         lens: lens with any window.

@@ -5,8 +5,8 @@ the top; the sign of its slope shows which. Coordinates refer to the whole pictu
 i lies at (i + 0.5) / size. The display window of the file is the map's picture. Pixels outside of that window, and a
 map larger than the footage, are overscan. A map does not state its direction, so `--st-map-way` does:
 
-    undistort   one pixel per pixel of the undistorted picture, with coordinates in the original (undistorts a plate)
-    redistort   one pixel per pixel of the original, with coordinates in the undistorted picture (distorts a render)
+    undistort   a map of the undistorted picture, with coordinates in the original (undistorts a plate)
+    redistort   a map of the original picture, with coordinates in the undistorted one (distorts a render)
 
 Pixels that are 0 in both channels, transparent, or clipped at 0 or 1 are ignored.
 """
@@ -33,11 +33,11 @@ PAIRS = (("r", "g"), ("red", "green"), ("u", "v"), ("s", "t"), ("x", "y"))
 """Known names of the two channels, in lower case."""
 DEGREES = (1, 3, 5, 7, 9, 11, 13, 15)
 CLOSE_PX = 5e-3
-"""Largest error, in pixels of the footage, at which a polynomial reproduces the map and the search stops."""
+"""Largest error of a polynomial, in pixels of the footage, at which the search for a better fit stops."""
 ROUGH_PX = 0.1
 """Largest accepted error in pixels, in addition to the rounding of the file. Above it, the map is not smooth."""
 NO_GAIN = 0.996
-"""Largest ratio of the new to the old error at which a higher degree is an improvement. Above it, the rest is noise."""
+"""Largest ratio of new to old error at which a higher degree counts as better. Above it, only noise remains."""
 STRAIGHT_PX = 0.05
 """Largest distortion in pixels of a map without a lens."""
 SHAPE = 0.03

@@ -51,9 +51,9 @@ class Undistorter:
 class BandUndistorter:
     """Like `Undistorter`, for pictures of any size and for unclipped floats. Uses 8 bytes per pixel.
 
-    A Catmull-Rom curve is the linear interpolation of two samples minus t (1 - t) / 2 times that of their second
-    differences. This takes four bilinear look-ups per pixel, band by band. The second differences use values clipped
-    to 0 to 1: otherwise a lamp of fifty times white would get a black ring.
+    A Catmull-Rom curve is a linear interpolation of two samples, minus t (1 - t) / 2 times a linear interpolation of
+    their second differences. This takes four bilinear look-ups per pixel, band by band. The second differences use
+    values clipped to [0, 1]: otherwise a lamp of fifty times white would get a black ring.
     """
 
     def __init__(self, where: NDArray[np.float32]) -> None:

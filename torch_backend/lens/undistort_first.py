@@ -31,7 +31,7 @@ class UndistortedFrames:
     def __init__(self, shot: Shot, frames: dict[str, Any], lens: MapLens, folder: Path, report: Reporter) -> None:
         """Undistorts the frames listed in `frames` (frames.json) into `folder`.
 
-        Raises JobError if the lens cannot be inverted, Cancelled.
+        Raises JobError if the lens cannot be inverted, or Cancelled.
         """
         self.folder, self._lens = folder, lens
         across, down = lens.slopes_in_the_middle
