@@ -1,1 +1,1 @@
-"""Cameras and points of a solve: stored, placed in a scene, read from and written for other programs."""
+"""Cameras and points of a solve: storage, placement in a scene, import from and export to other programs."""

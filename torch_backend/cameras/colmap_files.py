@@ -1,8 +1,8 @@
-"""COLMAP models on disk, read and written without COLMAP: cameras, images and points3D, as .bin or .txt.
+"""Reads and writes COLMAP models (cameras, images and points3D, as .bin or .txt) without COLMAP.
 
-The format is COLMAP's own (https://colmap.github.io/format.html): world-to-camera poses as a quaternion wxyz and a
-translation, OpenCV axes, pixel centres at +0.5. The 2D keypoints of images are passed over. Everything read is checked:
-such a folder may come from anywhere.
+The format is documented at https://colmap.github.io/format.html: world-to-camera poses as a quaternion wxyz and a
+translation, OpenCV axes, pixel centres at +0.5. The reader skips the 2D keypoints of images. It validates all values,
+because the folder may come from an untrusted source.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MODELS = {
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
-"""COLMAP's number of a camera model -> its name and how many parameters it has."""
+"""COLMAP's id of a camera model -> (name, number of parameters)."""
 PARTS = ("cameras", "images", "points3D")
 _MOST_POINTS = 50_000_000
 _PIXEL_BYTES = 24
@@ -43,10 +43,10 @@ _PIXEL_BYTES = 24
 
 @dataclass
 class ColmapCamera:
-    """One camera, which images share."""
+    """One camera. Several images may share it."""
 
     number: int
-    """COLMAP's id of it."""
+    """COLMAP's camera id."""
     model: str
     """Name of the camera model."""
     width: int
@@ -54,7 +54,7 @@ class ColmapCamera:
     height: int
     """Pixels."""
     params: tuple[float, ...]
-    """In the model's own order."""
+    """Parameters in COLMAP's order for this model."""
 
 
 @dataclass
@@ -62,11 +62,11 @@ class ColmapImage:
     """One image and its pose."""
 
     number: int
-    """COLMAP's id of it."""
+    """COLMAP's image id."""
     name: str
     """File name, relative to the folder of images."""
     camera: int
-    """Id of its camera."""
+    """Id of the camera that took the image."""
     pose: NDArray[np.float64]
     """[3, 4] world-to-camera, OpenCV axes."""
 
@@ -80,14 +80,14 @@ class ColmapPoints:
     rgb: NDArray[np.uint8]
     """[P, 3]."""
     error: NDArray[np.float64]
-    """[P] mean reprojection error in pixels of the images; negative where COLMAP did not say."""
+    """[P] mean reprojection error in pixels of the images; negative where unknown."""
     tracks: list[NDArray[np.int64]]
-    """P arrays of ids of the images that see the point; empty where the file does not say."""
+    """P arrays: ids of the images that see each point; empty where unknown."""
 
 
 @dataclass
 class ColmapModel:
-    """cameras, images and points3D of a folder."""
+    """Contents of a COLMAP model folder."""
 
     cameras: dict[int, ColmapCamera]
     """By id."""
@@ -98,9 +98,10 @@ class ColmapModel:
 
 
 def model_files(folder: Path) -> list[Path]:
-    """The files of the model in a folder, .bin before .txt as COLMAP has it; empty if it holds none.
+    """The files of the COLMAP model in a folder; empty if the folder holds no model.
 
-    points3D may be missing: poses are worth reading without.
+    The .bin files take precedence over the .txt files, as in COLMAP. The points3D file is optional: the poses are
+    useful without points.
     """
     for suffix in (".bin", ".txt"):
         found = [folder / (part + suffix) for part in PARTS]
@@ -110,11 +111,11 @@ def model_files(folder: Path) -> list[Path]:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """The model in a folder.
+    """Reads the COLMAP model in a folder.
 
     Raises:
-        FileNotFoundError: the folder holds none.
-        ValueError: a file is broken, cut off, or of a camera model that is not known here; names the file.
+        FileNotFoundError: the folder holds no model.
+        ValueError: a file is damaged or truncated, or has an unknown camera model. The message names the file.
     """
     files = model_files(folder)
     if not files:
@@ -142,9 +143,10 @@ def read_model(folder: Path) -> ColmapModel:
 
 
 def write_model(folder: Path, model: ColmapModel, text: bool = False) -> list[Path]:
-    """Writes a model into a folder, made if it is not there: binary, or `text`. Returns the files.
+    """Writes a model into a folder, as .txt if `text`, otherwise as .bin. Returns the files.
 
-    Tracks are left out: without the keypoints that they count, COLMAP would refuse them.
+    Creates the folder if it is missing. Does not write tracks: they index keypoints, and COLMAP rejects tracks
+    without keypoints.
     """
     folder.mkdir(parents=True, exist_ok=True)
     suffix = ".txt" if text else ".bin"
@@ -164,7 +166,7 @@ def write_model(folder: Path, model: ColmapModel, text: bool = False) -> list[Pa
 
 
 class _Bytes:
-    """A file read from front to back; struct.error where it ends too early."""
+    """Sequential reader of a binary file. Raises struct.error if the file ends too early."""
 
     def __init__(self, path: Path) -> None:
         with open_regular(path, LONGEST_ARRAYS) as source:
@@ -207,7 +209,7 @@ def _cameras_bin(path: Path) -> Iterator[ColmapCamera]:
     file = _Bytes(path)
     for _ in range(file.take("Q")[0]):
         number, model, width, height = file.take("iiQQ")
-        if model not in MODELS:  # what follows cannot be found without its length
+        if model not in MODELS:  # without the number of parameters, the next record cannot be located
             raise ValueError(f"camera {number} has the unknown model number {model}")
         name, count = MODELS[model]
         yield _camera(number, name, width, height, file.take(f"{count}d"))
@@ -244,7 +246,7 @@ def _points(rows: list[list[float]], tracks: list[NDArray[np.int64]]) -> ColmapP
 
 
 def _lines(path: Path) -> list[str]:
-    """The lines that say something. Empty ones stay: an image without keypoints has one."""
+    """The lines of a text file without comments. Keeps empty lines: an image without keypoints has one."""
     with open_regular(path, LONGEST_ARRAYS) as source:
         text = source.read().decode("utf-8")
     return [line for line in text.splitlines() if not line.lstrip().startswith("#")]
@@ -269,7 +271,7 @@ def _images_txt(path: Path) -> Iterator[ColmapImage]:
         camera = int(pose.pop())
         values = tuple(map(float, pose))
         yield _image(int(number), name.strip(), camera, values[:4], values[4:])
-        at += 2  # the second line holds its keypoints
+        at += 2  # the second line of an image holds its keypoints
 
 
 def _points_txt(path: Path) -> ColmapPoints:
@@ -316,7 +318,7 @@ def _points_as_bytes(model: ColmapModel) -> bytes:
 
 
 def _numbers(values: NDArray[Any] | tuple[float, ...]) -> str:
-    """As many digits as bring the same numbers back."""
+    """Numbers as text with enough digits to restore the same float64 values."""
     return " ".join(repr(float(v)) for v in values)
 
 

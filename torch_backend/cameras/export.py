@@ -1,8 +1,8 @@
-"""The solve for other programs: a COLMAP model, a nerfstudio transforms.json, or a camera for Nuke.
+"""Exports the solve to other programs: as a COLMAP model, a nerfstudio transforms.json, or a camera for Nuke.
 
-No pictures are copied: a COLMAP model names the plates as they are called in the shot's frames/, a transforms.json
-points there. Both are the solve as it is, so that what goes out can come back in, unless a placement is named. The
-camera for Nuke is where the shot stands in Blender's scene.
+The export does not copy pictures. A COLMAP model lists the file names of the plates in the shot's frames/ folder; a
+transforms.json stores paths to them. Both keep the axes and units of the solve unless the caller names a placement, so
+that an exported solve can be imported again. The camera for Nuke uses the shot's placement in Blender's scene.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False, plac
 
     Args:
         shot: a solved shot.
-        kind: of `FORMATS`. colmap: cameras, images and points3D, PINHOLE. nerfstudio: transforms.json and points.ply.
-            chan, nk: the animated camera in Nuke's axes, camera.chan or camera.nk.
-        folder: where to; made if it is not there.
-        text: a COLMAP model as .txt instead of .bin.
-        placement: see `placement_for`; of colmap and nerfstudio, empty leaves the solve's own axes and units.
+        kind: one of `FORMATS`. colmap: cameras, images and points3D, PINHOLE. nerfstudio: transforms.json and
+            points.ply. chan, nk: the animated camera in Nuke's axes, camera.chan or camera.nk.
+        folder: output folder; created if it is missing.
+        text: write a COLMAP model as .txt instead of .bin.
+        placement: see `placement_for`; for colmap and nerfstudio, empty keeps the axes and units of the solve.
 
     Returns:
         The files written.
 
     Raises:
-        ValueError: another format, or `placement` holds none.
-        JobError: the shot is not solved, or the folder holds a model that would be read instead of this one.
+        ValueError: `kind` is not in `FORMATS`, or the file `placement` holds no placement.
+        JobError: the shot is not solved, or the folder already holds a COLMAP model in the other format (.bin, .txt).
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")
@@ -67,7 +67,7 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False, plac
 
 
 def moved(path: CameraPath, where: Similarity) -> CameraPath:
-    """A camera path of solve units, as its cameras stand in the scene."""
+    """A camera path in solve units, transformed to the scene by `where`."""
     viewmats = where.viewmats(path_viewmats(path))
     frames = [dataclasses.replace(f, viewmat=v.ravel().tolist()) for f, v in zip(path.frames, viewmats, strict=True)]
     return dataclasses.replace(path, frames=frames)
@@ -114,7 +114,7 @@ def _intrinsics(K: list[float]) -> dict[str, float]:
 
 
 def _seen_from(folder: Path, file: Path) -> str:
-    """A file's path from a folder, with slashes; absolute where there is no way (another drive)."""
+    """A file's path relative to a folder, with forward slashes; absolute if the file is on another drive."""
     try:
         return Path(os.path.relpath(file, folder.absolute())).as_posix()
     except ValueError:

@@ -1,4 +1,4 @@
-"""The floor among the points of a solve: what Blender stands the shot on."""
+"""Detects the floor plane in the points of a solve. Blender uses it to set the shot upright on the ground."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from ..contract import CameraPath
 from .poses import camera_centre
 
 TILT_DEGREES = 40.0
-"""Most that the floor may lean against the cameras' mean up: people hold cameras level, but look down."""
+"""Largest angle between the floor's normal and the mean up direction of the cameras: people hold cameras level, but
+tilt them down."""
 LEAST_POINTS = 50
-"""Fewer points say nothing about a floor."""
+"""Minimum number of points for a floor search."""
 BIG = 0.08
-"""Least share of the points on the floor."""
+"""Minimum share of the points that lie on the floor."""
 BELOW = 0.05
-"""Largest share of points below the floor, which are outliers. A table top has more: the floor's own points."""
+"""Maximum share of outliers below the floor. A table top has more points below: those of the floor."""
 NEAR = 0.01
-"""A point this near is on a plane, in median distances from the cameras."""
+"""Largest distance of an inlier from the plane, as a share of the points' median distance from the cameras."""
 _TRIES, _LOOKED_AT, _FINAL, _ALL = 5000, 400, 12, 3000
-"""Triples drawn; points that each is judged by at first; those judged by all points; most points used."""
+"""Number of random triples; points for the first scoring; planes scored on all points; maximum number of points."""
 
 
 def floor_of(path: CameraPath, points: NDArray[Any]) -> dict[str, Any] | None:
-    """`find_floor` of solved cameras and points [P, 3] as solve.json has it: normal, height; None if there is none."""
+    """`find_floor` for solved cameras and points [P, 3] as solve.json stores it: normal, height. None if not found."""
     viewmats = np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4)
     found = find_floor(points, np.stack([camera_centre(v) for v in viewmats]), -viewmats[:, 1, :3])
     return None if found is None else {"normal": found[0].tolist(), "height": found[1]}
@@ -34,17 +35,17 @@ def floor_of(path: CameraPath, points: NDArray[Any]) -> dict[str, Any] | None:
 def find_floor(
     points: NDArray[Any], centres: NDArray[Any], ups: NDArray[Any]
 ) -> tuple[NDArray[np.float64], float] | None:
-    """The floor under a solve: the plane with most points among those that have next to nothing under them.
+    """The floor of a solve: the plane with most inliers among the planes with almost no points below.
 
-    The same points give the same floor, always.
+    The result is deterministic: the random draws have a fixed seed.
 
     Args:
         points: sparse points, [P, 3], solve units; outliers are expected.
-        centres: where the camera was, [F, 3], solve units. All of it is above the floor.
-        ups: its upward directions, [F, 3]; the floor faces their mean within `TILT_DEGREES`.
+        centres: camera centres, [F, 3], solve units. All lie above the floor.
+        ups: upward directions of the cameras, [F, 3]; the floor faces their mean within `TILT_DEGREES`.
 
     Returns:
-        (normal [3] of length 1, upwards; height h): the points x with normal . x = h. None if there is none.
+        (normal [3] of length 1, upwards; height h): the points x with normal . x = h. None if no floor was found.
     """
     points = np.asarray(points, dtype=np.float64)
     points = points[np.isfinite(points).all(axis=1)]
@@ -64,7 +65,7 @@ def find_floor(
     keep[keep] &= (centres @ normals[keep].T - heights[keep]).min(axis=0) > near
     normals, heights = normals[keep], heights[keep]
     few = points[:_LOOKED_AT]
-    # A sample is judged with some leave: chance adds to either share.
+    # The limits are relaxed by a factor of 2 here, because both shares are noisy on a sample.
     score = _judged(few, normals, heights, near, BIG / 2, 2 * BELOW)
     first = np.argsort(-score, kind="stable")[:_FINAL]
     first = first[score[first] > 0]
@@ -91,7 +92,7 @@ def _judged(
 def _refined(
     points: NDArray[Any], normal: NDArray[Any], height: float, near: float
 ) -> tuple[NDArray[np.float64], float]:
-    """A plane fitted to the points that are near it, three times over: the direction in which they spread least."""
+    """The plane refitted three times to the points within `near`, by their direction of least variance."""
     for _ in range(3):
         on = points[np.abs(points @ normal - height) < near]
         if len(on) < 3:
@@ -104,6 +105,6 @@ def _refined(
 
 
 def _unit(vectors: NDArray[Any]) -> NDArray[np.float64]:
-    """Vectors [..., 3] at length 1; those of length 0 stay 0."""
+    """Vectors [..., 3] scaled to length 1; zero vectors stay 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)

@@ -1,7 +1,7 @@
-"""Imported cameras: a COLMAP model, a nerfstudio transforms.json, or a CameraPath, matched to a shot's frames.
+"""Imports cameras from a COLMAP model, a nerfstudio transforms.json, or a CameraPath, and matches them to frames.
 
-Whatever the file holds comes out as world-to-camera poses with OpenCV axes, and as lenses of four kinds with COLMAP's
-parameters: PINHOLE, OPENCV, FULL_OPENCV, OPENCV_FISHEYE. No pycolmap and no pictures: files in, plain values out.
+Each format is converted to world-to-camera poses with OpenCV axes, and to lenses of four COLMAP models: PINHOLE,
+OPENCV, FULL_OPENCV, OPENCV_FISHEYE. The module needs neither pycolmap nor the pictures.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ from .poses import camera_centre
 
 LEAST_CAMERAS = 8
 LEAST_SHARE = 0.25
-"""Least share of the clip's frames with a camera: with fewer, most of the path would be interpolated."""
+"""Minimum share of the clip's frames with a camera: with fewer, most of the path would be interpolated."""
 ASPECT_SLACK = 0.01
-"""Of the ratio of width to height: what rounding to whole pixels may change."""
+"""Tolerance of the aspect ratio, relative: rounding to whole pixels changes the ratio."""
 RIGID_SLACK = 1e-2
-"""How far the columns of a rotation may be from being perpendicular and of length 1."""
+"""Tolerance for a rotation R: the largest absolute element of R^T R - I."""
 MODEL_FOLDERS = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
-"""Where a COLMAP model is searched for below the folder that was named."""
+"""Subfolders of the chosen folder in which a COLMAP model is searched."""
 _ANGLE_POINTS = 2000
 _MOST_NOTES = 8
 _BLENDERS = (".abc", ".fbx", ".usd", ".usda", ".usdc", ".usdz")
-"""Endings of files whose cameras Blender's importers read, see `splannequin_addon/solve/camera_file.py`."""
+"""File extensions that only Blender's importers read, see `splannequin_addon/solve/camera_file.py`."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How a camera takes the world to pixels."""
+    """Projection of a camera: model and parameters."""
 
     model: str
     """PINHOLE, OPENCV, FULL_OPENCV or OPENCV_FISHEYE."""
@@ -60,10 +60,10 @@ class Lens:
     height: int
     """Pixels."""
     params: tuple[float, ...]
-    """fx, fy, cx, cy in pixels, centres at +0.5, then the coefficients as COLMAP orders them."""
+    """fx, fy, cx, cy in pixels, centres at +0.5, then the distortion coefficients in COLMAP's order."""
 
     def scaled(self, width: int, height: int) -> Lens:
-        """The same lens for pictures of another size in pixels. Coefficients have no size."""
+        """The same lens for pictures of another size in pixels. The distortion coefficients do not change."""
         x, y = width / self.width, height / self.height
         fx, fy, cx, cy, *bend = self.params
         return Lens(self.model, width, height, (fx * x, fy * y, cx * x, cy * y, *bend))
@@ -74,53 +74,53 @@ class ImportedCamera:
     """One camera of the file."""
 
     name: str
-    """What the file calls its picture."""
+    """Name of its picture in the file."""
     pose: NDArray[np.float64]
     """[3, 4] world-to-camera, OpenCV axes."""
     lens: int
-    """Index into the solve's lenses."""
+    """Index into `ImportedSolve.lenses`."""
     number: int | None = None
-    """Frame number of the shot, where the file gives it for certain and not only a name."""
+    """Frame number in the shot if the file states it; None if only the picture's name suggests one."""
 
 
 @dataclass
 class ImportedSolve:
-    """What a file holds."""
+    """Contents of a file with cameras."""
 
     path: Path
     """The file, or the folder of the model."""
     kind: str
     """COLMAP model, transforms.json or camera path."""
     lenses: list[Lens]
-    """In the size of the pictures that they were found from."""
+    """Lenses at the size of the pictures that were solved."""
     cameras: list[ImportedCamera]
     """In the file's order."""
     points: dict[str, Any] | None = None
     """xyz float64 [P, 3], rgb uint8 [P, 3], error float64 [P] px (negative: unknown), seen: P arrays of indices into
     `cameras`, empty where unknown. None if the file holds no points."""
     world: str = ""
-    """What its coordinates are: `contract.SCENE_WORLD`, or empty for a world of its own."""
+    """Coordinate system of the cameras: `contract.SCENE_WORLD`, or empty if arbitrary."""
     notes: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    """(sentence, hint) that the file has for the artist."""
+    """Messages of the file for the artist, as (sentence, hint)."""
 
 
 @dataclass
 class Matched:
-    """The cameras of a solve that stand for frames of a clip."""
+    """Imported cameras assigned to the frames of a clip."""
 
     cameras: dict[int, ImportedCamera]
     """By frame number."""
     missing: list[int]
     """Frame numbers without a camera."""
     said: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    """(sentence, hint) about how they were matched, where the file's numbers are not the frames' for certain."""
+    """(sentence, hint) about the matching, if the pictures are numbered differently or the match is ambiguous."""
 
 
-# ------------------------------------------------------------------------------------------------- what there is
+# ------------------------------------------------------------------------------------------------- finding and reading
 
 
 def find(path: str | Path) -> tuple[str, list[Path]]:
-    """(kind, files) of what stands at a path: "colmap" or "json". JobError if there is nothing that can be read."""
+    """(kind, files) of the cameras at a path; kind is "colmap" or "json". Raises JobError if it finds none."""
     path = Path(path)
     if not path.exists():
         raise _refusal(f"{path} does not exist.", "Name a COLMAP folder, a transforms.json or a camera path.")
@@ -132,7 +132,7 @@ def find(path: str | Path) -> tuple[str, list[Path]]:
                 f"{path.name} is read by Blender alone.",
                 "Solve in Blender, or with `blender --background --command splannequin`.",
             )
-        path = path.parent  # one file of a model was chosen
+        path = path.parent  # the user chose one file of a COLMAP model
     for below in MODEL_FOLDERS:
         files = model_files(path / below)
         if files:
@@ -147,7 +147,7 @@ def find(path: str | Path) -> tuple[str, list[Path]]:
 
 
 def fingerprint(path: str | Path) -> str:
-    """Hash of what `find` finds: the same cameras need not be taken in twice. JobError as `find`."""
+    """SHA-256 of the files that `find` returns, used to skip a repeated import. Raises JobError as `find` does."""
     digest = hashlib.sha256()
     for file in find(path)[1]:
         digest.update(file.name.encode())
@@ -158,7 +158,7 @@ def fingerprint(path: str | Path) -> str:
 
 
 def read(path: str | Path) -> ImportedSolve:
-    """Whatever stands at a path. JobError (SOLVE) in a sentence if it cannot be read or used."""
+    """Reads the cameras at a path, in any supported format. Raises JobError (SOLVE) if they are unreadable."""
     kind, files = find(path)
     try:
         if kind == "colmap":
@@ -174,7 +174,7 @@ def read(path: str | Path) -> ImportedSolve:
         ) from error
 
 
-# ------------------------------------------------------------------------------------------------- the three kinds
+# ------------------------------------------------------------------------------------------------- the three formats
 
 
 def _from_colmap(folder: Path) -> ImportedSolve:
@@ -195,10 +195,10 @@ def _colmap_points(model: ColmapModel) -> dict[str, Any] | None:
 
 
 def lens_from_colmap(model: str, width: int, height: int, params: Sequence[float]) -> Lens:
-    """A COLMAP camera as one of the four kinds of lens. ValueError names a model that has no such form."""
+    """Converts a COLMAP camera to one of the four lens models. Raises ValueError for an unsupported model."""
     p = tuple(map(float, params))
     if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
-        p = (p[0], *p)  # one focal length for both directions
+        p = (p[0], *p)  # these models have a single focal length
     bend = (*p[4:], 0.0, 0.0, 0.0, 0.0)[:4]
     if model in ("SIMPLE_PINHOLE", "PINHOLE"):
         return _lens("PINHOLE", width, height, p)
@@ -233,7 +233,10 @@ def _from_path(file: Path, data: dict[str, Any]) -> ImportedSolve:
 
 
 def _from_transforms(file: Path, data: dict[str, Any]) -> ImportedSolve:
-    """nerfstudio's format: camera-to-world, OpenGL axes; what a frame does not say of its lens stands at the top."""
+    """Cameras of a nerfstudio transforms.json: camera-to-world, OpenGL axes.
+
+    Lens values at the top level of the file are the defaults for frames that lack them.
+    """
     lenses: dict[Lens, int] = {}
     cameras: list[ImportedCamera] = []
     own_facts: Any = data.get(OWN_FACTS)
@@ -255,7 +258,7 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ImportedSolve:
 
 
 def _notes(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    """What Blender wrote beside the cameras for the artist; rows of another form are left out."""
+    """Messages for the artist that Blender stored in the file, as (sentence, hint). Skips malformed rows."""
     rows: Any = facts.get("notes")
     rows = cast("list[Any]", rows) if isinstance(rows, list) else []
     pairs = [cast("list[Any]", row) for row in rows[:_MOST_NOTES] if isinstance(row, list)]
@@ -271,7 +274,7 @@ def _transforms_lens(file: Path, values: dict[str, Any]) -> Lens:
         return float(value)
 
     width, height = int(number("w")), int(number("h"))
-    if "fl_x" not in values and "camera_angle_x" in values:  # as instant-ngp writes it, radians
+    if "fl_x" not in values and "camera_angle_x" in values:  # instant-ngp's key, radians
         values = {**values, "fl_x": 0.5 * width / math.tan(0.5 * number("camera_angle_x"))}
     fx = number("fl_x")
     pinhole = (fx, number("fl_y", fx), number("cx", 0.5 * width), number("cy", 0.5 * height))
@@ -289,7 +292,10 @@ def _transforms_lens(file: Path, values: dict[str, Any]) -> Lens:
 
 
 def _rigid(matrix: NDArray[Any], name: str) -> NDArray[np.float64]:
-    """[3, 4] of a rigid [4, 4]: the rotation nearest to its own, which a file may have rounded."""
+    """The [3, 4] pose of a rigid [4, 4] matrix. Replaces a rounded rotation by the nearest exact one.
+
+    Raises ValueError if the matrix is not finite or not rigid.
+    """
     if not np.isfinite(matrix).all():
         raise ValueError(f"the camera of {name} is not finite")
     rotation = matrix[:3, :3]
@@ -299,28 +305,29 @@ def _rigid(matrix: NDArray[Any], name: str) -> NDArray[np.float64]:
     return np.concatenate([u @ vt, matrix[:3, 3:]], axis=1)
 
 
-# ------------------------------------------------------------------------------------------------- to the clip
+# ------------------------------------------------------------------------------------------------- matching
 
 
 def match(
     solve: ImportedSolve, counted: Counted, size: tuple[int, int], solved: Sequence[int] | None = None
 ) -> Matched:
-    """Finds the camera of each frame by the numbers of all pictures, see `pairing`.
+    """Assigns a camera to each frame by the numbers in the picture names, see `pairing`.
 
     Args:
-        solve: what was read.
+        solve: the imported cameras.
         counted: the shot's frames.
         size: width and height of the working frames in pixels.
-        solved: of the frames, those that are trained on; None: all.
+        solved: frame numbers used in training; None: all.
 
     Raises:
-        JobError: too few of these have a camera, several sequences could be meant, or the pictures had another shape.
+        JobError: too few training frames have a camera, several sequences of pictures match the clip, or the pictures
+            have another aspect ratio.
     """
     frames = counted.frames
     needed = list(frames if solved is None else solved)
     least = max(min(LEAST_CAMERAS, len(needed)), LEAST_SHARE * len(needed))
     tables = _tables(solve)
-    shifts = any(c.number is None for c in solve.cameras)  # else these are numbers of frames, not of pictures
+    shifts = any(c.number is None for c in solve.cameras)  # frame numbers of the shot need no shift
     paired = [(name, table, pair(sorted(table), counted, may_shift=shifts)) for name, table in tables.items()]
     fitting = [one for one in paired if sum(n in one[2].numbers for n in needed) >= least]
     fitting = [one for one in fitting if one[2].by_own_number] or fitting
@@ -355,7 +362,7 @@ def match(
 
 
 def _tables(solve: ImportedSolve) -> dict[str, dict[int, ImportedCamera]]:
-    """Cameras by number, of each sequence of pictures in the file by its pattern. JobError for one number twice."""
+    """Pattern of each picture sequence in the file -> cameras by number. Raises JobError for duplicate numbers."""
     if all(c.number is not None for c in solve.cameras):
         return {"": {c.number: c for c in solve.cameras if c.number is not None}}
     of_name: dict[str, ImportedCamera] = {}
@@ -376,7 +383,7 @@ def _tables(solve: ImportedSolve) -> dict[str, dict[int, ImportedCamera]]:
 
 
 def remarks(solve: ImportedSolve, matched: Matched) -> list[tuple[str, str]]:
-    """(sentence, hint) of what the artist should know about the matching."""
+    """Messages for the artist about the import and the matching, as (sentence, hint)."""
     remarks = [*solve.notes, *matched.said]
     if matched.missing:
         remarks.append(
@@ -389,11 +396,14 @@ def remarks(solve: ImportedSolve, matched: Matched) -> list[tuple[str, str]]:
 
 
 def own_points(solve: ImportedSolve, matched: Matched, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
-    """The solve's own points as points.npz has them before filtering, and the angle under which they are seen.
+    """The imported points in the layout of points.npz, before filtering. None if the file holds no points.
 
-    Returns xyz float32 [P, 3], rgb uint8 [P, 3], error float32 [P] px of the working frames (0 where unknown), track
-    uint16 [P] (cameras of the clip that see it; where the file does not say, those whose picture it lies in), depth
-    float32 [P] (the least over those), and angle float64 [] (median of the widest angle, degrees). None without any.
+    Returns:
+        xyz float32 [P, 3]; rgb uint8 [P, 3]; error float32 [P] in px of the working frames (0 where unknown).
+        track uint16 [P]: number of the clip's cameras that see the point. Without tracks in the file, the number of
+        cameras whose picture contains the point.
+        depth float32 [P]: smallest depth over these cameras; -inf if there are none.
+        angle float64 []: median over points of the widest triangulation angle, degrees.
     """
     if solve.points is None:
         return None
@@ -428,8 +438,10 @@ def own_points(solve: ImportedSolve, matched: Matched, size: tuple[int, int]) ->
 
 
 def _in_picture(at: NDArray[Any], pictures: NDArray[Any]) -> NDArray[np.int64]:
-    """Rows of the cameras whose picture, straightened, a point lies in: the point in camera axes [C, 3]; `pictures`
-    [C, 6] fx, fy, cx, cy, width, height."""
+    """Indices of the cameras whose undistorted picture contains a point.
+
+    `at` [C, 3] is the point in the axes of each camera; `pictures` [C, 6] holds fx, fy, cx, cy, width, height.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = pictures[:, :2] * at[:, :2] / at[:, 2:] + pictures[:, 2:4]
     return np.flatnonzero((at[:, 2] > 0) & ((pixels >= 0) & (pixels < pictures[:, 4:])).all(axis=1))

@@ -1,7 +1,7 @@
-"""An animated camera as Nuke reads it: a .chan table, or a .nk script to paste.
+"""An animated camera for Nuke: a .chan table, or a .nk script to paste.
 
-Nuke's world has y up: (x, y, z) of the scene, with z up, is (x, z, -y) there, in the scene's units. Rotations are in
-degrees and of order ZXY, Nuke's own: the matrix is Ry Rx Rz for column vectors (Foundry, Camera node, rot_order).
+Nuke's world has y up: (x, y, z) of the scene, with z up, becomes (x, z, -y), in the scene's units. Rotations are in
+degrees, in Nuke's default order ZXY: the matrix is Ry Rx Rz for column vectors (Foundry, Camera node, rot_order).
 """
 
 from __future__ import annotations
@@ -17,13 +17,16 @@ from ..contract import CameraPath
 from .placement import SENSOR_MM, Lens, Similarity, camera_to_world, lens_of, path_viewmats
 
 Y_UP = Similarity(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), 1.0, np.zeros(3))
-"""The scene's axes (z up) to Nuke's (y up)."""
+"""Transform from the scene's axes (z up) to Nuke's (y up)."""
 _LEVEL = 1e-9
-"""Cosine of the rotation about x under which those about y and z are one, and z is taken to be 0."""
+"""Gimbal-lock threshold. If the cosine of the x rotation is not above it, the z rotation is set to 0."""
 
 
 def euler_zxy(rotations: NDArray[Any]) -> NDArray[np.float64]:
-    """Degrees about x, y and z, [F, 3], of rotations [F, 3, 3] = Ry Rx Rz; without jumps from frame to frame."""
+    """Euler angles in degrees about x, y and z, [F, 3], of rotations [F, 3, 3] = Ry Rx Rz.
+
+    Unwrapped over the frames, so that no angle jumps by 360 degrees.
+    """
     r = np.asarray(rotations, np.float64)
     about_x = np.arcsin(np.clip(-r[:, 1, 2], -1.0, 1.0))
     is_level = np.hypot(r[:, 1, 0], r[:, 1, 1]) > _LEVEL
@@ -33,7 +36,7 @@ def euler_zxy(rotations: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def poses(path: CameraPath, where: Similarity) -> tuple[NDArray[np.float64], NDArray[np.float64], list[Lens]]:
-    """Places [F, 3] and `euler_zxy` [F, 3] of a path's cameras in Nuke's world, and their lenses."""
+    """Positions [F, 3] and `euler_zxy` [F, 3] of a path's cameras in Nuke's world, and their lenses."""
     to_world = camera_to_world(Y_UP.after(where).viewmats(path_viewmats(path)))
     return (
         to_world[:, :3, 3],
@@ -43,14 +46,15 @@ def poses(path: CameraPath, where: Similarity) -> tuple[NDArray[np.float64], NDA
 
 
 def chan_text(path: CameraPath, where: Similarity, name: str) -> str:
-    """A .chan: a line per frame of frame number, place x y z, rotation x y z, vertical field of view in degrees.
+    """The camera as a .chan table.
 
-    The format has no word for a lens that is off the centre, nor for a name: `nk_text` has both.
+    Each line holds: frame number, position x y z, rotation x y z, vertical field of view in degrees. The format cannot
+    store an off-centre principal point or a name; `nk_text` stores both.
 
     Args:
         path: cameras in solve units.
-        where: from solve units to the scene.
-        name: of the shot; not used.
+        where: transform from solve units to the scene.
+        name: name of the shot; not used.
     """
     places, turns, lenses = poses(path, where)
     views = [2.0 * np.degrees(np.arctan2(lens.sensor_height_mm / 2.0, lens.focal_mm)) for lens in lenses]
@@ -62,25 +66,25 @@ def chan_text(path: CameraPath, where: Similarity, name: str) -> str:
 
 
 def nk_text(path: CameraPath, where: Similarity, name: str) -> str:
-    """A script with the animated camera, and an axis that stands splats (z up) into Nuke's world.
+    """A .nk script with the animated camera, and an axis node that rotates splats (z up) into Nuke's world.
 
     Args:
         path: cameras in solve units.
-        where: from solve units to the scene.
-        name: of the shot, for the camera's.
+        where: transform from solve units to the scene.
+        name: name of the shot, from which the node names are built.
     """
     places, turns, lenses = poses(path, where)
     numbers = [frame.frame for frame in path.frames]
 
     def curve(values: Sequence[float] | NDArray[np.float64]) -> str:
-        """An animation with a straight line between keys, in Nuke's words."""
+        """An animation curve with linear interpolation, in Nuke's syntax."""
         keys = " ".join(f"x{number} {value:.9g}" for number, value in zip(numbers, values, strict=True))
         return f"{{curve L {keys}}}"
 
     def curves(columns: NDArray[np.float64]) -> str:
         return "{" + " ".join(curve(column) for column in columns.T) + "}"
 
-    # Nuke counts the window's offset in halves of the picture's width, across and up alike.
+    # Nuke's win_translate is in units of half the picture's width, in both directions.
     offset = np.array([[2.0 * lens.shift_x, 2.0 * lens.shift_y] for lens in lenses])
     camera = {
         "inputs": "0",
@@ -102,6 +106,6 @@ def _node(kind: str, knobs: dict[str, str]) -> str:
 
 
 def _node_name(name: str) -> str:
-    """A name that Nuke takes for a node: letters, digits and underscores, no digit first."""
+    """A valid Nuke node name: letters, digits and underscores, with no leading digit."""
     plain = re.sub(r"\W", "_", name, flags=re.ASCII) or "shot"
     return f"_{plain}" if plain[0].isdigit() else plain

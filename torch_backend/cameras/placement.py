@@ -1,4 +1,4 @@
-"""Places what leaves a shot: points and cameras of the solve in the axes and units of a scene."""
+"""Transforms points and cameras of a solve to the axes and units of a scene."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ class Similarity:
 
     @staticmethod
     def of(placement: Placement) -> Similarity:
-        """The similarity from solve units to the scene's; its rotation orthonormal to the last bit of float64."""
+        """The similarity from solve units to scene units, with its rotation made orthonormal to float64 precision."""
         matrix = np.array(placement.scene_from_solve, np.float64).reshape(4, 4)
         left, _, right = np.linalg.svd(matrix[:3, :3])
         return Similarity(left @ right, placement.scale, matrix[:3, 3])
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """[4, 4]."""
+        """The similarity as a homogeneous matrix [4, 4]."""
         result = np.eye(4)
         result[:3, :3], result[:3, 3] = self.scale * self.rotation, self.translation
         return result
 
     def after(self, first: Similarity) -> Similarity:
-        """`first`, and then this."""
+        """The composition that applies `first`, then this similarity."""
         return Similarity(
             self.rotation @ first.rotation,
             self.scale * first.scale,
@@ -46,15 +46,15 @@ class Similarity:
         )
 
     def inverse(self) -> Similarity:
-        """The way back."""
+        """The inverse similarity."""
         return Similarity(self.rotation.T, 1.0 / self.scale, -self.rotation.T @ self.translation / self.scale)
 
     def points(self, xyz: NDArray[Any]) -> NDArray[np.float64]:
-        """Points [..., 3] of the one space in the other."""
+        """Transformed points [..., 3]."""
         return self.scale * np.asarray(xyz, np.float64) @ self.rotation.T + self.translation
 
     def viewmats(self, viewmats: NDArray[Any]) -> NDArray[np.float64]:
-        """World-to-camera matrices [F, 4, 4] of the same cameras after the world was moved; rigid, OpenCV axes."""
+        """World-to-camera matrices [F, 4, 4] of the cameras in the transformed world; rigid, OpenCV axes."""
         result = np.array(viewmats, np.float64)
         result[:, :3, :3] = result[:, :3, :3] @ self.rotation.T
         result[:, :3, 3] = self.scale * result[:, :3, 3] - result[:, :3, :3] @ self.translation
@@ -62,15 +62,16 @@ class Similarity:
 
 
 def placement_for(shot: Shot, file: str = "") -> Placement:
-    """Where a shot's solve stands in the scene that things leave for.
+    """The placement of a shot's solve in the scene of an export.
 
     Args:
         shot: a solved shot.
-        file: JSON file of a `Placement`; empty: the shot's own, as Blender wrote it last, if it is of the present
-            solve; else upright, in solve units.
+        file: JSON file of a `Placement`. Empty: the shot's placement as Blender last wrote it, if it belongs to the
+            present solve; otherwise the default `Placement`, in solve units.
 
     Raises:
-        FileNotFoundError, ValueError: `file` is missing or holds no placement, or is one of another solve.
+        FileNotFoundError: `file` is missing.
+        ValueError: `file` holds no placement, or the placement of another solve.
     """
     solve = file_digest(shot.solve / CAMERAS_FILE)
     if file:
@@ -93,9 +94,9 @@ def path_viewmats(path: CameraPath) -> NDArray[np.float64]:
 
 
 def camera_to_world(viewmats: NDArray[Any]) -> NDArray[np.float64]:
-    """Camera-to-world matrices [F, 4, 4] with x right, y up and the camera looking along -z, of OpenCV's viewmats.
+    """Camera-to-world matrices [F, 4, 4] with x right, y up and the camera looking along -z, from OpenCV viewmats.
 
-    These are the camera axes of Blender, USD and Nuke. The world stays as it is.
+    These are the camera axes of Blender, USD and Nuke. World coordinates do not change.
     """
     viewmats = np.asarray(viewmats, np.float64)
     result = np.zeros_like(viewmats)
@@ -108,24 +109,24 @@ def camera_to_world(viewmats: NDArray[Any]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera as programs with a film back keep it."""
+    """A pinhole camera described by focal length, sensor size and lens shift, as in Blender, USD and Nuke."""
 
     focal_mm: float
     """Focal length in mm for a sensor `SENSOR_MM` wide."""
     sensor_height_mm: float
-    """Height in mm of what the picture shows of that sensor; pixels that are not square are counted in."""
+    """Height of the sensor in mm; takes pixels that are not square into account."""
     shift_x: float
-    """Offset of the picture to the right, in widths of the picture."""
+    """Offset of the picture to the right, as a share of its width."""
     shift_y: float
-    """Offset of the picture upwards, in widths of the picture."""
+    """Offset of the picture upwards, as a share of its width."""
 
 
 SENSOR_MM = 36.0
-"""Width in mm of the sensor that lenses are written for: Blender's default, full frame. Only ratios to it matter."""
+"""Width in mm of the sensor of every exported `Lens`: full frame, Blender's default. Only ratios to it matter."""
 
 
 def lens_of(K: list[float], width: int, height: int) -> Lens:
-    """The lens of K = (fx, fy, cx, cy) in pixels, pixel centres at +0.5, for pictures of width x height pixels."""
+    """The lens for K = (fx, fy, cx, cy) in pixels, pixel centres at +0.5, and pictures of width x height pixels."""
     fx, fy, cx, cy = K
     tall = fx / fy  # height of a pixel over its width
     return Lens(

@@ -1,4 +1,4 @@
-"""Camera poses between known ones: interpolation on SE(3), quaternions wxyz, OpenCV axes."""
+"""Interpolation between camera poses on SE(3): quaternions wxyz, OpenCV axes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 
 
 def rotation_to_quat(rotation: NDArray[Any]) -> NDArray[np.float64]:
-    """[3, 3] rotation to a unit quaternion wxyz with w >= 0, by the largest of the four ways (Shepperd 1978)."""
+    """The unit quaternion wxyz (w >= 0) of a [3, 3] rotation.
+
+    Uses the best conditioned of the four formulas of Shepperd (1978).
+    """
     r = np.asarray(rotation, np.float64)
     trace = r.trace()
     squares = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
@@ -29,7 +32,7 @@ def rotation_to_quat(rotation: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def quat_to_rotation(quat: NDArray[Any]) -> NDArray[np.float64]:
-    """Quaternion wxyz (any length but zero) to [3, 3]."""
+    """The [3, 3] rotation of a quaternion wxyz of any non-zero length."""
     w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)
     return np.array(
         [
@@ -46,7 +49,7 @@ def _multiply(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def slerp(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[np.float64]:
-    """From unit quaternion `a` the `share` of the shorter way to `b`: a exp(share log(a^-1 b))."""
+    """Spherical interpolation between unit quaternions along the shorter arc: a exp(share log(a^-1 b))."""
     relative = _multiply(a * [1.0, -1.0, -1.0, -1.0], b)
     if relative[0] < 0:
         relative = -relative
@@ -59,12 +62,15 @@ def slerp(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[np.float64]
 
 
 def camera_centre(pose: NDArray[Any]) -> NDArray[np.float64]:
-    """Centre in the world, solve units, of a [3, 4] or [4, 4] world-to-camera pose."""
+    """The camera centre in world coordinates (solve units) of a [3, 4] or [4, 4] world-to-camera pose."""
     return -pose[:3, :3].T @ pose[:3, 3]
 
 
 def interpolate_pose(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[np.float64]:
-    """[3, 4] world-to-camera pose at `share` in [0, 1] between `a` and `b`: slerp of the rotation, line of centres."""
+    """The [3, 4] world-to-camera pose at `share` in [0, 1] between `a` and `b`.
+
+    Interpolates the rotation by `slerp` and the camera centre linearly.
+    """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     rotation = quat_to_rotation(slerp(rotation_to_quat(a[:3, :3]), rotation_to_quat(b[:3, :3]), share))
     centre = (1.0 - share) * camera_centre(a) + share * camera_centre(b)
@@ -72,9 +78,10 @@ def interpolate_pose(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[
 
 
 def fill_poses(seconds: NDArray[Any], known: dict[int, NDArray[Any]]) -> list[NDArray[np.float64]]:
-    """A [3, 4] pose for each of the N times, given poses at some indices: between neighbours by time, else clamped.
+    """A [3, 4] pose for each of N times, from known poses at some of the indices.
 
-    `seconds` is [N], ascending. ValueError if nothing is known.
+    Interpolates by time between the known neighbours. Before the first and after the last known pose, repeats that
+    pose. `seconds` is [N], ascending. Raises ValueError if no pose is known.
     """
     if not known:
         raise ValueError("no pose is known: there is nothing to interpolate")

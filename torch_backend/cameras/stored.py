@@ -1,4 +1,4 @@
-"""What a solve left in the shot, read again: a file that is damaged is named, with the step that makes it anew."""
+"""Loads the files of a solve from the shot. An error names the damaged file and the step that recreates it."""
 
 from __future__ import annotations
 
@@ -22,11 +22,14 @@ from ..contract import (
 from ..shot import Shot
 
 _POINTS = {"xyz": ("f", (3,)), "rgb": ("u", (3,)), "error": ("f", ()), "track": ("iu", ())}
-"""Kinds of numbers, as numpy calls them, and shape of a row."""
+"""Array of points.npz -> (allowed numpy dtype kinds, shape of a row)."""
 
 
 def load_cameras(shot: Shot) -> CameraPath:
-    """cameras.json. JobError (SOLVE) if the shot is not solved or the file is damaged, ValueError if it is too new."""
+    """The contents of cameras.json.
+
+    Raises JobError (SOLVE) if the shot is not solved or the file is damaged, ValueError if the file is too new.
+    """
     path = _there(shot, CAMERAS_FILE)
     data = _object(path)
     check_version(data, path.name)
@@ -41,20 +44,20 @@ def load_cameras(shot: Shot) -> CameraPath:
 
 
 def load_record(shot: Shot) -> dict[str, Any]:
-    """solve.json. JobError (SOLVE) if the shot is not solved or the file is damaged."""
+    """The contents of solve.json. Raises JobError (SOLVE) if the shot is not solved or the file is damaged."""
     return _object(_there(shot, SOLVE_FILE))
 
 
 def load_points(shot: Shot) -> dict[str, NDArray[Any]]:
-    """points.npz: xyz float32 [P, 3] solve units, rgb uint8 [P, 3], error float32 [P] px, track uint16 [P].
+    """Arrays of points.npz: xyz float32 [P, 3] solve units, rgb uint8 [P, 3], error float32 [P] px, track uint16 [P].
 
-    JobError (SOLVE) if the shot is not solved or the file is damaged.
+    Raises JobError (SOLVE) if the shot is not solved or the file is damaged.
     """
     path = _there(shot, POINTS_FILE)
     try:
         with open_arrays(path) as handle, np.load(handle, allow_pickle=False) as data:
             points = {name: data[name] for name in _POINTS}
-    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds, in words for programmers
+    except Exception as error:  # zipfile, zlib and numpy raise many types, with messages unfit for users
         raise damaged(path, "it cannot be read") from error
     count = len(points["xyz"]) if points["xyz"].ndim else 0
     for name, (kinds, shape) in _POINTS.items():
@@ -66,7 +69,7 @@ def load_points(shot: Shot) -> dict[str, NDArray[Any]]:
 
 
 def damaged(path: Path, why: Exception | str) -> JobError:
-    """The sentence for a file of the solve that is not as it was written."""
+    """The error for a damaged file of the solve."""
     reason = " ".join(str(why).split()) or type(why).__name__
     return JobError(f"{path} is damaged ({reason[:200]}).", "Solve the camera again.", ExitCode.SOLVE)
 

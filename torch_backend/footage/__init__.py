@@ -1,4 +1,4 @@
-"""Footage: a video or an image sequence into the working frames of a shot."""
+"""Import of footage: converts a video or an image sequence to the working frames of a shot."""
 
 from .importing import FootageConfig, import_footage, load_frames
 

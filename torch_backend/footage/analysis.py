@@ -1,4 +1,4 @@
-"""What a frame is worth before any solve: sharpness, exposure, blank and duplicate frames, and which are kept."""
+"""Measures frames before the solve (sharpness, exposure, blank and duplicate frames), and selects frames to solve."""
 
 from __future__ import annotations
 
@@ -15,49 +15,51 @@ from .continuity import Features, quick_features, small_grey
 from .display import PLAIN, Display
 
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
-"""Rec. 709 weights, for luma of encoded values and for luminance of linear ones."""
+"""Rec. 709 weights, for the luma of encoded values and the luminance of linear values."""
 
 THUMB_WIDTH, THUMB_HEIGHT = 64, 36
 BLANK_DEVIATION = 1.5 / 255.0
 DUPLICATE_DIFFERENCE = 0.5 / 255.0
 BLUR_RATIO = 0.7
 _LOG_BLACK, _LOG_WHITE = 0.06, 0.9
-"""Luma that no frame of a log clip goes below and beyond: Canon Log has black at 0.073."""
+"""Minimum and maximum luma of a log clip: Canon Log has black at 0.073."""
 _LOG_SATURATION = 0.25
-"""Most difference of the channels of a log clip: a log one has 0.20, three of a display 0.31 to 0.58."""
+"""Largest difference of the channels in a log clip. Measured: 0.20 in log, 0.31 to 0.58 in three display clips."""
 TARGET_SOLVED = 68
 MAX_STEP_SECONDS = 0.4
 
 
 @dataclass
 class FrameMeasures:
-    """What was measured on one working frame."""
+    """Measurements of one working frame."""
 
     frame: int
-    """Frame number of the clip."""
+    """Frame number in the shot."""
     sharpness: float
     """Variance of the Laplacian of luma, in squared 8-bit steps."""
     exposure: float
     """Mean luminance in stops above 18 % grey."""
     flags: list[str] = field(default_factory=list[str])
-    """blank, duplicate, corrupt."""
+    """Any of blank, duplicate, corrupt."""
     thumb: NDArray[np.float32] = field(repr=False, default_factory=lambda: np.zeros((0, 0, 3), np.float32))
     """[36, 64, 3] encoded colour in [0, 1]."""
     luma: NDArray[np.float32] = field(repr=False, default_factory=lambda: np.zeros((0, 0), np.float32))
     """Every other pixel of luma in [0, 1]."""
     features: Features | None = field(repr=False, default=None)
-    """What its picture is compared by to find cuts."""
+    """Image features for the detection of cuts."""
     brightest: float = 1.0
-    """The largest number in it, 0 to 1."""
+    """Largest value of a channel, 0 to 1."""
     tones: tuple[float, float] = (0.0, 1.0)
-    """Luma of its darkest and brightest thousandth, 0 to 1."""
+    """0.1 % and 99.9 % quantiles of luma, 0 to 1."""
     digest: str = ""
-    """Identifies the picture by its pixels."""
+    """Hash of the pixels."""
 
 
 def measure(frame: int, pixels: NDArray[Any], display: Display = PLAIN) -> FrameMeasures:
-    """Measures a working frame, [H, W, 3] uint8 or uint16, of a display. What is brighter than white exposes as white:
-    a lamp that comes into the picture changes nothing of the lens."""
+    """Measures a working frame, [H, W, 3] uint8 or uint16, encoded for `display`.
+
+    The exposure counts values above white as white, so that a lamp that enters the picture does not change it.
+    """
     scale = 1.0 / (65535.0 if pixels.dtype == np.uint16 else 255.0)
     luma = (pixels @ LUMA) * np.float32(scale)
     inner = luma[1:-1, 1:-1]
@@ -80,17 +82,17 @@ def measure(frame: int, pixels: NDArray[Any], display: Display = PLAIN) -> Frame
 
 
 def tones_of(luma: NDArray[np.float32]) -> tuple[float, float]:
-    """Luma of the darkest and of the brightest thousandth of a picture [H, W]."""
+    """0.1 % and 99.9 % quantiles of a luma picture [H, W]."""
     count = max(0, luma.size // 1000)
     ordered = np.partition(luma.ravel(), (count, luma.size - 1 - count))
     return float(ordered[count]), float(ordered[luma.size - 1 - count])
 
 
 def looks_like_log(measures: Sequence[FrameMeasures]) -> tuple[float, float] | None:
-    """Luma of the darkest and brightest tones of a clip, 0 to 1, if it is flat and pale as log; else None.
+    """Luma of the darkest and brightest tones of a clip, 0 to 1, if it looks like log footage; else None.
 
-    Camera logs put black at 7 to 13 % and what is not clipped below 90 %. Pictures for a display mostly reach 3 % and
-    97 % in some frame, and have twice the saturation.
+    Camera logs encode black at 7 to 13 % and unclipped highlights below 90 %. Pictures for a display usually reach 3 %
+    and 97 % in some frame, and have twice the saturation.
     """
     usable = [m for m in measures if not m.flags and m.thumb.size]
     darkest = min((m.tones[0] for m in usable), default=0.0)
@@ -102,13 +104,13 @@ def looks_like_log(measures: Sequence[FrameMeasures]) -> tuple[float, float] | N
 
 
 def thumbnail(pixels: NDArray[Any]) -> NDArray[np.float32]:
-    """[H, W, 3] to [36, 64, 3] block means in the units of the pixels; a smaller picture gives a smaller one."""
+    """Block means [36, 64, 3] of a picture [H, W, 3], in the units of its pixels. Smaller pictures are not enlarged."""
     rows = _block_means(pixels.astype(np.float32), 0, THUMB_HEIGHT)
     return _block_means(rows, 1, THUMB_WIDTH).astype(np.float32)
 
 
 def _block_means(values: NDArray[Any], axis: int, size: int) -> NDArray[Any]:
-    """[H, W, 3] with at most `size` blocks along an axis, each the mean of what lies in it."""
+    """Means of at most `size` blocks of [H, W, 3] along an axis."""
     length = int(values.shape[axis])
     edges = np.linspace(0, length, min(size, length) + 1).astype(int)
     shape = [-1 if i == axis else 1 for i in range(3)]
@@ -116,7 +118,7 @@ def _block_means(values: NDArray[Any], axis: int, size: int) -> NDArray[Any]:
 
 
 def flag_duplicate(current: FrameMeasures, last_distinct: FrameMeasures | None) -> bool:
-    """Flags `current` if it repeats the last frame that was not itself a repeat; returns whether it does."""
+    """Flags `current` if it repeats the last distinct frame. Returns True if it does."""
     if last_distinct is None or last_distinct.luma.shape != current.luma.shape:
         return False
     repeated = float(np.abs(current.luma - last_distinct.luma).mean()) < DUPLICATE_DIFFERENCE
@@ -126,17 +128,17 @@ def flag_duplicate(current: FrameMeasures, last_distinct: FrameMeasures | None) 
 
 
 def automatic_step(count: int, fps: float) -> int:
-    """Step that leaves nearest to 68 of `count` frames, but never further apart than 0.4 s: tracks would break."""
+    """Step that selects about 68 of `count` frames, at most 0.4 s apart: at larger gaps, feature tracks break."""
     longest = max(1, round(fps * MAX_STEP_SECONDS)) if fps > 0 else 1
     steps = range(1, min(longest, max(1, count // 8)) + 1)
     return min(steps, key=lambda s: abs(np.log(max(1.0, count / s) / TARGET_SOLVED)))
 
 
 def choose_solved(measures: Sequence[FrameMeasures], step: int) -> set[int]:
-    """Frame numbers that the solve and the training use: every `step`-th, and the first and last usable one.
+    """Frame numbers for the solve and the training: every `step`-th frame, and the first and last usable frame.
 
-    A chosen frame that is flagged, or much blurrier than a neighbour nearer to it than to the next choice, gives way
-    to the sharpest of those neighbours.
+    A frame that is flagged or much blurrier than its surroundings is replaced by the sharpest usable frame within half
+    a step.
     """
     if step < 1:
         raise UserError(f"step should be at least 1, got {step}")

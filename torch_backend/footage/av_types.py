@@ -1,4 +1,4 @@
-"""What PyAV's types say otherwise than it is."""
+"""Wrappers for PyAV calls whose type stubs are wrong."""
 
 from typing import Any, cast
 
@@ -6,11 +6,11 @@ import av
 
 
 def seconds_of(frame: av.VideoFrame) -> float | None:
-    """When a frame is shown, on its stream's clock; None if the container does not say, which the types leave out."""
+    """Presentation time of a frame in seconds on the stream's clock; None if the container does not store it."""
     return cast(Any, frame).time
 
 
 def side_data(frame: av.VideoFrame, kind: object) -> bytes:
-    """What a frame carries of one kind beside its picture; empty if nothing."""
+    """Side data of one kind attached to a frame; empty if there is none."""
     every: Any = frame.side_data
     return next((bytes(one) for one in every if one.type == kind), b"")

@@ -1,9 +1,8 @@
-"""Bars beside the picture: letterbox and pillars, of one colour or a blurred copy of the picture. They are no scene.
+"""Detects letterbox and pillarbox bars, filled with one colour or with a blurred copy of the picture.
 
-A bar ends at a straight border that stands at the same row or column in every frame, while the camera moves. Outside of
-it there is one colour, or far less detail than inside and a step at the border. What is merely dark ends where the
-scene says: somewhere else in every frame, or along no line. A false bar would cut off a part of the scene, so a
-doubtful edge is not a bar.
+A bar has a straight border at the same row or column in every frame, while the camera moves. It has one colour, or it
+has far less detail than the picture and a step at the border. The edge of a dark part of the scene moves, or is not
+straight. A false bar would cut off a part of the scene, so the code rejects doubtful bars.
 """
 
 from __future__ import annotations
@@ -16,35 +15,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LEAST_FRAMES = 12
-"""Of fewer pictures nothing is said."""
+"""Minimum number of pictures for a decision."""
 _LEAST, _MOST = 0.012, 0.45
-"""Share of the picture's side that one bar takes, at least (less is a camera's own rim) and at most."""
+"""Minimum and maximum size of one bar, as a share of the picture's side. Thinner borders are camera artefacts."""
 _FLAT = 6.0
-"""Steps of 255 that a pixel of a bar may differ from the bar's colour: compression does not leave more."""
+"""Largest difference of a bar's pixel from the bar's colour, in steps of 255. Compression causes no more."""
 _FLAT_SHARE = 0.7
-"""Share of the pixels of a bar's line that have the bar's colour, in nearly every frame: the rest may be a subtitle."""
+"""Minimum share of pixels with the bar's colour in a line, in nearly every frame. The rest may be a subtitle."""
 _STEP = 14.0
-"""Steps of 255 by which the picture differs from the bar just inside of the border, where it is not as dark itself."""
+"""Minimum difference between bar and picture at the border, in steps of 255."""
 _STEP_SHARE = 0.4
-"""By how much larger a share of the border's length does so inside than outside, in nearly every frame. Of three clips,
-compressed, with bars added it is 0.67 to 0.99; of the same ones underexposed until their blacks clip, 0.06 at most."""
+"""Minimum share of the border with a difference of `_STEP` just inside it, less that share just outside. Measured in
+three compressed clips: 0.67 to 0.99 with added bars, at most 0.06 if underexposed until blacks clip."""
 _OFTEN = 0.9
-"""Share of the frames that have to agree."""
+"""Minimum share of frames that agree."""
 _SMOOTH = 0.45
-"""Detail outside of a blurred bar's border, as a share of that inside: 0.16 to 0.38 of three clips, compressed."""
+"""Largest ratio of detail in a blurred bar to detail in the picture. Measured in three clips: 0.16 to 0.38."""
 _STANDS_OUT = 1.4
-"""By how much a blurred bar's step exceeds the steps of the picture near it."""
+"""Minimum ratio of the step at a blurred bar's border to the steps of the picture nearby."""
 _NEAR = 3
-"""Lines on either side of a border that are blurred by scaling and compression."""
+"""Number of lines on each side of a border that scaling and compression blur."""
 
 
 _MIXED = 2
-"""Lines of the picture that scaling and compression mix with a bar."""
+"""Number of lines of the picture that scaling and compression mix with a bar."""
 
 
 @dataclass(frozen=True)
 class Bars:
-    """Lines of the frame that belong to no picture, at each side."""
+    """Number of lines covered by a bar at each side of the frame."""
 
     top: int = 0
     bottom: int = 0
@@ -53,13 +52,13 @@ class Bars:
 
     @property
     def sides(self) -> list[str]:
-        """Words for where they are."""
+        """Names of the sides with a bar, for messages."""
         named = {"above": self.top, "below": self.bottom, "left": self.left, "right": self.right}
         return [name for name, size in named.items() if size]
 
     @property
     def widened(self) -> Bars:
-        """The same with the lines of the picture that are mixed with them."""
+        """The bars extended by the `_MIXED` lines of the picture at their border."""
         return Bars(*(side + _MIXED if side else 0 for side in (self.top, self.bottom, self.left, self.right)))
 
     def inner(self, height: int, width: int) -> tuple[slice, slice]:
@@ -67,25 +66,25 @@ class Bars:
         return slice(self.top, height - self.bottom), slice(self.left, width - self.right)
 
     def mask(self, height: int, width: int) -> NDArray[np.bool_]:
-        """[height, width] bool: the bars."""
+        """Mask of the bars, [height, width] bool."""
         covered = np.ones((height, width), bool)
         covered[self.inner(height, width)] = False
         return covered
 
 
 def recorded_bars(record: dict[str, Any], height: int, width: int) -> Bars:
-    """The bars of a frame of that size that an import noted in its frames.json: `bars`, shares of the frame's sides."""
+    """The bars recorded in frames.json (`bars`: shares of the frame's sides), for a frame of this size."""
     shares: dict[str, float] = record.get("bars") or {}
     lengths = {"top": height, "bottom": height, "left": width, "right": width}
     return Bars(**{side: round(float(shares.get(side, 0.0)) * length) for side, length in lengths.items()})
 
 
 def find_bars(pictures: Sequence[NDArray[np.uint8]]) -> Bars:
-    """The bars of grey pictures [H, W], spread over a clip; none where the evidence is weak."""
+    """The bars of a clip, from grey pictures [H, W] spread over it; empty if the evidence is weak."""
     if len(pictures) < _LEAST_FRAMES:
         return Bars()
     stack = np.stack(pictures).astype(np.float32)
-    if float(np.abs(stack - stack.mean(axis=0)).mean()) < 1.0:  # nothing moves: any edge stands
+    if float(np.abs(stack - stack.mean(axis=0)).mean()) < 1.0:  # in a static clip every edge stays in place
         return Bars()
     top, bottom, left, right = _flat(stack)
     rest = stack[:, top : stack.shape[1] - bottom, left : stack.shape[2] - right]
@@ -97,15 +96,15 @@ def find_bars(pictures: Sequence[NDArray[np.uint8]]) -> Bars:
 
 
 def _flat(stack: NDArray[np.float32]) -> tuple[int, int, int, int]:
-    """Lines of one colour at the top, bottom, left and right of [F, H, W]."""
+    """Sizes of bars of one colour at the top, bottom, left and right of [F, H, W]."""
     top, bottom = _flat_sides(stack)
     return top, bottom, *_flat_sides(stack[:, top : stack.shape[1] - bottom].swapaxes(1, 2))
 
 
 def _flat_sides(stack: NDArray[np.float32]) -> tuple[int, int]:
-    """How many of the first and last rows of [F, H, W] are bars of one colour."""
+    """Sizes of bars of one colour at the first and the last rows of [F, H, W]."""
     first, last = _flat_side(stack), _flat_side(stack[:, ::-1])
-    # Where the picture is as dark as the bar, the border on the other side tells where it is.
+    # If the picture is as dark as one of the bars, the opposite bar defines the size of both.
     if first and not last and _has_colour_of(stack, stack[:, ::-1], first):
         last = first
     elif last and not first and _has_colour_of(stack[:, ::-1], stack, last):
@@ -114,13 +113,13 @@ def _flat_sides(stack: NDArray[np.float32]) -> tuple[int, int]:
 
 
 def _has_colour_of(found: NDArray[np.float32], other: NDArray[np.float32], lines: int) -> bool:
-    """True if the first rows of `other` [F, H, W] have the colour of the bar of `found`, up to near its border."""
+    """True if the first rows of `other` [F, H, W], up to near the border, have the colour of the bar in `found`."""
     off = np.abs(other[:, : max(1, lines - _NEAR)] - np.median(found[:, :lines]))
     return bool((np.quantile((off <= _FLAT).mean(axis=2), 1.0 - _OFTEN, axis=0) >= _FLAT_SHARE).all())
 
 
 def _flat_side(stack: NDArray[np.float32]) -> int:
-    """How many of the first rows of [F, H, W] are a bar of one colour."""
+    """Size of a bar of one colour at the first rows of [F, H, W]; 0 without a bar."""
     height = stack.shape[1]
     most = int(_MOST * height)
     head = stack[:, : most + 2 * _NEAR]
@@ -135,7 +134,7 @@ def _flat_side(stack: NDArray[np.float32]) -> int:
 
 
 def _blurred(stack: NDArray[np.float32]) -> int:
-    """How many columns at the left and as many at the right of [F, H, W] are a blurred copy of what is between."""
+    """Size of two equal blurred bars at the left and right of [F, H, W]; 0 without bars."""
     width = stack.shape[2]
     least, most = max(int(_LEAST * width), 2 * _NEAR), int(_MOST * width)
     if width < 8 * _NEAR:
@@ -147,7 +146,7 @@ def _blurred(stack: NDArray[np.float32]) -> int:
 
 
 def _is_border(stack: NDArray[np.float32], step: NDArray[np.float32], middle: NDArray[np.float32], side: int) -> bool:
-    """True if pictures [F, H, W] have a step `side` columns from either border, and are smooth beyond it."""
+    """True if pictures [F, H, W] have a step at `side` columns from the left and right, and are smooth outside."""
     width = stack.shape[2]
     for at in (side, width - side):
         near = step[:, max(0, at - 12) : at + 11]
@@ -164,5 +163,5 @@ def _is_border(stack: NDArray[np.float32], step: NDArray[np.float32], middle: ND
 
 
 def _detail(stack: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[F]: how much the rows of each picture [F, H, W] differ from a straight line between their neighbours."""
+    """Mean absolute second difference between the rows of each picture [F, H, W], as [F]."""
     return np.abs(2.0 * stack[:, 1:-1] - stack[:, :-2] - stack[:, 2:]).mean(axis=(1, 2))

@@ -1,9 +1,8 @@
-"""Finds what is burnt into a clip: a logo, a caption. It stays in place while the scene moves, and smears a frozen
-frame.
+"""Detects overlays burnt into a clip, such as logos and captions. They would smear over a frozen frame.
 
-Edges of the world are elsewhere in every frame once the camera moves; the median of a pixel's gradient over the clip is
-then next to nothing. Where most frames have that very median, the edge belongs to the picture and not to the scene.
-Black bars are none: how strong their edge is depends on what is based on.
+While the camera moves, edges of the scene change place, so that the median gradient of a pixel over the clip is near
+zero. An edge with the same gradient in most frames belongs to an overlay. Black bars do not qualify: the strength of
+their edge depends on the adjacent picture.
 """
 
 from __future__ import annotations
@@ -15,39 +14,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 WIDTH = 640
-"""Largest width of the pictures that are used."""
+"""Maximum width of the analysed pictures."""
 FRAMES = 48
-"""Largest number of pictures that are used, evenly over the clip."""
+"""Maximum number of analysed pictures, spread evenly over the clip."""
 _LEAST_FRAMES, _LEAST_WIDTH = 12, 160
-"""Of fewer, or smaller ones, nothing is said."""
+"""Minimum number and width of the pictures for a decision."""
 _EDGE = 2.0
-"""Steps of 255 per pixel of the median gradient: less is no edge."""
+"""Minimum median gradient of an edge, in steps of 255 per pixel."""
 _ALIKE, _OFTEN = 0.5, 0.75
-"""A frame has an edge if its gradient differs from the median by less than this share of it; this share of them must.
-On three clips and five synthetic ones 0.5 at most of the frames agree on any edge of the world, 1.0 on a logo's."""
+"""Largest relative difference of a frame's gradient from the median; minimum share of frames within it. Measured in
+three real and five synthetic clips: at most half of the frames agree on a scene edge, all on the edge of a logo."""
 _SCENE_OFTEN = 0.35
-"""Largest number of frames that may agree on half of the scene's edges: above it the camera hardly moves, and no mark
-can be found."""
+"""Largest median share of frames that agree on a scene edge. Above it, the camera hardly moves, and an overlay cannot
+be detected."""
 _CLOSE = 13
-"""Pixels of a picture 640 wide between edges that belong together."""
+"""Largest gap between edges of one overlay, in pixels of a picture 640 wide."""
 _LEAST, _MOST = 60, 0.25
-"""Square pixels of a picture 640 wide, and share of it: what is smaller is noise, what is larger the scene."""
+"""Minimum area of an overlay in square pixels of a picture 640 wide; maximum area as a share of the picture."""
 _RIM = 8
-"""Pixels of a picture 640 wide from its border: what lies wholly there is a camera's own rim, and does little harm."""
+"""Width of the border in pixels of a picture 640 wide. Parts entirely within it are dark camera borders: harmless."""
 _GROW = 2
-"""Pixels of a picture 640 wide around it that are part of it: edges are blurred."""
+"""Dilation of the mask in pixels of a picture 640 wide, to cover blurred edges."""
 
 
 def looked_at(count: int) -> list[int]:
-    """Which of `count` pictures `find_mark` is to see, ascending."""
+    """Indices of the pictures out of `count` that `find_mark` needs, ascending."""
     return sorted({*np.linspace(0, count - 1, min(count, FRAMES)).round().astype(int).tolist()}) if count else []
 
 
 def find_mark(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.bool_] | None:
-    """bool [H, W]: what is burnt into grey pictures [H, W] spread over a clip.
+    """Mask [H, W] bool of the overlay in grey pictures [H, W] spread over a clip.
 
-    None if nothing is, or if it cannot be decided.
-    It cannot where the camera hardly moves, or where pictures are few or small.
+    None if there is no overlay, or if the camera hardly moves, or if the pictures are too few or too small.
     """
     if len(pictures) < _LEAST_FRAMES or pictures[0].shape[1] < _LEAST_WIDTH:
         return None
@@ -77,7 +75,7 @@ def find_mark(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.bool_] | None
 
 
 def _gradient(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float16]:
-    """[2, h, w] x and y, in steps of 255 per pixel of a picture of that size."""
+    """Gradient [2, h, w] along x and y of the picture resized to `size`, in steps of 255 per pixel."""
     small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.float32)
     smooth = cv2.GaussianBlur(small, (0, 0), 1.0)
     parts = [cv2.Sobel(smooth, cv2.CV_32F, *way, scale=0.125) for way in ((1, 0), (0, 1))]
@@ -85,7 +83,7 @@ def _gradient(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.f
 
 
 def _whole(edges: NDArray[np.bool_], unit: float) -> NDArray[np.bool_]:
-    """[h, w]: what edges outline: closed, with what they enclose, less what is too small."""
+    """Mask [h, w] of the regions outlined by edges: gaps closed, holes filled, small parts removed."""
     closed = np.asarray(cv2.morphologyEx(edges.astype(np.uint8), cv2.MORPH_CLOSE, _disc(_CLOSE * unit)), np.uint8)
     numbers, areas = _parts(closed)
     rim, inner = max(1, round(_RIM * unit)), np.zeros(len(areas), bool)
@@ -102,12 +100,12 @@ def _whole(edges: NDArray[np.bool_], unit: float) -> NDArray[np.bool_]:
 
 
 def _disc(across: float) -> NDArray[np.uint8]:
-    """An odd number of pixels, at least 3."""
+    """Elliptic structuring element, with a size rounded up to an odd number of at least 3."""
     side = max(3, round(across) | 1)
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
 
 
 def _parts(mask: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Number of the part that each pixel [h, w] of a mask belongs to, 0 outside, and the parts' areas."""
+    """Connected components of a mask: label of each pixel [h, w], 0 outside, and the area of each component."""
     _, numbers, about, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
     return np.asarray(numbers, np.int32), np.asarray(about, np.int64)[:, cv2.CC_STAT_AREA]

@@ -1,11 +1,11 @@
-"""The one place where display-referred sRGB and scene-linear light are converted into each other.
+"""Conversion between display-referred sRGB and scene-linear light. All other modules use these functions.
 
-Working frames and the trained model are display-referred (what splatting blends in; `display` bends sRGB where it has
-to hold more than white); everything that leaves, EXR first of all, is scene-linear with the Rec.709 / sRGB primaries.
+Working frames and the trained model are display-referred, because splats blend in that space; `display` compresses the
+highlights of footage brighter than white. Output such as EXR is scene-linear with the Rec.709 / sRGB primaries.
 Transfer function: IEC 61966-2-1, exact piecewise form. It is odd-extended below 0 and its power segment continues above
-1, so that ringing and highlights survive the way there and back.
+1, so that ringing and highlights survive a round trip.
 
-Footage comes in other encodings too: `InputSpace` brings each of them to display-referred sRGB, or to light.
+`InputSpace` converts footage in other encodings to display-referred sRGB or to light.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from ..array_types import linear_solution
 from ..contract import PROBE
 
 SRGB_KNEE = np.float32(0.04045)
-"""Encoded value where the linear segment ends."""
+"""Encoded value at the end of the linear segment."""
 LINEAR_KNEE = np.float32(0.04045 / 12.92)
 """The same point in linear light; derived from `SRGB_KNEE`, not the rounded 0.0031308, so that both branches agree."""
 
 
 def srgb_to_linear(x: ArrayLike) -> NDArray[np.float32]:
-    """Display-referred sRGB to scene-linear, any shape, float32 out; 0..1 maps to 0..1.
+    """Converts display-referred sRGB of any shape to scene-linear float32; 0..1 maps to 0..1.
 
     Values beyond about 1.2e16 overflow to infinity (their linear value does not fit float32).
     """
@@ -40,9 +40,9 @@ def srgb_to_linear(x: ArrayLike) -> NDArray[np.float32]:
 
 
 def linear_to_srgb(x: ArrayLike) -> NDArray[np.float32]:
-    """Scene-linear to display-referred sRGB, any shape, float32 out; the inverse of `srgb_to_linear`.
+    """Converts scene-linear values of any shape to display-referred sRGB float32; the inverse of `srgb_to_linear`.
 
-    There and back is exact to a relative 1e-6 below 16 and 1e-5 up to 1e38.
+    A round trip has a relative error of 1e-6 below 16 and 1e-5 up to 1e38.
     """
     x = np.asarray(x, dtype=np.float32)
     magnitude = np.abs(x)
@@ -53,16 +53,16 @@ def linear_to_srgb(x: ArrayLike) -> NDArray[np.float32]:
 
 
 def linear_to_srgb8(x: ArrayLike) -> NDArray[np.uint8]:
-    """Scene-linear to 8-bit sRGB, clipped to 0..1 and rounded, any shape. NaN becomes 0."""
+    """Converts scene-linear values of any shape to 8-bit sRGB, clipped to 0..1 and rounded. NaN becomes 0."""
     encoded = np.nan_to_num(linear_to_srgb(x), nan=0.0)
     return (np.clip(encoded, 0.0, 1.0) * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
 
 
 def on_straight_colour(rgba: ArrayLike, curve: Callable[[ArrayLike], NDArray[np.float32]]) -> NDArray[np.float32]:
-    """[..., 4] colour premultiplied by alpha through a curve, premultiplied again. ValueError for another shape.
+    """Applies a curve to colour premultiplied by alpha, [..., 4]. Raises ValueError for another shape.
 
     The curve acts on the unpremultiplied colour, so a half-covered white pixel of sRGB becomes light (0.5, 0.5, 0.5,
-    0.5), not darker. Where alpha is 0, colour (pure emission) is converted as it stands.
+    0.5), not darker. If alpha is 0 (pure emission), the curve acts on the stored colour.
     """
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.ndim < 1 or rgba.shape[-1] != 4:
@@ -72,7 +72,7 @@ def on_straight_colour(rgba: ArrayLike, curve: Callable[[ArrayLike], NDArray[np.
     return np.concatenate([curve(rgba[..., :3] / weight) * weight, alpha], axis=-1)
 
 
-# ------------------------------------------------------------------------------------------------- what footage means
+# ------------------------------------------------------------------------------------------------- input colour spaces
 
 Chromaticities = tuple[float, float, float, float, float, float, float, float]
 """CIE 1931 x and y of red, green, blue and white."""
@@ -90,21 +90,21 @@ PRIMARIES: dict[str, tuple[str, Chromaticities]] = {
     "ap0": ("ACES2065-1 (AP0)", (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, *_ACES_WHITE)),
     "ciexyzd65": ("CIE XYZ", (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, *_D65)),
 }
-"""Short name, as colour interop ids have it -> the name that people read, and the chromaticities."""
+"""Short name as in colour interop ids -> (name for messages, chromaticities)."""
 
 DIFFUSE_WHITE_NITS = 203.0
-"""Luminance of white in HDR footage, which becomes 1 (ITU-R BT.2408)."""
+"""Luminance of white in HDR footage, mapped to 1 (ITU-R BT.2408)."""
 _HLG_PEAK_NITS, _HLG_GAMMA = 1000.0, 1.2
 _HALF_MAX = 65504.0
 _REC2020_LUMA = np.array([0.2627, 0.6780, 0.0593], np.float32)
 
 
 Curve = Callable[[ArrayLike], NDArray[np.float32]]
-"""Numbers of any shape into others, one by one."""
+"""Elementwise function of arrays of any shape."""
 
 
 def rgb_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
-    """[3, 3] from linear RGB of these primaries to CIE XYZ, white at Y = 1. ValueError if they span no gamut."""
+    """Matrix [3, 3] from linear RGB of these primaries to CIE XYZ, white at Y = 1. ValueError if they span no gamut."""
     x, y = np.array(chromaticities, np.float64).reshape(4, 2).T
     if not np.isfinite([*x, *y]).all() or abs(y[3]) < 1e-6:
         raise ValueError(f"these are no chromaticities: {chromaticities}")
@@ -116,7 +116,7 @@ def rgb_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
 
 
 def to_rec709(chromaticities: Chromaticities) -> NDArray[np.float64]:
-    """[3, 3] from linear RGB of these primaries to Rec.709's, their white becoming D65 (Bradford)."""
+    """Matrix [3, 3] from linear RGB of these primaries to linear Rec.709, adapting their white to D65 (Bradford)."""
     bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
     ours, theirs = rgb_to_xyz(REC709), rgb_to_xyz(chromaticities)
     cones = (bradford @ ours.sum(axis=1)) / (bradford @ theirs.sum(axis=1))
@@ -125,13 +125,13 @@ def to_rec709(chromaticities: Chromaticities) -> NDArray[np.float64]:
 
 
 LIGHTS = ("rec709", "rec2020", "p3d65", "ap1", "ap0")
-"""Primaries, as `PRIMARIES` names them, in whose linear light frozen frames may leave; the first is ours."""
+"""Keys of `PRIMARIES` available for the linear light of frozen frames. The first is the internal space."""
 
 
 def light_matrix(light: str) -> NDArray[np.float32] | None:
-    """[3, 3] for row vectors, from linear Rec.709 to linear light of one of `LIGHTS`; None: it is that.
+    """Matrix [3, 3] for row vectors, from linear Rec.709 to linear light of one of `LIGHTS`; None for Rec.709 itself.
 
-    ValueError for primaries that are none of them.
+    Raises ValueError for other primaries.
     """
     if light not in LIGHTS:
         raise ValueError(f"frames leave in the light of {', '.join(LIGHTS)}, not {light!r}")
@@ -141,22 +141,22 @@ def light_matrix(light: str) -> NDArray[np.float32] | None:
 
 
 def in_light(pixels: NDArray[Any], matrix: NDArray[np.float32] | None) -> NDArray[Any]:
-    """Pixels [..., 3 or more], the first three linear colour, through a matrix of `light_matrix`; the rest stays."""
+    """Applies a matrix of `light_matrix` to the first three channels of pixels [..., 3 or more]."""
     if matrix is None:
         return pixels
     return np.concatenate([np.asarray(pixels[..., :3], np.float32) @ matrix, pixels[..., 3:]], axis=-1)
 
 
 def light_of_chromaticities(values: Sequence[float] | None) -> str:
-    """Which of `LIGHTS` a file's chromaticities mean; ours for those that mean none of them."""
+    """The member of `LIGHTS` with a file's chromaticities; the first member if none matches."""
     known = (x for x in LIGHTS if values is not None and np.allclose(values, PRIMARIES[x][1], atol=2e-3))
     return next(known, LIGHTS[0])
 
 
 def cineon_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Cineon log (printing density, 10 bits as 0..1) to scene-linear: black at code 95 is 0, white at 685 is 1.
+    """Converts Cineon log (printing density, 10 bits as 0..1) to scene-linear: code 95 (black) to 0, 685 (white) to 1.
 
-    Kodak's conversion: 0.002 density a code, negative gamma 0.6.
+    Kodak's conversion: 0.002 density per code, negative gamma 0.6.
     """
     black = 10.0 ** ((95.0 - 685.0) * 0.002 / 0.6)
     light = np.power(np.float32(10.0), (x * np.float32(1023.0) - np.float32(685.0)) * np.float32(0.002 / 0.6))
@@ -164,7 +164,7 @@ def cineon_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def pq_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """SMPTE ST 2084 to linear light, 1 at `DIFFUSE_WHITE_NITS`."""
+    """Converts SMPTE ST 2084 to linear light, 1 at `DIFFUSE_WHITE_NITS`."""
     m1, m2, c1, c2, c3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
     root = np.power(np.clip(x, 0.0, 1.0).astype(np.float64), 1.0 / m2)
     nits = 10000.0 * np.power(np.maximum(root - c1, 0.0) / (c2 - c3 * root), 1.0 / m1)
@@ -172,7 +172,7 @@ def pq_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def hlg_to_linear(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """BT.2100 HLG [..., 3] to linear light of a display of 1000 cd/m2, 1 at `DIFFUSE_WHITE_NITS`."""
+    """Converts BT.2100 HLG [..., 3] to the linear light of a display of 1000 cd/m2, 1 at `DIFFUSE_WHITE_NITS`."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     x = np.clip(x, 0.0, 1.0)
     upper = np.exp((np.maximum(x, np.float32(0.5)) - np.float32(c)) / np.float32(a)) + np.float32(b)
@@ -196,69 +196,69 @@ _DISPLAY = {
     "g24": (_power(2.4), _power(1.0 / 2.4)),
     "g26": (_power(2.6), _power(1.0 / 2.6)),
 }
-"""Transfer function of pictures made for a display -> to light, and back. All but gamma 1.8 are taken for sRGB's as
-they stand, as players and Blender do: only their primaries are converted, in the light of their own display."""
+"""Transfer function of pictures made for a display -> (curve to light, curve back). Except for gamma 1.8, the encoded
+values are used as sRGB without conversion, as in players and Blender. Only their primaries are converted, in light."""
 _SCENE: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
     "lin": lambda x: x,
     "cineon": cineon_to_linear,
     "pq": pq_to_linear,
     "hlg": hlg_to_linear,
 }
-"""Transfer function of pictures that hold light -> to light."""
+"""Transfer function of pictures that hold light -> curve to light."""
 TRANSFERS = {
     "srgb": "sRGB", "g18": "gamma 1.8", "g22": "gamma 2.2", "g24": "video", "g26": "gamma 2.6", "lin": "linear",
     "cineon": "Cineon log", "pq": "PQ", "hlg": "HLG",
 }  # fmt: skip
-"""Names that people read."""
+"""Transfer function -> name for messages."""
 
 
 @dataclass(frozen=True)
 class InputSpace:
-    """What the numbers in a picture mean."""
+    """Colour space of the values in a picture."""
 
     transfer: str
     """One of `TRANSFERS`."""
     primaries: str = "rec709"
     """One of `PRIMARIES`, or "" for `chromaticities`."""
     chromaticities: Chromaticities = REC709
-    """Of primaries that have no name."""
+    """Chromaticities of primaries without a name."""
     declared: bool = True
-    """True if the footage says so, False if it was assumed."""
+    """True if the footage declares the colour space, False if it was assumed."""
 
     @property
     def name(self) -> str:
-        """As people read it."""
+        """Name for messages."""
         gamut = PRIMARIES[self.primaries][0] if self.primaries else "primaries of its own"
         return f"{TRANSFERS[self.transfer]}, {gamut}"
 
     @property
     def is_light(self) -> bool:
-        """True if the numbers are light or a code for it, not made for a display."""
+        """True if the values encode light (linear, log, HDR) instead of a picture for a display."""
         return self.transfer in _SCENE
 
     @property
     def as_it_stands(self) -> bool:
-        """True if pictures are taken for sRGB without a change."""
+        """True if the values are used as sRGB without conversion."""
         return self.transfer in _DISPLAY and self.transfer != "g18" and self._wide is None
 
     @property
     def origin(self) -> dict[str, str]:
-        """What the record of an import says beside the name: where that comes from, if not from here."""
+        """Source of the colour space for the import's record, such as a look or an OCIO configuration; else empty."""
         return {}
 
     @property
     def light(self) -> str:
-        """In which of `LIGHTS` frames made of such footage leave: in its own, where it holds that."""
+        """Member of `LIGHTS` for output frames: the footage's primaries if it is linear, otherwise Rec.709."""
         return self.primaries if self.transfer == "lin" and self.primaries in LIGHTS else LIGHTS[0]
 
     @property
     def probe(self) -> tuple[float, ...]:
-        """Linear Rec.709 light that `contract.PROBE` means in this space."""
+        """Linear Rec.709 light of the value `contract.PROBE` in this space."""
         return tuple(float(value) for value in self.to_linear(np.array([[PROBE]], np.float32))[0, 0])
 
     @property
     def rows(self) -> int:
-        """Rows of a picture that are best converted at a time: float32 takes four times what codes do."""
+        """Number of rows to convert at a time: float32 takes four times the memory of codes."""
         return 64
 
     @property
@@ -267,9 +267,9 @@ class InputSpace:
         return None if found == REC709 else found
 
     def to_srgb(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[H, W, 3] as read, made for a display, to display-referred sRGB in [0, 1]. NaN becomes 0.
+        """Converts a picture [H, W, 3] made for a display to display-referred sRGB in [0, 1]. NaN becomes 0.
 
-        ValueError for light, which needs `to_linear` and a `display.Display`.
+        Raises ValueError if the space holds light, which needs `to_linear` and a `display.Display`.
         """
         if self.is_light:
             raise ValueError(f"{self.name} holds light: sRGB would cut it")
@@ -280,21 +280,21 @@ class InputSpace:
         return encode(np.clip(light, 0.0, 1.0))
 
     def to_linear(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """[H, W, 3] as read to scene-linear Rec.709, values below 0 and above 1 kept.
+        """Converts a picture [H, W, 3] to scene-linear Rec.709, keeping values below 0 and above 1.
 
-        NaN becomes 0, what a half float cannot hold the most that it can.
+        NaN becomes 0. Values are clipped to the range of a half float.
         """
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=_HALF_MAX, neginf=-_HALF_MAX)
         if self.as_it_stands:
             light = srgb_to_linear(pixels)
         else:
             light, encode = self._light(pixels)
-            # A picture made for a display is taken as it stands once its primaries are ours: not its light is.
+            # After the conversion of primaries, the encoded values of a display picture count as sRGB, not its light.
             light = light if self.is_light else srgb_to_linear(encode(light))
         return np.clip(np.nan_to_num(light, nan=0.0), -_HALF_MAX, _HALF_MAX)
 
     def _light(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], Curve]:
-        """Light of these numbers, with Rec.709's primaries, and the curve by which it leaves."""
+        """(light with Rec.709 primaries, curve that encodes it again)."""
         decode, encode = _DISPLAY.get(self.transfer) or (_SCENE[self.transfer], linear_to_srgb)
         light = decode(pixels)
         if self._wide is not None:
@@ -303,7 +303,7 @@ class InputSpace:
 
 
 def named_space(name: str) -> InputSpace | None:
-    """The space that a file names: a colour interop id (lin_ap1_scene) or what older files say; None if unknown."""
+    """The colour space of a name in a file: a colour interop id (lin_ap1_scene) or an older name; None if unknown."""
     short = _ALIASES.get(name.lower(), name.lower())
     transfer, _, after_transfer = short.partition("_")
     primaries = after_transfer.partition("_")[0]
@@ -313,7 +313,7 @@ def named_space(name: str) -> InputSpace | None:
 
 
 def space_of_chromaticities(values: Chromaticities) -> InputSpace:
-    """Linear light of these primaries, by name if they have one. ValueError if they span no gamut."""
+    """The linear space with these primaries, named if they are in `PRIMARIES`. ValueError if they span no gamut."""
     for short, (_, known) in PRIMARIES.items():
         if np.allclose(values, known, atol=2e-3):
             return InputSpace("lin", short)

@@ -1,7 +1,7 @@
-"""What two frames of a clip have in common: features of one scene that one homography maps onto each other.
+"""Measures the overlap of two frames: the number of features that one homography maps onto each other.
 
-Brightness and colour hardly matter: pictures are compared after their contrast was made equal everywhere. Mirrored and
-negative pictures do not match, as they must not.
+The local contrast of both pictures is normalised first, so that brightness and colour hardly matter. Mirrored and
+negative pictures do not match.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 WIDTH = 320
-"""Width in pixels of the pictures that are compared."""
+"""Width in pixels of the compared pictures."""
 _FEATURES = 500
 _LEAST_FEATURES = 40
-"""A picture with fewer is blank or smeared: nothing can be said of it."""
+"""Minimum number of features for a comparison. A picture with fewer is blank or smeared."""
 _TOLERANCE = 5.0
-"""Pixels by which parallax may move a feature off its place in a common homography."""
+"""Largest error of an inlier to the homography, in pixels. It leaves room for parallax."""
 _FLOOR = 2.0
-"""8-bit steps added to the local contrast, so that noise in black is not stretched to texture."""
+"""Value added to the local contrast, in 8-bit steps, so that noise in black does not become texture."""
 _DISTINCT = 0.8
-"""Most that a match may differ, as a share of the second best one's difference (Lowe's ratio)."""
+"""Largest ratio of the best match's distance to the second best match's distance (Lowe's ratio)."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """What two pictures have in common."""
+    """Overlap of two pictures."""
 
     count: int = 0
-    """Features that agree."""
+    """Number of common features: inliers of the homography."""
     share: float = 0.0
-    """The same as a share of the features of the poorer picture."""
+    """Common features as a share of the features of the picture with fewer features."""
     shift: float = 1.0
-    """Their median way, as a share of the picture's width."""
+    """Median displacement of the common features, as a share of the picture's width."""
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32), repr=False)
-    """[count, 2] where they are in the second picture, pixels."""
+    """[count, 2] positions of the common features in the second picture, pixels."""
     homography: NDArray[np.float64] = field(default_factory=lambda: np.eye(3), repr=False)
     """[3, 3] from the first picture to the second, pixels."""
 
@@ -51,26 +51,26 @@ class Features:
     descriptors: NDArray[Any]
     """[N, D] uint8 of ORB, float32 of SIFT."""
     sharpness: float
-    """Mean square of the Laplacian of the picture with equal contrast: how sharp it is, however bright."""
+    """Mean square of the Laplacian of the picture with normalised contrast: sharpness independent of brightness."""
 
     @property
     def enough(self) -> bool:
-        """Whether the picture shows enough to be compared."""
+        """True if the picture has enough features for a comparison."""
         return len(self.points) >= _LEAST_FEATURES
 
 
 def quick_features(grey: NDArray[np.uint8]) -> Features:
-    """ORB features of [h, w] grey: 10 ms. Unrelated pictures share up to 4 % of them by chance."""
+    """ORB features of a grey picture [h, w]. Takes 10 ms. Unrelated pictures share up to 4 % of them by chance."""
     return _features(grey, cv2.ORB_create(_FEATURES, 1.3, 4, edgeThreshold=9, patchSize=21, fastThreshold=7))  # type: ignore[attr-defined]
 
 
 def sure_features(grey: NDArray[np.uint8]) -> Features:
-    """SIFT features of [h, w] grey: 100 ms, for pictures whose ORB features have little in common."""
+    """SIFT features of a grey picture [h, w]. Takes 100 ms; used for pictures with few common ORB features."""
     return _features(grey, cv2.SIFT_create(2 * _FEATURES, contrastThreshold=0.02))  # type: ignore[attr-defined]
 
 
 def link(a: Features, b: Features) -> Link:
-    """What two pictures of one size have in common."""
+    """The overlap of two pictures of the same size."""
     if min(len(a.points), len(b.points)) < 8:
         return Link()
     if a.descriptors.dtype == np.uint8:
@@ -81,8 +81,8 @@ def link(a: Features, b: Features) -> Link:
     if len(matches) < 8:
         return Link()
     here, there = a.points[[m.queryIdx for m in matches]], b.points[[m.trainIdx for m in matches]]
-    cv2.setRNGSeed(0)  # the same answer each time
-    # Both are None where no homography is found; OpenCV's types do not say so.
+    cv2.setRNGSeed(0)  # makes RANSAC deterministic
+    # Both are None without a homography, which OpenCV's type stubs omit.
     answer: tuple[Any, Any] = cv2.findHomography(here, there, cv2.RANSAC, _TOLERANCE, maxIters=500)
     homography, found = answer
     inside = np.zeros(len(matches), bool) if found is None else np.asarray(found).ravel() > 0
@@ -96,7 +96,7 @@ def link(a: Features, b: Features) -> Link:
 
 
 def small_grey(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """A picture [H, W, 3] as [h, `WIDTH`] uint8 grey."""
+    """A picture [H, W, 3] resized to [h, `WIDTH`] uint8 grey."""
     pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
     height, width = pixels.shape[:2]
     way = cv2.INTER_AREA if width > WIDTH else cv2.INTER_CUBIC

@@ -1,11 +1,11 @@
-"""Where a clip goes from one take to another: hard cuts, dissolves, wipes, fades through black or white.
+"""Detects transitions between takes in a clip: hard cuts, dissolves, wipes, fades through black or white.
 
-In one take, neighbouring frames show one scene: a cut is two sharp frames that have next to nothing in common, while
-each has much in common with its other neighbour. And in one take that is transitive: if frame m lies near where frames
-m - L and m + L look, those two overlap. In a dissolve or wipe m shows both takes, and they have nothing in common.
+Hard cut: two sharp neighbouring frames share almost no features, while each shares many with its other neighbour.
+Dissolve or wipe: frame m shares features with both m - L and m + L, but these two share none with each other. Within
+one take they would overlap.
 
-All that is compared with what the neighbours have in common, so noise, blur and darkness do not count. A flash, a
-passer-by or a whip pan is no cut: frames before and after fit, or the frames between are smeared.
+All thresholds are relative to the features that neighbours share, so that noise, blur and darkness have no effect. A
+flash, a passer-by or a whip pan is no cut: the frames before and after match, or the frames between are smeared.
 """
 
 from __future__ import annotations
@@ -20,70 +20,70 @@ from numpy.typing import NDArray
 from .continuity import Features, Link, link, sure_features
 
 SUSPICIOUS = 0.35
-"""Share of what the neighbours have in common, by the quick features, below which the sure ones are asked."""
+"""SIFT features decide if the overlap of two frames by quick features, relative to their neighbours, is below this."""
 APART = 0.13
-"""The same by the sure features, at or below which two frames show different scenes. Measured: 0.20 to 1.5 in three
-handheld clips at their fastest, darkened, noisy, flickering and blurred; cuts 0.01 to 0.083, to mirrored pictures and
-to other views of one room too."""
+"""Largest overlap of different scenes by SIFT features, relative to the overlap of neighbouring frames.
+Measured: 0.20 to 1.5 in the fastest parts of three handheld clips, darkened, noisy, flickering and blurred. 0.01 to
+0.083 at cuts, including cuts to mirrored pictures and to other views of one room."""
 _LEAST_LEVEL = 20
-"""Sure features that neighbours have in common, from which on something can be said."""
+"""Minimum number of SIFT features that neighbours share, for a decision."""
 _LINKED = 0.15
-"""Quick features that a frame has in common with a neighbour, unless it is noise, a flash or smeared."""
+"""Minimum share of quick features in common with a neighbour. Noise, flashes and smeared frames have fewer."""
 _SHARP = 0.4
-"""Sharpness of a frame as a share of its take's, below which it is smeared."""
+"""Ratio of a frame's sharpness to the median of its take, below which the frame is smeared."""
 _AROUND = 8
-"""Frames of a take by which its sharpness and exposure are told."""
+"""Number of frames for the median sharpness of a take."""
 _LEAST_TAKE = 3
-"""Frames of a take that tell its own sharpness."""
+"""Minimum number of frames for the median sharpness of a take."""
 _ALIKE = 0.06
 """Share of quick features that unrelated pictures may have in common, with a margin: measured up to 0.04."""
 _NEAR = 0.2
-"""Way of the picture, as a share of its width, up to which frames on both sides of a third have to overlap."""
+"""Largest shift of the picture, as a share of its width, at which two frames around a third one must overlap."""
 _WIPED = 0.1
-"""Matches between the frames on both sides of a wipe, over the matches of the frame between with the poorer one.
-Measured: 0.04 and 0.05; 0.15 where somebody walks through the picture, 0.29 and more in handheld clips with noise."""
+"""Largest ratio for a wipe: matches between the frames before and after, over the fewer of the mixed frame's matches
+with either. Measured: 0.04 and 0.05; 0.15 if somebody walks past, 0.29 and more in handheld clips with noise."""
 _MIXED = 0.4
-"""The same of a dissolve, in which matches are uncertain. It has to be a sum of the two pictures, too."""
+"""The limit of `_WIPED` for a dissolve, which has uncertain matches but must also be a sum of the two pictures."""
 _LEAST_COMMON = 10
-"""Sure features that place the two pictures of a dissolve on the frame between."""
+"""Minimum number of SIFT features to align the two pictures of a dissolve with the frame between."""
 _EXPLAINED = 0.85
-"""Least share of a dissolved frame's variance that the sum of the two pictures explains."""
+"""Minimum share of a dissolved frame's variance that the sum of the two pictures explains."""
 _GAINED = 2.2
-"""Times by which the sum leaves less unexplained than either picture alone. Measured: 2.2 to 8 in dissolves over 4 to
-30 frames; often more in one take, see `_UNLIKE`."""
+"""Minimum factor by which the sum reduces the residual of either picture alone. Measured: 2.2 to 8 in dissolves over 4
+to 30 frames; often more within one take, see `_UNLIKE`."""
 _UNLIKE = 0.65
-"""Correlation of the two pictures, laid over each other, above which they show the same. Measured: 0.41 to 0.55 in
-dissolves, 0.74 and more in one take, where the mean of two neighbours also explains the frame between."""
+"""Correlation of the two aligned pictures above which they show the same scene. Measured: 0.41 to 0.55 in dissolves,
+0.74 and more within one take, where the mean of two neighbours also explains the frame between."""
 _LEAST_PART = 0.25
-"""Least weight of either picture in the sum, which is near 1 in total."""
+"""Minimum weight of either picture in the sum. The weights add up to about 1."""
 _FADED_STOPS = 2.0
-"""Stops by which a picture between two takes is darker or brighter than both if they are faded."""
+"""Minimum difference in stops between the darkest or brightest frame of a fade and both takes."""
 _FADING = 0.1
-"""Stops by which a picture changes from one frame of a fade to the next."""
+"""Minimum change in stops from one frame of a fade to the next."""
 
 
 @dataclass(frozen=True)
 class Transition:
-    """The end of a take and the beginning of the next."""
+    """A transition between two takes."""
 
     kind: str
     """hard cut, dissolve, fade, or `wipe or dissolve`."""
     before: int
-    """Index of a frame up to which there is the one take alone."""
+    """Index of a frame that still shows only the first take."""
     after: int
-    """Index of a frame from which on there is the other alone."""
+    """Index of a frame that shows only the second take."""
 
 
 class Frames:
-    """Frames of a clip, compared with each other; nothing is compared twice."""
+    """Pairwise comparison of the frames of a clip. Caches all results."""
 
     def __init__(
         self, quick: Sequence[Features], exposure: Sequence[float], picture: Callable[[int], NDArray[np.uint8]]
     ) -> None:
         """Args:
-        quick: of each frame.
-        exposure: of each frame, stops.
-        picture: grey picture of a frame by its index, as `continuity.small_grey`.
+        quick: quick features of each frame.
+        exposure: exposure of each frame, stops.
+        picture: returns the grey picture of a frame by its index, as `continuity.small_grey` does.
         """
         self.quick, self.exposure, self.picture = quick, exposure, picture
         self._links: dict[tuple[int, int], Link] = {}
@@ -91,17 +91,17 @@ class Frames:
         self._sure_links: dict[tuple[int, int], Link] = {}
 
     def share(self, a: int, b: int) -> float:
-        """Share of quick features that two frames have in common."""
+        """Share of quick features in common between two frames."""
         return self.linked(a, b).share
 
     def linked(self, a: int, b: int) -> Link:
-        """What two frames have in common by their quick features."""
+        """Overlap of two frames by quick (ORB) features."""
         if (a, b) not in self._links:
             self._links[a, b] = link(self.quick[a], self.quick[b])
         return self._links[a, b]
 
     def sure(self, a: int, b: int) -> Link:
-        """The same by their sure features."""
+        """Overlap of two frames by sure (SIFT) features."""
         for index in (a, b):
             if index not in self._sure:
                 self._sure[index] = sure_features(self.picture(index))
@@ -110,28 +110,28 @@ class Frames:
         return self._sure_links[a, b]
 
     def forget(self, before: int) -> None:
-        """Frees what was kept of frames before an index."""
+        """Frees the cached SIFT features of frames before an index."""
         self._sure = {index: kept for index, kept in self._sure.items() if index >= before}
 
 
 def find_transitions(frames: Frames, usable: Sequence[int]) -> list[Transition]:
-    """All transitions, in order; `usable` are indices of frames that are neither blank, repeated nor damaged."""
+    """All transitions, in order. `usable` are the indices of frames without flags (blank, duplicate, corrupt)."""
     shown = [i for i in usable if frames.quick[i].enough]
     ends = (shown[:1], shown[-1:])
 
     def held(n: int) -> bool:
-        # Noise in black, flashes and smears have nothing in common with a neighbour.
+        # Noise in black, flashes and smeared frames match no neighbour.
         near = [pair for pair in (shown[max(0, n - 1) : n + 1], shown[n : n + 2]) if len(pair) == 2]
         return max((frames.share(*pair) for pair in near), default=0.0) >= _LINKED
 
-    # At the clip's ends a single frame may be what is left of another take.
+    # The first and the last frame may be the rest of another take, so they always stay.
     shown = [i for n, i in enumerate(shown) if [i] in ends or held(n)]
     found = _breaks(frames, shown)
     return sorted([*found, *_mixtures(frames, shown, found)], key=lambda one: one.before)
 
 
 def _breaks(frames: Frames, shown: list[int]) -> list[Transition]:
-    """Hard cuts and fades: neighbours among the frames that show something, and have nothing in common."""
+    """Hard cuts and fades: neighbouring frames with enough features but without overlap."""
     found: list[Transition] = []
     for n in range(len(shown) - 1):
         before, after = shown[max(0, n - 2) : n + 1], shown[n + 1 : n + 4]
@@ -145,7 +145,7 @@ def _breaks(frames: Frames, shown: list[int]) -> list[Transition]:
         ):
             continue
         if any(frames.sure(*pair).shift > _NEAR for pair in inner):
-            continue  # so fast that the next frame may show another place: a whip pan
+            continue  # whip pan: even the next frame of the same take may show another place
         if not (_is_sharp(frames, shown, n, -1) and _is_sharp(frames, shown, n + 1, 1)):
             continue
         frames.forget(before[0])
@@ -158,21 +158,21 @@ def _breaks(frames: Frames, shown: list[int]) -> list[Transition]:
 
 
 def _is_sharp(frames: Frames, shown: list[int], n: int, way: int) -> bool:
-    """Whether a frame is as sharp as its take, which lies before it (`way` -1) or after it (1)."""
+    """True if a frame is as sharp as its take, which lies before it (`way` -1) or after it (1)."""
     take = shown[max(0, n - _AROUND) : n + 1] if way < 0 else shown[n : n + _AROUND + 1]
-    if len(take) < _LEAST_TAKE:  # what is left at the clip's end may all be smeared: the other side tells
+    if len(take) < _LEAST_TAKE:  # a few frames at the clip's end may all be smeared: use both sides
         take = shown[max(0, n - _AROUND) : n + _AROUND + 1]
     usual = float(np.median([frames.quick[i].sharpness for i in take]))
     return frames.quick[shown[n]].sharpness >= _SHARP * usual
 
 
 def _is_plain_gap(frames: Frames, before: int, after: int) -> bool:
-    """Whether the frames between two takes show nothing: smeared ones of a whip pan do."""
+    """True if all frames between two takes are blank. The smeared frames of a whip pan are not."""
     return not any(frames.quick[i].enough for i in range(before + 1, after))
 
 
 def _faded(frames: Frames, before: int, after: int) -> Transition | None:
-    """The fade in which two takes end and begin, out to where their exposure is what it was; None if there is none."""
+    """The fade between two takes, extended to the frames with the full exposure; None if there is no fade."""
     light = frames.exposure
     between = light[before : after + 1]
     first, last = before, after
@@ -187,7 +187,7 @@ def _faded(frames: Frames, before: int, after: int) -> Transition | None:
 
 
 def _mixtures(frames: Frames, shown: list[int], known: list[Transition]) -> list[Transition]:
-    """Dissolves and wipes: a frame that has something in common with two others, which have nothing in common."""
+    """Dissolves and wipes: a frame that overlaps with two others, which do not overlap with each other."""
     found: list[Transition] = []
     reach = 2
     while 2 * reach < len(shown):
@@ -195,7 +195,7 @@ def _mixtures(frames: Frames, shown: list[int], known: list[Transition]) -> list
             a, m, b = shown[n - reach], shown[n], shown[n + reach]
             if not any(one.before < b and a < one.after for one in [*known, *found]):
                 kind = _mixed(frames, a, m, b)
-                if kind == "dissolve":  # the frames on both sides may be mixed a little, too
+                if kind == "dissolve":  # the neighbours may be slightly mixed, too
                     a, b = shown[max(0, n - 2 * reach)], shown[min(len(shown) - 1, n + 2 * reach)]
                 if kind:
                     found.append(Transition(kind, a, b))
@@ -204,7 +204,7 @@ def _mixtures(frames: Frames, shown: list[int], known: list[Transition]) -> list
 
 
 def _mixed(frames: Frames, a: int, m: int, b: int) -> str:
-    """dissolve, or wipe or dissolve, if frame `m` shows takes of which `a` shows one and `b` the other; else empty."""
+    """Kind of transition ("dissolve", "wipe or dissolve") if frame `m` mixes the takes of `a` and `b`; else empty."""
     quick = frames.share(a, m), frames.share(m, b)
     if frames.share(a, b) > _ALIKE or max(quick) < _ALIKE:
         return ""
@@ -218,7 +218,7 @@ def _mixed(frames: Frames, a: int, m: int, b: int) -> str:
 
 
 def _is_sum(frames: Frames, left: Link, m: int, right: Link, a: int, b: int) -> bool:
-    """Whether frame `m` is a weighted sum of frames `a` and `b`, laid over it by what they have in common with it."""
+    """True if frame `m` is a weighted sum of frames `a` and `b`, aligned with it by their common features."""
     target = _soft(frames.picture(m))
     size = (target.shape[1], target.shape[0])
     laid = [
@@ -249,5 +249,5 @@ def _is_sum(frames: Frames, left: Link, m: int, right: Link, a: int, b: int) -> 
 
 
 def _soft(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """A grey picture in which a pixel's misplacement does not count."""
+    """A grey picture blurred to tolerate an alignment error of a pixel."""
     return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 3.0), np.float32)

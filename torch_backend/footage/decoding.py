@@ -1,4 +1,4 @@
-"""Packets and frames of a video as they come: what cannot be decoded keeps its place, fields become whole pictures."""
+"""Decodes the packets of a video in order. Undecodable packets keep their place; interlaced frames are deinterlaced."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ import av.filter
 from av.error import FFmpegError
 
 _PROBED = 40
-"""Frames that are examined for fields, at each of two places."""
+"""Number of frames examined for combing, at each of two places."""
 _COMBED_SHARE = 0.2
-"""Share of those that are combed in an interlaced clip, at least."""
+"""Minimum share of combed frames in an interlaced clip."""
 
 
 @dataclass
 class Noticed:
-    """What decoding found on its way."""
+    """Observations during decoding."""
 
     damaged: set[Fraction | None] = field(default_factory=set[Fraction | None])
-    """Times of packets that were decoded although the container knows them to be incomplete."""
+    """Times of decoded packets that the container marks as incomplete."""
     interlaced: int = 0
-    """Frames of two fields."""
+    """Number of interlaced frames."""
 
 
 def decoded(container: Any, stream: Any, noticed: Noticed | None = None, fields: str = "") -> Iterator[Any]:
-    """Whole pictures, and in the place of a packet that cannot be decoded its error. Ends where the file breaks off.
+    """Progressive frames, with an FFmpegError in the place of each undecodable packet. Ends where the file breaks off.
 
-    `fields`: of a clip that is interlaced without saying so, as `unmarked_fields` finds it.
+    `fields`: result of `unmarked_fields` for an interlaced clip that is not marked as such.
     """
     noticed = noticed or Noticed()
     return _whole_pictures(stored_frames(container, stream, noticed), noticed, fields)
 
 
 def unmarked_fields(container: Any, stream: Any) -> str:
-    """Which field comes first ("tff", "bff") of frames that are not marked as interlaced but are combed; else empty.
+    """Field order ("tff", "bff") of frames that are combed but not marked as interlaced; else empty.
 
-    Told by FFmpeg's idet from pictures at the beginning and in the middle: what moves is combed where two fields of
-    different instants were woven into one frame. Of three progressive clips it calls no frame combed, of an interlaced
-    one nine of ten, of film on tape (3:2) two of five.
+    Runs FFmpeg's idet filter at the beginning and in the middle. A frame woven from two fields of different instants
+    shows combing at moving edges. Share of frames that idet reported as combed: none in three progressive clips, nine
+    of ten in an interlaced clip, two of five in film on tape (3:2).
     """
     combed: Counter[str] = Counter()
     for spot in (0.0, 0.5):
@@ -59,7 +59,7 @@ def unmarked_fields(container: Any, stream: Any) -> str:
 
 
 def _combed(frames: Iterator[Any]) -> Counter[str]:
-    """How many of the next frames are "tff", "bff", "progressive" or "undetermined"."""
+    """Counts the next frames by "tff", "bff", "progressive" and "undetermined"."""
     graph: av.filter.Graph | None = None
     found: Counter[str] = Counter()
     try:
@@ -68,20 +68,20 @@ def _combed(frames: Iterator[Any]) -> Counter[str]:
                 graph = _graph(frame, ("idet", ""))
             graph.vpush(frame)
             found.update(one.metadata.get("lavfi.idet.multiple.current_frame", "") for one in _pulled(graph))
-    except (FFmpegError, ValueError):  # the filter knows no such pixels, or the size changes
+    except (FFmpegError, ValueError):  # the filter does not support the pixel format, or the size changes
         return Counter()
     return found
 
 
 def time_of(item: Any) -> Fraction | None:
-    """When a packet or a frame is shown, exactly; None if the container does not say."""
+    """Exact presentation time of a packet or a frame in seconds; None if the container does not store it."""
     return None if item.pts is None or item.time_base is None else item.pts * item.time_base
 
 
 def stored_frames(
     container: Any, stream: Any, noticed: Noticed | None = None, decoder: Any = None
 ) -> Iterator[Any]:  # fmt: skip
-    """As `decoded`, but interlaced frames as they are stored. `decoder`: a codec context in place of the stream's."""
+    """Like `decoded`, but without deinterlacing. `decoder`: a codec context to use in place of the stream's."""
     for packet in _packets(container, stream):
         if isinstance(packet, FFmpegError):
             yield packet
@@ -95,10 +95,10 @@ def stored_frames(
 
 
 def _packets(container: Any, stream: Any) -> Iterator[Any]:
-    """Packets, the last of them empty: it asks the decoder for what it still holds. An error ends the file early.
+    """Packets of a stream, then an empty packet, which flushes the decoder. An error ends the file early.
 
-    The packet in the middle of which a file ends is left out: it would be half a picture, and its error would cost
-    those that the decoder has not given out yet.
+    Omits a truncated packet at the end of the file. It holds half a picture, and its error would discard the frames
+    still in the decoder.
     """
     packets: Iterator[Any] = container.demux(stream)
     held: Any = None
@@ -109,7 +109,7 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
         except FFmpegError as failure:
             packet, error = None, failure
         if packet is not None and not packet.size and packet.dts is not None:
-            continue  # a repeat of the frame before, in an AVI: to a decoder it means the end
+            continue  # in an AVI, a repeat of the previous frame; a decoder would read it as the end
         at_end = packet is None or not packet.size
         if held is not None and not (at_end and held.is_corrupt):
             yield held
@@ -123,11 +123,10 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
 
 
 def _whole_pictures(frames: Iterator[Any], noticed: Noticed, fields: str) -> Iterator[Any]:
-    """Frames as many as came; from the first interlaced one on through FFmpeg's bwdif, which leaves others alone.
+    """Deinterlaces frames by FFmpeg's bwdif, from the first interlaced frame on. Keeps the number of frames.
 
-    With `fields`, "tff" or "bff", all of them are taken for interlaced.
-
-    The filter looks one frame ahead: what it holds is given out before anything that does not go through it.
+    The filter does not change progressive frames. With `fields` ("tff" or "bff"), all frames count as interlaced. The
+    filter looks one frame ahead, so it is flushed before an error or a change of size.
     """
     graph: av.filter.Graph | None = None
     size: tuple[int, int, str] | None = None
@@ -156,13 +155,13 @@ def _size(frame: av.VideoFrame) -> tuple[int, int, str]:
 
 
 def _deinterlacer(frame: av.VideoFrame, fields: str) -> av.filter.Graph:
-    """A graph that makes one picture of each frame: of the field that comes first, the other's lines interpolated."""
+    """A graph that makes one picture of each frame: keeps the first field and interpolates the other lines."""
     wanted = f"parity={fields}:deint=all" if fields else "parity=auto:deint=interlaced"
     return _graph(frame, ("bwdif", f"mode=send_frame:{wanted}"))
 
 
 def _graph(frame: av.VideoFrame, *filters: tuple[str, str]) -> av.filter.Graph:
-    """A graph of filters (name, options), for frames like this one."""
+    """A chain of filters, given as (name, options), for frames of this size and format."""
     graph = av.filter.Graph()
     source = graph.add_buffer(
         width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base or Fraction(1, 1000)

@@ -1,7 +1,7 @@
-"""Depth maps that an artist gives: one picture per frame, of a phone's sensor or a monocular network.
+"""Depth maps from the artist: one picture per frame, from a phone's sensor or a monocular network.
 
-Values are what the files hold: metres, disparity, or anything that grows or falls with either. What they mean is found
-by `train.depth_fit`. Pictures go by number (`pairing`) and are stretched over the frame as it was filmed.
+Values are as stored: metres, disparity, or any monotonic function of depth. `train.depth_fit` finds their meaning.
+Pictures are assigned to frames by number (`pairing`), and cover the whole original frame.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from .sequence_files import find_sequence
 from .sources import footage_error, frame_words
 
 _FARTHEST = 1e9
-"""Values from which on renderers and sensors mean "nothing here": Blender writes 1e10, others 1e30 or infinity."""
+"""Smallest value that means "no depth": Blender writes 1e10, other programs 1e30 or infinity."""
 _SHAPE = 0.04
-"""How much a map's aspect may differ from the frame's: networks round sides to multiples of 14 or 32 pixels."""
+"""Relative tolerance of a map's aspect ratio: networks round sides to multiples of 14 or 32 pixels."""
 _GREY = 1.0 / 512.0
-"""Difference of red, green and blue, in 0..1, from which on a picture is coloured: half a step of 8 bits."""
+"""Largest difference of red, green and blue in a grey picture, in 0..1: half a step of 8 bits."""
 
 
 class UnusableMap(Exception):
-    """A depth map that is left out; its text completes "The depth map of frame 4 ..."."""
+    """Reason to ignore a depth map. The text completes the sentence "The depth map of frame 4 ..."."""
 
 
 @dataclass
@@ -39,23 +39,23 @@ class DepthSequence:
     """The depth maps of a shot's frames."""
 
     source: Path
-    """What the artist named: a folder, one of its files or a pattern."""
+    """The artist's choice: a folder, one of its files or a pattern."""
     files: dict[int, Path]
-    """Frame number of the shot -> its map, ascending."""
+    """Frame number of the shot -> file of its map, ascending."""
     aspect: float
-    """Width over height of the frames as they were filmed."""
+    """Width over height of the original frames."""
     stretched: float = 1.0
-    """Width of the footage's pixels over their height."""
+    """Pixel aspect of the footage: width of a pixel over its height."""
     refused: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
-    """Reason -> frames whose map was left out for it."""
+    """Reason -> frames whose map was ignored."""
 
     @property
     def key(self) -> str:
-        """Changes with the numbers and contents of the files."""
+        """Digest of the numbers and contents of the files."""
         return files_digest(self.files)
 
     def read(self, frame: int) -> NDArray[np.float32] | None:
-        """[h, w] values of a frame's map, NaN where it holds none; None, noted in `refused`, if it is of no use."""
+        """Values [h, w] of a frame's map, NaN where unknown; None for an unusable map, with the reason in `refused`."""
         file = self.files.get(frame)
         try:
             if file is None:
@@ -70,7 +70,7 @@ class DepthSequence:
             return None
 
     def refused_words(self, frames: int) -> str:
-        """A sentence about the maps that were left out, of `frames` wanted ones; empty if none was."""
+        """A sentence about the ignored maps, out of `frames` requested maps; empty if all were usable."""
         count = sum(map(len, self.refused.values()))
         if not count:
             return ""
@@ -79,9 +79,9 @@ class DepthSequence:
 
 
 def find_depth(shot: Shot, source: str, report: Reporter) -> DepthSequence:
-    """The depth maps that `source` names, a folder, one of its pictures or a pattern, by the shot's frames.
+    """Finds the depth maps in `source` (a folder, one of its pictures or a pattern) for the shot's frames.
 
-    JobError (FOOTAGE) if there are none, or if none belongs to a frame.
+    Raises JobError (FOOTAGE) if there are none, or if none belongs to a frame.
     """
     path, record = Path(source), load_frames(shot)
     if not path.exists() and not is_pattern(path.name):
@@ -106,10 +106,10 @@ def find_depth(shot: Shot, source: str, report: Reporter) -> DepthSequence:
 
 
 def read_map(file: Path) -> NDArray[np.float32]:
-    """[h, w] float32 values of a depth map as stored, NaN where it holds none.
+    """Values [h, w] float32 of a depth map as stored, NaN where unknown.
 
-    Unknown is what is not finite, zero, or beyond 1e9. Of an EXR the channel Z, or one named depth, or the only one is
-    read. UnusableMap says what is wrong with a file.
+    Values that are not finite, zero, or at least 1e9 in magnitude are unknown. From an EXR, reads the channel Z, else
+    one named depth, else Y or the only channel. Raises UnusableMap if the file holds no depth.
     """
     try:
         image = oiio.ImageInput.open(regular_file(file))
@@ -138,7 +138,7 @@ def read_map(file: Path) -> NDArray[np.float32]:
 
 
 def _depth_channels(file: Path, image: oiio.ImageInput) -> tuple[int, range]:
-    """(part, channels) of a picture that hold its depth; three channels are to be grey. The part is sought."""
+    """(part, channels) of a picture's depth. Three channels are valid only if grey. Leaves `image` at that part."""
     best: tuple[int, int, range] | None = None
     seen: list[str] = []
     part, is_exr = 0, image.format_name() == "openexr"
@@ -163,13 +163,13 @@ def _depth_channels(file: Path, image: oiio.ImageInput) -> tuple[int, range]:
 
 
 def _candidates(names: list[str], alpha: int, is_exr: bool) -> list[tuple[int, range]]:
-    """(rank, channels) of what may be depth, the surest with the lowest rank."""
+    """Candidates for the depth channels, as (rank, channels). The lowest rank is the most reliable."""
     found: list[tuple[int, range]] = []
     lower = [name.lower() for name in names]
     for n, name in enumerate(lower):
         layer, _, last = name.rpartition(".")
         dot = layer + "." if layer else ""
-        if last == "z" and dot + "x" not in lower:  # a Z beside an X is a vector's
+        if last == "z" and dot + "x" not in lower:  # X and Z together are a vector
             found.append((0, range(n, n + 1)))
         elif "depth" in name:
             found.append((1, range(n, n + 1)))

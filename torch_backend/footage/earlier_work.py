@@ -1,4 +1,4 @@
-"""Work that was done on a shot's frames, when an import is about to give the shot other frames."""
+"""Protects earlier work on a shot (solves, runs, paint) when an import is about to replace the shot's frames."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ _RANGE = ("first", "last", "start")
 
 
 class SamePictures(Exception):
-    """The import gives the pictures that the shot has already: nothing is to be replaced."""
+    """Raised if an import yields the pictures that the shot already has, so that nothing is replaced."""
 
 
 @dataclass(frozen=True)
 class EarlierWork:
-    """A solve, runs, takes, paint and so on, and the frames that they belong to."""
+    """Earlier work on a shot, such as a solve, runs, takes and paint, with its frames."""
 
     shot: Shot
     words: list[str]
-    """Of `contract.work_words`, not empty."""
+    """Result of `contract.work_words`, not empty."""
     record: dict[str, Any]
-    """frames.json of those frames; {} if it is damaged."""
+    """frames.json of the old frames; {} if it is damaged."""
 
     @classmethod
     def of(cls, shot: Shot, record: dict[str, Any]) -> EarlierWork | None:
-        """None if no work was done on the shot."""
+        """The earlier work on a shot; None if there is none."""
         words = work_words(shot)
         return cls(shot, words, record) if words else None
 
     def may_be_same(self, settings: Mapping[str, Any], info: SourceInfo) -> bool:
-        """True if an import with these settings may give the same pictures; only decoding can decide it.
+        """True if an import with these settings may yield the same pictures. Only decoding gives certainty.
 
-        `settings` and `info` are in the shot's numbers. The key of an import may differ for the same pictures: of a
-        range that names all frames, a file that was packed anew, an import of an earlier version.
+        `settings` and `info` use the shot's frame numbers. Two imports of the same pictures may have different keys,
+        for example if one names the full range, reads a repackaged file, or is by an earlier version.
         """
         if not self.record or info.last is None:
             return bool(self.record)
@@ -56,9 +56,9 @@ class EarlierWork:
         return (first, last) == (rows[0]["frame"], rows[-1]["frame"]) and known == {name: plain[name] for name in known}
 
     def stop_if_same(self, record: Mapping[str, Any], fresh: Path) -> None:
-        """Raises SamePictures if a new import's frames.json describes the pictures that the shot has.
+        """Raises SamePictures if the frames.json of a new import describes the pictures of the shot.
 
-        Of those, frames whose file was lost are taken from the new import, whose frames are in `fresh`.
+        Before that, restores lost or damaged files of the shot from the new frames in `fresh`.
         """
         whole = ("width", "height", "fps", "colour", "bits", "step")
         if any(record[name] != self.record.get(name) for name in whole) or not self._agree(record):
@@ -69,23 +69,23 @@ class EarlierWork:
         raise SamePictures
 
     def _agree(self, record: Mapping[str, Any]) -> bool:
-        """True if all frames of a new frames.json are those of the old one, by number, time and content."""
+        """True if a new frames.json lists the same frames as the old one, by number, time and content."""
         new, old = record["frames"], self.record["frames"]
         if [_place(row) for row in new] != [_place(row) for row in old]:
             return False
         return all(self._digest(was) in (None, now["digest"]) for was, now in zip(old, new, strict=True))
 
     def _digest(self, row: Mapping[str, Any]) -> str | None:
-        """Digest of an old frame's picture; None if its file is lost, and an earlier import noted none."""
+        """Digest of an old frame's picture; None if the record has no digest and the file is lost."""
         if row.get("digest"):
             return str(row["digest"])
         path = self.shot.frames / str(row["file"])
         return digest_of(read_frame(path)) if is_whole_png(path) else None
 
     def order(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Facts for `Shot.publish_frames`, in addition to those of the new frames.json.
+        """Instructions for `Shot.publish_frames`: `replaced`, the folder name of the old work, and `same`.
 
-        Paint and masks stay with a frame that has the same number in the same footage, or the same pixels.
+        `same` lists the frames that keep their paint and masks: same number in the same footage, or same pixels.
         """
         old = {int(row["frame"]): row for row in self.record.get("frames", ())}
         footage = record["footage"] == self.record.get("footage")
@@ -95,7 +95,7 @@ class EarlierWork:
         return {"replaced": next_name(self.shot), "same": same}
 
     def refusal(self) -> JobError:
-        """The sentence for an import that was not allowed to replace it."""
+        """The error for an import without consent to replace earlier work."""
         rows, name = self.record.get("frames"), self.shot.root.name
         clip, span = self.shot.info().source, f", frames {rows[0]['frame']} to {rows[-1]['frame']}" if rows else ""
         return JobError(
@@ -106,7 +106,7 @@ class EarlierWork:
         )
 
     def kept(self, order: Mapping[str, Any]) -> tuple[str, str]:
-        """The warning (message, hint) of an import that replaced it."""
+        """The warning (message, hint) after an import that replaced earlier work."""
         place = self.shot.replaced / str(order["replaced"])
         return (
             f"What was in the shot ({', '.join(self.words)}) is kept in {place}.",
@@ -115,12 +115,12 @@ class EarlierWork:
 
 
 def digest_of(pixels: np.ndarray[Any, Any]) -> str:
-    """Identifies a picture by its pixels, whatever file they are in."""
+    """Hash of a picture's pixels, independent of the file format."""
     return content_key([str(pixels.dtype), list(pixels.shape)], _sha(pixels))
 
 
 def footage_key(info: SourceInfo, shift: int) -> str:
-    """Identifies footage and its numbering in the shot (`shift`: see `numbering`), whatever range is taken of it."""
+    """Key of footage and its numbering in the shot (`shift`: see `numbering`), independent of the imported range."""
     return content_key(info.key, shift)
 
 

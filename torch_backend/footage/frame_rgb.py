@@ -1,8 +1,8 @@
-"""R'G'B' of a decoded video frame: by its YCbCr matrix and range, to less than a step.
+"""Converts a decoded video frame to R'G'B' by its YCbCr matrix and range, with an error below one step.
 
-FFmpeg's scaler does the work with its careful flags: its quick ones are up to 3 of 255 off and make a picture darker by
-1 on average. Beyond 8 bits it leaves white below 65535, by a factor that is known and taken back here. Curves that
-are steep (HDR, linear light) get floats from the planes themselves.
+Uses FFmpeg's scaler with its accurate flags: without them, errors reach 3 of 255, and pictures become darker by 1 on
+average. Above 8 bits, the scaler leaves white below 65535 by a known factor, which this module corrects. For steep
+curves (HDR, linear light), the module computes floats from the planes.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from .images import CAREFUL
 
 MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9, 10: 9}
-"""YCbCr matrix of the stream (ITU-T H.273) -> FFmpeg's scaler's. BT.2020's constant luminance is taken as the other."""
+"""YCbCr matrix of the stream (ITU-T H.273) -> matrix of FFmpeg's scaler. BT.2020 constant luminance is read as
+non-constant luminance."""
 LUMA = {1: (0.2126, 0.0722), 4: (0.30, 0.11), 5: (0.299, 0.114), 7: (0.212, 0.087), 9: (0.2627, 0.0593)}
-"""Shares of red and blue in luma, by the scaler's matrix."""
+"""Matrix of the scaler -> shares of red and blue in luma."""
 BT709, BT601, RGB = 1, 5, 0
 VIDEO_RANGE, FULL_RANGE = 1, 2
 MATRIX_OVERRIDES = {"bt709": BT709, "bt601": BT601, "bt2020": 9}
@@ -28,43 +29,43 @@ MATRIX_OVERRIDES = {"bt709": BT709, "bt601": BT601, "bt2020": 9}
 RANGE_OVERRIDES = {"video": VIDEO_RANGE, "full": FULL_RANGE}
 
 _WHITE16_OF_VIDEO_RANGE = 65280
-"""What the scaler makes of white in video range, in 16 bits: 255 of 256."""
+"""The scaler's 16-bit output for white in video range: 65536 * 255 / 256."""
 
 
 @dataclass(frozen=True)
 class Coding:
-    """What the planes of a clip's frames mean."""
+    """Matrix and range of the planes of a clip's frames."""
 
     matrix: int
-    """YCbCr matrix, one of `LUMA`; `RGB` where the planes are red, green and blue."""
+    """YCbCr matrix, a key of `LUMA`; `RGB` if the planes are red, green and blue."""
     is_full: bool
     """True if codes go from 0 to the largest, False if black is 16 and white 235 of 255."""
     matrix_told: bool
-    """True if the file or the artist says so, False if it was assumed."""
+    """True if the file or the artist declares the matrix, False if it was assumed."""
     range_told: bool
-    """The same of the range."""
+    """True if the file or the artist declares the range, False if it was assumed."""
 
     @property
     def matrix_name(self) -> str:
-        """As people read it."""
+        """Name of the matrix for messages."""
         return "RGB" if self.matrix == RGB else Colorspace(self.matrix).name
 
     @property
     def range_name(self) -> str:
-        """As people read it."""
+        """Name of the range for messages."""
         return "full" if self.is_full else "video"
 
 
 def coding_of(frame: av.VideoFrame, matrix: str = "", code_range: str = "") -> Coding:
-    """What a frame's planes mean: as the artist says ("": nothing), else as it is tagged, else as players assume.
+    """Matrix and range of a frame: by the artist's choice ("": none), else by its tags, else by what players assume.
 
-    Players take 1280 columns or more as BT.709 and less as BT.601, and YCbCr as video range.
+    Players assume BT.709 for 1280 columns or more, BT.601 for fewer, and video range for YCbCr.
     """
     if frame.format.is_rgb or frame.format.name == "pal8":
         return Coding(RGB, is_full=True, matrix_told=True, range_told=True)
     tagged = MATRICES.get(int(frame.colorspace))
     assumed = BT709 if max(frame.width, frame.height) >= 1280 else BT601
-    # The names of old JPEG formats and, to FFmpeg, grey without a tag mean full range.
+    # Formats named yuvj are full range. FFmpeg also assumes full range for grey without a tag.
     named_full = frame.format.name.startswith("yuvj")
     tag = FULL_RANGE if named_full else int(frame.color_range)
     known = tag in (VIDEO_RANGE, FULL_RANGE)
@@ -79,12 +80,12 @@ def coding_of(frame: av.VideoFrame, matrix: str = "", code_range: str = "") -> C
 
 
 def depth_of(frame: av.VideoFrame) -> int:
-    """Bits of the deepest component."""
+    """Bit depth of the deepest component."""
     return max(component.bits for component in frame.format.components)
 
 
 def rgb_codes(frame: av.VideoFrame, coding: Coding, *, deep: bool) -> NDArray[Any]:
-    """R'G'B' [H, W, 3], uint8 or, if `deep`, uint16: black 0, white the largest."""
+    """R'G'B' [H, W, 3], uint8, or uint16 if `deep`: black is 0, white the largest code."""
     if _is_grey(frame):
         return _grey_codes(frame, coding, deep=deep)
     pixels: NDArray[Any] = _scaled(frame, coding, "rgb48le" if deep else "rgb24").to_ndarray()
@@ -93,7 +94,7 @@ def rgb_codes(frame: av.VideoFrame, coding: Coding, *, deep: bool) -> NDArray[An
     if not coding.is_full:  # 65280 becomes 65535
         np.minimum(pixels, _WHITE16_OF_VIDEO_RANGE, out=pixels)
         pixels += (pixels + np.uint16(128)) >> np.uint16(8)
-    elif 8 <= (bits := depth_of(frame)) < 16:  # so does the largest code, shifted left to 16 bits
+    elif 8 <= (bits := depth_of(frame)) < 16:  # the largest code, shifted left to 16 bits, becomes 65535
         white = np.uint16((1 << 16) - (1 << (16 - bits)))
         np.minimum(pixels, white, out=pixels)
         pixels += pixels >> np.uint16(bits)
@@ -101,7 +102,7 @@ def rgb_codes(frame: av.VideoFrame, coding: Coding, *, deep: bool) -> NDArray[An
 
 
 def exact_rgb(frame: av.VideoFrame, coding: Coding) -> NDArray[np.float32]:
-    """R'G'B' [H, W, 3], white 1, as steep curves need it; values beyond 0 and 1 are kept."""
+    """R'G'B' [H, W, 3] float32 for steep curves: white is 1; values below 0 and above 1 are kept."""
     if coding.matrix == RGB or _is_grey(frame):
         return rgb_codes(frame, coding, deep=True).astype(np.float32) * np.float32(1.0 / 65535.0)
     y, cb, cr = _planes(frame, coding)
@@ -112,9 +113,9 @@ def exact_rgb(frame: av.VideoFrame, coding: Coding) -> NDArray[np.float32]:
 
 
 def _planes(frame: av.VideoFrame, coding: Coding) -> list[NDArray[np.float32]]:
-    """Y in 0 to 1, Cb and Cr in -0.5 to 0.5, [H, W] each; beyond where the codes are."""
+    """Y in 0 to 1, Cb and Cr in -0.5 to 0.5, [H, W] each. Codes outside of the range exceed these limits."""
     bits, form = depth_of(frame), frame.format
-    # Where chroma is as large as luma the scaler would stretch full range's luma and shift its chroma: own depth.
+    # For 4:4:4, keep the bit depth: conversion to 16 bits would stretch full-range luma and shift its chroma.
     whole = form.chroma_width(64) == 64 and form.chroma_height(64) == 64
     stored = bits if whole else 16
     even = _scaled(frame, coding, "yuv444p" if stored == 8 else f"yuv444p{stored}le", keeps_range=True)
@@ -136,7 +137,7 @@ def _planes(frame: av.VideoFrame, coding: Coding) -> list[NDArray[np.float32]]:
 def _scaled(frame: av.VideoFrame, coding: Coding, kind: str, *, keeps_range: bool = False) -> av.VideoFrame:
     codes = ColorRange.JPEG if coding.is_full else ColorRange.MPEG
     if coding.matrix != RGB:
-        frame.color_range = codes  # what was assumed, or said by the artist
+        frame.color_range = codes  # the coding may differ from the frame's tag
     matrix = None if coding.matrix == RGB else Colorspace(coding.matrix)
     into = codes if keeps_range else None
     return frame.reformat(
@@ -153,7 +154,7 @@ def _is_grey(frame: av.VideoFrame) -> bool:
 
 
 def _grey_codes(frame: av.VideoFrame, coding: Coding, *, deep: bool) -> NDArray[Any]:
-    """Of luma alone: the scaler takes it for full range whatever it is."""
+    """R'G'B' from luma only. Bypasses the scaler, which always treats grey as full range."""
     bits = depth_of(frame)
     plane = frame.planes[0]
     big = frame.format.name.endswith("be")

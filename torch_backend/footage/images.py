@@ -1,8 +1,8 @@
-"""Pictures on disk and their sizes: PNG in and out through OpenImageIO, resizing.
+"""Reads, writes and resizes pictures. PNG files go through OpenImageIO.
 
 Arrays are RGB, [H, W, 3], uint8 or uint16, display-referred sRGB. OpenImageIO and pycolmap must not be loaded into one
-process: their copies of zlib collide (double free in deflateEnd, seen with 3.2.2 and 4.2.1). Hence pycolmap lives in
-the child process of `sfm/worker.py` alone.
+process: their copies of zlib collide (double free in deflateEnd, seen with 3.2.2 and 4.2.1). Therefore only the child
+process `sfm/worker.py` loads pycolmap.
 """
 
 from __future__ import annotations
@@ -37,41 +37,41 @@ from ..contract import (
 from ..shot import atomic_path
 
 _PNG_ENCODING = {"compression": "rle", "png:filter": 128}
-"""Only runs are matched, after libpng's Paeth filter: half the time of zlib's level 2 with the filter chosen per row (a
-third for 16 bits), and files 3 to 12 % smaller, since matches in filtered pictures are mostly chance."""
+"""Run-length compression after libpng's Paeth filter. Compared with zlib's level 2 and a filter chosen per row, it
+takes half the time (a third for 16 bits). Files are 3 to 12 % smaller: most matches in filtered pictures are chance."""
 
 CAREFUL = Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
-"""Flags of FFmpeg's scaler without which it takes colour from every other column only, and rounds downwards."""
+"""Accurate flags of FFmpeg's scaler. Without them, it reads chroma only at every other column, and rounds down."""
 
 _FULL_BYTES = 4 << 20
 _MADE_BY = {
     RAW_FOLDER: ("Import the clip again.", ExitCode.FOOTAGE),
     FRAMES_FOLDER: ("Solve the camera again.", ExitCode.SOLVE),
 }
-"""Folder of working frames -> what makes them anew, and the exit code."""
+"""Folder of working frames -> (hint how to recreate them, exit code)."""
 
 
 def error_of(source: Any = oiio) -> str:
-    """The pending error of OpenImageIO or of one of its objects, which is thereby taken back."""
+    """Returns and clears the pending error of OpenImageIO or of one of its objects."""
     try:
         text = source.geterror()
-    except UnicodeDecodeError:  # it quotes the bytes of a damaged file
+    except UnicodeDecodeError:  # the message quotes bytes of a damaged file
         return "it is damaged"
     claimed = re.search(r"claimed to be (\d+)x(\d+)", text)
-    if claimed:  # what follows is advice to programmers
+    if claimed:  # the rest of the message is advice for programmers
         return f"it claims to be {claimed[1]} x {claimed[2]} pixels"
     return text.strip().partition("\n")[0].rstrip(".")
 
 
 def check_size(name: str, spec: oiio.ImageSpec) -> None:
-    """JobError (FOOTAGE) if a picture's header announces more pixels than are read: before any of them are."""
+    """Raises JobError (FOOTAGE) if a picture's header announces more than `MOST_PIXELS`. Call before reading pixels."""
     for width, height in ((spec.full_width, spec.full_height), (spec.width, spec.height)):
         if width * height > MOST_PIXELS:
             raise too_large(name, width, height)
 
 
 def too_large(name: str, width: int, height: int) -> JobError:
-    """The refusal of a picture of more than `MOST_PIXELS`."""
+    """The error for a picture with more than `MOST_PIXELS`."""
     return JobError(
         f"{name} is {width} x {height} pixels, or says so: at most {MOST_PIXELS >> 20} megapixels are read.",
         "Make it smaller.",
@@ -80,9 +80,9 @@ def too_large(name: str, width: int, height: int) -> JobError:
 
 
 def write_png(path: str | Path, pixels: NDArray[Any], key: str = "") -> None:
-    """Writes [H, W, 3] uint8 or uint16 as PNG of the same depth, whole or not at all. OSError if it cannot.
+    """Writes [H, W, 3] uint8 or uint16 atomically as a PNG of the same depth. Raises OSError if that fails.
 
-    `key` is kept in the file as the text `splannequin:key`.
+    `key` is stored in the file as the text `splannequin:key`.
     """
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype.type not in (np.uint8, np.uint16):
         raise ValueError(f"pixels should be [H, W, 3] uint8 or uint16, got {pixels.shape} {pixels.dtype}")
@@ -93,21 +93,21 @@ def write_png(path: str | Path, pixels: NDArray[Any], key: str = "") -> None:
     if key:
         buffer.specmod().attribute("splannequin:key", key)
     with atomic_path(path) as partial:
-        # OpenImageIO's writer says nothing when the disk is full.
+        # OpenImageIO's writer reports no error when the disk is full.
         if not (buffer.write(str(partial)) and _has_end(partial)):
             full = shutil.disk_usage(partial.parent).free < max(_FULL_BYTES, pixels.nbytes)
             raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot write picture: {error_of(buffer)}", str(path))
 
 
 def _has_end(png: Path) -> bool:
-    """True if the last part of a PNG is there."""
+    """True if a PNG ends with its IEND chunk."""
     with open(png, "rb") as written:
         written.seek(max(0, png.stat().st_size - 8))
         return written.read(4) == b"IEND"
 
 
 def read_png(path: str | Path) -> NDArray[Any]:
-    """A PNG as [H, W, 3] uint8 or uint16, as stored. FileNotFoundError, or ValueError naming the file."""
+    """Reads a PNG as [H, W, 3] uint8 or uint16, as stored. Raises FileNotFoundError, or ValueError naming the file."""
     path = Path(path)
     if not path.is_file():
         raise MissingError(f"picture {path} does not exist")
@@ -121,7 +121,7 @@ def read_png(path: str | Path) -> NDArray[Any]:
 
 
 def read_frame(path: Path) -> NDArray[Any]:
-    """A working frame of a shot, as `read_png`. JobError names it and the step that makes it anew."""
+    """Reads a working frame like `read_png`. Raises JobError, which names the frame and the step that recreates it."""
     try:
         return read_png(path)
     except (ValueError, FileNotFoundError) as error:
@@ -132,7 +132,7 @@ def read_frame(path: Path) -> NDArray[Any]:
 
 
 def is_whole_png(path: Path) -> bool:
-    """True if each part of a PNG is there and right by its own checksum: ten times quicker than to decode it."""
+    """True if all chunks of a PNG are present with a correct checksum. Ten times faster than decoding."""
     try:
         with open_regular(path) as handle:
             whole = handle.read(8) == b"\x89PNG\r\n\x1a\n"
@@ -147,9 +147,9 @@ def is_whole_png(path: Path) -> bool:
 
 
 def resize(pixels: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """[h, w, 3] uint8 or uint16 to [height, width, 3] of the same dtype; Lanczos-3, in the space the pixels are in.
+    """Resizes [h, w, 3] uint8 or uint16 to [height, width, 3] of the same dtype by Lanczos-3, without linearising.
 
-    By FFmpeg's scaler: 24 ms for 1080 to 720 lines where OpenImageIO takes 850, and the two differ by 0.13 of an
+    Uses FFmpeg's scaler: 24 ms for 1080 to 720 lines, where OpenImageIO takes 850 ms. The results differ by 0.13 of an
     8-bit step (RMS).
     """
     if pixels.shape[:2] == (height, width):
@@ -160,9 +160,9 @@ def resize(pixels: NDArray[Any], width: int, height: int) -> NDArray[Any]:
 
 
 def resize_float(pixels: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """[h, w, C] float32 to [height, width, C], nothing cut, black 0 and white 1; Lanczos-3 as `resize`.
+    """Resizes [h, w, C] float32 (black 0, white 1) to [height, width, C] by Lanczos-3, without clipping.
 
-    What lies below black and above white has a tent instead: around a lamp of fifty times white Lanczos rings black.
+    The parts below 0 and above 1 use a tent filter: around a lamp of fifty times white, Lanczos would ring to black.
     """
     if pixels.shape[:2] == (height, width):
         return pixels
@@ -183,9 +183,9 @@ def _weigh(pixels: NDArray[np.float32], width: int, height: int, lobes: int) -> 
 
 
 def _weights(size: int, new_size: int, lobes: int) -> SparseMatrix:
-    """[wanted, size] float32 weights along one side, of a tent (1 lobe) or Lanczos's kernel; the border is repeated.
+    """Weights [new_size, size] float32 along one side, of a tent (1 lobe) or a Lanczos kernel. The border is repeated.
 
-    Shrinking, the kernel is as much wider as pixels become fewer.
+    For downscaling, the kernel widens by the scale factor.
     """
     scale = max(1.0, size / new_size)
     centre = (np.arange(new_size) + 0.5) * (size / new_size) - 0.5
@@ -201,16 +201,16 @@ def _weights(size: int, new_size: int, lobes: int) -> SparseMatrix:
 
 
 WORKING_LINES = 720
-"""Most lines of working frames of landscape footage, unless the import was told otherwise."""
+"""Default maximum height of working frames of landscape footage, in pixels."""
 WORKING_AREA = 1280 * WORKING_LINES
-"""Most pixels of working frames of portrait and square footage: as many as landscape footage of 16:9 has."""
+"""Default maximum area of working frames of portrait and square footage, in pixels: the area of a 16:9 frame."""
 
 
 def working_size(width: int, height: int, requested_height: int) -> tuple[int, int]:
-    """Size of the working frames in pixels, `requested_height` high, never enlarged.
+    """(width, height) of the working frames in pixels for a requested height. Never larger than the source.
 
-    0 stands for the source's height, at most what `WORKING_LINES` and `WORKING_AREA` say. A size that differs from the
-    source's has even sides, which video encoders like; an unscaled odd one is kept.
+    A requested height of 0 means the source's height, limited by `WORKING_LINES` or `WORKING_AREA`. Scaled frames have
+    even sides, for video encoders; unscaled frames keep odd sides.
     """
     most = WORKING_LINES if width > height else max(WORKING_LINES, int(math.sqrt(WORKING_AREA * height / width)))
     target = min(height, requested_height if requested_height > 0 else most)

@@ -1,4 +1,4 @@
-"""Reasons to refuse the frames of an import, and remarks about them."""
+"""Errors and warnings about the frames of an import."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CLIPPED_SHARE = 0.01
 
 @dataclass
 class Extracted:
-    """Frames on disk and what was measured of them, in order."""
+    """Measurements of the extracted frames, in order."""
 
     measures: list[FrameMeasures]
     seconds: list[float]
@@ -44,7 +44,7 @@ class Extracted:
 
 
 def refuse_unusable(measures: list[FrameMeasures]) -> None:
-    """JobError for a clip that no solve could use: too short, or a still."""
+    """Raises JobError for an unusable clip: too few usable frames, or a static camera."""
     if len(measures) < LEAST_FRAMES:
         raise footage_error(
             f"The clip has only {len(measures)} frames: a freeze needs at least {LEAST_FRAMES}.",
@@ -65,7 +65,7 @@ def refuse_unusable(measures: list[FrameMeasures]) -> None:
 
 
 def refuse_cuts(measures: list[FrameMeasures], folder: Path, shift: int) -> None:
-    """JobError for a clip of several takes; `folder` holds its working frames. `shift`: see `numbering`."""
+    """Raises JobError for a clip of several takes. `folder` holds its working frames. `shift`: see `numbering`."""
 
     def picture(index: int) -> NDArray[np.uint8]:
         return small_grey(read_frame(folder / frame_file(measures[index].frame, PICTURE)))
@@ -78,7 +78,7 @@ def refuse_cuts(measures: list[FrameMeasures], folder: Path, shift: int) -> None
 
 
 def _cut_error(numbers: list[int], found: list[Transition]) -> Exception:
-    """The error, in the footage's own `numbers`, which the range that it proposes has to be in."""
+    """The error for a clip with cuts. It uses the footage's own `numbers`, because the user enters ranges in them."""
     starts = [numbers[0], *(numbers[one.after] for one in found)]
     ends = [*(numbers[one.before] for one in found), numbers[-1]]
     longest = max(zip(starts, ends, strict=True), key=lambda take: take[1] - take[0])
@@ -94,7 +94,7 @@ def _cut_error(numbers: list[int], found: list[Transition]) -> Exception:
 
 
 def _transition_words(kind: str, before: int, after: int) -> str:
-    """A transition as part of a sentence, by the last frame before it and the first one after it."""
+    """A transition as part of a sentence, from the last frame before it and the first frame after it."""
     if kind == "hard cut":
         return f"a hard cut at frame {after}"
     return f"a {kind} between frames {before} and {after}"

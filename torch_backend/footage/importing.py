@@ -1,4 +1,4 @@
-"""Footage into a shot folder: working frames, what each is worth, and which of them are solved and trained on."""
+"""Imports footage into a shot folder: extracts working frames, measures them, and selects frames to solve and train."""
 
 from __future__ import annotations
 
@@ -62,21 +62,21 @@ _DISK_CHECK_FRAMES = 16
 
 
 FootageConfig = ImportParams
-"""Range, size and colour of an import. Its `source` is ignored: the footage is an argument of its own."""
+"""Range, size and colour of an import. `import_footage` ignores its `source` and has a separate argument."""
 
 
 def import_footage(shot: Shot, source: str, config: FootageConfig, report: Reporter) -> dict[str, Any]:
     """Extracts every source frame of the range into `shot`, and writes frames.json and shot.json.
 
-    Frames are frames/raw/NNNNNN.png, 8-bit sRGB, or 16-bit where the source is deeper, with a shoulder (`display` in
-    frames.json) where it holds light; `seconds` in frames.json count from the first frame of the range. A finished
-    import of the same source and configuration is left alone, also one of before there was a shoulder. Another one
-    takes its place once it is whole; files that are not ours stay. If work was done on the old frames, `config.replace`
-    has to consent, and the old frames and that work are kept in SHOT/replaced. An import that gives the same pictures
-    replaces nothing.
+    Frames are frames/raw/NNNNNN.png: 8-bit sRGB, or 16-bit for a deeper source. If the source holds light, they have a
+    shoulder (`display` in frames.json). `seconds` in frames.json count from the first frame of the range. A finished
+    import of the same source and configuration is kept, also one by a version without the shoulder. Otherwise, the new
+    import replaces the old one when complete; files from other programs stay. If the old frames carry work,
+    `config.replace` must be set, and frames and work move to SHOT/replaced. An import of the same pictures replaces
+    nothing.
 
     Returns {frames, solved_frames, first, last, step, width, height, fps, colour, reading, read_as, source}.
-    Raises JobError (FOOTAGE, DISK) in one sentence, and Cancelled; either leaves no half import behind.
+    Raises JobError (FOOTAGE, DISK) or Cancelled; neither leaves a partial import.
     """
     _check(config)
     opened = open_source(source, config.fps, config.layer, Colours(config.colour_space), told_in(config))
@@ -90,10 +90,10 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     done = _finished(shot, {k for d in (None, PLAIN) for k in import_keys(opened.info, config, d, shift)})
     if done is not None:
         report.progress("import", 1, 1, "already imported")
-        if shot.info().source != str(source):  # the same footage in another place, where it is searched for from now on
+        if shot.info().source != str(source):  # the same footage was moved: remember its new place
             shot.update(source=str(source))
         return _result(shot, done)
-    opened = renumbered(opened, shift)  # from here on all numbers are the shot's
+    opened = renumbered(opened, shift)  # all following code uses the shot's numbers
     numbered = _in_the_shots_numbers(config, shift)
     earlier = EarlierWork.of(shot, _listed_before(shot))
     if earlier is not None and not config.replace and not earlier.may_be_same(_recorded(numbered), opened.info):
@@ -128,25 +128,25 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
 
 
 _ALWAYS_IN_THE_KEY = ("first", "last", "step", "working_height", "fps")
-"""Of what was taken; all else only where it is not its default, so that a new option leaves finished imports alone."""
+"""Settings that are always part of the key. Others only count if not at their default, so that a new option does not
+invalidate finished imports."""
 
 
 def display_for(info: SourceInfo) -> Display:
-    """The display of working frames that are made of a source now."""
+    """The display for new working frames of a source."""
     return ROLLED if info.colour == "linear" else PLAIN
 
 
 def import_key(info: SourceInfo, config: FootageConfig, display: Display | None = None, shift: int = 0) -> str:
-    """What tells an import from others: of which footage it is, what was taken of it, and in which display.
+    """Key of an import: identifies the footage, the settings and the display.
 
-    `display` None: the one in which it would be made now. `shift`: see `numbering`.
+    `display` None: the result of `display_for`. `shift`: see `numbering`.
     """
     return _import_key(info.key, config, display or display_for(info), shift)
 
 
 def import_keys(info: SourceInfo, config: FootageConfig, display: Display | None = None, shift: int = 0) -> set[str]:
-    """`import_key`, and the one that an earlier version made of the same footage while its files' times are the same:
-    an import that carries either is finished."""
+    """All keys of a finished import: `import_key`, and the key by an earlier version, which depends on file times."""
     display = display or display_for(info)
     return {_import_key(key, config, display, shift) for key in (info.key, info.former_key) if key}
 
@@ -154,18 +154,18 @@ def import_keys(info: SourceInfo, config: FootageConfig, display: Display | None
 def _import_key(footage: list[Any], config: FootageConfig, display: Display, shift: int) -> str:
     plain = _recorded(type(config)())
     settings = {n: v for n, v in _recorded(config).items() if n in _ALWAYS_IN_THE_KEY or v != plain[n]}
-    settings.pop("start", None)  # a start that is the footage's own number changes nothing
+    settings.pop("start", None)  # `shift` replaces it: a start at the footage's own number changes nothing
     settings |= {"shift": shift} if shift else {}
     return content_key(FRAMES_VERSION, footage, settings, *([display.name] if display.name else []))
 
 
 def _recorded(config: FootageConfig) -> dict[str, Any]:
-    """Settings that decide the imported pictures: without the footage's path, and without the consent to replace."""
+    """Settings that determine the imported pictures: all but the footage's path and the consent to replace."""
     return {name: value for name, value in asdict(config).items() if name not in ("source", "replace")}
 
 
 def _listed_before(shot: Shot) -> dict[str, Any]:
-    """frames.json of the frames that the shot has; {} if there are none, or it is damaged."""
+    """frames.json of the shot's present frames; {} if it is missing or damaged."""
     try:
         return load_frames(shot)
     except JobError:
@@ -173,13 +173,13 @@ def _listed_before(shot: Shot) -> dict[str, Any]:
 
 
 def _in_the_shots_numbers(config: FootageConfig, shift: int) -> FootageConfig:
-    """The configuration with its range, which is in the footage's own numbers, in those of the shot."""
+    """The configuration with its range converted from the footage's numbers to the shot's numbers."""
     first, last = (None if number is None else number + shift for number in (config.first, config.last))
     return replace(config, first=first, last=last)
 
 
 def load_frames(shot: Shot) -> dict[str, Any]:
-    """frames.json of a finished import. JobError says to import first, or again if it is damaged."""
+    """The frames.json of a finished import. Raises JobError if it is missing or damaged."""
     path = shot.listing
     if not path.is_file():
         raise footage_error(f"The shot {shot.root.name} has no frames yet.", "Import footage first.")
@@ -194,7 +194,7 @@ def load_frames(shot: Shot) -> dict[str, Any]:
         record, numbers, whole = {}, [], False
     if not whole:
         raise footage_error(f"{path} is damaged.", "Import the clip again.")
-    if numbers[0] < 0 or numbers[-1] > LAST_FRAME:  # earlier versions took a dash in a name for a minus
+    if numbers[0] < 0 or numbers[-1] > LAST_FRAME:  # earlier versions read a dash in a file name as a minus
         raise footage_error(
             f"The frames of this shot are numbered {numbers[0]} to {numbers[-1]}: Blender's go from 0 to {LAST_FRAME}.",
             "Import the clip again.",
@@ -203,8 +203,10 @@ def load_frames(shot: Shot) -> dict[str, Any]:
 
 
 def holds_footage(root: Path, config: FootageConfig) -> bool:
-    """True if the shot in a folder was imported from footage of the content of `config.source`, wherever that lay.
-    JobError if the footage cannot be opened."""
+    """True if the shot in a folder was imported from footage with the content of `config.source`, at any path.
+
+    Raises JobError if the footage cannot be opened.
+    """
     try:
         record = read_json(ShotFolder(root).listing)
     except (OSError, ValueError):
@@ -214,8 +216,11 @@ def holds_footage(root: Path, config: FootageConfig) -> bool:
 
 
 def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
-    """Where a shot's footage may lie: where a farm has what was named so, as it was named, beside the shot with which
-    it was moved, in the same folder."""
+    """Paths where a shot's footage may lie, in order of preference.
+
+    These are the recorded path mapped for this machine, the recorded path, the recorded path relative to the shot (both
+    may have moved together), and the file's name in the shot's parent folder.
+    """
     named, beside = shot.info().source, str(record.get("beside") or "")
     places = [mapped(named), named] if named else []
     if beside:
@@ -228,7 +233,7 @@ def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
 def _check(config: FootageConfig) -> None:
     if config.step < 0 or config.working_height < 0:
         raise UserError(f"step and working_height cannot be negative: {config.step}, {config.working_height}")
-    if config.fps and not SLOWEST_FPS <= config.fps <= FASTEST_FPS:  # NaN is neither
+    if config.fps and not SLOWEST_FPS <= config.fps <= FASTEST_FPS:  # also rejects NaN
         raise UserError(f"fps is {config.fps}: it should be {SLOWEST_FPS} to {FASTEST_FPS:g}, or 0: the footage's own")
     if config.first is not None and config.last is not None and config.last - config.first + 1 < LEAST_FRAMES:
         raise footage_error(
@@ -238,7 +243,7 @@ def _check(config: FootageConfig) -> None:
 
 
 def _check_range(opened: Source, config: FootageConfig, shift: int) -> None:
-    """JobError for a range that the footage lacks, or numbers in the shot (own number + `shift`) that cannot be."""
+    """Raises JobError for a range outside of the footage, or for invalid frame numbers of the shot (own + `shift`)."""
     info = opened.info
     if info.last is None:
         return
@@ -257,7 +262,7 @@ def _check_range(opened: Source, config: FootageConfig, shift: int) -> None:
 def _finished(shot: Shot, keys: set[str]) -> dict[str, Any] | None:
     try:
         record = load_frames(shot)
-    except JobError:  # none yet, or damaged: it is imported anew
+    except JobError:  # missing or damaged: import again
         return None
     whole = record.get("key") in keys and all(is_whole_png(shot.frames / f["file"]) for f in record["frames"])
     return record if whole else None
@@ -272,7 +277,7 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
         report.warning(f"The clip is {info.height} pixels high: the working frames stay that high.")
     total = _expected(opened, config)
     frame_bytes = width * height * (5.0 if info.deep else 2.0)
-    # Twice: the solve writes the undistorted frames beside these.
+    # Twice, because the solve also writes undistorted frames.
     need_disk(shot.root, 2.0 * total * frame_bytes + (64 << 20), "The import of this clip")
     make_folder(into)
     measures: list[FrameMeasures] = []
@@ -284,7 +289,7 @@ def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, repo
         nonlocal distinct
         one = pending.popleft().result()
         repeats = flag_duplicate(one, distinct)
-        spent = one if repeats else distinct  # only the last one that is no repeat is compared with
+        spent = one if repeats else distinct  # later frames are only compared with the last distinct frame
         if spent is not None:
             spent.luma = np.zeros((0, 0), np.float32)
         distinct = distinct if repeats else one
@@ -327,7 +332,7 @@ def _expected(opened: Source, config: FootageConfig) -> int:
 
 
 def _log_remark(info: SourceInfo, config: FootageConfig, extracted: Extracted) -> list[tuple[str, str]]:
-    """A warning about a clip that looks like a camera's log and was taken for a display."""
+    """A warning about a clip that looks like camera log but was read as a picture for a display."""
     tones = looks_like_log(extracted.measures)
     if tones is None or info.colour == "linear" or config.colour_space or config.lut:
         return []
@@ -342,7 +347,7 @@ def _log_remark(info: SourceInfo, config: FootageConfig, extracted: Extracted) -
 
 
 def _record(opened: Source, config: FootageConfig, extracted: Extracted, key: str, shift: int) -> dict[str, Any]:
-    """frames.json; `shift`: see `numbering`."""
+    """The contents of frames.json. `shift`: see `numbering`."""
     measures, info = extracted.measures, opened.info
     step = config.step or automatic_step(len(measures), info.fps)
     solved = choose_solved(measures, step)
@@ -352,7 +357,7 @@ def _record(opened: Source, config: FootageConfig, extracted: Extracted, key: st
             "Choose a smaller step.",
         )
     start, timecode = extracted.seconds[0], str(info.reading.get("timecode", ""))
-    # The source's first frame has it. Slower than a frame in two seconds nothing can be counted.
+    # The timecode is that of the source's first frame. It cannot count below half a frame per second.
     timecode = later(timecode, measures[0].frame - info.first, info.fps) if timecode and round(info.fps) else ""
     frames = [
         {
@@ -392,12 +397,15 @@ def _record(opened: Source, config: FootageConfig, extracted: Extracted, key: st
 
 
 def _numbered(first: int, shift: int) -> list[str]:
-    """A sentence that says how the shot numbers its frames, if not as the footage does."""
+    """A sentence about the frame numbers, if the shot and the footage count differently."""
     return [f"Frame {first} of the shot is frame {first - shift} of the footage."] if shift else []
 
 
 def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -> dict[str, Any]:
-    """What frames.json says of something burnt into the clip; its mask is written beside, and the artist is told."""
+    """Detects bars and burnt-in overlays. Returns their entries for frames.json.
+
+    Also writes their mask into `fresh`, and warns the artist.
+    """
     usable = [row["file"] for row in record["frames"] if not row["flags"]]
     pictures: list[NDArray[np.uint8]] = []
     for n in looked_at(len(usable)):
@@ -424,8 +432,10 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
 
 
 def _tell_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], report: Reporter) -> dict[str, float]:
-    """What frames.json says of bars found in pictures [h, w], and of the lines mixed with them: each as a share of the
-    frame's height or width. The artist is told."""
+    """The entry of frames.json for bars found in pictures [h, w]. Warns the artist.
+
+    The value of each side is a share of the frame's height or width, and includes the mixed lines.
+    """
     h, w = shape
     width, height = (int(side) for side in record["source_size"])
     rows, columns = bars.inner(h, w)
@@ -440,7 +450,7 @@ def _tell_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], repor
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:
-    """A working frame, no larger than it is examined: of 48 in 4K all pixels would be 400 MB."""
+    """A working frame in grey, at most `WIDTH` wide: 48 full frames in 4K would take 400 MB."""
     pixels = read_frame(path)
     pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -452,13 +462,13 @@ def _grey(path: Path) -> NDArray[np.uint8]:
 
 
 def _displayed(info: SourceInfo, measures: list[FrameMeasures]) -> dict[str, Any]:
-    """What frames.json says of the working frames' display, as `display_of` reads it."""
+    """The entries of frames.json for the display of the working frames, as `display_of` reads them."""
     display = display_for(info)
     return {"display": display.name, "brightest": max(m.brightest for m in measures)} if display.bends else {}
 
 
 def _news(record: dict[str, Any], source: str) -> dict[str, Any]:
-    """What shot.json is to be told: it stands beside the frames from the moment on at which they take their place."""
+    """Changes to shot.json. Stored beside the new frames, so that both take effect at the same moment."""
     frames = record["frames"]
     imported = {name: record[name] for name in ("step", "fps", "width", "height", "colour")}
     return {"source": str(source), "first": frames[0]["frame"], "last": frames[-1]["frame"], **imported}

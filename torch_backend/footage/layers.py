@@ -1,4 +1,4 @@
-"""Which of the layers and parts of a picture is the one to freeze."""
+"""Selects the layer of a picture file that holds the picture itself."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from .oiio_types import channel_names
 from .sources import footage_error
 
 BEAUTY = ("", "rgba", "rgb", "beauty", "combined", "c", "composite", "color", "colour", "final", "main", "master")
-"""Names of the layer that is the picture itself, the surest first."""
+"""Common names of the main layer, the most reliable first."""
 _COLOURS = (("R", "G", "B", "A"), ("r", "g", "b", "a"), ("red", "green", "blue", "alpha"))
 _NO_PICTURE = ("crypto", "depth", "normal", "position", "motion", "vector", "uv", "mist", "index")
 
 
 @dataclass(frozen=True)
 class Layer:
-    """Where a picture's colour lies in its file."""
+    """Location of a colour layer in its file."""
 
     name: str
-    """As the file has it; empty for the channels R, G, B without a layer."""
+    """Name in the file; empty for the channels R, G, B without a layer."""
     part: int
-    """Subimage."""
+    """Index of the subimage."""
     channels: tuple[int, int, int]
-    """Of red, green and blue in that subimage; one channel thrice if it is grey."""
+    """Indices of red, green and blue in that subimage; three times the same for grey."""
     alpha: int | None
-    """Of its alpha, if it has one."""
+    """Index of the alpha channel, if there is one."""
 
 
 def find_layer(file: Path, layer_name: str = "") -> tuple[Layer, list[str]]:
-    """The layer `layer_name`, or the one that is the picture itself, and the names of all layers in the file.
+    """Finds the layer `layer_name`, by default the main layer. Returns it and the names of all layers in the file.
 
-    JobError lists the layers if there is none of that name, or none that is sure to be the picture. OSError if the
-    file cannot be read.
+    Raises JobError, which lists the layers, if no layer has that name or no main layer is certain. Raises OSError if
+    the file cannot be read.
     """
     found, names = _layers(file)
     if layer_name:
@@ -64,7 +64,7 @@ def find_layer(file: Path, layer_name: str = "") -> tuple[Layer, list[str]]:
 
 
 def shown(name: str) -> str:
-    """A layer's name as people read it."""
+    """A layer's name for messages."""
     return name or "RGB without a name"
 
 
@@ -79,7 +79,7 @@ def _rank(layer: Layer) -> tuple[int, int]:
 
 
 def _layers(file: Path) -> tuple[list[Layer], list[str]]:
-    """Layers with colour, and the names of all, in the order of the file."""
+    """(layers with colour, names of all layers), in the order of the file."""
     image = oiio.ImageInput.open(regular_file(file))
     if image is None:
         raise OSError(f"{file}: {error_of()}")
@@ -87,7 +87,7 @@ def _layers(file: Path) -> tuple[list[Layer], list[str]]:
     names: list[str] = []
     try:
         part = 0
-        # Only OpenEXR's parts are layers: those of a TIFF are pages, of a PSD the pieces of its first.
+        # Only the parts of an OpenEXR are layers. The parts of a TIFF are pages; those of a PSD make up its first part.
         while image.seek_subimage(part, 0) and (part == 0 or image.format_name() == "openexr"):
             spec = image.spec()
             check_size(file.name, spec)

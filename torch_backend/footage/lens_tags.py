@@ -1,4 +1,4 @@
-"""What files say of the lens: the focal length that gives the same view on 35 mm film, as phones write it."""
+"""Reads the focal length from file metadata, as the 35 mm equivalent that phones write."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import OpenImageIO as oiio
 from .oiio_types import attribute
 
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
-"""The equivalent focal length is for the same angle over the diagonal (CIPA DCG-001)."""
+"""Diagonal of 35 mm film. The equivalent focal length has the same diagonal angle of view (CIPA DCG-001)."""
 FOCAL_LIMITS_MM = (5.0, 2000.0)
-"""What is outside is no focal length: cameras write 0 where they do not know."""
+"""Range of valid focal lengths. Cameras write 0 for an unknown value."""
 _QUICKTIME = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
 
 def focal_of_picture(spec: oiio.ImageSpec) -> float | None:
-    """Millimetres on 35 mm film by a picture's Exif; None if it does not say."""
+    """35 mm equivalent focal length in mm from a picture's Exif; None if missing."""
     return _believable(attribute(spec, "Exif:FocalLengthIn35mmFilm"))
 
 
 def focal_of_video(container: Any, stream: Any) -> float | None:
-    """Millimetres on 35 mm film by the QuickTime keys of a video; None if it does not say."""
+    """35 mm equivalent focal length in mm from the QuickTime keys of a video; None if missing."""
     tables = [stream.metadata, container.metadata]
     values = (_believable(table[key]) for table in tables for key in table if key.lower() == _QUICKTIME)
     return next((focal for focal in values if focal is not None), None)
 
 
 def focal_px(focal_mm: float, width: int, height: int) -> float:
-    """Focal length in pixels of frames of a size, for one in millimetres on 35 mm film."""
+    """Focal length in pixels for frames of a size, from the 35 mm equivalent in mm."""
     return focal_mm / FILM_DIAGONAL_MM * math.hypot(width, height)
 
 

@@ -1,8 +1,7 @@
-"""Looks of cameras: a .cube table (1D or 3D) that makes a picture for a display of what a camera recorded.
+"""Camera looks: a .cube table (1D or 3D) that converts recorded values to a picture for a display.
 
-OpenImageIO's OpenColorIO reads and applies it. Its output counts as display-referred sRGB, as players and editors show
-it: working frames, plates and all that leaves are made of that, so they agree. Light beyond white is cut by most
-tables.
+OpenImageIO's OpenColorIO reads and applies the table. Its output counts as display-referred sRGB, as in players and
+editors. Working frames, plates and output all use it, so that they agree. Most tables clip light above white.
 """
 
 from __future__ import annotations
@@ -21,23 +20,24 @@ from .images import error_of
 from .sources import footage_error
 
 _CONFIG = "ocio://default"
-"""A table needs no configuration, but OpenImageIO reads one: this takes half the time of the studio's."""
+"""Configuration for OpenImageIO, which loads one although a table needs none. It loads twice as fast as the studio
+configuration."""
 _MOST_BYTES = 64 << 20
-"""Of a file: a cube of 129 steps, the largest that OpenColorIO reads, takes about that."""
+"""Maximum size of a file: about that of a cube of 129 steps, the largest that OpenColorIO reads."""
 
 
 @dataclass(frozen=True)
 class LookSpace(InputSpace):
-    """What the numbers in a picture mean: what a table makes of them is for a display."""
+    """Colour space of pictures that a table converts for a display."""
 
     file: str = ""
-    """The table."""
+    """Path of the table."""
     digest: str = ""
-    """Of its content."""
+    """Digest of the table's content."""
 
     @property
     def name(self) -> str:
-        """As people read it."""
+        """Name for messages."""
         return f"by the look {Path(self.file).name}"
 
     @property
@@ -47,12 +47,12 @@ class LookSpace(InputSpace):
 
     @property
     def origin(self) -> dict[str, str]:
-        """The table, by its content."""
+        """Digest of the table, for the import's record."""
         return {"look": self.digest}
 
     @property
     def rows(self) -> int:
-        """Many: each call has a cost of its own."""
+        """Number of rows to convert at a time: many, because each call has a fixed cost."""
         return 1024
 
     def _light(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], Curve]:
@@ -60,7 +60,7 @@ class LookSpace(InputSpace):
 
 
 def look_space(file: str) -> LookSpace:
-    """The space of pictures that are seen through a .cube file. JobError if it is invalid, or cannot be read."""
+    """The colour space of pictures with the look of a .cube file. Raises JobError if the file is unusable."""
     path = Path(file)
     hint = "Choose a 1D or 3D look as .cube."
     if path.suffix.lower() != ".cube":
@@ -80,12 +80,12 @@ def look_space(file: str) -> LookSpace:
 
 
 def _through(pixels: NDArray[np.float32], file: str) -> NDArray[np.float32]:
-    """[H, W, 3] through a table. JobError if it cannot be read."""
+    """Applies a table to [H, W, 3]. Raises JobError if the table cannot be read."""
     source = oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
     shown = oiio.ImageBufAlgo.ociofiletransform(source, file, False, False, _CONFIG)
     values = None if shown.has_error else shown.get_pixels(oiio.FLOAT)
     if values is None:
-        error_of(shown)  # OpenColorIO's own words are about its formats
+        error_of(shown)  # clears the error; OpenColorIO's message is about file formats
         raise footage_error(
             f"The look {Path(file).name} is damaged, or no .cube table: it cannot be read.",
             "Export it again as a 1D or 3D .cube.",

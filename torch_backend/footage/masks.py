@@ -1,8 +1,8 @@
-"""Masks that an artist gives: which pixels of which frame they cover, at the working frames' size.
+"""Reads masks from the artist: the covered pixels of each frame, at the size of the working frames.
 
-A mask is one picture for all frames, a numbered sequence, a video, or the footage's own alpha. White is covered, from
-half of it on. An alpha that is opaque in some places only is the mask, unless the colour is black and white. Frames go
-by number (`pairing`). What does not fit the frames is refused in a sentence.
+A mask is one picture for all frames, a numbered sequence, a video, or the footage's own alpha. Pixels of at least half
+brightness are covered. If a mask has an alpha that is partly transparent, the alpha is the mask, unless the colour is
+black and white. Pictures are assigned to frames by number (`pairing`).
 """
 
 from __future__ import annotations
@@ -35,55 +35,56 @@ from .video import VideoSource
 
 _HALF = 0.5
 _SHAPE = 0.01
-"""How much the shape of a mask may differ from the footage's: sizes are rounded."""
+"""Relative tolerance of a mask's aspect ratio, because sizes are rounded."""
 _MOST_PIXELS = 1 << 25
-"""Of a mask that is larger than the footage: as floats it takes 0.5 GB."""
+"""Maximum number of pixels of a mask that is larger than the footage. As floats, it takes 0.5 GB."""
 _ALL = 0.98
-"""Share of the picture from which on a mask leaves nothing to solve by."""
+"""Largest covered share of the picture at which a solve is possible."""
 _BLACK, _MATTE = 0.1, 0.95
-"""Colour is a matte of its own if this share of it is black or white to within a tenth, and there is some of both."""
+"""A colour is a matte itself if the share `_MATTE` of its pixels is within `_BLACK` of black or white, with some of
+both."""
 _BRIGHTNESS, _ALPHA, _BOTH = "brightness", "alpha", "both"
-"""How the pictures of a mask are read."""
+"""Channels that define the mask."""
 _Picture = tuple[int | None, NDArray[np.float32], NDArray[np.float32] | None]
 """Frame (None: all), colour [h, w, C], alpha [h, w], in 0..1."""
 WORDS = {"ignore": "what is ignored", "people": "what may move"}
-"""Kind of mask -> what it says, in sentences."""
+"""Kind of mask -> phrase for messages."""
 
 
 @dataclass
 class Mask:
-    """One mask, of every frame of a shot."""
+    """One mask for every frame of a shot."""
 
     kind: str
     """One of `MASK_KINDS`."""
     size: tuple[int, int]
     """Width and height of the working frames in pixels."""
     packed: dict[int, bytes] = field(default_factory=dict[int, bytes])
-    """Frame number -> its bits, packed: a mask takes about a thousandth of its pixels."""
+    """Frame number -> compressed bits. A mask takes about a thousandth of its pixels."""
     share: float = 0.0
-    """Share of all frames' pixels that it covers."""
+    """Covered share of all frames' pixels."""
 
     def add(self, frame: int, covered: NDArray[np.bool_]) -> None:
-        """Keeps what it covers of a frame, bool [H, W]."""
+        """Stores the covered pixels of a frame, bool [H, W]."""
         self.packed[frame] = zlib.compress(np.packbits(covered).tobytes(), 1)
 
     def of(self, frame: int) -> NDArray[np.bool_]:
-        """[H, W] bool: what it covers of a frame, over the frame as it was filmed."""
+        """The covered pixels of a frame, bool [H, W], in the original (distorted) frame."""
         width, height = self.size
         bits = np.frombuffer(zlib.decompress(self.packed[frame]), np.uint8)
         return np.unpackbits(bits, count=width * height).reshape(height, width).astype(bool)
 
     @property
     def key(self) -> str:
-        """Changes with what is covered, and with nothing else."""
+        """Key that depends only on the kind, the size and the covered pixels."""
         return content_key(self.kind, self.size, [[frame, zlib.crc32(bits)] for frame, bits in self.packed.items()])
 
 
 def read_masks(shot: Shot, sources: dict[str, str], report: Reporter) -> dict[str, Mask]:
-    """The masks of an imported shot, by kind; `sources` has a path or `MASK_ALPHA` for each kind that is wanted.
+    """The masks of an imported shot, by kind. `sources` holds a path or `MASK_ALPHA` for each requested kind.
 
-    JobError (FOOTAGE) for what cannot be read, has another shape than the footage, lacks frames, covers nothing, or,
-    all together, leaves nothing to solve by.
+    Raises JobError (FOOTAGE) for a mask that is unreadable, has another aspect ratio, lacks frames or covers nothing,
+    and for masks that together cover nearly everything.
     """
     wanted = {kind: source for kind, source in sources.items() if source}
     if not wanted:
@@ -104,7 +105,7 @@ def read_masks(shot: Shot, sources: dict[str, str], report: Reporter) -> dict[st
 
 
 class _Reading:
-    """One mask while it is read."""
+    """Reader of one mask."""
 
     def __init__(self, shot: Shot, frames: dict[str, Any], kind: str, source: str, report: Reporter) -> None:
         self.shot, self.frames, self.kind, self.source, self.report = shot, frames, kind, source, report
@@ -134,14 +135,14 @@ class _Reading:
         return made
 
     def _covered(self, grey: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """[H, W] bool at the working size, of a picture [h, w] in 0..1. JobError for one of another shape."""
+        """Covered pixels [H, W] bool at the working size of a picture [h, w] in 0..1. Raises as `_check_shape` does."""
         h, w = grey.shape
         self._check_shape(w, h)
         small = cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA if w > self.size[0] else cv2.INTER_LINEAR)
         return np.asarray(small) >= _HALF
 
     def _check_shape(self, w: int, h: int) -> None:
-        """JobError for a picture of another shape than the footage's, or of many more pixels."""
+        """Raises JobError for a picture with another aspect ratio than the footage, or with far more pixels."""
         ours = self.frames.get("source_size") or self.size
         if w * h > max(ours[0] * ours[1], _MOST_PIXELS):
             raise footage_error(
@@ -150,7 +151,7 @@ class _Reading:
             )
         aspect = float(self.frames.get("reading", {}).get("pixel_aspect", 1.0))
         shape = w / h
-        # A mask of anamorphic footage may have the footage's own pixels, or square ones.
+        # A mask of anamorphic footage has square pixels, or the pixels of the footage.
         if all(abs(shape / (ours[0] / ours[1] / stretch) - 1.0) > _SHAPE for stretch in (1.0, aspect)):
             raise footage_error(
                 f"{self.name} is {w}x{h}, the footage {ours[0]}x{ours[1]}: they have not the same shape.",
@@ -160,7 +161,7 @@ class _Reading:
     # ------------------------------------------------------------------------------------------------- from files
 
     def _pictures(self) -> Iterator[tuple[int | None, NDArray[np.float32]]]:
-        """(frame, [h, w] in 0..1) of each frame; a frame of None is for all of them."""
+        """(frame, [h, w] in 0..1) of each picture. A frame of None means all frames."""
         path = Path(self.source)
         if not path.exists() and not is_pattern(path.name):
             raise footage_error(f"{self.name} does not exist.", "Check the path.")
@@ -180,7 +181,7 @@ class _Reading:
             yield frame, grey
 
     def _way(self, pictures: Iterator[_Picture]) -> str:
-        """How all pictures of the mask are read, by those that have an alpha: the artist is told."""
+        """The channels that define the mask, decided from the pictures with an alpha. Tells the artist."""
         low, high, opaque = 1.0, 0.0, None
         for _, colour, alpha in pictures:
             if alpha is None:
@@ -200,14 +201,14 @@ class _Reading:
         return _ALPHA
 
     def _files(self, path: Path) -> dict[int | None, Path]:
-        """Number -> file; None for a picture that is none of a sequence."""
+        """Number -> file; the number is None for a single picture."""
         if path.is_file():
             sequence = sequence_of_file(path)
             return {None: path} if sequence is None else {**sequence.files}
         return {**find_sequence(path).files}
 
     def _matched(self, theirs: list[int]) -> dict[int, int]:
-        """Frame -> number of the mask's picture. JobError names the frames that have none."""
+        """Frame -> number of the mask's picture. Raises JobError, which lists the frames without a picture."""
         paired = pair(theirs, self.counted, needs_all=True)
         missing = sorted(set(self.numbers) - set(paired.numbers))
         if missing:
@@ -221,7 +222,7 @@ class _Reading:
         return paired.numbers
 
     def _of_mask_files(self, files: dict[int | None, Path], with_alpha: bool = False) -> Iterator[_Picture]:
-        """The pictures of a mask; `with_alpha`: those alone that have one."""
+        """The pictures of a mask from files; `with_alpha`: only pictures that have an alpha."""
         for frame, file in files.items():
             buffer, orientation = _opened(file)
             spec = buffer.spec()
@@ -233,7 +234,7 @@ class _Reading:
             yield frame, pixels[..., colours[:3]], None if alpha is None else pixels[..., alpha]
 
     def _of_mask_video(self, path: Path) -> Callable[..., Iterator[_Picture]]:
-        """The same of a video."""
+        """A function that yields the pictures of a mask from a video, with the parameters of `_of_mask_files`."""
         video = open_video(path)
         self._check_shape(video.info.width, video.info.height)
         count = sum(1 for _ in video.frames(None, None))
@@ -258,7 +259,7 @@ class _Reading:
     # ------------------------------------------------------------------------------------------------- from alpha
 
     def _alpha(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """(frame, what the footage's alpha covers): of what is ignored the transparent, of what may move the opaque."""
+        """(frame, mask [h, w]) from the footage's alpha: transparent pixels for "ignore", opaque ones for "people"."""
         footage = self._footage()
         alphas = self._of_video(footage) if isinstance(footage, VideoSource) else self._of_files(*footage)
         for number, alpha in alphas:
@@ -290,7 +291,7 @@ class _Reading:
             )
 
     def _footage(self) -> tuple[dict[int, Path], str] | VideoSource:
-        """The footage: a video, or its files by frame and the layer that was imported. JobError if it is gone."""
+        """The footage: a video, or (files by frame, name of the imported layer). Raises JobError if it is missing."""
         config = self.frames.get("config", {})
         settings = FootageConfig(fps=float(config.get("fps", 0.0)), layer=str(config.get("layer", "")))
         for place in source_places(self.shot, self.frames):
@@ -313,12 +314,12 @@ class _Reading:
 
 
 def _read(file: Path, part: int = 0) -> tuple[NDArray[np.float32], int | None]:
-    """A whole picture, upright, [h, w, C] with straight colour, and which channel alpha is."""
+    """(picture [h, w, C], upright, with straight colour; index of the alpha channel or None)."""
     return _pixels(file, *_opened(file, part))
 
 
 def _opened(file: Path, part: int = 0) -> tuple[oiio.ImageBuf, Orientation]:
-    """A picture of which only the header is read yet. JobError if that cannot be, or says that it is too large."""
+    """Opens a picture and reads only its header. Raises JobError if the header is unreadable or the size too large."""
     buffer = oiio.ImageBuf(regular_file(file), part, 0, AS_STORED)
     spec = buffer.spec()
     if buffer.has_error:
@@ -328,7 +329,7 @@ def _opened(file: Path, part: int = 0) -> tuple[oiio.ImageBuf, Orientation]:
 
 
 def _pixels(file: Path, buffer: oiio.ImageBuf, orientation: Orientation) -> tuple[NDArray[np.float32], int | None]:
-    """`_read` of what `_opened` gave."""
+    """Result of `_read` for a picture opened by `_opened`."""
     spec = buffer.spec()
     x, y = spec.full_x, spec.full_y
     roi = oiio.ROI(x, x + spec.full_width, y, y + spec.full_height, 0, 1, 0, spec.nchannels)

@@ -1,7 +1,7 @@
-"""Frame numbers of a shot that do not follow the footage's own: `--start`.
+"""Frame numbers of a shot that differ from the footage's own: `--start`.
 
-A shot counts one number everywhere. Where the footage counts differently, the difference is recorded in frames.json,
-and `Renumbered` is the only place that applies it: whoever opens the footage sees the shot's numbers.
+All code uses the shot's frame numbers. If the footage counts differently, frames.json records the difference, and only
+`Renumbered` applies it.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from ..contract import ImportParams
 from .sources import Known, PlateReader, Source, SourceFrame, SourceInfo
 
 OWN_NUMBERS = "Frames are named by the footage's own numbers here."
-"""Added to the hint of a warning about single frames of footage that the shot numbers otherwise."""
+"""Sentence added to the hint of a warning about single frames, if shot and footage count differently."""
 
 
 def shift_of(info: SourceInfo, config: ImportParams) -> int:
-    """Number of a frame in the shot minus its number in the footage, as an import asks for it.
+    """Shift requested by an import: number of a frame in the shot minus its number in the footage.
 
-    `start` is the number of the first frame of the range, also where that frame is missing: gaps stay gaps.
+    `start` is the number of the first frame of the range, even if that frame is missing, so that gaps are preserved.
     """
     if config.start is None:
         return 0
@@ -30,17 +30,17 @@ def shift_of(info: SourceInfo, config: ImportParams) -> int:
 
 
 def recorded_shift(record: dict[str, Any]) -> int:
-    """The same of a finished import; `record` is frames.json. Not computed again: the footage may have lost files."""
+    """The shift of a finished import, from its frames.json. Recomputing it could fail: the footage may lack files."""
     return int(record.get("shift") or 0)
 
 
 def renumbered(source: Source, shift: int) -> Source:
-    """The source in the shot's numbers: itself where they are the footage's own."""
+    """The source with the shot's frame numbers; the same object if `shift` is 0."""
     return Renumbered(source, shift) if shift else source
 
 
 class Renumbered:
-    """A source whose frame numbers are `shift` higher than those of its files."""
+    """A source with all frame numbers raised by `shift`."""
 
     def __init__(self, source: Source, shift: int) -> None:
         self._source, self._shift = source, shift
@@ -64,7 +64,7 @@ class Renumbered:
 
 
 class _RenumberedPlates:
-    """Plates by the shot's numbers."""
+    """Plate reader with the shot's frame numbers."""
 
     def __init__(self, source: Source, known: Known, shift: int) -> None:
         self._shift = shift

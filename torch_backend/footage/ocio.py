@@ -1,9 +1,8 @@
-"""Colour spaces by the names of an OpenColorIO configuration, converted by OpenImageIO's OpenColorIO.
+"""Colour spaces of an OpenColorIO configuration, converted by OpenImageIO's OpenColorIO.
 
-The configuration is that of $OCIO, as in Blender and every other program of a studio; without it the ACES studio
-configuration that OpenColorIO has built in, which knows the logs of cameras. Light arrives in linear Rec.709 with white
-at D65 by the role `aces_interchange`, whatever the configuration calls its spaces; one without that role has to name
-linear Rec.709 itself.
+The configuration is that of $OCIO, as in Blender and other studio programs. Without $OCIO, it is OpenColorIO's built-in
+ACES studio configuration, which includes camera logs. The role `aces_interchange` defines the conversion to linear
+Rec.709 with white at D65, whatever the names of the spaces. A configuration without that role must name linear Rec.709.
 """
 
 from __future__ import annotations
@@ -25,45 +24,45 @@ from .images import error_of
 from .sources import footage_error
 
 BUILT_IN = "ocio://studio-config-latest"
-"""The configuration without $OCIO: ACES, with camera logs, inside of OpenColorIO."""
+"""Default configuration without $OCIO: the ACES configuration with camera logs, built into OpenColorIO."""
 INTERCHANGE = "aces_interchange"
-"""Role of ACES2065-1, by which configurations are converted into each other."""
+"""Role of ACES2065-1, the common space for conversion between configurations."""
 LINEAR = ("lin_rec709_scene", "lin_rec709", "Linear Rec.709", "Utility - Linear - sRGB", "Linear", "linear")
-"""What configurations without that role call linear Rec.709."""
+"""Names of linear Rec.709 in configurations without that role."""
 
 
 @dataclass(frozen=True)
 class OcioSpace(InputSpace):
-    """What the numbers in a picture mean, as a colour space of a configuration."""
+    """A colour space of an OCIO configuration."""
 
     space: str = ""
     """Name in the configuration."""
     config: str = ""
-    """The configuration: a file, or the ocio:// address of one that is built in."""
+    """The configuration: a file, or the ocio:// address of a built-in one."""
 
     @property
     def name(self) -> str:
-        """As people read it."""
+        """Name for messages."""
         return f"{self.space} (OCIO)"
 
     @property
     def is_light(self) -> bool:
-        """True: a configuration says how its numbers become light."""
+        """True: the configuration defines the conversion to light."""
         return True
 
     @property
     def as_it_stands(self) -> bool:
-        """False: what is sRGB is an `InputSpace`."""
+        """False: `known_space` returns a plain `InputSpace` for sRGB."""
         return False
 
     @property
     def origin(self) -> dict[str, str]:
-        """The configuration."""
+        """The configuration, for the import's record."""
         return {"ocio": self.config}
 
     @property
     def rows(self) -> int:
-        """Many: each call reads the configuration anew, which takes 20 ms."""
+        """Number of rows to convert at a time: many, because each call reads the configuration again, in 20 ms."""
         return 1024
 
     def _light(self, pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], Curve]:
@@ -72,17 +71,17 @@ class OcioSpace(InputSpace):
 
 @dataclass(frozen=True)
 class Colours:
-    """How the footage's colours are to be found out."""
+    """Determines the colour space of footage."""
 
     chosen: str = ""
-    """Colour space that a person named; empty: what the files say."""
+    """Name of the user's colour space; empty: from the files."""
     config: str = ""
-    """Configuration that names are looked up in; empty, or one that is gone: the active one."""
+    """Configuration to look up names in. If empty or missing on disk: the active configuration."""
 
     def space(self) -> InputSpace | None:
-        """The space that a person named, None if they named none.
+        """The user's colour space; None if the user chose none.
 
-        JobError if no colour space has that name, if it is no colour, or if the configuration cannot be read.
+        Raises JobError if the name is unknown or means data, or if the configuration cannot be read.
         """
         if not self.chosen:
             return None
@@ -100,11 +99,11 @@ class Colours:
         )
 
     def known(self, name: str) -> InputSpace | None:
-        """The space of a name that stands in a file; None if the configuration has none of that name."""
+        """The space of a name stored in a file; None if the configuration lacks the name."""
         return known_space(name, self._used())
 
     def by_rules(self, file: Path) -> InputSpace | None:
-        """The space that the file rules of $OCIO give a file; None if they say nothing of it in particular."""
+        """The space from the file rules of $OCIO; None if only the default rule matches."""
         if not (self.config or os.environ.get("OCIO")):
             return None
         config = self._used()
@@ -118,7 +117,7 @@ class Colours:
 
 
 def active_config() -> str:
-    """$OCIO, else `BUILT_IN`."""
+    """The configuration in $OCIO, else `BUILT_IN`."""
     return os.environ.get("OCIO") or BUILT_IN
 
 
@@ -128,7 +127,7 @@ def _is_there(config: str) -> bool:
 
 @cache
 def _configuration(config: str) -> oiio.ColorConfig:
-    """JobError if it cannot be read: OpenImageIO would go on with one of its own."""
+    """Loads a configuration. Raises JobError if that fails, where OpenImageIO would fall back to a default."""
     found = oiio.ColorConfig(config)
     failed = cast(Any, found).geterror()
     if failed:
@@ -140,15 +139,14 @@ def _configuration(config: str) -> oiio.ColorConfig:
 
 
 def space_names(config: str) -> list[str]:
-    """Names of all colour spaces of a configuration. JobError if it cannot be read."""
+    """Names of all colour spaces of a configuration. Raises JobError if it cannot be read."""
     return list(_configuration(config).getColorSpaceNames())
 
 
 def known_space(name: str, config: str) -> InputSpace | None:
-    """The colour space of this name, alias or role in a configuration; None if there is none, or if it is not a colour
-    space.
+    """The colour space with this name, alias or role in a configuration; None if it is missing or means data.
 
-    JobError if the configuration cannot be read, or if nothing leads from it to linear Rec.709.
+    Raises JobError if the configuration cannot be read, or defines no conversion to linear Rec.709.
     """
     found: Any = _configuration(config)
     space = str(found.resolve(name) or name)
@@ -157,14 +155,14 @@ def known_space(name: str, config: str) -> InputSpace | None:
         return None
     space = index[space.lower()]
     if str(found.get_color_interop_id(space) or "") in ("srgb_rec709_display", "srgb_rec709_scene"):
-        return InputSpace("srgb")  # as it stands, to the bit
+        return InputSpace("srgb")  # unconverted, bit for bit
     primaries = _primaries(space, config)
     return InputSpace("lin", primaries) if primaries else OcioSpace("lin", "", space=space, config=config)
 
 
 @cache
 def _primaries(space: str, config: str) -> str:
-    """Which of `LIGHTS` a space holds as it stands, as its conversion of a few pixels tells; empty if none."""
+    """The member of `LIGHTS` that equals a space, tested by converting a few pixels; empty if none does."""
     pixels = np.concatenate([np.eye(3), 30.0 * np.eye(3), -0.1 * np.ones((1, 3))]).astype(np.float32)
     light = light_of(pixels[None], space, config)[0]
     near = (n for n in LIGHTS if np.allclose(light, pixels @ to_rec709(PRIMARIES[n][1]).T, rtol=1e-4, atol=1e-4))
@@ -173,7 +171,7 @@ def _primaries(space: str, config: str) -> str:
 
 @cache
 def _way_out(config: str) -> tuple[str, Callable[[ArrayLike], NDArray[np.float32]] | None]:
-    """A space to convert to, and what makes linear Rec.709 of it; None: it is that. JobError if there is neither."""
+    """(target space, its conversion to linear Rec.709; None if the target is linear Rec.709). JobError if missing."""
     found: Any = _configuration(config)
     if str(found.getColorSpaceNameByRole(INTERCHANGE) or ""):
         matrix = to_rec709(PRIMARIES["ap0"][1]).T.astype(np.float32)
@@ -190,9 +188,9 @@ def _way_out(config: str) -> tuple[str, Callable[[ArrayLike], NDArray[np.float32
 
 
 def light_of(pixels: NDArray[np.float32], space: str, config: str) -> NDArray[np.float32]:
-    """[H, W, 3] float32 in a colour space of a configuration to scene-linear Rec.709, nothing cut.
+    """Converts [H, W, 3] float32 from a colour space of a configuration to scene-linear Rec.709, unclipped.
 
-    JobError if the configuration cannot convert it.
+    Raises JobError if the configuration cannot convert the space.
     """
     target, finish = _way_out(config)
     source = oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
@@ -201,5 +199,5 @@ def light_of(pixels: NDArray[np.float32], space: str, config: str) -> NDArray[np
     if values is None:
         raise footage_error(f"{space!r} cannot be converted to light: {error_of(light)}.", "Name another colour space.")
     values = np.asarray(values, np.float32)
-    with np.errstate(all="ignore"):  # codes that no picture has become infinite light
+    with np.errstate(all="ignore"):  # codes outside of a camera's range may become infinite light
         return values if finish is None else finish(values)

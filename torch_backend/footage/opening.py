@@ -1,4 +1,4 @@
-"""Opens footage: which kind it is."""
+"""Opens footage as a video or as an image sequence."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from .video import VideoSource
 def open_source(
     source: str, fps: float = 0.0, layer: str = "", colours: Colours | None = None, told: Told | None = None
 ) -> Source:
-    """Opens a video file, a folder or file or pattern of a numbered sequence.
+    """Opens a video file, or a numbered sequence by its folder, one of its files or a pattern.
 
-    `fps` overrides a sequence's rate, `layer` names the layer of its pictures to take, `colours` what colour space they
-    are in; None: what the files say. So does `told` for the rest.
+    `fps` overrides the rate of a sequence. `layer` is the layer of a sequence, or the stream number of a video.
+    `colours` and `told` override what the files declare; None: no overrides.
 
-    JobError in one sentence for what is missing, empty, or no footage at all.
+    Raises JobError if the footage is missing, empty or of an unknown kind.
     """
     if not source:
         raise footage_error(
@@ -38,7 +38,7 @@ def open_source(
         wanted = not path.exists() and is_pattern(path.name)
         if path.is_dir():
             os.listdir(path)
-    except (OSError, ValueError) as error:  # no permission, too long a name, a zero byte in it
+    except (OSError, ValueError) as error:  # no permission, a name that is too long or has a zero byte
         reason = getattr(error, "strerror", None) or error
         raise footage_error(f"The footage {source!r} cannot be opened: {reason}.", "Check the path.") from error
     if wanted or path.is_dir() or (path.is_file() and not opens_as_video(path)):
@@ -58,15 +58,15 @@ def open_source(
 
 
 def opens_as_video(path: Path) -> bool:
-    """True if a file is opened as a video: all but still pictures that OpenImageIO reads."""
+    """True if a file is to be opened as a video: any file except a still picture that OpenImageIO reads."""
     if path.suffix.lower() not in PICTURES:
         return True
     picture = oiio.ImageInput.open(regular_file(path))
-    if picture is None:  # damaged: its sequence says so
+    if picture is None:  # damaged: `SequenceSource` reports it
         error_of()
         return False
     try:
-        if picture.format_name() == "png":  # OpenImageIO reads the first picture of an animated PNG alone
+        if picture.format_name() == "png":  # OpenImageIO only reads the first picture of an animated PNG
             with av.open(regular_file(path)) as container:
                 return container.format.name == "apng"
         return bool(picture.spec().get_int_attribute("oiio:Movie"))
@@ -77,7 +77,7 @@ def opens_as_video(path: Path) -> bool:
 
 
 def open_video(path: Path, colours: Colours | None = None, told: Told | None = None, layer: str = "") -> VideoSource:
-    """Opens a video. Raises JobError for a picture, animated or not."""
+    """Opens a video. Raises JobError for a still picture, and for an animated picture that cannot be read."""
     try:
         video = VideoSource(path, colours, told, layer)
     except JobError as error:
@@ -97,14 +97,14 @@ def open_video(path: Path, colours: Colours | None = None, told: Told | None = N
 
 
 def _refuse_pictures(path: Path) -> None:
-    """JobError if a file is one of numbered pictures that OpenImageIO does not read, and not of numbered videos."""
+    """Raises JobError if a file belongs to numbered pictures of an unreadable format. Ignores numbered videos."""
     found = numbered_neighbours(path)
     if found is not None and not any(_is_clip(path.parent / name) for name in list(found.files.values())[:3]):
         raise unreadable_pictures(found.pattern)
 
 
 def _is_clip(path: Path) -> bool:
-    """True if a file is a video of two frames or more."""
+    """True if a file is a video with at least two frames."""
     try:
         return len(list(islice(VideoSource(path).frames(None, 2), 2))) == 2
     except JobError:
@@ -112,7 +112,7 @@ def _is_clip(path: Path) -> bool:
 
 
 def _pictures(path: Path, fps: float, layer: str, colours: Colours, told: Told | None) -> SequenceSource:
-    """A sequence. What can only be said of a video is told to be passed over."""
+    """Opens a sequence. Warns that options for videos are ignored."""
     told = told or Told()
     pictures = SequenceSource(find_sequence(path), fps, layer, colours, told.pixel_aspect, told.look)
     for value, what in ((told.matrix, "matrix"), (told.levels, "levels")):

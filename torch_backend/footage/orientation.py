@@ -1,4 +1,4 @@
-"""How stored pictures and videos are mirrored and turned to be upright: one of the eight ways of EXIF."""
+"""Orientation of stored pictures and videos: the eight EXIF orientations, and the transform to upright."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .av_types import side_data
 from .oiio_types import attribute
 
 _NEARLY = 0.02
-"""How far a display matrix may be off one of the eight: one degree is 0.017."""
+"""Tolerance for the elements of a display matrix: a rotation by one degree changes them by 0.017."""
 _WORDS = {
     2: "mirrored left to right", 3: "turned by 180 degrees", 4: "mirrored top to bottom",
     5: "mirrored along its diagonal", 6: "turned clockwise", 7: "mirrored along its other diagonal",
@@ -26,35 +26,35 @@ _MATRICES = {
     (1, 0, 0, 1): 1, (-1, 0, 0, 1): 2, (-1, 0, 0, -1): 3, (1, 0, 0, -1): 4,
     (0, 1, 1, 0): 5, (0, 1, -1, 0): 6, (0, -1, -1, 0): 7, (0, -1, 1, 0): 8,
 }  # fmt: skip
-"""Directions (a, b, c, d) of a display matrix, by which x' = a x + c y and y' = b x + d y, y downwards -> EXIF code."""
+"""Elements (a, b, c, d) of a display matrix with x' = a x + c y and y' = b x + d y, y downwards -> EXIF code."""
 
 
 @dataclass(frozen=True)
 class Orientation:
-    """One of the eight ways to put a picture upright."""
+    """One of the eight EXIF orientations."""
 
     code: int = 1
-    """As EXIF counts them, 1 to 8; 1: the picture is stored upright."""
+    """EXIF code, 1 to 8; 1: the picture is stored upright."""
 
     _PARTS: ClassVar[dict[int, tuple[bool, int]]] = {
         1: (False, 0), 2: (True, 0), 3: (False, 2), 4: (True, 2), 5: (True, 1), 6: (False, 3), 7: (True, 3),
         8: (False, 1),
     }  # fmt: skip
-    """Code -> whether to mirror left to right, and then how many quarter turns counterclockwise follow."""
+    """Code -> (mirror left to right first, number of quarter turns counterclockwise)."""
 
     @property
     def is_mirrored(self) -> bool:
-        """True if left and right are exchanged, beyond any turn."""
+        """True if the orientation includes a reflection."""
         return self._PARTS[self.code][0]
 
     @property
     def swaps_sides(self) -> bool:
-        """True if width becomes height."""
+        """True if width and height are exchanged."""
         return self.code >= 5
 
     @property
     def words(self) -> str:
-        """What is done to the stored picture, as it ends a sentence; empty if nothing is."""
+        """Description of the transform, for the end of a sentence; empty for upright pictures."""
         return _WORDS.get(self.code, "")
 
     def size(self, width: int, height: int) -> tuple[int, int]:
@@ -62,19 +62,19 @@ class Orientation:
         return (height, width) if self.swaps_sides else (width, height)
 
     def upright(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """A stored picture [h, w, ...] upright, contiguous."""
+        """The upright version of a stored picture [h, w, ...], contiguous."""
         is_mirrored, turns = self._PARTS[self.code]
         return np.ascontiguousarray(np.rot90(pixels[:, ::-1] if is_mirrored else pixels, turns))
 
 
 UPRIGHT = Orientation()
-"""Of pictures that are stored as they are to be seen."""
+"""Orientation of pictures that are stored upright."""
 
 
 def orientation_of_picture(spec: oiio.ImageSpec) -> Orientation | None:
-    """What the header of a picture says; upright if it says nothing, None if it says what EXIF does not know."""
+    """The orientation in a picture's header; upright if missing, None for an invalid code."""
     code = attribute(spec, "Orientation")
-    if code is None or code == 0:  # 0: cameras that do not know
+    if code is None or code == 0:  # cameras write 0 for unknown
         return UPRIGHT
     return Orientation(code) if isinstance(code, int) and 1 <= code <= 8 else None
 
@@ -82,7 +82,7 @@ def orientation_of_picture(spec: oiio.ImageSpec) -> Orientation | None:
 def orientation_of_matrix(matrix: NDArray[np.int32]) -> Orientation | None:
     """The orientation in a display matrix (9 numbers, as in MP4 and FFmpeg); None if it is none of the eight.
 
-    Its scale and its offset do not matter: pictures are shown whole, and FFmpeg makes a pixel aspect of two scales.
+    Scale and offset are ignored: pictures are shown whole, and FFmpeg converts unequal scales to a pixel aspect.
     """
     a, b, u, c, d, v = (float(value) for value in matrix[:6])
     across, down = math.hypot(a, b), math.hypot(c, d)
@@ -93,11 +93,11 @@ def orientation_of_matrix(matrix: NDArray[np.int32]) -> Orientation | None:
     if max(abs(x - y) for x, y in zip(exact, rounded, strict=True)) > _NEARLY or rounded not in _MATRICES:
         return None
     found = Orientation(_MATRICES[rounded])
-    # FFmpeg's pixel aspect is that of the shown picture, which a quarter turn makes another of the stored one.
+    # FFmpeg's pixel aspect is that of the shown picture. After a quarter turn, it would not fit the stored picture.
     return None if found.swaps_sides and abs(across / down - 1.0) > _NEARLY else found
 
 
 def display_matrix(frame: av.VideoFrame) -> NDArray[np.int32] | None:
-    """The display matrix of a decoded frame: its own, or its stream's; None if neither has one."""
+    """The display matrix of a decoded frame or of its stream; None if neither has one."""
     data = side_data(frame, Type.DISPLAYMATRIX)
     return np.frombuffer(data, np.int32, 9) if len(data) >= 36 else None

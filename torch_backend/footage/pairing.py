@@ -1,7 +1,7 @@
-"""Which numbered picture belongs to which frame: one decision over the whole set, for masks and for cameras.
+"""Assigns numbered pictures to frames, for masks, depth maps and cameras. One decision covers the whole set.
 
-Numbers alone do not tell how the pictures were counted: as the shot, as the footage, or from 0 or 1. Each way is tried
-for all pictures together, and the one that fits is taken.
+Pictures may be numbered like the shot, like the footage, or from 0 or 1, and the numbers alone do not show which. The
+code tries each numbering for all pictures together and selects the best fit.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from .numbering import recorded_shift
 
 @dataclass(frozen=True)
 class Counted:
-    """How a shot counts its frames."""
+    """Frame numbering of a shot."""
 
     frames: list[int]
     """Frame numbers of the shot, ascending."""
     clip: tuple[int, int] | None = None
-    """First and last frame that the whole footage has, in the shot's numbers; None if it is not known."""
+    """First and last frame of the whole footage, in the shot's numbers; None if unknown."""
     shift: int = 0
-    """What the import added to the footage's own numbers."""
+    """Number that the import added to the footage's own frame numbers."""
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """Pictures and the frames they belong to."""
+    """Assignment of pictures to frames."""
 
     numbers: dict[int, int]
     """Frame -> number of its picture, ascending."""
     by_own_number: bool = True
     """True if each picture has the number of its frame."""
     is_certain: bool = True
-    """False if another way to count the pictures fits as well."""
+    """False if another numbering of the pictures fits equally well."""
 
 
 def counted_of(record: dict[str, Any]) -> Counted:
-    """How an imported shot counts; `record` is its frames.json."""
+    """Frame numbering of an imported shot, from its frames.json."""
     numbers = [int(row["frame"]) for row in record["frames"]]
     clip = record.get("clip")
     span = (int(clip[0]), max(int(clip[1] or 0), numbers[-1])) if clip else None
@@ -47,30 +47,30 @@ def counted_of(record: dict[str, Any]) -> Counted:
 
 
 def pair(pictures: Sequence[int], counted: Counted, needs_all: bool = False, may_shift: bool = True) -> Pairing:
-    """The picture of each frame.
+    """Assigns a picture to each frame.
 
-    A way to count is better if the pictures are exactly the frames; then if all pictures lie within the clip; then if
-    most frames have one. If two are alike, the shot's own numbers win, then the footage's;
-    but pictures from 0 are counted from 0 where the footage begins at 1.
+    Criteria for a numbering, in this order: pictures and frames match exactly; few pictures lie outside of the clip;
+    enough frames have a picture. In a tie, the shot's numbers win, then the footage's numbers. Exception: if the
+    footage begins at 1, picture 0 belongs to its first frame.
 
     Args:
         pictures: numbers of the pictures, ascending.
-        counted: how the shot counts.
-        needs_all: only ways that give every frame a picture are of use, where there are any.
-        may_shift: False if the pictures are numbered as the shot or the footage for certain.
+        counted: frame numbering of the shot.
+        needs_all: prefer numberings in which every frame has a picture.
+        may_shift: False if the pictures certainly have the numbers of the shot or of the footage.
     """
     if not pictures:
         return Pairing({})
     frames, first = counted.frames, pictures[0]
     steps = [0, counted.shift]
     clip = counted.clip or (frames[0], frames[-1])
-    # Numbers from 0 or 1 are a count of the pictures' own; so are others that miss most frames and are as many.
+    # Pictures may count independently if they start at 0 or 1, or if few numbers match a frame but the total matches.
     strange = 2 * len(set(pictures) & set(frames)) < len(frames)
     as_many = len(pictures) in (len(frames), clip[1] - clip[0] + 1)
     may_count_anew = may_shift and (first in (0, 1) or (strange and as_many))
     if may_count_anew:
         steps += [clip[0] - first, frames[0] - first]
-    if may_shift and first == 0 and clip[0] - counted.shift == 1:  # programs count from 0 what people count from 1
+    if may_shift and first == 0 and clip[0] - counted.shift == 1:  # programs count from 0, people from 1
         steps.insert(0, clip[0])
     ways = [_Way(step, pictures, counted, needs_all) for step in dict.fromkeys(steps)]
     best = max(ways, key=lambda way: way.worth)
@@ -81,20 +81,20 @@ def pair(pictures: Sequence[int], counted: Counted, needs_all: bool = False, may
 
 
 class _Worth(NamedTuple):
-    """How well a way to count fits, the weightiest first."""
+    """Quality of a numbering, most important criterion first."""
 
     complete: bool
-    """Every frame has a picture, where that is needed."""
+    """True if every frame needs a picture and has one."""
     exact: bool
-    """Pictures and frames are the same."""
+    """True if pictures and frames match one to one."""
     inside: int
     """Minus the number of pictures outside of the clip."""
     enough: bool
-    """Every frame has a picture, or half of them where not all need one: beyond that more pictures tell nothing."""
+    """True if enough frames have a picture: all if all need one, otherwise half."""
 
 
 class _Way:
-    """One way to count pictures: `step` is added to their numbers."""
+    """One candidate numbering, which adds `step` to the numbers of the pictures."""
 
     def __init__(self, step: int, pictures: Sequence[int], counted: Counted, needs_all: bool) -> None:
         self.step = step
@@ -108,12 +108,12 @@ class _Way:
 
 
 def _is_even(numbers: Sequence[int]) -> bool:
-    """True if numbers go up by one step: they count something."""
+    """True if numbers increase by a constant step."""
     return len({b - a for a, b in pairwise(numbers)}) <= 1
 
 
 def pairing_words(name: str, pictures: Sequence[int], paired: Pairing) -> tuple[str, str] | None:
-    """(sentence, hint) for the artist about how pictures were taken; None where nothing else was possible.
+    """(sentence, hint) for the artist about the assignment; None if it is unambiguous and uses the frames' numbers.
 
     `name` is the subject, such as "The mask m.####.png".
     """

@@ -1,7 +1,7 @@
-"""How plates are held: what their source has, in as few bytes.
+"""Encoding of plates in memory: keeps the precision of the source in few bytes.
 
-Codes are [H, W, 3]: uint8 or uint16, display-referred sRGB from 0 to their largest, or float16, scene-linear Rec.709
-with values below 0 and above 1. A half holds light as EXR does: within 2.5e-4 of its value, up to 65504.
+Codes are [H, W, 3]: uint8 or uint16, display-referred sRGB from 0 to the largest code; or float16, scene-linear Rec.709
+with values below 0 and above 1. A half float holds light as EXR does: with a relative error of 2.5e-4, up to 65504.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from .color import InputSpace, linear_to_srgb, srgb_to_linear
 from .images import resize, resize_float
 
 ROWS = 64
-"""Rows converted at a time: a large plate as float32 is four times what it takes as codes."""
+"""Number of rows converted at a time: a large plate takes four times the memory as float32."""
 _HALF_MAX = np.float32(65504.0)
 
 
 def half_of(pixels: NDArray[np.float32], space: InputSpace) -> NDArray[np.float16]:
-    """[H, W, 3] as read, in `space`, to float16 codes."""
+    """Converts [H, W, 3] as read, in `space`, to float16 codes."""
     out = np.empty(pixels.shape, np.float16)
     for top in range(0, len(pixels), space.rows):
         out[top : top + space.rows] = space.to_linear(pixels[top : top + space.rows])
@@ -29,7 +29,7 @@ def half_of(pixels: NDArray[np.float32], space: InputSpace) -> NDArray[np.float1
 
 
 def display(codes: NDArray[Any]) -> NDArray[np.float32]:
-    """Codes of any shape to extended display-referred, white 1."""
+    """Converts codes of any shape to extended display-referred values, white 1."""
     out = np.empty(codes.shape, np.float32)
     for top in range(0, len(codes), ROWS):
         part = codes[top : top + ROWS]
@@ -41,7 +41,7 @@ def display(codes: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def linear(codes: NDArray[Any]) -> NDArray[np.float32]:
-    """Codes of any shape to scene-linear Rec.709."""
+    """Converts codes of any shape to scene-linear Rec.709."""
     if codes.dtype == np.float16:
         return codes.astype(np.float32)
     out, table = np.empty(codes.shape, np.float32), _linear_of_integers(np.iinfo(codes.dtype).max)
@@ -51,7 +51,7 @@ def linear(codes: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def from_display(pixels: NDArray[np.float32], kind: DTypeLike) -> NDArray[Any]:
-    """Extended display-referred to codes of a kind; integers cut at 0 and 1 and round."""
+    """Converts extended display-referred values to codes of a dtype. Clips and rounds integer codes."""
     if np.dtype(kind) == np.float16:
         return np.clip(srgb_to_linear(pixels), -_HALF_MAX, _HALF_MAX).astype(np.float16)
     most = np.float32(np.iinfo(kind).max)
@@ -59,7 +59,7 @@ def from_display(pixels: NDArray[np.float32], kind: DTypeLike) -> NDArray[Any]:
 
 
 def resize_plate(codes: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """Codes to [height, width, 3] codes of the same kind, by Lanczos-3, on display-referred values as `resize` does."""
+    """Resizes codes to [height, width, 3] of the same dtype, by Lanczos-3 on display-referred values as in `resize`."""
     if codes.shape[:2] == (height, width):
         return codes
     if codes.dtype != np.float16:
@@ -69,7 +69,7 @@ def resize_plate(codes: NDArray[Any], width: int, height: int) -> NDArray[Any]:
 
 @cache
 def _display_of_halves() -> NDArray[np.float32]:
-    """Display-referred value of each of the 65536 half floats, by its bits."""
+    """Table of the display-referred value of each of the 65536 half floats, indexed by its bits."""
     with np.errstate(all="ignore"):
         return linear_to_srgb(np.arange(65536, dtype=np.uint16).view(np.float16).astype(np.float32))
 

@@ -1,7 +1,7 @@
-"""Plates: the source's frames at its own size and depth, without the lens, one by one.
+"""Plates: undistorted source frames at the source's size and bit depth.
 
-Working frames are small and hold light up to white, or 64 times that; frozen frames take their pixels from here. Where
-the source holds no more than the working frames do, these are the plates.
+Working frames are small, and hold light only up to white, or 64 times white. Frozen frames take their pixels from the
+plates instead. If the source has no more detail than the working frames, the working frames are the plates.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from .sources import Known, Source, SourceInfo, told_in
 
 PLATES_VERSION = 1
 STAYS = "Frozen frames stay at the size and depth of the working frames."
-"""End of every note."""
+"""Last sentence of every note."""
 _KEPT, _KEPT_BYTES = 11, 150e6
 _AGREE = 4.0 / 255.0
 _DISAGREE_SHARE = 1e-3
-"""A plate is of another picture than its working frame if more than this share of pixels is farther off than that, or
-one of its colours on the mean."""
+"""Test whether a plate shows the picture of its working frame: the mean difference of each channel is below `_AGREE`,
+and the luma of less than this share of pixels differs by more than `_AGREE`."""
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 class Plates:
-    """Undistorted source frames, read as they are requested; the last few are kept, as codes (see `plate_encoding`).
+    """Undistorted source frames, read on request. Caches the last few as codes (see `plate_encoding`).
 
-    A kept plate takes 3 to 6 bytes a pixel, 50 MB at 3840 x 2160. Not safe to use from several threads.
+    A cached plate takes 3 to 6 bytes per pixel, up to 50 MB at 3840 x 2160. Not thread-safe.
     """
 
     width: int
@@ -53,24 +53,24 @@ class Plates:
     height: int
     """Pixels."""
     frames: list[int]
-    """Numbers of every source frame of the range, ascending; also those that a step left out of training."""
+    """Numbers of all source frames of the range, ascending, including those not used in training."""
     deep: bool
     """True if values may lie below 0 and above 1."""
     note: str
-    """One sentence for a warning where working frames stand in for the source; empty if nothing is lost."""
+    """Sentence for a warning if working frames replace the source; empty if nothing is lost."""
     key: str
-    """Changes with the footage, the solve, and the size."""
+    """Key of the footage, the solve and the size."""
 
     def __init__(self, shot: Shot, size: tuple[int, int] | None = None, keep: int = 0) -> None:
-        """`size` is width and height in pixels, None the source's; `keep` the most plates held.
+        """`size`: width and height in pixels; None: those of the source. `keep`: maximum number of cached plates.
 
-        The default, 0, holds what a frozen frame and the next one ask for: itself, two before and two after it at
-        every other frame, and t*; of large plates fewer, as many as `_KEPT_BYTES` hold, but three. JobError (FOOTAGE,
-        SOLVE) if the shot is not imported and solved.
+        The default, 0, caches the plates for a frozen frame and the next one: the frame itself, the second and the
+        fourth frame before and after it, and t*. Large plates are limited to `_KEPT_BYTES`, but at least three are
+        cached. Raises JobError (FOOTAGE, SOLVE) if the shot is not imported and solved.
         """
         load_cameras(shot)
         record = load_frames(shot)
-        # Cameras may come without the record of a solve: a scene of truth has none.
+        # Synthetic ground-truth scenes have cameras without the record of a solve.
         solved = load_record(shot) if shot.solve_record.is_file() else {}
         self._shot = shot
         self._files = {int(row["frame"]): str(row["file"]) for row in record["frames"]}
@@ -84,7 +84,7 @@ class Plates:
         self._keep = keep or min(_KEPT, max(3, int(_KEPT_BYTES / (6.0 * self.width * self.height))))
         self.deep = self._display.bends or (info is not None and info.extended)
         if not self.deep and (self.width, self.height) == self._working:
-            source = None  # the working frames are just that
+            source = None  # the working frames have the same pixels
         self._reader = source.plates(self._known(record)) if source is not None else None
         self._warp: tuple[PlateLens | MapLens, BandUndistorter] | None = None
         self._held: OrderedDict[int, NDArray[Any]] = OrderedDict()
@@ -92,23 +92,23 @@ class Plates:
         self.key = content_key(PLATES_VERSION, record.get("key"), solved.get("key"), footage, [self.width, self.height])
 
     def display(self, frame: int) -> Tensor:
-        """[H, W, 3] float32 on the CPU, in the working frames' display: values below 0 and above 1 where `deep`.
+        """A plate [H, W, 3] float32 on the CPU, in the working frames' display, with values beyond 0 to 1 if `deep`.
 
-        ValueError if the shot has no such frame; JobError (FOOTAGE, SOLVE) if its picture cannot be read any more.
+        Raises ValueError if the shot has no such frame, JobError (FOOTAGE, SOLVE) if its picture cannot be read.
         """
         return from_numpy(self._display.bent(plate_encoding.display(self._codes(frame))))
 
     def linear(self, frame: int, rows: slice = slice(None)) -> Tensor:
-        """The same in scene-linear Rec.709: all of it, or some rows, which at 4K spares 100 MB."""
+        """A plate in scene-linear Rec.709: all rows, or a slice to save 100 MB at 4K. Raises as `display` does."""
         return from_numpy(plate_encoding.linear(self._codes(frame)[rows]))
 
     @property
     def kept(self) -> int:
-        """Plates held now."""
+        """Number of cached plates."""
         return len(self._held)
 
     def original(self) -> SourceInfo | None:
-        """The footage, where it is there and what was imported; also where working frames hold as much."""
+        """Facts of the footage, also if working frames replace it; None if it is missing or not the imported one."""
         record = load_frames(self._shot)
         config = _config(record)
         for _, source in self._opened(record, config):
@@ -116,12 +116,12 @@ class Plates:
         return None
 
     def lens(self) -> PlateLens | MapLens | None:
-        """The lens of all frames; None where frames have lenses of their own, or it is not told."""
+        """The lens shared by all frames; None if frames have different lenses, or the lens is unknown."""
         lenses = set(self._lenses.values()) if isinstance(self._lenses, dict) else set[PlateLens | MapLens]()
         return next(iter(lenses)) if len(lenses) == 1 else None
 
     def bars(self, frame: int) -> NDArray[np.bool_] | None:
-        """[H, W]: what of a plate is a bar beside the picture, as the import found it; None if there is none."""
+        """Mask [H, W] of the letterbox or pillarbox bars in a plate, from the import's record; None without bars."""
         bars = recorded_bars(load_frames(self._shot), self.height, self.width)
         if not bars.sides:
             return None
@@ -130,7 +130,7 @@ class Plates:
         return codes > np.iinfo(codes.dtype).max // 2
 
     def close(self) -> None:
-        """Frees what is held; plates are read anew if they are requested again."""
+        """Frees the cache and closes the footage. Later requests read the plates again."""
         self._held.clear()
         if self._reader is not None:
             self._reader.close()
@@ -163,12 +163,12 @@ class Plates:
         return self._undistorted(plate_encoding.resize_plate(picture, self.width, self.height), frame)
 
     def _undistorted(self, picture: NDArray[Any], frame: int) -> NDArray[Any]:
-        """Codes without the lens; those of 8 bits become 16, which lie between them."""
+        """Undistorted codes. 8-bit codes become 16-bit, because interpolated values lie between the codes."""
         lens = self._lenses[frame] if isinstance(self._lenses, dict) else None
         if lens is None or lens.is_none:
             return picture
         if self._warp is None or self._warp[0] != lens:
-            self._warp = None  # before the next one takes its room
+            self._warp = None  # free its memory before building the next one
             self._warp = lens, BandUndistorter(lens.where(self.width, self.height))
         kind = np.dtype(np.float16 if picture.dtype == np.float16 else np.uint16)
         into = np.empty(picture.shape, kind)
@@ -177,7 +177,7 @@ class Plates:
     # ------------------------------------------------------------------------------------------------- the source
 
     def _find(self, record: dict[str, Any]) -> tuple[Source | None, str]:
-        """The footage, or None for the working frames and, where those hold less, a sentence that says why."""
+        """(footage, ""), or (None, reason) to use the working frames. The reason is empty if nothing is lost."""
         if _holds_no_more(record, self._working):
             return None, ""
         if isinstance(self._lenses, str):
@@ -192,8 +192,8 @@ class Plates:
         return None, f"The footage {self._shot.info().source or 'of this shot'} cannot be read. {STAYS}"
 
     def _opened(self, record: dict[str, Any], config: FootageConfig) -> Iterator[tuple[str, Source]]:
-        """Where footage lies that can be opened, and itself, read as it was imported."""
-        # By the configuration of the import: another one of today would read other colours.
+        """(path, footage) for each place where the footage can be opened, with the settings of the import."""
+        # Use the OCIO configuration of the import: the present one may convert colours differently.
         reading: dict[str, Any] = record.get("reading") or {}
         shift = recorded_shift(record)
         colours = Colours(config.colour_space, str(reading.get("ocio", "")))
@@ -204,7 +204,7 @@ class Plates:
                 continue
 
     def _is_imported(self, source: Source, record: dict[str, Any], config: FootageConfig) -> bool:
-        """True if the footage is by its key, or by its first, middle and last picture, what was imported."""
+        """True if the footage is the imported one, by its key or by its first, middle and last picture."""
         info = source.info
         if record.get("key") in import_keys(info, config, self._display, recorded_shift(record)):
             return True
@@ -225,13 +225,13 @@ class Plates:
         return Known(seconds, float(start) if start is not None else None, self._agrees)
 
     def _agrees(self, frame: int, picture: NDArray[Any]) -> bool:
-        """True if a picture of the source shows what the raw working frame does."""
+        """True if a picture of the source matches the raw working frame."""
         try:
             raw = read_png(self._shot.frames / self._files[frame])
         except (OSError, ValueError):
-            return True  # nothing to hold it against
+            return True  # there is nothing to compare
         width, height = self._working
-        if self._display.bends:  # as the import made it
+        if self._display.bends:  # convert as the import did
             if picture.dtype != np.float16:
                 return False
             small = plate_encoding.display(self._display.codes_of(picture, width, height))
@@ -240,7 +240,7 @@ class Plates:
         else:
             small = plate_encoding.display(plate_encoding.resize_plate(picture, width, height))
         off = np.clip(small, 0.0, 1.0) - plate_encoding.display(raw)
-        # By brightness: colour at edges depends on how chroma was scaled up, which changed between versions.
+        # Compare luma: colour at edges depends on chroma upsampling, which differs between versions.
         alike = (np.abs(off @ _LUMA) > _AGREE).mean() < _DISAGREE_SHARE
         return bool(alike and np.abs(off.mean(axis=(0, 1))).max() < _AGREE)
 
@@ -251,12 +251,12 @@ def _config(record: dict[str, Any]) -> FootageConfig:
 
 
 def _holds_no_more(record: dict[str, Any], working: tuple[int, int]) -> bool:
-    """True if the footage is known to have the working frames' size and no values that they lack."""
+    """True if the record shows that the footage has the working frames' size and no values beyond 0 to 1."""
     return tuple(record.get("source_size", ())) == working and not record.get("extended", True)
 
 
 def _lenses(shot: Shot) -> dict[int, PlateLens | MapLens] | str:
-    """The lens of each frame, or a sentence that says why there is none. JobError (SOLVE) if there is no solve."""
+    """The lens of each frame, or a sentence why the lens is unknown. Raises JobError (SOLVE) if there is no solve."""
     load_cameras(shot)
     try:
         return load_plate_lenses(shot)

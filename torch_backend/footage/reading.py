@@ -1,4 +1,4 @@
-"""Sentences for the artist about how footage was read."""
+"""Sentences for the artist about the interpretation of footage."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ _ASSUMED = {
     "fps_told": "rate", "pixel_aspect_told": "pixel aspect", "colour_told": "colour space", "matrix_told": "matrix",
     "range_told": "levels",
 }  # fmt: skip
-"""What a reading may have assumed, and what people call it."""
+"""Key of a reading that is False if the property was assumed -> name of the property for messages."""
 
 
 def read_as(info: SourceInfo, timecode: str = "") -> list[str]:
-    """One sentence that says how the footage is read, and one that names what of it was assumed, if anything was.
+    """Sentences: how the footage is read, from which files, and which properties were assumed.
 
-    `timecode` is that of the first frame that was taken.
+    `timecode` is that of the first imported frame.
     """
     reading = info.reading
     aspect = float(reading.get("pixel_aspect", 1.0))

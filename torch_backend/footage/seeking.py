@@ -1,8 +1,8 @@
-"""Single frames of a video, in any order, by the numbers that import gave them.
+"""Reads single frames of a video in any order, by the frame numbers of the import.
 
-Import numbers frames by counting what the decoder gives out, which no seek can do. So a frame is found by the time
-that import recorded for it, and what was sought is held against its working frame. A file in which that fails, or
-whose frames have no times, is counted from its beginning, as import did.
+The import numbers frames by counting the decoder's output, which is impossible after a seek. Therefore the reader finds
+a frame by the time that the import recorded, and compares it with its working frame. If that fails, or frames have no
+times, the reader counts from the beginning of the file, as the import did.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from .av_types import seconds_of
 from .sources import Known, footage_error
 
 _THREADS = 2
-"""Threads of the decoder; each holds its own frames."""
+"""Number of decoder threads. Each holds its own frames."""
 _KEPT = 4
 """Number of decoded frames kept: the next request is usually for a neighbour, forwards or backwards."""
 _AHEAD = 32
-"""Distance in frames up to which decoding on is faster than seeking: key frames are usually farther apart."""
+"""Distance in frames up to which further decoding is faster than a seek: key frames are usually farther apart."""
 _EARLIER = (0.0, 1.0, 5.0, 20.0)
-"""Seconds before a frame at which a key frame is searched for, in this order."""
+"""Offsets in seconds before a frame at which to search for a key frame, in this order."""
 _LEAST_GAP = 1e-5
-"""Seconds between frames that can be told apart: import rounds to 1e-6."""
+"""Minimum gap in seconds to distinguish frames by time: the import rounds times to 1e-6."""
 
 
 class DecodedVideo(Protocol):
-    """A video whose frames are read again; `VideoSource` is one."""
+    """Interface of a video for `VideoReader`, implemented by `VideoSource`."""
 
     path: Path
 
     def open(self, threads: int) -> tuple[Any, Any]:
-        """Container and video stream, at the beginning, with so many threads for the decoder."""
+        """(container, video stream) at the beginning, with this number of decoder threads."""
         ...
 
     def decode(self, container: Any, stream: Any) -> Iterator[Any]:
-        """Frames from where the container stands, and errors in the place of what cannot be decoded."""
+        """Frames from the container's position, with an FFmpegError in the place of each undecodable packet."""
         ...
 
     def plate_of(self, frame: av.VideoFrame) -> NDArray[Any]:
@@ -52,12 +52,12 @@ class DecodedVideo(Protocol):
 
     @property
     def run_up(self) -> float:
-        """Seconds before a frame from which decoding has to begin for the same picture."""
+        """Seconds before a frame at which decoding must start to reproduce the same picture."""
         ...
 
 
 class VideoReader:
-    """See `sources.PlateReader`. Holds up to `_KEPT` frames as decoded: at most 25 MB each at 3840 x 2160, 10 bit."""
+    """A `sources.PlateReader` of a video. Caches `_KEPT` decoded frames, at most 25 MB each (3840 x 2160, 10 bit)."""
 
     def __init__(self, source: DecodedVideo, known: Known) -> None:
         self._source, self._known, self._start = source, known, known.start
@@ -71,9 +71,9 @@ class VideoReader:
         self._stream: Any = None
         self._decoder: Iterator[Any] = iter(())
         self._counted: int | None = None
-        """Frames given out since the beginning; None after a seek: frames are told by their times then."""
+        """Number of frames decoded since the beginning; None after a seek, when frames are identified by time."""
         self._at = 0
-        """Number of the frame that was decoded last."""
+        """Number of the last decoded frame."""
 
     def plate(self, number: int) -> NDArray[Any]:
         """See `PlateReader.plate`."""
@@ -109,14 +109,14 @@ class VideoReader:
             self._container = None
 
     def _reopen(self) -> None:
-        """To the beginning, where counting starts."""
+        """Opens the file again at the beginning, and starts counting."""
         self.close()
         self._container, self._stream = self._source.open(min(_THREADS, os.cpu_count() or 1))
         self._decoder = self._source.decode(self._container, self._stream)
         self._counted, self._at = 0, 0
 
     def _sought(self, number: int) -> NDArray[Any] | None:
-        """The plate by way of the key frame before it; None, once and for all, if this file cannot be sought in."""
+        """The plate by a seek to the key frame before it. If that fails, returns None and disables further seeks."""
         for earlier in _EARLIER:
             if not self._jump(self._time_of(number) - earlier - self._source.run_up):
                 break
@@ -131,7 +131,7 @@ class VideoReader:
         return None
 
     def _jump(self, seconds: float) -> bool:
-        """Goes to the key frame before a time, as the container sees it. False if it cannot."""
+        """Seeks to the key frame before a time on the container's clock. Returns False on failure."""
         self._kept.clear()
         self._counted, self._at = None, self._listed[0] - 1
         try:
@@ -142,7 +142,7 @@ class VideoReader:
         return True
 
     def _forward(self, number: int) -> av.VideoFrame | None:
-        """Decodes up to frame `number`, keeping those on the way; None if it does not come."""
+        """Decodes up to frame `number`, and caches the frames on the way. Returns None if the frame is missing."""
         for frame in self._decoder:
             if self._counted is not None:
                 self._counted += 1
@@ -169,7 +169,7 @@ class VideoReader:
         return self._start + self._known.seconds[number]
 
     def _number_at(self, frame: av.VideoFrame) -> int | None:
-        """Number of a frame by its time; None if import listed none there."""
+        """Number of a frame by its time; None if the import recorded no frame at that time."""
         seconds = seconds_of(frame)
         if seconds is None or self._start is None:
             return None
@@ -179,6 +179,6 @@ class VideoReader:
         return self._listed[at] if near else None
 
     def _is_past(self, frame: av.VideoFrame, number: int) -> bool:
-        """True if a frame without a number comes after `number`, or cannot be placed at all."""
+        """True if a frame without a number comes after `number` or has no time."""
         seconds = seconds_of(frame)
         return seconds is None or seconds > self._time_of(number) + self._slack

@@ -1,6 +1,6 @@
-"""Frames of a numbered image sequence through OpenImageIO: one layer, straight colour, square pixels, sRGB or light.
+"""Reads a numbered image sequence through OpenImageIO: one layer, straight colour, square pixels, sRGB or light.
 
-What was made for a display and is not 8-bit sRGB already becomes 16-bit sRGB.
+Pictures made for a display stay 8-bit sRGB if they are that already; otherwise they become 16-bit sRGB.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ DEFAULT_FPS = 24.0
 _IN_BLENDER = {
     ".exr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dpx", ".cin", ".hdr", ".tga", ".bmp", ".webp", ".jp2", ".psd",
 }  # fmt: skip
-"""Endings of files that Blender shows alike. It knows no JPEG XL, and loses a line of a colour of SGI files."""
+"""Extensions of files that Blender shows correctly. Blender cannot read JPEG XL, and damages one line of SGI files."""
 
 
 _NO_ORIENTATION = (
@@ -61,7 +61,7 @@ _NO_ORIENTATION = (
 
 
 def _several_numbers(pattern: str) -> tuple[str, str]:
-    """The warning that more than one number varies in the names of a sequence."""
+    """The warning about file names in which more than one number varies."""
     return (
         f"Several numbers vary in the names: the frame number was read where # stands in {pattern}.",
         "If another one counts the frames, name the clip by a pattern with # in its place.",
@@ -69,7 +69,7 @@ def _several_numbers(pattern: str) -> tuple[str, str]:
 
 
 class SequenceSource:
-    """A numbered sequence. Frame numbers are those of the files; missing and unreadable ones are left out."""
+    """A numbered sequence. Frame numbers are those of the files. Missing and unreadable frames are omitted."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class SequenceSource:
             deep=light or not space.as_it_stands or str(spec.format) not in ("uint8", "int8"),
             extended=light or not space.as_it_stands or str(spec.format) in ("half", "float", "double"),
             colour="linear" if light else "srgb",
-            # By content: footage may be copied or moved. What is read otherwise than it used to be is imported again.
+            # By content: footage may be copied or moved. Footage that this version reads differently gets a new key.
             key=content_key_of(self._files) + reading_key,
             former_key=[*self._former_key(sequence), *reading_key],
             reading={
@@ -127,7 +127,7 @@ class SequenceSource:
         )
 
     def _reading_key(self, layers: int) -> list[Any]:
-        """How the pictures are read, for the clip's key; empty for ordinary ones, of which it did not always say."""
+        """Part of the clip's key about the interpretation of the pictures; empty for ordinary ones, as in old keys."""
         space = self._space
         ordinary = space.as_it_stands or space == InputSpace("lin", declared=space.declared)
         ordinary = ordinary and self._aspect == 1 and self._layer.alpha is None and layers == 1
@@ -136,13 +136,13 @@ class SequenceSource:
         return ([] if ordinary else key) + turned
 
     def _former_key(self, sequence: PictureSequence) -> list[Any]:
-        """The key that an earlier version gave these files: by name, size and date."""
+        """The key of these files in an earlier version: by name, size and modification time."""
         stats = [file.stat() for file in self._files.values()]
         size, time = sum(stat.st_size for stat in stats), max(stat.st_mtime_ns for stat in stats)
         return [_former_name(sequence), len(stats), size, time]
 
     def _reading(self, spec: oiio.ImageSpec) -> dict[str, Any]:
-        """How the pictures are read, for frames.json."""
+        """Interpretation of the pictures, for frames.json."""
         space = self._space
         return {
             "colour": space.name,
@@ -177,7 +177,7 @@ class SequenceSource:
         for number in sorted(n for n in self._files if first <= n <= last):
             try:
                 pixels = self._read(self._files[number], findings)
-            except (OSError, UnicodeDecodeError):  # the name of a channel may be damaged too
+            except (OSError, UnicodeDecodeError):  # UnicodeDecodeError: damaged channel name
                 unreadable.append(number)
                 continue
             yield SourceFrame(number, (number - self.info.first) / self.info.fps, pixels)
@@ -192,7 +192,7 @@ class SequenceSource:
             self.warnings.append(("Pictures fill only a part of their frame: the rest of it is black.", ""))
 
     def _describe(self, names: list[str], requested_layer: str, size: tuple[int, int]) -> None:
-        """Warns of what is taken otherwise than it stands in the files."""
+        """Warns about a chosen layer, pixels that are not square, and a conversion of primaries."""
         if len(names) > 1 and not requested_layer:
             others = ", ".join(shown(n) for n in names if n != self._layer.name)
             message = f"The pictures have {len(names)} layers: {shown(self._layer.name)} is taken."
@@ -241,15 +241,15 @@ class SequenceSource:
         return plate_encoding.resize_plate(np.ascontiguousarray(rgb), self.info.width, self.info.height)
 
     def _light(self, rgb: NDArray[np.float32]) -> NDArray[Any]:
-        """[H, W, 3] float16 plate of pixels as they are stored."""
+        """A plate [H, W, 3] float16 of light, from stored pixels."""
         plate = plate_encoding.half_of(rgb, self._space)
         return plate_encoding.resize_plate(plate, self.info.width, self.info.height)
 
     def close(self) -> None:
-        """See `PlateReader.close`: files are not kept open."""
+        """See `PlateReader.close`. Does nothing, because no files stay open."""
 
     def _read(self, file: Path, findings: _Findings) -> NDArray[Any]:
-        """[H, W, 3] uint8 or uint16 sRGB, or float16 light. OSError if unreadable."""
+        """A picture [H, W, 3]: uint8 or uint16 sRGB, or float16 light. Raises OSError if unreadable."""
         rgb = self._stored_pixels(file, findings)
         if self._space.is_light:
             return self._light(rgb)
@@ -258,7 +258,7 @@ class SequenceSource:
         return resize(np.ascontiguousarray(rgb), self.info.width, self.info.height)
 
     def _stored_pixels(self, file: Path, findings: _Findings) -> NDArray[Any]:
-        """[h, w, 3] of the layer, straight, in the file's space and pixels: uint8, or float32 if the source is deep."""
+        """Straight colour [h, w, 3] of the layer, in the file's colour space and size: uint8, or float32 if deep."""
         (spec, buffer, failed), layer = _open(file, self._layer.part), self._layer
         if channel_names(spec) != self._channels:
             layer = self._same_layer(file)
@@ -268,8 +268,8 @@ class SequenceSource:
         size = spec.full_width, spec.full_height
         orientation = orientation_of_picture(spec) or UPRIGHT
         if orientation != self._orientation:
-            # Each turned by its own would be as wrong as all by the first: cameras change the note during a take while
-            # the picture goes on, and programs turn the pixels of some.
+            # No rule is safe here. Some cameras change the tag during a take without turning the picture, and some
+            # programs turn the pixels of a few files. So neither each file's tag nor the first tag is reliable.
             words = [one.words or "stored upright" for one in (orientation, self._orientation)]
             raise footage_error(
                 f"{file.name} is {words[0]} by its header, the sequence began with pictures that are {words[1]}.",
@@ -301,7 +301,7 @@ class SequenceSource:
         return orientation.upright(rgb)
 
     def _same_layer(self, file: Path) -> Layer:
-        """Where the sequence's layer lies in a file whose channels are others than the first one's."""
+        """Location of the sequence's layer in a file with other channels than the first file."""
         layer = find_layer(file, self._layer.name)[0]
         if layer.name != self._layer.name:
             raise footage_error(
@@ -313,7 +313,7 @@ class SequenceSource:
 
 @dataclass
 class _Findings:
-    """What the pictures read so far had that is not taken."""
+    """Properties of the pictures read so far that need a warning."""
 
     transparent: bool = False
     cropped: bool = False
@@ -321,11 +321,11 @@ class _Findings:
 
 AS_STORED = oiio.ImageSpec()
 AS_STORED.attribute("oiio:UnassociatedAlpha", 1)
-"""Colour is not to be multiplied by alpha where the file has not done so."""
+"""Read option: OpenImageIO must not multiply unassociated colour by alpha."""
 
 
 def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
-    """Header and pixels, and what is wrong with them, if anything is."""
+    """(header, pixels, error message or "")."""
     buffer = oiio.ImageBuf(regular_file(file), part, 0, AS_STORED)
     spec = buffer.spec()
     check_size(file.name, spec)
@@ -333,8 +333,8 @@ def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
 
 
 def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction, orientation: Orientation) -> str:
-    """Why other programs show such pictures otherwise, see `SourceInfo.unlike`."""
-    if orientation != UPRIGHT:  # no Blender turns pictures by their header, up to 5.2
+    """Why other programs show such pictures differently, see `SourceInfo.unlike`."""
+    if orientation != UPRIGHT:  # Blender ignores the orientation tag, up to 5.2
         return f"its pictures are {orientation.words} by their header"
     if aspect != 1:
         return "its pixels are not square"
@@ -346,7 +346,7 @@ def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction, orientation: Or
 
 
 def _named_unlike(name: str, files: dict[int, Path]) -> str:
-    """The same by the files' names: Blender is given one of them and looks for the others under its name."""
+    """Result of `_unlike` from the file names: Blender opens one file, and derives the names of the others."""
     if Path(name).suffix.lower() not in _IN_BLENDER:
         return f"Blender does not show {Path(name).suffix} pictures as they are"
     if all(file.name == file_as_blender_counts(name, number) for number, file in files.items()):
@@ -355,7 +355,7 @@ def _named_unlike(name: str, files: dict[int, Path]) -> str:
 
 
 def _former_name(sequence: PictureSequence) -> str:
-    """What earlier versions called a sequence without gaps in a shot's key: `shot.1001-1010#.exr`."""
+    """Name of a sequence without gaps in the keys of earlier versions: `shot.1001-1010#.exr`."""
     numbers = list(sequence.files)
     hashes = re.search(r"#+", sequence.pattern)
     if hashes is None or sequence.numbered.others_vary:
@@ -366,7 +366,7 @@ def _former_name(sequence: PictureSequence) -> str:
 
 
 def _rate(spec: oiio.ImageSpec) -> float:
-    """Frames per second that a picture tells; 0 if it tells none, or none that can be."""
+    """Frames per second from a picture's header; 0 if missing or implausible."""
     rate = attribute(spec, "framesPerSecond") or attribute(spec, "FramesPerSecond")
     if isinstance(rate, tuple):  # a rational, as OpenEXR stores it
         rate = rate[0] / rate[1] if rate[1] else 0.0
@@ -374,14 +374,14 @@ def _rate(spec: oiio.ImageSpec) -> float:
 
 
 def _data_window(spec: oiio.ImageSpec) -> tuple[slice, slice]:
-    """Rows and columns of the picture's frame that the file holds."""
+    """(rows, columns) of the data window within the display window."""
     left, top = spec.x - spec.full_x, spec.y - spec.full_y
     rows = slice(min(max(0, top), spec.full_height), max(0, min(spec.full_height, top + spec.height)))
     return rows, slice(min(max(0, left), spec.full_width), max(0, min(spec.full_width, left + spec.width)))
 
 
 def straight_colour(rgb: NDArray[Any], alpha: NDArray[Any], opaque: float) -> NDArray[Any]:
-    """Colour [H, W, 3] that was multiplied by alpha [H, W] without it; as it stands where alpha is 0 (pure light)."""
+    """Unpremultiplies colour [H, W, 3] by alpha [H, W]. Colour with alpha 0 (pure light) stays unchanged."""
     covered = (alpha > 0) & (alpha < opaque)
     if not covered.any():
         return rgb
@@ -391,7 +391,7 @@ def straight_colour(rgb: NDArray[Any], alpha: NDArray[Any], opaque: float) -> ND
 
 
 def _pixel_aspect(spec: oiio.ImageSpec) -> Fraction | None:
-    """Width of a pixel over its height; None where the file does not say."""
+    """Width of a pixel over its height; None if the file does not store it."""
     value = spec.getattribute("PixelAspectRatio")
     if not isinstance(value, (int, float)) or not np.isfinite(value) or value <= 0:
         return None
@@ -401,7 +401,7 @@ def _pixel_aspect(spec: oiio.ImageSpec) -> Fraction | None:
 
 
 def _input_space(file: Path, spec: oiio.ImageSpec, colours: Colours, warnings: list[tuple[str, str]]) -> InputSpace:
-    """Colour space of a picture: from the options, its file or a rule of $OCIO, else the usual one of such files."""
+    """Colour space of a picture: from the options, its file or a rule of $OCIO, else the usual one of its format."""
     chosen = colours.space()
     if chosen is not None:
         return chosen
@@ -438,13 +438,13 @@ def _input_space(file: Path, spec: oiio.ImageSpec, colours: Colours, warnings: l
 
 
 def _known_to_ocio(file: Path, name: str, colours: Colours) -> InputSpace | None:
-    """The space that a file names as the OCIO configuration does, or that its rules give the file."""
+    """The OCIO space with the name stored in a file, or the space from the configuration's file rules."""
     found = colours.known(name) if name and name.lower() != "unknown" else None
     return found or colours.by_rules(file)
 
 
 def _film_space(suffix: str, transfer: str, warnings: list[tuple[str, str]]) -> InputSpace:
-    """Of DPX and Cineon files, which hold anything from a film scan to video."""
+    """Colour space of DPX and Cineon files, which hold anything from film scans to video."""
     if suffix == ".cin" or transfer in ("Printing density", "Logarithmic"):
         warnings.append(
             (

@@ -1,4 +1,4 @@
-"""Which files of a folder are the pictures of a sequence."""
+"""Finds the files of an image sequence in a folder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FEW = 2
 
 
 _NO_PICTURES = {"null", "term"}
-"""Formats of OpenImageIO that hold none: one makes pictures up, one writes text."""
+"""Formats of OpenImageIO without stored pictures: null generates pictures, term writes text."""
 
 
 def _picture_endings() -> frozenset[str]:
@@ -34,7 +34,7 @@ def _picture_endings() -> frozenset[str]:
 
 
 PICTURES = _picture_endings()
-"""Endings of files that OpenImageIO reads, lower case."""
+"""File extensions that OpenImageIO reads, lower case."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class PictureSequence:
 
     @property
     def pattern(self) -> str:
-        """Name of its files with # for the frame number."""
+        """Name of the files, with # for the frame number."""
         return self.numbered.pattern
 
     @property
@@ -56,9 +56,9 @@ class PictureSequence:
 
 
 def find_sequence(path: Path) -> PictureSequence:
-    """The sequence that a folder, one file of it, or a pattern (shot.####.exr, *_left.%04d.png) stands for.
+    """Finds the sequence for a folder, one of its files, or a pattern (shot.####.exr, *_left.%04d.png).
 
-    JobError if there is none, if a file has no number, or if several are meant.
+    Raises JobError if there is no sequence, if the file has no number, or if several sequences match.
     """
     if path.is_dir():
         return _only(path, _sequences_in(path, _names_in(path)), f"The folder {path} holds", _no_sequence_in(path))
@@ -78,19 +78,19 @@ def find_sequence(path: Path) -> PictureSequence:
 
 
 def sequence_of_file(path: Path) -> PictureSequence | None:
-    """The sequence that a picture belongs to; None if it is a single one. JobError if it belongs to several."""
+    """The sequence that a picture belongs to; None for a single picture. Raises JobError if it belongs to several."""
     found = [s for s in _sequences_in(path.parent, _names_in(path.parent)) if path.name in s.files.values()]
     return _only(path.parent, found, f"{path.name} belongs to", None) if found else None
 
 
 def numbered_neighbours(path: Path) -> NumberedFiles | None:
-    """The numbered files, of whatever ending, that a file belongs to; None if it stands alone."""
+    """The numbered files of any extension that a file belongs to; None for a single file."""
     found = numbered_files(_names_in(path.parent))
     return next((s for s in found if len(s.files) >= FEW and path.name in s.files.values()), None)
 
 
 def unreadable_pictures(pattern: str) -> JobError:
-    """The refusal of numbered files that OpenImageIO does not read."""
+    """The error for numbered files that OpenImageIO cannot read."""
     return footage_error(
         f"{pattern} cannot be read: OpenImageIO does not know the ending {ending(pattern) or 'of these pictures'}.",
         "Convert them to PNG, TIFF or EXR.",
@@ -100,7 +100,7 @@ def unreadable_pictures(pattern: str) -> JobError:
 def _names_in(folder: Path) -> list[str]:
     try:
         with os.scandir(folder) as entries:
-            # Names with a leading dot are metadata that macOS and other programs store next to a file.
+            # Skip files with a leading dot, in which macOS and other programs store metadata.
             return [entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file()]
     except OSError:
         return []
@@ -112,12 +112,12 @@ def _sequences_in(folder: Path, names: list[str]) -> list[NumberedFiles]:
 
 
 def _is_readable(numbered: NumberedFiles) -> bool:
-    """True if OpenImageIO reads such files."""
+    """True if OpenImageIO reads these files, by their extension."""
     return Path(next(iter(numbered.files.values()))).suffix.lower() in PICTURES
 
 
 def _only(folder: Path, found: list[NumberedFiles], who: str, missing: JobError | None) -> PictureSequence:
-    """The one of the sequences found. JobError if there are several, or files with the same number."""
+    """The only found sequence. Raises JobError if there are several, or two files with the same number."""
     if not found and missing is not None:
         raise missing
     if len(found) > 1:

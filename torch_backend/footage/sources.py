@@ -1,4 +1,4 @@
-"""What footage is to an import: its facts, its frames one after the other, single ones again; and words for them."""
+"""Interfaces of footage for an import: facts, sequential frames, single frames (plates); and helpers for messages."""
 
 from __future__ import annotations
 
@@ -13,80 +13,80 @@ from numpy.typing import NDArray
 from ..contract import ExitCode, ImportParams, JobError, files_digest, mapped
 
 LEAST_FRAMES = 8
-"""Frames that a freeze needs."""
+"""Minimum number of frames for a freeze."""
 LONGEST_PIXEL = 4
-"""Anamorphic pixels are at most about 2 times as wide as high."""
+"""Largest plausible pixel aspect. Anamorphic pixels are at most about 2 times as wide as high."""
 
 
 SLOWEST_FPS, FASTEST_FPS = 0.1, 1000.0
-"""Rates of image sequences that are trusted: what else a file or a person says is a slip."""
+"""Range of plausible frame rates of image sequences. Values outside of it are mistakes."""
 
 
 @dataclass
 class SourceFrame:
-    """One frame as the source holds it."""
+    """One frame of the source."""
 
     number: int
     """Frame number: from 1 in a video, the file's number in a sequence."""
     seconds: float
     """Presentation time in seconds on the source's own clock."""
     pixels: NDArray[Any]
-    """[H, W, 3], square pixels, upright: uint8 or uint16 display-referred sRGB, or of footage that holds light
-    (`SourceInfo.colour`) float16, scene-linear Rec.709 with nothing cut, as `plate_encoding` has it."""
+    """[H, W, 3], square pixels, upright: uint8 or uint16 display-referred sRGB. For footage that holds light
+    (`SourceInfo.colour`): float16, scene-linear Rec.709, unclipped, see `plate_encoding`."""
     corrupt: bool = False
-    """The decoder had to guess parts of it."""
+    """True if the decoder had to guess parts of the picture."""
 
 
 @dataclass
 class SourceInfo:
-    """What is known of the footage before it is decoded."""
+    """Facts about the footage that are known before decoding."""
 
     width: int
     """Width in pixels, upright and with square pixels."""
     height: int
     """Height in pixels."""
     fps: float
-    """Frames per second, the average if they vary."""
+    """Frames per second; the average for a variable rate."""
     first: int
     """Number of the first frame."""
     last: int | None
-    """Number of the last frame; None where the container does not say."""
+    """Number of the last frame; None if the container does not store it."""
     deep: bool
-    """True if working frames keep 16 bits."""
+    """True if working frames have 16 bits."""
     extended: bool
     """True if its plates may hold values below 0 and above 1: light, floats, other primaries than Rec.709."""
     colour: str
     """srgb, or linear for pictures that hold light: scene-linear, log, HDR."""
     key: list[Any]
-    """What tells this footage from another: its files' count, bytes and content, and how they are read."""
+    """Key of the footage: count, bytes and content of its files, and their interpretation."""
     reading: dict[str, Any] = field(default_factory=dict[str, Any])
-    """How it is read, and what of that was assumed: the record in frames.json says so."""
+    """Interpretation of the footage, with flags for assumed properties; stored in frames.json."""
     file: str = ""
     """The video, or the first picture of the sequence."""
     probe: tuple[float, ...] = ()
-    """Linear Rec.709 light that `contract.PROBE` means in its files."""
+    """Linear Rec.709 light of the value `contract.PROBE` in the footage."""
     unlike: str = ""
-    """Why another program would show the files otherwise than they are read here, a clause; empty if it would not."""
+    """Clause why another program would show the files differently; empty if it would not."""
     former_key: list[Any] = field(default_factory=list[Any])
-    """`key` as earlier versions made it, of names and modification times: imports that carry it stay finished."""
+    """`key` in earlier versions, from names and modification times. Imports with this key stay valid."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What a person says of the footage in place of its files."""
+    """The user's overrides of properties of the footage."""
 
     matrix: str = ""
-    """One of `frame_rgb.MATRIX_OVERRIDES`; empty: what the file says, or players assume."""
+    """Key of `frame_rgb.MATRIX_OVERRIDES`; empty: from the file, else the assumption of players."""
     levels: str = ""
-    """One of `frame_rgb.RANGE_OVERRIDES`; empty: what the file says, or players assume."""
+    """Key of `frame_rgb.RANGE_OVERRIDES`; empty: from the file, else the assumption of players."""
     pixel_aspect: Fraction | None = None
-    """Width of a pixel over its height; None: what the files say, else square."""
+    """Width of a pixel over its height; None: from the files, else square."""
     look: str = ""
-    """File of a look through which the footage is seen, see `look`; empty: none."""
+    """File of a look to apply to the footage, see `look`; empty: none."""
 
 
 def told_in(config: ImportParams) -> Told:
-    """What of it an import was asked for."""
+    """The overrides in the parameters of an import. Raises JobError for a colour space together with a look."""
     matrix, levels = ("" if value == "auto" else value for value in (config.matrix, config.levels))
     if config.lut and config.colour_space:
         raise footage_error(
@@ -104,53 +104,53 @@ class Source(Protocol):
     warnings: list[tuple[str, str]]
 
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
-        """Frames `first` to `last`, inclusive, in order. Those that cannot be decoded are left out, with a warning."""
+        """Frames `first` to `last`, inclusive, in order. Omits undecodable frames, with a warning."""
         ...
 
     def plates(self, known: Known) -> PlateReader:
-        """Reads single frames of an import of this source again, at the source's own size and depth."""
+        """A reader for single frames of an import of this source, at the source's size and depth."""
         ...
 
 
 @dataclass
 class Known:
-    """Facts that an import stored about the frames that are read again."""
+    """Facts from an import, for a `PlateReader`."""
 
     seconds: dict[int, float]
-    """Time of each listed frame since the first of them, by its number."""
+    """Frame number -> time in seconds since the first listed frame."""
     start: float | None
     """Time of the first listed frame on the source's own clock; None if the import did not record it."""
     agrees: Callable[[int, NDArray[Any]], bool]
-    """Whether a frame's plate shows what its working frame shows."""
+    """Function that returns True if a frame's plate matches its working frame."""
 
 
 class PlateReader(Protocol):
-    """Single frames of a source, in any order; ascending ones, and their near neighbours, are quick."""
+    """Reads single frames of a source in any order. Ascending order and near neighbours are fast."""
 
     def plate(self, number: int) -> NDArray[Any]:
-        """Frame `number`, upright, with square pixels, uncut, as `plate_encoding` has it.
+        """Frame `number`, upright, with square pixels, unclipped, as codes of `plate_encoding`.
 
-        OSError or JobError (FOOTAGE) if it cannot be read.
+        Raises OSError or JobError (FOOTAGE) if the frame cannot be read.
         """
         ...
 
     def close(self) -> None:
-        """Frees what is held open."""
+        """Closes open files."""
         ...
 
 
 def content_key_of(files: Mapping[int, Path]) -> list[Any]:
-    """What `SourceInfo.key` begins with: count, bytes and content of numbered files; 1 is the number of a video."""
+    """First part of `SourceInfo.key`: count, bytes and content of numbered files. A video has the number 1."""
     return [len(files), sum(file.stat().st_size for file in files.values()), files_digest(files)]
 
 
 def footage_error(message: str, hint: str = "") -> JobError:
-    """An error about the footage, as the artist reads it."""
+    """An error about the footage, for the artist."""
     return JobError(message, hint, ExitCode.FOOTAGE)
 
 
 def frame_words(numbers: Sequence[int]) -> str:
-    """'frame 4', or 'frames 3-5, 9' for 3, 4, 5 and 9; at most eight spans are listed. `numbers` ascend."""
+    """Frame numbers as text: 'frame 4', or 'frames 3-5, 9'. Lists at most eight spans. `numbers` are ascending."""
     spans: list[list[int]] = []
     for number in numbers:
         if spans and number == spans[-1][1] + 1:
@@ -163,7 +163,7 @@ def frame_words(numbers: Sequence[int]) -> str:
 
 
 def believable_aspect(aspect: Fraction, warnings: list[tuple[str, str]]) -> Fraction:
-    """Width of a pixel over its height; 1, with a warning, if no camera or lens has such pixels."""
+    """The pixel aspect if plausible; otherwise 1, with a warning."""
     if 1 / LONGEST_PIXEL <= aspect <= LONGEST_PIXEL:
         return aspect
     warnings.append((f"The footage claims pixels {float(aspect):g} times as wide as high: taken as square.", ""))
@@ -171,7 +171,7 @@ def believable_aspect(aspect: Fraction, warnings: list[tuple[str, str]]) -> Frac
 
 
 def square_size(width: int, height: int, aspect: Fraction) -> tuple[int, int]:
-    """Size of a picture once its pixels, `aspect` times as wide as high, are square; neither side shrinks."""
+    """(width, height) of a picture resampled to square pixels from the pixel aspect `aspect`. Neither side shrinks."""
     if aspect >= 1:
         return max(1, round(width * aspect)), height
     return width, max(1, round(height / aspect))

@@ -1,4 +1,4 @@
-"""Files in a shot's folder of frames that no import made: they stay."""
+"""Keeps files in a shot's frames folder that other programs or users put there."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..shot import make_folder
 
 
 def keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:
-    """Takes over what lies in the frames folder and is not ours, under its own name or, where we need that, another.
+    """Links or copies foreign files of the frames folder `old` into `fresh`. Renames a file if its name is in use.
 
-    Ours are the listing, the frames that it names, and their undistorted copies beside raw/.
+    All files are foreign except frames.json, the frames listed in it, and their undistorted copies beside raw/.
     """
     ours, needed = _listed(old / FRAMES_FILE), _names(record)
     for found in sorted(p for p in old.rglob("*") if p.is_symlink() or not p.is_dir()):
@@ -33,12 +33,12 @@ def keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:
         make_folder(target.parent)
         try:
             os.link(found, target, follow_symlinks=False)
-        except (OSError, NotImplementedError):  # no hard links there: a network share, a memory card
+        except (OSError, NotImplementedError):  # no hard links, as on a network share or a memory card
             shutil.copy2(found, target, follow_symlinks=False)
 
 
 def _listed(listing: Path) -> set[Path]:
-    """Our files in a folder with this frames.json; the listing alone if it cannot be read: no other is known to be."""
+    """Own files in a folder with this frames.json; only frames.json itself if it cannot be read."""
     try:
         return _names(read_json(listing))
     except (OSError, ValueError, KeyError, TypeError):
@@ -46,7 +46,7 @@ def _listed(listing: Path) -> set[Path]:
 
 
 def _names(record: dict[str, Any]) -> set[Path]:
-    """Files of an import, relative to the frames folder, and the undistorted ones that a solve writes beside raw/."""
+    """Files of an import relative to the frames folder, with the undistorted frames that a solve writes beside raw/."""
     files = [Path(str(row["file"])) for row in record["frames"]]
     return {
         Path(FRAMES_FILE),

@@ -1,4 +1,4 @@
-"""Frames of a video file through PyAV: real timestamps, upright, square pixels, display-referred sRGB or light."""
+"""Reads a video file through PyAV: real timestamps, upright, square pixels, display-referred sRGB or light."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from .video_stream import (
 )
 
 _ANIMATED_PICTURES = {"apng", "gif"}
-"""Formats of FFmpeg that other programs take for pictures."""
+"""FFmpeg formats that other programs treat as still pictures."""
 
 # Code points of ITU-T H.273, as stored in the stream.
 UNSAID = (0, 2, 3)
@@ -62,16 +62,16 @@ TRANSFERS = {
     1: "g24", 4: "g22", 5: "g24", 6: "g24", 7: "g24", 8: "lin", 11: "g24", 12: "g24", 13: "srgb", 14: "g24",
     15: "g24", 16: "pq", 18: "hlg",
 }  # fmt: skip
-"""Transfer functions, as `color.InputSpace` names them."""
+"""Code -> name of the transfer function in `color.InputSpace`."""
 PRIMARIES = {1: "rec709", 9: "rec2020", 10: "ciexyzd65", 11: "p3dci", 12: "p3d65"}
 NEAR_REC709 = {4: "BT.470 M", 5: "BT.601 625", 6: "BT.601 525", 7: "SMPTE 240M", 22: "EBU 3213"}
-"""Primaries of standard definition: taken as Rec.709's, as editors and Blender do; the difference is small."""
+"""Primaries of standard definition. They are read as Rec.709, as in editors and Blender: the difference is small."""
 
 
 _MOST_INTERLACED = 1088
-"""Lines of the largest pictures that any standard interlaces."""
+"""Maximum height of interlaced pictures in any standard, in lines."""
 _fields_of: dict[tuple[str, int, int], str] = {}
-"""Path, size and time of a file -> `decoding.unmarked_fields` of it."""
+"""(path, size, modification time) of a file -> its `decoding.unmarked_fields`."""
 _NO_ORIENTATION = (
     "The clip's header asks to show the picture at an angle or stretched, which is neither a quarter turn nor a "
     "mirroring: frames are read as they are stored.",
@@ -80,13 +80,13 @@ _NO_ORIENTATION = (
 
 
 class VideoSource:
-    """A video file. Frame numbers count from 1 in presentation order; an undecodable one keeps its number.
+    """A video file. Frame numbers count from 1 in presentation order, including undecodable frames.
 
-    A file that ends before what it announces, and a picture that changes its size midway, are told by name.
+    Warns if the file ends earlier than announced, or if the picture changes its size.
     """
 
     def __init__(self, path: Path, colours: Colours | None = None, told: Told | None = None, layer: str = "") -> None:
-        """`layer`: number of the video stream to read, from 1; empty: the largest. Passed over where there is one."""
+        """`layer`: number of the video stream to read, from 1; empty: the largest. Ignored for a single stream."""
         self.path, self.layer = path, layer
         self.warnings: list[tuple[str, str]] = []
         told = told or Told()
@@ -99,7 +99,8 @@ class VideoSource:
             self._is_picture = container.format.name in _ANIMATED_PICTURES
             orientation = UPRIGHT if (matrix := display_matrix(frame)) is None else orientation_of_matrix(matrix)
             self._orientation, self._rotation = orientation or UPRIGHT, frame.rotation
-            # FFmpeg makes the stream's pixel aspect of the matrix: of one that is not applied it means nothing.
+            # FFmpeg derives the stream's pixel aspect from the display matrix. If that matrix is not applied, use the
+            # codec's pixel aspect.
             aspect = told.pixel_aspect or pixel_aspect(stream if orientation else stream.codec_context)
             self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
             look = look_space(told.look) if told.look else None
@@ -147,12 +148,12 @@ class VideoSource:
         )
 
     def _reading_key(self) -> list[Any]:
-        """How the pictures are read, for the clip's key; empty for ordinary ones."""
+        """Part of the clip's key about the interpretation of the pictures; empty for ordinary clips."""
         key: list[Any] = _reading_key(self._space) + (["deinterlaced"] if self._interlaced else [])
         return key + ([f"orientation {self._orientation.code}"] if self._orientation.is_mirrored else [])
 
     def _reading_of(self, container: Any, stream: Any) -> dict[str, Any]:
-        """How the stream is read, for frames.json."""
+        """Interpretation of the stream, for frames.json."""
         return {
             "pixel_aspect": float(self._aspect),
             "alpha": self.has_alpha,
@@ -163,13 +164,13 @@ class VideoSource:
         }
 
     def _unlike(self, frame: av.VideoFrame, orientation: Orientation | None) -> str:
-        """Why other programs show the clip otherwise, see `SourceInfo.unlike`."""
+        """Why other programs show the clip differently, see `SourceInfo.unlike`."""
         tagged = coding_of(frame)
         if self._is_picture:
             return "Blender shows an animated picture as a still one"
         if self._aspect != 1:
             return "its pixels are not square"
-        if orientation is None or orientation.is_mirrored:  # Blender 5 takes a mirrored picture for a turned one
+        if orientation is None or orientation.is_mirrored:  # Blender 5 rotates instead of mirroring
             return f"its header says that it is {orientation.words if orientation else 'turned or stretched'}"
         if not self._is_first_stream:
             return "it has several video streams, of which other programs show another"
@@ -177,7 +178,7 @@ class VideoSource:
             return "it is interlaced, and frames are made of its fields here"
         if (tagged.matrix, tagged.is_full) != (self._coding.matrix, self._coding.is_full):
             return "its matrix or range was set by hand"
-        if not tagged.matrix_told and tagged.matrix != BT601:  # what FFmpeg, and so Blender, takes such a clip for
+        if not tagged.matrix_told and tagged.matrix != BT601:  # FFmpeg, and therefore Blender, assume BT.601
             return "it does not say by which matrix its colours are stored"
         return ""
 
@@ -223,7 +224,7 @@ class VideoSource:
     def alphas(self, last: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """(number, alpha) of the frames up to `last`, in order: [H, W] in 0..1, upright, pixels as stored or square.
 
-        Frames that cannot be decoded are left out. JobError if the clip has no alpha, or changes its size.
+        Omits undecodable frames. Raises JobError if the clip has no alpha, or changes its size.
         """
         if not self.has_alpha:
             raise footage_error(f"{self.path.name} has no alpha.", "Give the mask as pictures of their own.")
@@ -243,7 +244,7 @@ class VideoSource:
                     raise footage_error(f"{self.path.name} changes its size at frame {number}.", "Export it in one.")
                 alpha = frame.reformat(format="rgba").to_ndarray()[..., 3].astype(np.float32) * np.float32(1 / 255)
                 orientation = self._orientation_of(frame)
-                if orientation.swaps_sides:  # its pixels would be as much too high as they are too wide
+                if orientation.swaps_sides:  # a quarter turn would invert the pixel aspect: resample to square pixels
                     size = square_size(frame.width, frame.height, self._aspect)
                     alpha = resize_float(alpha[..., None], *size)[..., 0]
                 yield number, orientation.upright(alpha)
@@ -253,7 +254,7 @@ class VideoSource:
         return VideoReader(self, known)
 
     def plate_of(self, frame: av.VideoFrame) -> NDArray[Any]:
-        """A decoded frame as a plate, see `plate_encoding`. JobError if its size is not the clip's."""
+        """A decoded frame as a plate, see `plate_encoding`. Raises JobError if its size differs from the clip's."""
         if self._shown_size(frame) != self._size:
             raise footage_error(f"{self.path.name} is not the clip that was imported: its size changes.")
         if self._space.as_it_stands:
@@ -264,16 +265,16 @@ class VideoSource:
         return self._orientation_of(frame).upright(pixels)
 
     def decode(self, container: Any, stream: Any) -> Iterator[Any]:
-        """Frames from where a container of `open` stands, and errors in the place of what cannot be decoded."""
+        """See `DecodedVideo.decode`. `container` and `stream` come from `open`."""
         return decoded(container, stream, fields=self._fields)
 
     @property
     def run_up(self) -> float:
-        """Seconds before a frame from which decoding has to begin for the same picture: deinterlacing looks back."""
+        """Seconds before a frame at which decoding must start: the deinterlacer also reads earlier frames."""
         return 1.5 / self.info.fps if self._interlaced else 0.0
 
     def open(self, threads: int) -> tuple[Any, Any]:
-        """The container and its stream, to be decoded by at most this many threads. JobError if it cannot be opened."""
+        """(container, video stream), with at most this many decoder threads. Raises JobError if opening fails."""
         container = self._open()
         stream = stream_of(container, self.path, self.layer)
         stream.thread_type = "AUTO"
@@ -281,7 +282,7 @@ class VideoSource:
         return container, stream
 
     def _stop_at_change(self, number: int, got: int, frame: av.VideoFrame) -> None:
-        """A stream may change its size midway; the shot has one, and ends there."""
+        """Ends the shot at a change of picture size, with a warning. Raises JobError if no frame came before it."""
         width, height = self._shown_size(frame)
         sizes = f"{width}x{height} pixels instead of {self._size[0]}x{self._size[1]}"
         if got < 1:
@@ -297,9 +298,9 @@ class VideoSource:
         )
 
     def _check_promise(self, seen: _Seen, begin: int, last: int | None) -> None:
-        """Says so if the file ended before what it announces; JobError if less than half of what was asked came."""
+        """Warns if the file ended earlier than announced. Raises JobError if less than half of the range was read."""
         count, end = self._promise
-        # Both: a clip that was trimmed without encoding it again holds frames that are never shown.
+        # Test frame count and end time: a clip trimmed without re-encoding holds frames that are never shown.
         short = count - seen.number > 1 and end - seen.seconds > 1.5 / self.info.fps + seen.gap
         promised = count if last is None else min(last, count)
         if not short or seen.number >= promised:
@@ -312,11 +313,11 @@ class VideoSource:
         self.warnings.append((message, hint))
 
     def _tell_streams(self, container: Any, stream: Any) -> None:
-        """Says which of several video streams is read."""
+        """Warns about the choice if there are several video streams."""
         streams = streams_of(container, self.path)
         self.has_streams = len(streams) > 1
-        """True if there is another that `layer` could name."""
-        # Blender shows the first.
+        """True if there are several video streams to select by `layer`."""
+        # Blender shows the first stream.
         self._is_first_stream = stream.index == container.streams.video[0].index
         if self.has_streams and not self.layer:
             number = 1 + [one.index for one in streams].index(stream.index)
@@ -328,7 +329,7 @@ class VideoSource:
             )
 
     def _unmarked_fields(self, height: int) -> str:
-        """See `decoding.unmarked_fields`; of this file, looked at once."""
+        """Result of `decoding.unmarked_fields` for this file, cached."""
         if height > _MOST_INTERLACED:
             return ""
         stat = self.path.stat()
@@ -350,7 +351,7 @@ class VideoSource:
             raise no_video(self.path) from error
 
     def _upright(self, frame: av.VideoFrame) -> NDArray[Any]:
-        """[H, W, 3] uint8 or uint16 sRGB, or float16 light."""
+        """A decoded frame, upright, [H, W, 3]: uint8 or uint16 sRGB, or float16 light."""
         if self._space.is_light:
             return self.plate_of(frame)
         if self._space.as_it_stands:
@@ -363,9 +364,9 @@ class VideoSource:
         return self._orientation_of(frame).upright(resize(pixels, width, height))
 
     def _orientation_of(self, frame: av.VideoFrame) -> Orientation:
-        """Of one frame: its own, else that of the clip."""
-        # The matrix is only read from a frame that differs: PyAV's side data holds the frame that holds it, so that its
-        # memory waits for the garbage collector.
+        """Orientation of one frame; that of the clip if the frame has none."""
+        # Only read the matrix of a frame with another rotation: PyAV's side data and the frame refer to each other, so
+        # that only the garbage collector frees their memory.
         if frame.rotation == self._rotation:
             return self._orientation
         matrix = display_matrix(frame)
@@ -395,14 +396,14 @@ class VideoSource:
 
 @dataclass
 class _Seen:
-    """What was decoded of the file so far."""
+    """Progress of decoding a file."""
 
     number: int = 0
-    """Of the last frame that could be decoded; 0: none yet."""
+    """Number of the last decoded frame; 0: none yet."""
     seconds: float = 0.0
-    """Its time."""
+    """Time of the last decoded frame."""
     gap: float = 0.0
-    """Longest time between two frames, beyond the second: rates may vary."""
+    """Longest time between two decoded frames, for variable frame rates."""
 
     def add(self, number: int, seconds: float) -> None:
         if self.number:
@@ -416,7 +417,7 @@ def _deinterlaced_words(which: str) -> tuple[str, str]:
 
 
 def _reading(frame: av.VideoFrame, space: InputSpace, coding: Coding) -> dict[str, Any]:
-    """How the colours of a clip are read, for the record of the import."""
+    """Interpretation of the colours of a clip, for the import's record."""
     return {
         "colour": space.name,
         "colour_told": space.declared,
@@ -440,14 +441,14 @@ def _reading_key(space: InputSpace) -> list[str]:
 
 
 def _primaries_read(frame: av.VideoFrame, space: InputSpace) -> str:
-    """Name of the primaries that a frame's colours are read with."""
+    """Name of the primaries assumed for a frame's colours."""
     if not space.primaries:
         return space.name
     return NEAR_REC709.get(int(frame.color_primaries), PRIMARIES_READ[space.primaries][0])
 
 
 def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> InputSpace:
-    """Colour space of a frame from the stream's tags, or as players assume without them."""
+    """Colour space of a frame from the stream's tags; for missing tags, the assumptions of players."""
     transfer, primaries, matrix = int(frame.color_trc), int(frame.color_primaries), int(frame.colorspace)
     known = transfer in TRANSFERS or transfer in UNSAID
     known_primaries = primaries in PRIMARIES or primaries in NEAR_REC709 or primaries in UNSAID
@@ -465,7 +466,7 @@ def _input_space(frame: av.VideoFrame, warnings: list[tuple[str, str]]) -> Input
                 )
             )
     declared = transfer in TRANSFERS and primaries not in UNSAID
-    # HDR without primaries is BT.2020 in every standard that knows it.
+    # HDR without primaries is BT.2020 in every HDR standard.
     assumed = "rec2020" if transfer in (16, 18) else "rec709"
     gamut = PRIMARIES.get(primaries, assumed if primaries in UNSAID else "rec709")
     return InputSpace(TRANSFERS.get(transfer, "g24"), gamut, declared=declared)

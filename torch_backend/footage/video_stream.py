@@ -1,4 +1,4 @@
-"""The video stream of a container: which one, its first frame, length and timecode."""
+"""Selects the video stream of a container, and reads its first frame, length and timecode."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from .sources import (
 )
 
 NOT_VIDEO = {"tty", "bin", "xbin", "adf", "idf", "image2", "image2pipe", "hls", "concat", "rawvideo"}
-"""FFmpeg opens plain text as a terminal recording and follows playlists elsewhere: no clip is meant by either."""
+"""FFmpeg formats that are no clips: plain text opens as a terminal recording, and playlists refer to other files."""
 
 
 _ATOMS = {b"ftyp", b"mdat", b"free", b"skip", b"wide", b"uuid", b"pnot", b"moof", b"sidx", b"styp", b"meta"}
-"""What MP4 and QuickTime files consist of at their top, beside the index."""
+"""Top-level atoms of MP4 and QuickTime files, except the index (moov)."""
 
 
 def _lacks_index(path: Path) -> bool:
@@ -38,15 +38,15 @@ def _lacks_index(path: Path) -> bool:
                 if kind not in _ATOMS:
                     break
                 count += 1
-                at = at + length if length >= 8 else size  # 0: until the file ends
-            is_blank = head[:8] == bytes(8)  # room that was reserved and never filled
+                at = at + length if length >= 8 else size  # 0: the atom extends to the end of the file
+            is_blank = head[:8] == bytes(8)  # reserved space that was never filled
             return count > 0 and (at >= size - 8 or is_blank)
     except OSError:
         return False
 
 
 def no_video(path: Path) -> Exception:
-    """What is raised for a file in which no video is found."""
+    """The error for a file without a readable video."""
     if _lacks_index(path):
         return footage_error(
             f"{path.name} was not finished: its index (the moov atom) is missing, so that no player can read it.",
@@ -59,7 +59,7 @@ def no_video(path: Path) -> Exception:
 
 
 def stream_of(container: Any, path: Path, layer: str) -> Any:
-    """The video stream to read: of the number `layer`, else the largest. JobError if there is none."""
+    """The video stream with the number `layer` (from 1); by default the largest. Raises JobError if there is none."""
     streams = streams_of(container, path)
     if not layer or len(streams) == 1:
         return max(streams, key=lambda s: (s.codec_context.width or 0) * (s.codec_context.height or 0))
@@ -70,17 +70,17 @@ def stream_of(container: Any, path: Path, layer: str) -> Any:
 
 
 def size_words(stream: Any) -> str:
-    """Width and height of a stream in pixels, as a sentence has them."""
+    """Width and height of a stream in pixels, for messages."""
     return f"{stream.codec_context.width}x{stream.codec_context.height}"
 
 
 def listed(streams: list[Any]) -> str:
-    """Streams by number and size."""
+    """Numbers and sizes of streams, for messages."""
     return ", ".join(f"{number} ({size_words(one)})" for number, one in enumerate(streams, start=1))
 
 
 def streams_of(container: Any, path: Path) -> list[Any]:
-    """Video streams that can be decoded, in the file's order. JobError if there is none."""
+    """Decodable video streams, in the file's order. Raises JobError if there are none."""
     names = set(container.format.name.split(","))
     streams = [s for s in container.streams.video if not (s.disposition & s.disposition.attached_pic)]
     if names & NOT_VIDEO or not streams:
@@ -95,9 +95,9 @@ def streams_of(container: Any, path: Path) -> list[Any]:
 
 
 def alpha_decoder_of(stream: Any) -> str:
-    """The decoder that gives the alpha of a clip whose own leaves it out; empty if its own does, or there is none.
+    """Name of a special decoder for the alpha of a clip; empty if the default decoder suffices, or without alpha.
 
-    VP8 and VP9 store alpha as a second picture, which only Google's libvpx decoder joins with the first.
+    VP8 and VP9 store alpha as a second picture, which only Google's libvpx decoder combines with the first.
     """
     marked = {key.lower(): str(value) for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
     decoder = {"vp8": "libvpx", "vp9": "libvpx-vp9"}.get(stream.codec_context.name, "")
@@ -105,7 +105,7 @@ def alpha_decoder_of(stream: Any) -> str:
 
 
 def first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:
-    """The first frame that can be decoded. JobError (FOOTAGE) if none can."""
+    """The first decodable frame. Raises JobError (FOOTAGE) if there is none."""
     for frame in stored_frames(container, stream):
         if not isinstance(frame, FFmpegError):
             return frame
@@ -113,13 +113,13 @@ def first_frame(container: Any, stream: Any, path: Path) -> av.VideoFrame:
 
 
 def pixel_aspect(stream: Any) -> Fraction | None:
-    """Width of a pixel over its height; None if the file does not say."""
+    """Width of a pixel over its height; None if the file does not store it."""
     aspect = stream.sample_aspect_ratio
     return Fraction(aspect) if aspect and aspect > 0 else None
 
 
 def timecode(container: Any, stream: Any) -> str:
-    """Of the first frame; empty if the file carries none."""
+    """Timecode of the first frame; empty if the file stores none."""
     tables = [stream.metadata, container.metadata, *(one.metadata for one in container.streams)]
     timecodes = (
         parse_timecode(str(value)) for table in tables for key, value in table.items() if key.lower() == "timecode"
@@ -128,14 +128,15 @@ def timecode(container: Any, stream: Any) -> str:
 
 
 def promise(container: Any, stream: Any, rate: Fraction) -> tuple[int, float]:
-    """Frames that the file announces, and when the last of them ends, in seconds on the stream's clock.
+    """(number of frames, end of the last frame in seconds on the stream's clock), as announced by the file.
 
-    (0, 0) where it announces nothing for this stream: with sound, the container's length may be the sound's.
+    (0, 0) if the file announces nothing for this stream. The container's length does not count if there are several
+    streams: it may be the length of the sound.
     """
     start = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
     if stream.duration and stream.time_base:
         end = start + float(stream.duration * stream.time_base)
-    elif stream.metadata.get("DURATION"):  # Matroska: the end, not the length
+    elif stream.metadata.get("DURATION"):  # Matroska stores the end, not the length
         end = _clock(stream.metadata["DURATION"])
     elif container.duration and len(container.streams) == 1:
         end = start + container.duration / av.time_base
@@ -145,7 +146,7 @@ def promise(container: Any, stream: Any, rate: Fraction) -> tuple[int, float]:
 
 
 def _clock(text: str) -> float:
-    """Seconds of "00:00:01.958000000"; 0 if it is something else."""
+    """Seconds from a text such as "00:00:01.958000000"; 0 for another format."""
     try:
         hours, minutes, seconds = (float(part) for part in text.split(":"))
     except ValueError:
@@ -154,7 +155,7 @@ def _clock(text: str) -> float:
 
 
 def count_from_duration(container: Any, stream: Any, rate: Fraction) -> int:
-    """Frames by the duration that the stream, or else the container, tells; 0 if neither does."""
+    """Number of frames from the duration of the stream, else of the container; 0 if both are unknown."""
     if stream.duration and stream.time_base:
         return round(float(stream.duration * stream.time_base * rate))
     return round(container.duration / av.time_base * float(rate)) if container.duration else 0

@@ -1,1 +1,1 @@
-"""The lens: between pixels of the original and of the undistorted frames, and resampling through it."""
+"""Lens models: mapping between pixels of original and undistorted frames, ST maps, and resampling."""

@@ -1,9 +1,10 @@
-"""The lens of a solve: between pixels of the original frames and pixels of the undistorted ones, both ways.
+"""The lens of a solve: maps pixels of the original frames to pixels of the undistorted frames, and back.
 
-COLMAP's models SIMPLE_RADIAL, RADIAL and OPENCV are one formula: (x, y) on the plane at depth 1 is moved to
-(x, y) (1 + k1 r^2 + k2 r^4) plus tangential terms in p1 and p2, and then to pixels. numpy alone, float64: pycolmap
-cannot be loaded beside OpenImageIO (see footage/images.py). The undistorted frames have the size and the principal
-point of the original ones and a focal length of their own (`answers.undistortion`).
+COLMAP's models SIMPLE_RADIAL, RADIAL and OPENCV share one formula: the point (x, y) on the plane at depth 1 moves to
+(x, y) (1 + k1 r^2 + k2 r^4) plus tangential terms in p1 and p2, and then to pixels. The code uses numpy only, in
+float64, because pycolmap and OpenImageIO cannot be loaded in one process (see footage/images.py). The undistorted
+frames keep the size and the principal point of the original frames; their focal length differs
+(`answers.undistortion`).
 """
 
 from __future__ import annotations
@@ -25,36 +26,36 @@ _EXTRA = {
     "RADIAL": ("k1", "k2"),
     "OPENCV": ("k1", "k2", "p1", "p2"),
 }
-"""COLMAP model -> what its distortion parameters are, in their order."""
+"""COLMAP model -> names of its distortion parameters, in COLMAP's order."""
 _MOST_STEPS = 60
 _DONE_PX = 1e-9
-"""Newton ends when no pixel is farther than this from where it should be."""
+"""Newton's method stops when the largest error over all pixels is below this."""
 _WRONG_PX = 1e-6
 _ALONG = 24
-"""Points on each line from the middle to the border at which the picture is tested for a fold."""
+"""Steps along each line from the middle to the border in the test for a fold."""
 
 
 NARROWEST_DEG, WIDEST_DEG = 12.0, 130.0
-"""Range of plausible angles of view along the longer side: 171 mm to 8.4 mm on full frame. A focal length that nothing
-in the clip holds runs off beyond them."""
+"""Plausible angles of view along the longer side: 171 mm to 8.4 mm on full frame. A solve that cannot determine the
+focal length ends outside of this range."""
 LEAST_DEG, MOST_DEG = 8.0, 150.0
-"""Beyond these it is refused: 257 mm, 4.8 mm."""
+"""Angles of view outside of this range are an error: 257 mm, 4.8 mm."""
 _MOST_STRETCH = 2.0
-"""How much farther from the middle than straight lines have it a corner may lie, or how much less far."""
+"""Largest plausible factor by which the distortion moves a corner away from the middle, or towards it."""
 
 
 def view_deg(width: int, height: int, focal: float) -> float:
-    """Angle of view in degrees along the longer side of a pinhole camera; 0 or 180 where there is no focal length."""
+    """Angle of view in degrees along the longer side of a pinhole camera; 0 for an invalid focal length."""
     if not np.isfinite(focal) or focal <= 0:
         return 0.0
     return float(np.degrees(2.0 * np.arctan(0.5 * max(width, height) / focal)))
 
 
 def doubtful(width: int, height: int, focal: tuple[float, float], k1: float, k2: float = 0.0) -> str:
-    """Why a lens that a solve found cannot be right: "narrow", "wide", "bent", or "" if it can.
+    """Why the lens of a solve is implausible: "narrow", "wide", "bent", or "" if it is plausible.
 
-    `focal` is fx, fy in pixels. A lens is bent if its radial terms fold the picture over before its corner, or stretch
-    the corner out of all measure, or if its pixels are far from square.
+    `focal` is fx, fy in pixels. "bent" means that the radial terms fold the picture within its corners or stretch the
+    corners by more than `_MOST_STRETCH`, or that the pixels are far from square.
     """
     angle = view_deg(width, height, 0.5 * (focal[0] + focal[1]))
     if not angle >= NARROWEST_DEG:
@@ -74,7 +75,7 @@ def doubtful(width: int, height: int, focal: tuple[float, float], k1: float, k2:
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens model and the pinhole camera of the frames that were undistorted with it."""
+    """A lens model, and the pinhole camera of the frames undistorted with this model."""
 
     width: int
     """Pixels of the working frames, original and undistorted."""
@@ -85,21 +86,21 @@ class Lens:
     plate_focal: tuple[float, float]
     """fx, fy of the undistorted frames, pixels."""
     centre: tuple[float, float]
-    """Principal point of both, pixels, pixel centres at +0.5."""
+    """Principal point of original and undistorted frames, pixels, pixel centres at +0.5."""
     k1: float = 0.0
-    """Radial."""
+    """Radial coefficient of r^2."""
     k2: float = 0.0
-    """Radial."""
+    """Radial coefficient of r^4."""
     p1: float = 0.0
-    """Tangential."""
+    """Tangential coefficient."""
     p2: float = 0.0
-    """Tangential."""
+    """Tangential coefficient."""
     model: str = "OPENCV"
-    """COLMAP's name, for sentences."""
+    """COLMAP's name of the model, for messages."""
 
     @property
     def is_none(self) -> bool:
-        """True if the original frames are straight already."""
+        """True if the lens has no distortion."""
         return not any((self.k1, self.k2, self.p1, self.p2))
 
     @property
@@ -108,13 +109,14 @@ class Lens:
         return (*self.plate_focal, *self.centre)
 
     def to_original(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels [N, 2] of the undistorted frame -> where they lie in the original one. No test for folds."""
+        """Maps pixels [N, 2] of the undistorted frame to pixels of the original frame. Does not test for folds."""
         return self._bent((pixels - self.centre) / self.plate_focal)[0] * self.focal + self.centre
 
     def to_plate(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels [N, 2] of the original frame -> where they lie in the undistorted one, or beyond its border.
+        """Maps pixels [N, 2] of the original frame to pixels of the undistorted frame, also beyond its border.
 
-        The inverse of `to_original` by Newton's method to 1e-6 px and better. JobError (SOLVE) where there is none.
+        Inverts `to_original` by Newton's method, with an error below 1e-6 px. Raises JobError (SOLVE) if the iteration
+        does not converge.
         """
         target = (pixels - self.centre) / self.focal
         ideal = target.copy()
@@ -124,7 +126,7 @@ class Lens:
                 at, slope = self._bent(ideal)
                 off = at - target
                 error = float(np.abs(off * self.focal).max(initial=0.0))
-                if not error > _DONE_PX:  # done, or not a number any more
+                if not error > _DONE_PX:  # converged, or NaN
                     break
                 (a, b), (c, d) = np.moveaxis(slope, 0, -1)
                 det = a * d - b * c
@@ -135,10 +137,10 @@ class Lens:
         return ideal * self.plate_focal + self.centre
 
     def check(self) -> None:
-        """JobError (SOLVE) if the model folds over within the original frame or within the undistorted one.
+        """Raises JobError (SOLVE) if the model folds over within the original frame or within the undistorted one.
 
-        Both borders are walked round, and the lines from the middle to each of their points: where the picture keeps
-        its orientation all along, each point is met once, and there is a way back.
+        Tests the lines from the middle to each point of both borders. The mapping is invertible if its Jacobian
+        determinant is positive along all lines.
         """
         x, y = np.linspace(0.0, self.width, 2 * self.width + 1), np.linspace(0.0, self.height, 2 * self.height + 1)
         border = np.concatenate(
@@ -153,7 +155,7 @@ class Lens:
                 raise self._folded()
 
     def _bent(self, ideal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Points [N, 2] at depth 1 as the lens bends them, and the derivative [N, 2, 2]: row result, column input."""
+        """Distorted points [N, 2] at depth 1, and their derivative [N, 2, 2]: row result, column input."""
         x, y = ideal[:, 0], ideal[:, 1]
         square = x * x + y * y
         radial = 1.0 + square * (self.k1 + self.k2 * square)
@@ -183,7 +185,10 @@ class Lens:
 
 
 def load_lens(shot: Shot) -> Lens | MapLens:
-    """The lens of a solved shot, from solve.json and cameras.json. JobError (SOLVE) if they do not tell it."""
+    """The lens of a solved shot, from solve.json and cameras.json.
+
+    Raises JobError (SOLVE) if the files do not define one supported lens for the whole clip.
+    """
     record, path = load_record(shot), load_cameras(shot)
     if record.get("camera_model") == ST_MAP:
         try:
@@ -208,7 +213,7 @@ def load_lens(shot: Shot) -> Lens | MapLens:
             "The maps are for lenses that do not zoom.",
             ExitCode.SOLVE,
         )
-    # solve.json has the mean of fx and fy of the original frames; both were given the same zoom.
+    # solve.json stores the mean of fx and fy of the original frames. Undistortion scaled both by the same zoom.
     zoom = 0.5 * (fx + fy) / float(focal)
     terms = {name: float(value) for name, value in zip(_EXTRA[model], extra, strict=True)}
     return Lens(path.width, path.height, (fx / zoom, fy / zoom), (fx, fy), (cx, cy), **terms, model=model)

@@ -1,4 +1,4 @@
-"""Whether a lens that a solve found can be one: what is doubted, what is refused, and in which words."""
+"""Checks the plausibility of a solved lens, and words the warnings and errors about it."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from ..contract import ExitCode, JobError
 from .lens import LEAST_DEG, MOST_DEG, NARROWEST_DEG, doubtful, view_deg
 
 FISHEYE = "OPENCV_FISHEYE"
-"""COLMAP's model of a lens whose picture grows with the angle: theta (1 + k1 theta^2 + ... + k4 theta^8)."""
+"""COLMAP's fisheye model: the image radius is theta (1 + k1 theta^2 + ... + k4 theta^8) for the angle theta."""
 FISHEYE_START = 0.45
-"""Focal length of a fisheye before any picture was seen, as a share of the picture's width: 127 degrees wide."""
+"""Initial focal length of a fisheye, as a share of the picture's width: 127 degrees wide."""
 MOST_BEND = 1.0
 """Largest plausible first radial coefficient."""
 RUN_OFF = 1.3
-"""Times by which a solve may change a focal length that it was given, before the given one is trusted instead."""
+"""Largest factor by which a solve may change the artist's focal length. Beyond it, the artist's value is kept."""
 WIDE_DEG = 100.0
-"""Angle of view from which on a lens solved without a fisheye model may be a fisheye."""
+"""Angle of view above which a lens solved without a fisheye model may be a fisheye."""
 LEFT_SHARE = 0.003
-"""How far pictures without its lens may still be bent at the corners, as a share of the diagonal: 2.4 px at 640x480."""
+"""Tolerated distortion at the corners after undistortion, as a share of the diagonal: 2.4 px at 640x480."""
 _SAMPLES = 2048
 _BEYOND = 2.0
-"""How far out of the picture a radial curve is examined, in corners."""
+"""Length of the sampled radial curve, as a multiple of the corner's distance from the middle."""
 
 
 def angle_deg(model: str, width: int, height: int, params: Sequence[float]) -> float:
-    """Angle of view in degrees along the longer side of a camera with COLMAP's `params`; 360 if it sees all around."""
+    """Angle of view in degrees along the longer side of a camera with COLMAP's `params`.
+
+    360 if the curve of a fisheye does not reach the side of the picture.
+    """
     focal = _focal(model, params)
     if model != FISHEYE or not np.isfinite(focal) or focal <= 0:
         return view_deg(width, height, focal)
@@ -39,7 +42,10 @@ def angle_deg(model: str, width: int, height: int, params: Sequence[float]) -> f
 
 
 def doubt_of(model: str, width: int, height: int, params: Sequence[float], given: float = 0.0) -> str:
-    """Why a lens is doubted: as `lens.doubtful`; "off" if its focal length ran off from the one `given`, in pixels."""
+    """Why a lens is implausible: a value of `lens.doubtful`, or "off".
+
+    "off" means that its focal length differs from `given` (pixels) by more than the factor `RUN_OFF`.
+    """
     focal = _focal(model, params)
     if given and not given / RUN_OFF <= focal <= given * RUN_OFF:
         return "off"
@@ -55,7 +61,7 @@ def doubt_of(model: str, width: int, height: int, params: Sequence[float], given
 
 
 def impossible(model: str, width: int, height: int, params: Sequence[float]) -> str:
-    """What of a lens's bend no camera has: "folded", "strong", or "" if it can be."""
+    """Why no camera has this distortion: "folded", "strong", or "" if it is possible."""
     bends = [*bends_of(model, params), 0.0]
     if not abs(bends[0]) <= MOST_BEND:
         return "strong"
@@ -68,14 +74,14 @@ def impossible(model: str, width: int, height: int, params: Sequence[float]) -> 
         at = ideal * (1.0 + bends[0] * ideal**2 + bends[1] * ideal**4)
     reached = np.flatnonzero(at >= corner)
     falls = np.flatnonzero(np.diff(at) <= 0.0)
-    if model == FISHEYE and not len(reached):  # the corners of a round picture are black
+    if model == FISHEYE and not len(reached):  # a circular fisheye picture has black corners: test the sides
         side = np.flatnonzero(at >= 0.5 * max(width / fx, height / fy))
         reached = side if len(side) else reached
     return "folded" if not len(reached) or (len(falls) > 0 and falls[0] < reached[0]) else ""
 
 
 def refuse_lens(answer: dict[str, Any]) -> None:
-    """JobError (SOLVE) for a lens that no camera has; `answer` is the worker's."""
+    """Raises JobError (SOLVE) for an impossible lens. `answer` is the answer of the solve worker."""
     lens = answer["lens"]
     angle = _shown_deg(lens, "view_deg", answer["focal_px"])
     numbers = ", ".join(f"{value:.3g}" for value in answer.get("distortion", []))
@@ -98,15 +104,17 @@ def refuse_lens(answer: dict[str, Any]) -> None:
 
 
 def like_a_fisheye(answer: dict[str, Any]) -> bool:
-    """True if a worker's answer found an ordinary lens as a fisheye would be taken for one: very wide, or bent inwards
-    until it folds over."""
+    """True if the ordinary lens in a worker's answer looks like a misread fisheye.
+
+    Signs are a very wide angle of view, or implausibly strong barrel distortion.
+    """
     lens = answer["lens"]
     wide = max(lens.get("found_deg", 0.0), lens.get("view_deg", 0.0)) >= WIDE_DEG
     return wide or (lens.get("doubt") == "bent" and lens.get("found_bend", 0.0) < 0)
 
 
 def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
-    """(sentence, hint) for a lens that is doubtful, or was put in the place of one that is."""
+    """(sentence, hint) for an implausible lens, or for a default lens that replaced one."""
     left = left_px(answer)
     if left > LEFT_SHARE * np.hypot(answer["lens"]["width"], answer["lens"]["height"]):
         return [
@@ -120,7 +128,7 @@ def lens_remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def left_px(answer: dict[str, Any]) -> float:
-    """How far the corners of frames whose lens was out before the solve are from where the solve would have them."""
+    """Remaining distortion in pixels at the corners of frames that were undistorted before the solve."""
     lens, focal = answer["lens"], float(answer["focal_px"])
     corner = float(np.hypot(0.5 * lens["width"], 0.5 * lens["height"])) / focal
     return abs(float(lens.get("left_bend", 0.0))) * corner**3 * focal
@@ -179,12 +187,12 @@ def _remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _shown_deg(lens: dict[str, Any], name: str, focal: float) -> float:
-    """An angle that the worker told, else that of a pinhole."""
+    """Angle of view `name` in degrees from the worker's answer; if missing, the angle of a pinhole camera."""
     return float(lens[name]) if name in lens else view_deg(lens["width"], lens["height"], focal)
 
 
 def _focals(model: str, params: Sequence[float]) -> tuple[float, float]:
-    """fx, fy of COLMAP's parameters, pixels."""
+    """fx, fy in pixels from COLMAP's parameters."""
     single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     return (float(params[0]), float(params[0 if single else 1]))
 
@@ -194,14 +202,14 @@ def _focal(model: str, params: Sequence[float]) -> float:
 
 
 def bends_of(model: str, params: Sequence[float]) -> list[float]:
-    """Radial coefficients: those of a fisheye all four, of others k1 and, if the model has it, k2."""
+    """Radial coefficients: k1 to k4 of a fisheye; k1 of other models, and k2 if the model has one."""
     counts = {"SIMPLE_RADIAL": (3, 1), "RADIAL": (3, 2), "OPENCV": (4, 2), FISHEYE: (4, 4)}
     first, count = counts.get(model, (0, 0))
     return [float(value) for value in params[first : first + count]] or [0.0]
 
 
 def _fisheye_curve(params: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(angles from the axis, how far from the middle each is seen, in focal lengths), to straight behind."""
+    """(angles from the axis in radians, 0 to pi; image radius of each, in focal lengths)."""
     angle = np.linspace(0.0, np.pi, _SAMPLES)
     square = angle * angle
     k = params[4:8]

@@ -1,9 +1,10 @@
-"""A lens that was handed over as an ST map, as a formula: both ways, for pictures of any size, past the map's edge too.
+"""The lens of an ST map as a polynomial: maps pixels both ways, for any picture size, also past the map's edge.
 
-A map is samples of something smooth, often with the noise of 16-bit floats, and often it ends where the undistorted
-picture does while the way back has to look beyond. So a polynomial in x and y is kept in its place, of the lowest
-degree that meets every sample (`map_reading`), in the direction in which that is the lower: most models of lenses are
-such polynomials in one of the two, and go on past the edge as the lens does. numpy alone, float64.
+A map samples a smooth function, often with the rounding of 16-bit floats. It often ends at the border of the
+undistorted picture, but redistortion reads beyond that border. Therefore a polynomial in x and y replaces the map.
+`map_reading` fits the lowest degree that matches every sample, in the direction that needs the lower degree. Most lens
+models are such polynomials in one direction, and extrapolate past the edge as the lens does. The code uses numpy only,
+in float64.
 """
 
 from __future__ import annotations
@@ -21,52 +22,52 @@ from ..array_types import between_nodes, linear_solution, meshgrid
 from ..contract import ExitCode, JobError
 
 ST_MAP = "ST_MAP"
-"""What stands in solve.json where COLMAP's models have their names."""
+"""Name of this lens model in solve.json, in the place of COLMAP's model names."""
 _ROWS = 64
 _NODE_PX, _LEAST_NODES = 8.0, 40
-"""Pixels between two places at which a way without a formula is found; how many of them there are at least."""
+"""Spacing in pixels of the grid on which the inverse is solved; minimum number of intervals along a side."""
 _MOST_STEPS = 60
 _DONE_PX, _WRONG_PX = 1e-9, 1e-6
-"""Newton ends when no pixel is farther than the first from where it should be, and has failed beyond the second."""
+"""Errors in pixels: below the first, Newton's method stops; above the second, it has failed."""
 _BEYOND = 0.5
-"""How far out of the polynomial's box the search for a way back may go, in boxes."""
+"""Margin around the polynomial's box for the inversion, as a share of the box."""
 _NONE_PX = 1e-3
 """Largest shift in pixels of a map that counts as no distortion."""
 _GRID = 33
-"""Points along a side at which a picture is tested for a fold."""
+"""Points along each side of the grid in the test for a fold."""
 _SLACK_PX = 0.02
-"""How far out of the original a pixel of the plate may lie: maps are no better."""
+"""Tolerance for pixels of the plate outside of the original picture: maps are not more accurate."""
 _LEAST_WINDOW, _MOST_WINDOW = 0.1, 2.0
 
 
 @dataclass(frozen=True)
 class Polynomial:
-    """A smooth way from one plane to another: two polynomials in x and y, in Chebyshev's terms."""
+    """A smooth mapping from one plane to another: two polynomials in x and y, in the Chebyshev basis."""
 
     degree: int
-    """Most of the sum of both exponents."""
+    """Maximum total degree: the sum of the exponents of x and y."""
     box: tuple[float, float, float, float]
-    """Least x, least y, most x, most y: what is -1 to 1 for the terms."""
+    """Minimum x, minimum y, maximum x, maximum y: the region that is scaled to [-1, 1] for the basis."""
     terms: tuple[float, ...]
-    """[2, K]: of x and of y, in the order of `exponents`."""
+    """[2, K] coefficients, flattened: first of the resulting x, then of y, in the order of `exponents`."""
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points [N, 2] to points [N, 2]."""
+        """Maps points [N, 2] to points [N, 2]."""
         return self._values(points, self._tables)
 
     def slopes(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The derivative [N, 2, 2] at points [N, 2]: row result, column input."""
+        """The Jacobian [N, 2, 2] at points [N, 2]: row result, column input."""
         x, y = self._derived
         return np.stack([self._values(points, x), self._values(points, y)], axis=-1)
 
     def of_grid(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points [len(y), len(x), 2] of all pairs: much quicker than one by one."""
+        """Mapped points [len(y), len(x), 2] of the grid of x and y. Much faster than single points."""
         left, above = self._vanders(x, y)
         return np.stack([above @ table @ left.T for table in self._tables], axis=-1)
 
     @cached_property
     def _tables(self) -> NDArray[np.float64]:
-        """[2, degree + 1, degree + 1]: of each result by exponent of y, then of x."""
+        """Coefficients [2, degree + 1, degree + 1], indexed by result, exponent of y, exponent of x."""
         tables = np.zeros((2, self.degree + 1, self.degree + 1))
         x, y = exponents(self.degree)
         tables[:, y, x] = np.reshape(self.terms, (2, -1))
@@ -74,7 +75,7 @@ class Polynomial:
 
     @cached_property
     def _derived(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """As `_tables`, of the derivatives by x and by y."""
+        """Coefficients of the derivatives by x and by y, in the layout of `_tables`."""
         if not self.degree:
             return np.zeros_like(self._tables), np.zeros_like(self._tables)
         found = [chebyshev.chebder(self._tables, axis=axis) for axis in (2, 1)]
@@ -94,14 +95,14 @@ class Polynomial:
 
 
 def exponents(degree: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Exponents of x and of y of all terms up to a degree, [K] each."""
+    """Exponents of x and of y of all terms up to a total degree, [K] each."""
     x, y = np.meshgrid(np.arange(degree + 1), np.arange(degree + 1))
     kept = (x + y <= degree).ravel()
     return x.ravel()[kept], y.ravel()[kept]
 
 
 def fitted(points: NDArray[np.float64], values: NDArray[np.float64], degree: int, box: Sequence[float]) -> Polynomial:
-    """The polynomial of a degree that takes `points` [N, 2] nearest to `values` [N, 2], by least squares."""
+    """Least-squares fit of a polynomial of total degree `degree` that maps `points` [N, 2] to `values` [N, 2]."""
     whole = Polynomial(degree, (box[0], box[1], box[2], box[3]), ())
     left, above = whole._vanders(points[:, 0], points[:, 1])  # pyright: ignore[reportPrivateUsage]
     x, y = exponents(degree)
@@ -111,10 +112,10 @@ def fitted(points: NDArray[np.float64], values: NDArray[np.float64], degree: int
 
 @dataclass(frozen=True)
 class MapLens:
-    """The lens of an ST map, and which part of the map's undistorted picture the undistorted frames show.
+    """The lens of an ST map, and the window of the map's undistorted picture that the undistorted frames show.
 
-    Both planes of the polynomial are 0 to 1 over a whole picture, x to the right, y down: of the original frames, and
-    of the undistorted picture as the map's maker has it, in whose middle the undistorted frames lie.
+    The polynomial maps between two planes with coordinates from 0 to 1, x to the right, y down. One plane is the
+    original frame. The other is the map's undistorted picture; the undistorted frames are a window in its middle.
     """
 
     width: int
@@ -122,17 +123,17 @@ class MapLens:
     height: int
     """Pixels."""
     bend: Polynomial
-    """From one of the two planes to the other."""
+    """Mapping between the two planes, in the direction of `forward`."""
     forward: bool = True
     """True if `bend` goes from the undistorted picture to the original."""
     window: tuple[float, float] = (1.0, 1.0)
     """Width and height of the undistorted frames as shares of the map's undistorted picture."""
     intrinsics: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
-    """fx, fy, cx, cy of the undistorted frames, pixels, once a solve has found them."""
+    """fx, fy, cx, cy of the undistorted frames, pixels. Placeholders before the solve."""
 
     @property
     def params(self) -> list[float]:
-        """All but the size and the intrinsics as numbers, for solve.json."""
+        """All fields except size and intrinsics as a list of numbers, for solve.json."""
         head = [float(self.forward), float(self.bend.degree), *self.window, *self.bend.box]
         return [*head, *self.bend.terms]
 
@@ -140,8 +141,10 @@ class MapLens:
     def from_params(
         cls, width: int, height: int, params: Sequence[float], K: Sequence[float] = (1.0, 1.0, 0.0, 0.0)
     ) -> MapLens:
-        """The lens that `params` stored, for frames of a size in pixels with intrinsics `K`. ValueError for other
-        numbers."""
+        """The lens stored as `params`, for frames of a size in pixels with intrinsics `K`.
+
+        Raises ValueError if `params` is malformed.
+        """
         values = [float(value) for value in params]
         forward, degree = (int(value) for value in values[:2])
         terms = tuple(values[8:])
@@ -158,33 +161,33 @@ class MapLens:
 
     @property
     def slopes_in_the_middle(self) -> tuple[float, float]:
-        """Pixels of the original frame per pixel of the undistorted one in its middle, to the right and down."""
+        """Pixels of the original frame per pixel of the undistorted frame, at the middle, along x and y."""
         middle = np.array([[0.5 * self.width, 0.5 * self.height]])
         ends = self.to_original(middle + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]]))
         return float(ends[1, 0] - ends[0, 0]), float(ends[3, 1] - ends[2, 1])
 
     def to_original(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels [N, 2] of the undistorted frame -> where they lie in the original one.
+        """Maps pixels [N, 2] of the undistorted frame to pixels of the original frame.
 
-        JobError (SOLVE) where there is no way.
+        Raises JobError (SOLVE) if the inversion fails.
         """
         points = self.map_of_plate(pixels)
         at = self.bend(points) if self.forward else self._back(points)
         return at * (self.width, self.height)
 
     def to_plate(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels [N, 2] of the original frame -> where they lie in the undistorted one, or beyond its border.
+        """Maps pixels [N, 2] of the original frame to pixels of the undistorted frame, also beyond its border.
 
-        JobError (SOLVE) where there is no way back.
+        Raises JobError (SOLVE) if the inversion fails.
         """
         points = pixels / (self.width, self.height)
         at = self._back(points) if self.forward else self.bend(points)
         return ((at - 0.5) / self.window + 0.5) * (self.width, self.height)
 
     def where(self, width: int, height: int) -> NDArray[np.float32]:
-        """[height, width, 2]: where each pixel of an undistorted plate lies in the original, both of that size.
+        """Position [height, width, 2] in the original picture of each pixel of the undistorted plate of the same size.
 
-        x and y in pixels, centres at +0.5. JobError as `to_original`.
+        x and y in pixels, centres at +0.5. Raises JobError as `to_original` does.
         """
         ratio = np.array([width / self.width, height / self.height])
         x, y = (np.arange(width) + 0.5) / ratio[0], (np.arange(height) + 0.5) / ratio[1]
@@ -202,7 +205,10 @@ class MapLens:
     def _where_between(
         self, x: NDArray[np.float64], y: NDArray[np.float64], ratio: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """`where` by Newton at every eighth pixel, and smoothly between: 0.5 s for HD, every pixel would take 11."""
+        """`where` by Newton's method at every eighth pixel, interpolated smoothly.
+
+        Takes 0.5 s for HD instead of 11 s for every pixel.
+        """
         nodes = [
             np.linspace(0.0, length, max(_LEAST_NODES, math.ceil(length * scale / _NODE_PX)) + 1)
             for length, scale in zip((self.width, self.height), ratio, strict=True)
@@ -213,7 +219,7 @@ class MapLens:
         return np.stack(planes, axis=-1).astype(np.float32)
 
     def check(self) -> None:
-        """JobError (SOLVE) if the lens folds over within the original frame or within the undistorted one."""
+        """Raises JobError (SOLVE) if the lens folds over within the original frame or within the undistorted one."""
         x, y = np.linspace(0.0, self.width, _GRID), np.linspace(0.0, self.height, _GRID)
         original = np.stack(meshgrid(x, y), -1).reshape(-1, 2)
         if self.forward:
@@ -224,11 +230,14 @@ class MapLens:
             raise _folded()
 
     def map_of_plate(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels [N, 2] of the undistorted frame -> places in the map's undistorted picture, 0 to 1, y down."""
+        """Maps pixels [N, 2] of the undistorted frame to the map's undistorted picture, 0 to 1, y down."""
         return (pixels / (self.width, self.height) - 0.5) * self.window + 0.5
 
     def _back(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where `bend` takes to `wanted` [N, 2], by Newton's method to 1e-6 px and better. JobError if nowhere."""
+        """The points that `bend` maps to `wanted` [N, 2], by Newton's method, with an error below 1e-6 px.
+
+        Raises JobError if the iteration does not converge.
+        """
         size = np.array([self.width, self.height])
         low, high = np.array(self.bend.box[:2]), np.array(self.bend.box[2:])
         reach = _BEYOND * (high - low)
@@ -238,7 +247,7 @@ class MapLens:
             for _ in range(_MOST_STEPS):
                 off = self.bend(at) - wanted
                 error = float(np.abs(off * size).max(initial=0.0))
-                if not error > _DONE_PX:  # done, or not a number any more
+                if not error > _DONE_PX:  # converged, or NaN
                     break
                 (a, b), (c, d) = np.moveaxis(self.bend.slopes(at), 0, -1)
                 det = a * d - b * c
@@ -250,22 +259,23 @@ class MapLens:
         return at
 
     def _start(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A first guess for `_back`: as if the map bent nothing."""
+        """Initial guess for `_back`: inverts the linear approximation at the middle."""
         middle = np.array([[0.5, 0.5]])
         return 0.5 + linear_solution(self.bend.slopes(middle)[0], (wanted - self.bend(middle)).T).T
 
 
 def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) -> MapLens:
-    """The same lens with the widest window in which no pixel of the undistorted frames falls outside of the original
-    ones: as wide as the map's own picture where it ends there, so that its pixels stay what they are.
+    """The same lens with the widest window whose pixels all lie within the original frames.
+
+    If the window nearly equals the map's whole picture, it becomes the whole picture, so that the pixels coincide.
 
     Args:
-        lens: of any window.
+        lens: lens with any window.
         shape: width over height of the map's undistorted picture.
-        known: least x, least y, most x, most y of the region of that picture that the map defines; None: all of it.
+        known: minimum x, minimum y, maximum x, maximum y of the part of that picture that the map defines; None: all.
 
     Raises:
-        JobError: (SOLVE) no part of the picture is whole.
+        JobError: (SOLVE) even the smallest window extends beyond the original frames.
     """
     ratio = lens.width / lens.height / shape
     sides = np.array([min(1.0, ratio), min(1.0, 1.0 / ratio)])
@@ -297,12 +307,12 @@ def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) ->
     for _ in range(40):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if inside(middle) else (low, middle)
-    # Pixel centres end half a pixel before the picture does.
+    # The outermost pixel centres lie half a pixel inside the picture, so `low` can slightly exceed 1.
     return tried(1.0 if 1.0 <= low <= 1.0 + 3.0 / min(lens.width, lens.height) else low)
 
 
 def _around(width: int, height: int) -> NDArray[np.float64]:
-    """[N, 2]: pixel centres of a picture's border, and of its middle row and column."""
+    """Pixel centres [N, 2] of a picture's border, and of its middle row and column."""
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     lines = [np.stack([x, np.full_like(x, at)], 1) for at in (y[0], y[len(y) // 2], y[-1])]
     lines += [np.stack([np.full_like(y, at), y], 1) for at in (x[0], x[len(x) // 2], x[-1])]

@@ -1,14 +1,14 @@
-"""Reads an ST map that somebody hands over into the lens that it holds, or says in one sentence why it holds none.
+"""Reads the lens from an imported ST map, or reports why the file holds none.
 
-What is taken: red is s, 0 to 1 from left to right, green is t, 0 to 1 from the bottom (Nuke's STMap, Flame, Blender's
-Map UV) or from the top, which its own slope tells; coordinates are of the whole picture that is looked into, and a
-pixel's centre lies at (i + 0.5) / size. The map's own picture is its display window: pixels outside of that, and a map
-larger than the footage, are overscan. `--st-map-way` says which picture the map is of, for a map does not:
+Red is s, 0 to 1 from left to right. Green is t, 0 to 1 from the bottom (Nuke's STMap, Flame, Blender's Map UV) or from
+the top; the sign of its slope shows which. Coordinates refer to the whole picture that is sampled; the centre of pixel
+i lies at (i + 0.5) / size. The display window of the file is the map's picture. Pixels outside of that window, and a
+map larger than the footage, are overscan. A map does not state its direction, so `--st-map-way` does:
 
-    undistort   of the undistorted one: where to look in the original (what takes the lens out of a plate)
-    redistort   of the original: where to look in the undistorted one (what puts it back into a render)
+    undistort   a map of the undistorted picture, with coordinates in the original (undistorts a plate)
+    redistort   a map of the original picture, with coordinates in the undistorted one (distorts a render)
 
-Values that are 0 in both channels, transparent, or cut off at 0 and 1 say nothing.
+Pixels that are 0 in both channels, transparent, or clipped at 0 or 1 are ignored.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from .map_lens import MapLens, Polynomial, fitted, widest
 
 UNDISTORT, REDISTORT = ST_MAP_WAYS
 PAIRS = (("r", "g"), ("red", "green"), ("u", "v"), ("s", "t"), ("x", "y"))
-"""What programs call the two channels, in small letters."""
+"""Known names of the two channels, in lower case."""
 DEGREES = (1, 3, 5, 7, 9, 11, 13, 15)
 CLOSE_PX = 5e-3
-"""A polynomial that is nowhere farther from the map's values, in pixels of the footage, is the map."""
+"""Largest error of a polynomial, in pixels of the footage, at which the search for a better fit stops."""
 ROUGH_PX = 0.1
-"""One that is farther than this, over what the file's rounding explains, is not: such a map is not smooth."""
+"""Largest accepted error in pixels, in addition to the rounding of the file. Above it, the map is not smooth."""
 NO_GAIN = 0.996
-"""Times the error by which a higher degree has to be better: what is left then is noise."""
+"""Largest ratio of new to old error at which a higher degree counts as better. Above it, only noise remains."""
 STRAIGHT_PX = 0.05
-"""A map that bends no pixel farther holds no lens."""
+"""Largest distortion in pixels of a map without a lens."""
 SHAPE = 0.03
-"""How much higher or flatter than wide a map may show the middle of the picture."""
+"""Tolerance for the ratio of the scales along x and y in the middle of the picture, as a natural logarithm."""
 _CUT = 0.02
-"""How far beyond the picture an undistorting map is heeded, as a share of it."""
+"""Margin around the original picture within which values of an undistorting map are used, as a share of the picture."""
 _SAMPLES, _CHECKED = 8_000, 60_000
 _LEAST_SHARE = 0.5
 _LARGEST = 32_768
@@ -51,24 +51,24 @@ _LARGEST = 32_768
 
 @dataclass
 class _Map:
-    """What a file holds."""
+    """Contents of an ST map file."""
 
     s: NDArray[np.float64]
     """[h, w]: to the right, 0 to 1."""
     t: NDArray[np.float64]
-    """[h, w]: down, 0 to 1, once it is known which way it counts."""
+    """[h, w]: up or down as in the file, 0 to 1."""
     known: NDArray[np.bool_]
-    """[h, w]: where the map says something."""
+    """[h, w]: True where the map holds coordinates."""
     at: tuple[int, int]
-    """Column and row of the first pixel in the map's own picture."""
+    """Column and row of the first pixel within the display window."""
     size: tuple[int, int]
-    """Width and height of that picture, pixels."""
+    """Width and height of the display window, pixels."""
     rounding: float
     """Largest step between two values of the file near 1."""
 
 
 def fingerprint(path: str) -> str:
-    """Hash of a map's file. JobError (USAGE) if it cannot be read."""
+    """SHA-256 of a map's file. Raises JobError (USAGE) if the file cannot be read."""
     digest = hashlib.sha256()
     try:
         with open_regular(path, LONGEST_PICTURE) as source:
@@ -80,20 +80,20 @@ def fingerprint(path: str) -> str:
 
 
 def read_lens(path: str, way: str, layer: str, frames: dict[str, Any], report: Reporter) -> MapLens:
-    """The lens of a map, for the working frames.
+    """The lens of an ST map for the working frames.
 
     Args:
-        path: the file.
+        path: file of the map.
         way: one of `contract.ST_MAP_WAYS`.
-        layer: the layer that holds it; empty: red and green, or the only pair there is.
-        frames: frames.json of the import.
-        report: receives what was assumed, and what the map leaves open.
+        layer: layer of the map; empty: red and green without a layer name, or the only pair of channels.
+        frames: contents of frames.json of the import.
+        report: receives warnings about assumptions and about parts that the map lacks.
 
     Returns:
-        The lens with the widest window in which the undistorted frames are whole, without intrinsics.
+        The lens with the widest window that has no empty pixels, without intrinsics.
 
     Raises:
-        JobError: (USAGE or SOLVE) what is wrong with the file, and what to do.
+        JobError: (USAGE or SOLVE) the file holds no usable map.
     """
     name = f"The ST map {Path(path).name}"
     read = _read(Path(path), layer, name)
@@ -132,7 +132,7 @@ def read_lens(path: str, way: str, layer: str, frames: dict[str, Any], report: R
 
 
 def _read(path: Path, layer: str, name: str) -> _Map:
-    """The two channels, and where they say something. JobError (USAGE) as `read_lens`."""
+    """Reads the two channels and the mask of valid pixels. Raises JobError (USAGE) as `read_lens` does."""
     opened = oiio.ImageInput.open(regular_file(path)) if path.is_file() else None
     if opened is None:
         why = error_of() if path.is_file() else "it is not there"
@@ -168,7 +168,7 @@ def _read(path: Path, layer: str, name: str) -> _Map:
     known = (s != 0.0) | (t != 0.0)
     if alpha is not None:
         known &= pixels[..., alpha] > 0.0
-    if min(s.min(), t.min()) >= 0.0 and max(s.max(), t.max()) <= 1.0:  # cut off there
+    if min(s.min(), t.min()) >= 0.0 and max(s.max(), t.max()) <= 1.0:  # values are clipped
         known &= (s > 0.0) & (s < 1.0) & (t > 0.0) & (t < 1.0)
     rounding = {"half": 2.0**-11, "uint16": 2.0**-16}.get(kind, 2.0**-24)
     at = spec.x - spec.full_x, spec.y - spec.full_y
@@ -176,7 +176,7 @@ def _read(path: Path, layer: str, name: str) -> _Map:
 
 
 def _channels(opened: oiio.ImageInput, layer: str, name: str) -> tuple[int, tuple[int, int], int | None]:
-    """Part, the two channels, and alpha if there is one. JobError lists the layers where it is not clear which."""
+    """(part, the two channels, alpha or None). Raises JobError if the choice is ambiguous, and lists the layers."""
     found: list[tuple[str, int, tuple[int, int], int | None]] = []
     part = 0
     while opened.seek_subimage(part, 0) and (part == 0 or opened.format_name() == "openexr"):
@@ -206,13 +206,13 @@ def _channels(opened: oiio.ImageInput, layer: str, name: str) -> tuple[int, tupl
     return chosen[1], chosen[2], chosen[3]
 
 
-# ------------------------------------------------------------------------------------------------- the lens in it
+# ------------------------------------------------------------------------------------------------- the fitted lens
 
 
 def _samples(read: _Map, way: str, name: str, report: Reporter) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places in the undistorted picture [N, 2] and in the original [N, 2] that a map says are one, y down, 0 to 1.
+    """Corresponding points in the undistorted picture [N, 2] and in the original [N, 2], y down, 0 to 1.
 
-    JobError as `read_lens`.
+    Raises JobError as `read_lens` does.
     """
     columns, rows = (_spread(length) for length in read.s.shape[::-1])
     at = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
@@ -247,39 +247,39 @@ def _samples(read: _Map, way: str, name: str, report: Reporter) -> tuple[NDArray
         values[:, 1] = 1.0 - values[:, 1]
     if way == REDISTORT:
         return values[known], points[known]
-    own = known & ((values > -_CUT) & (values < 1.0 + _CUT)).all(1)  # where no picture is, a model may do anything
+    own = known & ((values > -_CUT) & (values < 1.0 + _CUT)).all(1)  # lens models are arbitrary outside of the picture
     return points[own], values[own]
 
 
 def _spread(length: int) -> NDArray[np.int64]:
-    """Some indices of an axis, its ends among them."""
+    """Evenly spaced indices of an axis, including both ends."""
     return np.unique(np.linspace(0, length - 1, min(length, round(_CHECKED**0.5))).round().astype(np.int64))
 
 
 @dataclass
 class _Fit:
-    """A polynomial in the place of a map."""
+    """A polynomial fitted to a map."""
 
     bend: Polynomial
     forward: bool
-    """From the undistorted picture to the original, or back."""
+    """True if `bend` maps the undistorted picture to the original; False for the opposite direction."""
     points: NDArray[np.float64]
-    """[N, 2]: places from which it goes."""
+    """[N, 2]: input points of the fit."""
     off: NDArray[np.float64]
-    """[N]: how far it is from what the map says of them, pixels of the footage."""
+    """[N]: error at each point, in pixels of the footage."""
 
     @property
     def error(self) -> float:
-        """Root of the mean square of `off`."""
+        """Root mean square of `off`."""
         return float(np.sqrt((self.off**2).mean()))
 
 
 def _fit(
     undistorted: NDArray[np.float64], original: NDArray[np.float64], read: _Map, scale: NDArray[np.float64]
 ) -> _Fit:
-    """The polynomial of the lowest degree that explains a map's pairs of places [N, 2], in the better direction."""
+    """Fits the polynomial of the lowest sufficient degree to corresponding points [N, 2], in the better direction."""
     few = np.unique(np.linspace(0, len(original) - 1, _SAMPLES).astype(np.int64))
-    # The ends of what is known hold the curve.
+    # Include the outermost known points, which keep the polynomial stable at the border.
     few = np.union1d(few, np.flatnonzero((np.abs(undistorted - 0.5) >= np.abs(undistorted - 0.5).max(0)).any(1)))
 
     def tried(degree: int, forward: bool) -> _Fit:
@@ -299,12 +299,12 @@ def _fit(
                 best[forward] = made
         both = min(best.values(), key=lambda one: one.error)
         if both.bend.degree < degree and both.error < read.rounding * scale.max():
-            break  # what is left is the file's rounding
+            break  # the remaining error is the rounding of the file
     return min(best.values(), key=lambda one: one.error)
 
 
 def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: float, report: Reporter) -> None:
-    """JobError for a map that folds over, or only shifts."""
+    """Raises JobError for a map that folds over or only shifts. Warns about a map without distortion."""
     grid = found.points[:: max(1, len(found.points) // 20_000)]
     turned = np.linalg.det(found.bend.slopes(grid))
     if not turned.min() > 0.0:
@@ -315,7 +315,7 @@ def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: fl
             "It is no map of a lens there: write it with less overscan, or with 0 in both channels there.",
         )
     at, seen = (grid - 0.5) * scale, (found.bend(grid) - 0.5) * scale
-    plain = np.concatenate([at, np.ones((len(at), 1))], 1)  # what only shifts and scales
+    plain = np.concatenate([at, np.ones((len(at), 1))], 1)  # inputs of an affine fit
     straight = np.linalg.lstsq(plain, seen, rcond=None)[0]
     if np.abs(plain @ straight - seen).max() > STRAIGHT_PX + rounding * scale.max():
         return
@@ -329,17 +329,17 @@ def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: fl
 
 
 def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect: float, name: str) -> float:
-    """Width over height of the undistorted picture in square pixels. JobError if the map is of another picture.
+    """Width over height of the undistorted picture in square pixels. Raises JobError if the map is of another picture.
 
-    In the middle a lens is as high as wide: that tells the shape of the picture that the map looks into, however much
-    overscan it has.
+    In the middle of a lens, the scales along x and y are equal. This determines the aspect ratio of the sampled
+    picture, for any amount of overscan.
     """
-    # Of a window that is the whole of the map's picture, in shares of both.
+    # The window of this lens is the map's whole picture.
     slope = lens.slopes_in_the_middle
     width, height = read.size
     ours = source[0] / source[1]
     fits: dict[float, float] = {}
-    for stretch in {1.0, aspect}:  # of anamorphic footage a map may have the footage's own pixels, or square ones
+    for stretch in {1.0, aspect}:  # a map for anamorphic footage has square pixels, or the pixels of the footage
         own = stretch * width / height
         if way == UNDISTORT:
             fits[own] = slope[0] / slope[1] * ours / own
@@ -356,7 +356,7 @@ def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect:
 
 
 def _say_what_is_open(lens: MapLens, known: tuple[Any, ...], name: str, report: Reporter) -> None:
-    """A warning where the way back goes beyond what the map shows."""
+    """Warns if redistortion needs coordinates outside of the map."""
     x, y = np.linspace(0.5, lens.width - 0.5, 41), np.linspace(0.5, lens.height - 0.5, 41)
     at = lens.map_of_plate(lens.to_plate(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)))
     pixel = 1.0 / np.array([lens.width, lens.height])

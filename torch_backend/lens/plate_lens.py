@@ -1,7 +1,7 @@
-"""The lens through which each frame was undistorted, for pictures of any size: also zooms and fisheyes.
+"""The lens with which each frame was undistorted, for pictures of any size, including zooms and fisheyes.
 
-`lens.Lens` goes both ways and is one for a whole clip; this goes from undistorted pixels to the original's alone, for
-every kind of lens that a solve can have, frame by frame.
+`lens.Lens` maps both ways and serves a whole clip. `PlateLens` only maps undistorted pixels to original pixels, but
+supports every lens model of a solve, with one lens per frame.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _ROWS = 64
 
 @dataclass(frozen=True)
 class PlateLens:
-    """A lens, and the pinhole camera of the frames that were undistorted with it."""
+    """A lens, and the pinhole camera of the frames undistorted with this lens."""
 
     lens: imported.Lens
-    """Of the original working frames."""
+    """Lens of the original working frames."""
     pinhole: tuple[float, float, float, float]
-    """fx, fy, cx, cy of the undistorted ones, pixels."""
+    """fx, fy, cx, cy of the undistorted frames, pixels."""
 
     @property
     def is_none(self) -> bool:
@@ -38,10 +38,10 @@ class PlateLens:
         return straight and bool(np.allclose((fx, fy, cx, cy), self.pinhole, rtol=1e-9, atol=0.0))
 
     def where(self, width: int, height: int) -> NDArray[np.float32]:
-        """[height, width, 2]: where each pixel of an undistorted plate lies in the original, both of that size.
+        """Position [height, width, 2] in the original picture of each pixel of the undistorted plate of the same size.
 
-        x and y in pixels, centres at +0.5. Working frames may be a rounding flatter or narrower than their source:
-        both sides are scaled for themselves.
+        x and y in pixels, centres at +0.5. Width and height have separate scales: rounding to whole pixels may change
+        the aspect ratio of the working frames.
         """
         ratio = np.array([width / self.lens.width, height / self.lens.height])
         fx, fy, cx, cy = self.pinhole
@@ -53,7 +53,7 @@ class PlateLens:
         return out
 
     def _original(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points at depth 1 to pixels [..., 2] of the original working frame, as COLMAP's models have it."""
+        """Pixels [..., 2] of the original working frame for points at depth 1, by COLMAP's lens models."""
         fx, fy, cx, cy, *bend = self.lens.params
         k = np.array([*bend, *[0.0] * 8])
         square = x * x + y * y
@@ -74,10 +74,10 @@ class PlateLens:
 
 
 def load_plate_lenses(shot: Shot) -> dict[int, PlateLens | MapLens]:
-    """The lens of every solved frame, by its number; frames that share one share the object.
+    """The lens of every solved frame, by frame number. Frames with the same lens share the object.
 
-    JobError (SOLVE) if the shot is not solved, its files are damaged, or its solve, of an earlier version, did not
-    keep the lenses of a zoom or a fisheye.
+    Raises JobError (SOLVE) if the shot is not solved, its files are damaged, or an earlier version solved it with a
+    zoom or a fisheye and did not store the lenses.
     """
     record, path = load_record(shot), load_cameras(shot)
     recorded = record.get("lenses")

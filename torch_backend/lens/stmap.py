@@ -1,8 +1,8 @@
-"""ST maps of a solve, and how much picture beyond the plate's border a way back through the lens needs.
+"""ST maps of a solve, and the overscan beyond the plate's border that redistortion needs.
 
-A map is a picture of coordinates: R is s, to the right, G is t, up, both from 0 to 1 over the picture that is looked
-into, and pixel centres lie at (i + 0.5) / size. So Nuke's STMap and Blender's Map UV read them. B is 1: Blender's node
-takes it for how opaque the pixel is, Nuke's does not look at it.
+A map is a picture of coordinates: R is s, to the right, G is t, up, both from 0 to 1 over the sampled picture. Pixel
+centres lie at (i + 0.5) / size, as Nuke's STMap and Blender's Map UV expect. B is 1: Blender's node reads it as the
+opacity of the pixel; Nuke's node ignores it.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from .map_lens import MapLens
 from .plate_lens import PlateLens
 
 UNDISTORT, REDISTORT = STMAP_FILES
-"""Names of the maps in a shot's solve/."""
+"""File names of the maps in a shot's solve/ folder."""
 LARGEST = 16_384
-"""Most pixels of a map along a side."""
+"""Maximum width of a map in pixels."""
 _ROWS = 64
 _FILTER_PX = 2
-"""Pixels around a point that a cubic filter reads."""
+"""Radius of a cubic filter in pixels."""
 _TOUCHING_PX = 1e-3
 _MOST_PERCENT = 100.0
 
 
 def undistort_map(lens: Lens | MapLens, width: int, height: int) -> NDArray[np.float32]:
-    """[height, width, 3]: for each pixel of the undistorted frame, where to look in the original one."""
+    """The map [height, width, 3] that holds, for each pixel of the undistorted frame, its place in the original one."""
     out = np.ones((height, width, 3), np.float32)
     for top in range(0, height, _ROWS):
         at = lens.to_original(_centres(lens, width, height, top))
@@ -46,11 +46,10 @@ def undistort_map(lens: Lens | MapLens, width: int, height: int) -> NDArray[np.f
 def redistort_map(
     lens: Lens | MapLens, width: int, height: int, beyond: tuple[float, float] = (0.0, 0.0)
 ) -> NDArray[np.float32]:
-    """[height, width, 3]: for each pixel of the original frame, where to look in the undistorted one.
+    """The map [height, width, 3] that holds, for each pixel of the original frame, its place in the undistorted one.
 
-    `beyond`: the undistorted frame goes on past the plate by this share of the plate's width on the left and right, and
-    of its height above and below; (0, 0) is the plate itself, and where the lens looks past it, values lie below 0 and
-    above 1.
+    `beyond`: overscan of the undistorted frame on each side, as a share of the plate's width (left and right) and
+    height (above and below). Without overscan, (0, 0), values below 0 or above 1 lie outside of the plate.
     """
     out = np.ones((height, width, 3), np.float32)
     more = np.array(beyond)
@@ -61,13 +60,13 @@ def redistort_map(
 
 
 def needed_margin(lens: Lens | MapLens, width: int, height: int) -> tuple[int, int]:
-    """Pixels that a frozen frame of `width` x `height` needs beyond each side, and beyond top and bottom.
+    """Overscan in pixels of a frozen frame of `width` x `height`: at left and right, and at top and bottom.
 
-    With them every pixel of the original frame finds its neighbours for a bilinear or cubic filter. The same on
-    opposite sides, so that the plate stays in the middle.
+    With this overscan, a bilinear or cubic filter finds all its samples for every pixel of the original frame. Opposite
+    sides have the same overscan, so that the plate stays in the middle.
     """
     if lens.is_none:
-        return 0, 0  # also for a smaller frame, whose outer pixel centres lie farther in than the original's
+        return 0, 0  # the formula below would give overscan to a smaller frame: its outer pixel centres lie farther in
     x, y = np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5
     border = np.concatenate(
         [np.stack(np.broadcast_arrays(x, edge), 1) for edge in (y[0], y[-1])]
@@ -81,10 +80,10 @@ def needed_margin(lens: Lens | MapLens, width: int, height: int) -> tuple[int, i
 
 
 def margin(shot: Shot, params: FreezeParams, width: int, height: int, Ks: NDArray[np.float64]) -> tuple[int, int]:
-    """Pixels that a take of `width` x `height` has beyond each side, and beyond top and bottom, for its overscan.
+    """Overscan in pixels of a take of `width` x `height`: at left and right, and at top and bottom.
 
-    `Ks` [F, 4] are fx, fy, cx, cy of its frames at that size: what the lens needs is known for the clip's own alone.
-    JobError (USAGE or SOLVE) if it cannot be had.
+    `Ks` [F, 4] are fx, fy, cx, cy of the take's frames at this size. Automatic overscan requires the intrinsics of the
+    solved camera. Raises JobError (USAGE or SOLVE) if the overscan cannot be computed.
     """
     overscan = params.overscan
     if overscan == 0.0:
@@ -118,17 +117,17 @@ def margin(shot: Shot, params: FreezeParams, width: int, height: int, Ks: NDArra
 
 
 def same_camera(lens: Lens | MapLens, width: int, height: int, Ks: NDArray[np.float64]) -> bool:
-    """True if frames with intrinsics `Ks` [F, 4], of `width` x `height`, show what the plate shows, lens for lens."""
+    """True if frames of `width` x `height` with intrinsics `Ks` [F, 4] have the same field of view as the plate."""
     ratio = np.array([width / lens.width, height / lens.height] * 2)
     side = max(width, height)
     return bool((np.abs(np.asarray(Ks) - np.array(lens.intrinsics) * ratio) < 1e-3 * side).all())
 
 
 def write_maps(shot: Shot, width: int = 0) -> dict[str, Any]:
-    """Writes both maps of a solved shot into solve/; returns where they are and what they need.
+    """Writes both maps of a solved shot into solve/. Returns their paths, their size and the required overscan.
 
-    `width` of the maps in pixels; 0: the working frames'. JobError (SOLVE) if the lens is not told or has no way back,
-    USAGE for a width that is out of the question, DISK.
+    `width`: width of the maps in pixels; 0: the width of the working frames. Raises JobError: SOLVE if the lens is
+    unknown or cannot be inverted, USAGE if `width` is out of range, DISK if the disk is full.
     """
     lens = load_lens(shot)
     if width and not 16 <= width <= LARGEST:
@@ -150,11 +149,11 @@ def write_maps(shot: Shot, width: int = 0) -> dict[str, Any]:
 def write_take_map(
     shot: Shot, path: Path, width: int, height: int, beyond: tuple[int, int], Ks: NDArray[np.float64]
 ) -> Path | None:
-    """The redistortion map over the whole overscanned frames of a take, at `path`: `width` x `height` and `beyond`
-    around it.
+    """Writes the redistortion map for the frames of a take to `path`. Returns the path.
 
-    As large as the working frames, so that it gives back the original picture. None if the take's intrinsics `Ks`
-    [F, 4] are not the plate's: a camera of the artist's own has no lens. JobError (SOLVE) as `Lens.check`.
+    The take's frames are `width` x `height` pixels with `beyond` pixels of overscan on each side. The map has the size
+    of the working frames, so that it restores the original picture. Returns None if the take's intrinsics `Ks` [F, 4]
+    differ from the plate's: the artist's camera has no lens distortion. Raises JobError (SOLVE) as `Lens.check` does.
     """
     lens = load_lens(shot)
     if not same_camera(lens, width, height, Ks):
@@ -166,9 +165,9 @@ def write_take_map(
 
 
 def write_plate_map(path: Path, lens: PlateLens | MapLens, width: int, height: int, key: str) -> Path:
-    """The map from footage of `width` x `height` to the plate of that size without its lens, unless it is there.
+    """Writes the map that undistorts footage of `width` x `height` to a plate of the same size. Returns the path.
 
-    `key` tells whether a file that is there is this map. JobError (DISK), OSError.
+    Does nothing if the existing file has the same `key`. Raises JobError (DISK) or OSError.
     """
     known = oiio.ImageInput.open(regular_file(path)) if path.is_file() else None
     if known is not None:
@@ -187,12 +186,12 @@ def write_plate_map(path: Path, lens: PlateLens | MapLens, width: int, height: i
 
 
 def write_map(path: Path, pixels: NDArray[np.float32], key: str = "") -> Path:
-    """A map [H, W, 3] as a 32-bit float EXR, whole or not at all. JobError (DISK) if the disk is full, else OSError."""
+    """Writes a map [H, W, 3] atomically as a 32-bit float EXR. Raises JobError (DISK) for a full disk, else OSError."""
     height, width = pixels.shape[:2]
     spec = oiio.ImageSpec(width, height, 3, oiio.FLOAT)
     spec.channelnames = ("R", "G", "B")
     spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")  # as of frozen frames: a map is the same whoever wrote it, whenever
+    spec.attribute("DateTime", "")  # makes the file reproducible, as for frozen frames
     spec.attribute("oiio:ColorSpace", "data")
     if key:
         spec.attribute("splannequin:key", key)
@@ -210,12 +209,12 @@ def write_map(path: Path, pixels: NDArray[np.float32], key: str = "") -> Path:
 
 
 def _centres(lens: Lens | MapLens, width: int, height: int, top: int) -> NDArray[np.float64]:
-    """[P, 2]: pixel centres of rows from `top` of a map of that size, in pixels of the working frames."""
+    """Pixel centres [P, 2] of `_ROWS` rows from `top` of a `width` x `height` map, in pixels of the working frames."""
     x = (np.arange(width) + 0.5) / width * lens.width
     y = (np.arange(top, min(top + _ROWS, height)) + 0.5) / height * lens.height
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def _st(pixels: NDArray[np.float64], lens: Lens | MapLens) -> NDArray[np.float64]:
-    """Pixels [P, 2] of a working frame, y down, as s and t, t up."""
+    """Converts pixels [P, 2] of a working frame, y down, to s and t, t up."""
     return np.stack([pixels[:, 0] / lens.width, 1.0 - pixels[:, 1] / lens.height], axis=1)

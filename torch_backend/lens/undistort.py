@@ -1,4 +1,4 @@
-"""Resampling pictures through a map, by Catmull-Rom: with weights computed once, or in little memory."""
+"""Catmull-Rom resampling of pictures through a map: with precomputed weights, or in bands to save memory."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from ..footage.display import Display
 
 _TAPS = 4
 _BAND = 64
-"""Rows of a large picture that are made at a time."""
+"""Number of rows of a large picture processed at a time."""
 
 
 class Undistorter:
-    """Takes each output pixel from where it lies in the input, by Catmull-Rom (exact where nothing moves).
+    """Resamples pictures through a map by Catmull-Rom interpolation (exact where the map moves nothing).
 
     Holds one sparse matrix of 16 weights per pixel (128 bytes per pixel), which is ten times faster per frame than a
-    general warp. Safe to use from several threads.
+    general warp. Thread-safe.
     """
 
     def __init__(self, where: NDArray[np.float32]) -> None:
-        """`where` is [H, W, 2]: x and y in input pixels, centres at +0.5. Outside of the input its border is taken."""
+        """`where` is [H, W, 2]: x and y in input pixels, centres at +0.5. Outside of the input, the border repeats."""
         if where.ndim != 3 or where.shape[2] != 2:
             raise ValueError(f"the map should be [H, W, 2], got {where.shape}")
         self.height, self.width = where.shape[:2]
@@ -40,7 +40,7 @@ class Undistorter:
         self._matrix = sparse_rows(weights, index, starts, count)
 
     def __call__(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """[H, W, 3] uint8 or uint16 to the same. ValueError if the size is not the map's."""
+        """Resamples a picture [H, W, 3] uint8 or uint16, same dtype. Raises ValueError if its size is not the map's."""
         if pixels.shape != (self.height, self.width, 3):
             raise ValueError(f"the picture is {pixels.shape}, the map {self.height}x{self.width}: their sizes differ")
         moved = self._matrix @ pixels.reshape(-1, 3).astype(np.float32)
@@ -49,15 +49,15 @@ class Undistorter:
 
 
 class BandUndistorter:
-    """What `Undistorter` does, for pictures of any size and values: 8 bytes per pixel, and floats that nothing cuts.
+    """Like `Undistorter`, for pictures of any size and for unclipped floats. Uses 8 bytes per pixel.
 
-    A Catmull-Rom curve is the straight line between two samples less t (1 - t) / 2 times the line between their second
-    differences: four bilinear look-ups a pixel, band by band. What lies below black and above white is left to the
-    straight line, or a lamp of fifty times white would wear a black ring.
+    A Catmull-Rom curve is a linear interpolation of two samples, minus t (1 - t) / 2 times a linear interpolation of
+    their second differences. This takes four bilinear look-ups per pixel, band by band. The second differences use
+    values clipped to [0, 1]: otherwise a lamp of fifty times white would get a black ring.
     """
 
     def __init__(self, where: NDArray[np.float32]) -> None:
-        """`where` as for `Undistorter`, of any size: the output's."""
+        """`where` as for `Undistorter`; its size is the size of the output."""
         if where.ndim != 3 or where.shape[2] != 2:
             raise ValueError(f"the map should be [H, W, 2], got {where.shape}")
         self._where = where
@@ -69,9 +69,10 @@ class BandUndistorter:
         write: Callable[[NDArray[np.float32]], NDArray[Any]],
         out: NDArray[Any],
     ) -> NDArray[Any]:
-        """Fills `out` [H, W, 3] from `picture` [h, w, 3], and returns it.
+        """Resamples `picture` [h, w, 3] into `out` [H, W, 3], and returns `out`.
 
-        `read` turns rows of the picture to float32, black 0 and white 1; `write` such rows to what `out` holds.
+        `read` converts rows of the picture to float32, black 0 and white 1. `write` converts such rows to the dtype of
+        `out`.
         """
         for top in range(0, len(self._where), _BAND):
             band = slice(top, top + _BAND)
@@ -82,8 +83,11 @@ class BandUndistorter:
 def of_frames(
     undistort: Undistorter, where: NDArray[np.float32], display: Display
 ) -> Callable[[NDArray[Any]], NDArray[Any]]:
-    """What takes the lens out of working frames [H, W, 3] of a display: `undistort`, which is for `where`, or where the
-    display has a shoulder a way on which highlights do not ring (see `footage.display`). Safe for several threads."""
+    """A thread-safe function that undistorts working frames [H, W, 3].
+
+    Returns `undistort`, which was built for `where`. If the display has a shoulder (see `footage.display`), returns a
+    `BandUndistorter` in sRGB instead, in which highlights do not ring.
+    """
     if not display.bends:
         return undistort
     bands = BandUndistorter(where)
@@ -93,7 +97,7 @@ def of_frames(
 def _band(
     picture: NDArray[Any], read: Callable[[NDArray[Any]], NDArray[np.float32]], where: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Some rows of the output, [h, W, 3] float32."""
+    """One band of the output, [h, W, 3] float32, for the same rows of the map."""
     height, width = picture.shape[:2]
     x = np.clip(where[..., 0] - np.float32(0.5), -1.0, width)
     y = np.clip(where[..., 1] - np.float32(0.5), -1.0, height)
@@ -102,7 +106,7 @@ def _band(
     rows = read(picture[max(0, int(needed[0])) : int(needed[-1]) + 1])
     rows = rows[needed.clip(0, height - 1) - max(0, int(needed[0]))]
     rows = np.pad(rows, ((0, 0), (2, 2), (0, 0)), mode="edge")
-    x, y = x + np.float32(1.0), y - np.float32(first)  # as `inner` below counts
+    x, y = x + np.float32(1.0), y - np.float32(first)  # to coordinates of `inner` below
     bend_x, bend_y = _bend(x), _bend(y)
 
     def sample(inner: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -119,7 +123,7 @@ def _band(
 
 
 def _bend(at: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[h, W, 1]: t (1 - t) / 2 of the fractions of coordinates."""
+    """t (1 - t) / 2 for the fractional part t of coordinates, [h, W, 1]."""
     t = at - np.floor(at)
     t -= t * t
     t *= 0.5
@@ -127,7 +131,7 @@ def _bend(at: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _second_difference(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[n, ...] to [n - 2, ...]."""
+    """Second differences [n - 2, ...] of rows [n, ...]."""
     return np.asarray(rows[:-2] - (rows[1:-1] + rows[1:-1]) + rows[2:], np.float32)
 
 

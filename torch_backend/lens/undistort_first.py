@@ -1,4 +1,4 @@
-"""Undistorts frames before the solve, where an ST map gives the lens."""
+"""Undistorts frames before the solve if an ST map defines the lens."""
 
 from __future__ import annotations
 
@@ -19,17 +19,20 @@ _WRITERS = 2
 
 
 class UndistortedFrames:
-    """Working frames undistorted by the map of a lens, in a folder."""
+    """A folder of working frames undistorted by an ST map."""
 
     folder: Path
-    """Pictures with the names of the frames."""
+    """Folder of the pictures, which have the file names of the frames."""
     undistort: Undistorter
     """The undistortion that was applied."""
     focal_scale: float
     """Focal length of the undistorted frames over that of the original ones, both in pixels."""
 
     def __init__(self, shot: Shot, frames: dict[str, Any], lens: MapLens, folder: Path, report: Reporter) -> None:
-        """Writes those of `frames` (frames.json) into `folder`. JobError where the lens has no way, Cancelled."""
+        """Undistorts the frames listed in `frames` (frames.json) into `folder`.
+
+        Raises JobError if the lens cannot be inverted, or Cancelled.
+        """
         self.folder, self._lens = folder, lens
         across, down = lens.slopes_in_the_middle
         self.focal_scale = 2.0 / (across + down)
@@ -54,7 +57,10 @@ class UndistortedFrames:
                 raise
 
     def answer_changes(self, scratch: Path) -> dict[str, Any]:
-        """Fields of the answer that change as the worker saw undistorted frames. Also adapts the map in `scratch`."""
+        """Fields of the worker's answer to replace, because the worker saw undistorted frames.
+
+        Also rewrites the map in `scratch`.
+        """
         file = scratch / "undistort_0.npz"
         with np.load(file, allow_pickle=False) as data:
             pinhole = data["pinhole"]

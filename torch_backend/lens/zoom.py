@@ -1,7 +1,7 @@
-"""Detects a zoom during the take, from the focal length that fits each frame best. numpy alone.
+"""Detects a zoom during the take, from the focal length that fits each frame best. Uses numpy only.
 
-A solve has one focal length for all frames. Where the lens zooms, it moves the cameras along their axes instead, and
-the error stays small. Points at different depths tell the two apart.
+A solve has one focal length for all frames. If the lens zooms, the solve moves the cameras along their axes instead,
+and the error stays small. Points at different depths distinguish a zoom from a camera move.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from numpy.typing import NDArray
 from ..cameras.poses import quat_to_rotation
 
 ZOOM = 0.02
-"""Change of focal length within the take, in natural logarithms, from which on the lens zooms."""
+"""Smallest change of focal length within the take that counts as a zoom, as a natural logarithm."""
 _LEAST_POINTS = 30
-"""Fewer points do not tell the focal length of a frame."""
+"""Minimum number of points to estimate the focal length of a frame."""
 _LEAST_FRAMES = 8
 _STEPS = 20
 _MOST = 2.0
-"""Logarithm beyond which the refinement has run off."""
+"""Largest change of focal length, as a natural logarithm; beyond it, the refinement has diverged."""
 _OUTLIER_PX = 1.5
-"""Residuals beyond this count less, in pixels."""
+"""Threshold of the Huber weights, in pixels."""
 
 
 def focal_change(
     seen: NDArray[np.float64], points: NDArray[np.float64], pose: NDArray[np.float64], focal: float
 ) -> float:
-    """Natural logarithm of the focal length that a frame would rather have, over the one of the solve; nan if unknown.
+    """Natural logarithm of the best focal length for one frame over the focal length of the solve; nan if unknown.
 
-    Pose and focal length of the frame are refined together, with the points held (Gauss-Newton, Huber weights).
+    Refines pose and focal length of the frame together, with fixed points (Gauss-Newton, Huber weights).
 
     Args:
-        seen: [N, 2] where the frame shows the points, without the lens: x/z and y/z by the solve's focal length.
+        seen: [N, 2] undistorted observations of the points, as x/z and y/z for the solve's focal length.
         points: [N, 3] world.
         pose: [3, 4] world-to-camera.
         focal: focal length of the solve in pixels.
@@ -55,7 +55,7 @@ def focal_change(
             if not abs(change) < _MOST:
                 return float("nan")
             if abs(float(step[6])) < 1e-6:
-                # A flat scene seen head-on does not tell the focal length: its figure would be noise.
+                # A flat scene seen head-on does not determine the focal length: the estimate would be noise.
                 noise = 1.48 * float(np.median(np.abs(residual)))
                 known = noise * float(np.linalg.inv(normal)[6, 6]) ** 0.5 < 0.25 * ZOOM
                 return change if known else float("nan")
@@ -65,7 +65,7 @@ def focal_change(
 
 
 def _part(values: NDArray[Any]) -> NDArray[np.float64]:
-    """Values whose type numpy leaves open."""
+    """Values as float64, because numpy does not declare their type."""
     return np.asarray(values, np.float64)
 
 
@@ -77,20 +77,23 @@ def _linearised(
     focal: float,
     change: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(residuals [N, 2] in pixels, their derivatives [N, 2, 7]) by a turn, a shift of the camera and the logarithm."""
+    """(residuals [N, 2] in pixels, their Jacobian [N, 2, 7]).
+
+    The parameters are a rotation vector [3], a shift [3] in camera axes and the logarithm of the focal length.
+    """
     at = points @ rotation.T + shift
     flat = at[:, :2] / at[:, 2:]
     scale = focal * np.exp(change)
     by_shift = np.zeros((len(at), 2, 3))
     by_shift[:, 0, 0] = by_shift[:, 1, 1] = 1.0 / at[:, 2]
     by_shift[:, :, 2] = -flat / at[:, 2:]
-    by_turn = by_shift @ -_cross(at)  # a turn w moves a point p of the camera by w x p = -[p]x w
+    by_turn = by_shift @ -_cross(at)  # a rotation w moves a point p in camera axes by w x p = -[p]x w
     jacobian = scale * np.concatenate([by_turn, by_shift, flat[:, :, None]], axis=2)
     return _part(scale * flat - focal * seen), _part(jacobian)
 
 
 def zoom_words(changes: Mapping[int, float]) -> tuple[str, str] | None:
-    """(what is wrong, what to do) where the focal length changes over the take; None where it does not.
+    """(sentence, hint) for the artist if the focal length changes over the take; None if it does not.
 
     Args:
         changes: frame number -> `focal_change`.
@@ -100,7 +103,7 @@ def zoom_words(changes: Mapping[int, float]) -> tuple[str, str] | None:
         return None
     frames, values = [frame for frame, _ in known], np.array([change for _, change in known])
     padded = np.pad(values, 2, mode="edge")
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)  # one odd frame is no zoom
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)  # ignore single outliers
     whole = float(smooth.max() - smooth.min())
     if whole < ZOOM:
         return None
@@ -128,7 +131,7 @@ def _steady(values: NDArray[np.float64]) -> tuple[int, int]:
 
 
 def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[..., 3, 3] that a vector is multiplied by for the cross products of vectors [..., 3] with it."""
+    """Matrices [..., 3, 3] of the cross product: `_cross(v) @ w` is v x w, for vectors v [..., 3]."""
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return out - np.swapaxes(out, -1, -2)
