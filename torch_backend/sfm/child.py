@@ -1,5 +1,4 @@
-"""Runs the COLMAP worker as a child process: reads its progress, cancels it, and reports the end of its log if it dies.
-"""
+"""Runs the COLMAP worker as a child process: reads its progress, cancels it, and reports its log's end if it dies."""
 
 from __future__ import annotations
 

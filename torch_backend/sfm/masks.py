@@ -99,8 +99,7 @@ def facts_of(masks: dict[str, Mask], sources: dict[str, str]) -> dict[str, Any]:
 
 
 def given_masks(shot: Shot) -> dict[str, dict[str, Any]]:
-    """Maps kind to `facts_of` for the masks that the shot was solved with; {} if none, or if solve.json is unreadable.
-    """
+    """`facts_of` the masks that the shot was solved with; {} without masks or if solve.json is unreadable."""
     try:
         facts = read_json(shot.solve_record).get("masks")
     except (OSError, ValueError):
