@@ -30,7 +30,7 @@ class Blender:
     label: str
     """Name in messages."""
     command: tuple[str, ...]
-    """The command up to the script."""
+    """Command line before the script's path."""
 
     @property
     def is_wheel(self) -> bool:

@@ -21,7 +21,8 @@ from .errors import LauncherError
 from .places import ROOT
 
 AT_ONCE = 2
-"""Largest number of legs that run in parallel, if there are as many cores. A test uses little more than one core."""
+"""Largest number of legs that run in parallel, if there are as many cores. More legs would slow each other down: a test
+uses little more than one core."""
 NEWS_SECONDS = 60.0
 """Interval in seconds of progress lines while legs run in parallel, whose output is shown when they end."""
 

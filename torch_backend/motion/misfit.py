@@ -55,7 +55,7 @@ class Sight:
     viewmat: NDArray[np.float64]
     """[4, 4] world-to-camera, solve units."""
     K: NDArray[np.float64]
-    """[3, 3] in flow pixels."""
+    """[3, 3] intrinsics in flow pixels."""
 
 
 def misfit(
@@ -95,7 +95,7 @@ def _median(frame: Sight, inverse: Map, others: Sequence[Sight], grid: tuple[Map
         brought.append(np.where(visible[..., None], picture, np.float32(np.nan)))
     if not brought:
         return colors, np.zeros(inverse.shape, np.int64)
-    stack = np.sort(np.stack(brought), axis=0)  # NaN, outside, comes last
+    stack = np.sort(np.stack(brought), axis=0)  # sorts NaN, the invisible pixels, to the end
     number = np.count_nonzero(~np.isnan(stack[..., 0]), axis=0)
     middle = np.take_along_axis(stack, np.maximum(number - 1, 0)[None, ..., None] // 2, axis=0)[0]
     return np.where(number[..., None] > 0, middle, colors), number

@@ -304,7 +304,7 @@ class Labels:
         least = round((config.blob * self._clip.width / 640) ** 2)
         moving = seeded(score > config.grow, score > config.seed, least)
         moving |= seeded(difference > rest.weak, difference > rest.strong, least)
-        still = seeded(~moving, ~moving, least)  # holes are filled
+        still = seeded(~moving, ~moving, least)  # fills small holes of moving areas
         unknown = known < _UNKNOWN
         unknown = seeded(unknown, unknown, least)
         return np.where(~still, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))

@@ -2,8 +2,8 @@
 
 Another key frame is warped onto a key frame by the depth of still points. Still surfaces then coincide, and the
 residual flow is several times more precise than a match over the whole distance. Depths are fitted again to these
-matches. Residual flow that no depth explains is motion, if the pictures confirm it. The two frames are up to a second
-or more apart, because the displacement of a sway grows with time.
+matches. Residual flow that no depth explains is motion, if the pictures confirm it. The two frames are 0.4 to 1.6
+seconds apart (`FlowConfig.spans`), because the displacement of a sway grows with time.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class _Laid:
     gained: Map
     """[h, w] 0..1: how strongly the pictures favour the match over the still point."""
     visible: float
-    """Squared picture difference above the noise."""
+    """Noise of the pair as a squared picture difference; a larger change is visible."""
 
 
 class ResidualFlow:

@@ -8,7 +8,8 @@ Blending (per pixel, front to back by camera depth, ties by index):
   skip where alpha < ``ALPHA_MIN``; clamp alpha to ``ALPHA_MAX`` (no gradient through the clamp); stop once the
   transmittance *before* a Gaussian is <= ``T_STOP``.
 Projection: EWA with ``LOW_PASS`` px^2 added to the diagonal. For the Jacobian, x/z and y/z are clamped to the frustum
-widened by ``FRUSTUM_MARGIN`` half-widths on each side, with zero gradient outside.
+widened by ``FRUSTUM_MARGIN`` half-widths on each side, with zero gradient outside. The frustum's limits are relative to
+the principal point.
 """
 
 import math
@@ -22,7 +23,7 @@ T_STOP = 1e-4
 LOW_PASS = 0.3
 """Variance in px^2 added to both diagonal entries of every projected covariance."""
 FRUSTUM_MARGIN = 0.3
-"""Widening of the frustum for the Jacobian's clamp, as a share of tan(fov / 2): a centred frustum grows to 1.3."""
+"""Widening of the frustum for the Jacobian's clamp; the limit of a centred frustum is 1.3 tan(fov / 2)."""
 QUAT_MIN = 1e-6
 """Gaussians whose largest quaternion component has at most this magnitude are culled."""
 LOG_SCALE_MIN = -30.0

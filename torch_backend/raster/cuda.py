@@ -90,7 +90,7 @@ class _Launcher:
 
 
 class _Fibers:
-    """Enables Warp's CPU blocks within a `with` block, for one thread at a time: their shared memory is static."""
+    """Context that enables Warp's CPU blocks. A lock admits one thread at a time, because shared memory is static."""
 
     def __init__(self, wp: Any):
         self.wp = wp
@@ -160,7 +160,7 @@ class _Zeros(NamedTuple):
 
     tile_start: Tensor
     tile_end: Tensor
-    """See `_Binned`, also for `tile_start`."""
+    """For this field and `tile_start` see `_Binned`."""
     norms: tuple[Tensor, Tensor]
     """[C, N] each: where the backward pass writes `means2d_grad` and `means2d_absgrad`."""
     hits: Tensor

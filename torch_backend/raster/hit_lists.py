@@ -87,7 +87,7 @@ def listed(device: torch.device, cameras: int, width: int, height: int) -> int:
 
 
 def report_demands(device: torch.device) -> None:
-    """Copy the device's maxima to the host. Calls replayed by a CUDA graph do not do this."""
+    """Copy the device's maxima to the host, which calls replayed by a CUDA graph do not do."""
     with _lock:
         for (of, *_), demand in _demands.items():
             if of == device:

@@ -51,8 +51,8 @@ class RasterOutput:
     means2d_grad: Tensor
     """[C, N]: |d loss / d mean2d| in 1/px. Zeros until a backward pass writes it in place; each pass overwrites."""
     means2d_absgrad: Tensor
-    """[C, N]: norm of (sum over pixels |d loss / d x|, sum |d loss / d y|) in 1/px, written like `means2d_grad`. Zeros
-    if settings.absgrad is off."""
+    """[C, N]: norm of (sum over pixels |d loss / d x|, sum |d loss / d y|) in 1/px. Each backward pass overwrites it,
+    as it does `means2d_grad`. Zeros if settings.absgrad is off."""
     top_ids: Tensor | None = None
     """[C, H, W] int32: index of the Gaussian with the largest alpha T at the pixel, the front one if several are equal;
     -1 where alpha is 0."""

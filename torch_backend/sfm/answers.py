@@ -102,7 +102,7 @@ def undistortion(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], NDArray[
         return bool(((at >= low) & (at <= high)).all())
 
     low, high = 0.5, 2.0
-    while not inside(high) and high < WIDEST_ZOOM:  # a fisheye
+    while not inside(high) and high < WIDEST_ZOOM:  # only a fisheye needs more than 2
         high *= 2.0
     for _ in range(40):
         middle = 0.5 * (low + high)

@@ -126,6 +126,6 @@ def absolute_pose(
     camera: pycolmap.Camera,
     options: pycolmap.AbsolutePoseEstimationOptions,
 ) -> tuple[NDArray[np.float64], int] | None:
-    """World-to-camera pose [3, 4] from pixels [N, 2] and points [N, 3], and how many agree; None without any."""
+    """World-to-camera pose [3, 4] from pixels [N, 2] and points [N, 3], and its number of inliers; None on failure."""
     found = _colmap.estimate_and_refine_absolute_pose(xy, xyz, camera, options)
     return (found["cam_from_world"].matrix(), int(found["num_inliers"])) if found is not None else None

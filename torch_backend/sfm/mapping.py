@@ -36,9 +36,9 @@ def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruc
     options.random_seed = SEED
     options.mapper.random_seed = SEED
     options.triangulation.random_seed = SEED
-    # A clip of 75 frames needs no global adjustment every 10 % of growth. The number of rounds per adjustment stays
-    # COLMAP's, until convergence. With two global rounds or one local round, a start from two frames with little depth
-    # was kept: a whole walk was solved wrongly at an error of 0.9 px (docs/decisions.md).
+    # A clip of 75 frames needs no global adjustment every 10 % of growth. Each adjustment keeps COLMAP's default number
+    # of rounds. With only two global rounds or one local round, the mapper kept a start from two frames with little
+    # depth, and a whole walk was solved wrongly at an error of 0.9 px (docs/decisions.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
     # Ceres' default. With COLMAP's 0 an adjustment runs all 50 iterations even when it has converged.
     options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-6
@@ -124,7 +124,7 @@ def lens_of(camera: pycolmap.Camera) -> tuple[str, int, int, list[float]]:
 
 
 def lens_doubt(request: Request, model: pycolmap.Reconstruction) -> str:
-    """`lens_verdict.doubt_of` a model's lens."""
+    """`lens_verdict.doubt_of` for a model's lens."""
     return doubt_of(*lens_of(first_camera(model)), request.focal)
 
 
@@ -137,7 +137,7 @@ def as_good(held: pycolmap.Reconstruction, free: pycolmap.Reconstruction) -> boo
 
 
 def triangulation_angle(model: pycolmap.Reconstruction) -> float:
-    """Median over points (about 2000) of the widest angle in degrees under which a point is seen."""
+    """Median, over at most 4000 points, of the widest angle in degrees between two rays to a point."""
     centres = {image.image_id: image.projection_center() for image in posed(model)}
     points = sorted(colmap.points(model).items())
     angles: list[float] = []

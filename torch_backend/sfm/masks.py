@@ -31,9 +31,9 @@ _MOST_FEATURES = 3.0
 """Largest factor on the number of features of a masked picture: COLMAP counts masked features before it drops them."""
 
 _WIDE_SHARE = 0.25
-"""Masked share of the picture from which on more pairs of frames are matched than the usual overlap. The unmasked rest
-shows too little for those few pairs to hold the clip together. With 70 % of a ray-cast room masked, they gave cameras
-6 degrees off at 0.5 px, rated Good; all pairs gave 0.14 degrees."""
+"""Masked share of the picture above which more pairs of frames are matched than the usual overlap. The unmasked rest
+shows too little for those few pairs to hold the clip together. With 70 % of a ray-cast room masked, the usual pairs
+gave cameras 6 degrees off at 0.5 px, rated Good; all pairs gave 0.14 degrees."""
 
 
 def write_matching(
@@ -143,7 +143,7 @@ def painted_over(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_]) -> NDArr
 def limited(labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None, people: NDArray[np.bool_] | None) -> None:
     """Sets a motion matte [H, W] to still, 0, in place wherever the masks allow no motion.
 
-    This includes a rim around ignored pixels: scene points that they hide at other times seem to move there.
+    The still area includes a rim around ignored pixels, where scene points that become hidden would seem to move.
     """
     if ignored is not None:
         labels[_wider(ignored, _RIM) > 0] = 0

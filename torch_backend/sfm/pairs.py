@@ -25,7 +25,7 @@ MOST_PROCESSES = 4
 """Upper limit of processes: each needs a copy of the database (0.5 MB a frame) and its own search trees."""
 
 LEAST_PAIRS = 100
-"""Fewest pairs for which a process is started. Its start takes about a second, a pair 12 to 30 ms."""
+"""Smallest number of pairs per process. The start of a process takes about a second, a pair 12 to 30 ms."""
 
 BLOCK = 64
 """Pairs after which COLMAP reports progress and drops its search trees. 405 pairs take 9.5 CPU seconds in blocks of 8,

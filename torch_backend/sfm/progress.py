@@ -52,8 +52,8 @@ def weights_of(frames: Mapping[str, Any]) -> dict[str, float]:
         "other features": 0.27 * size * others,
         "other matches": 0.1 * others,
         "undistort": 0.04 * size * every,
-        "still world": 0.03 * max(400.0, 2.0 * every),  # steps of its training
-        "motion": 0.26 * every,  # after the still world, during which flow has begun
+        "still world": 0.03 * max(400.0, 2.0 * every),  # seconds per training step, times the number of steps
+        "motion": 0.26 * every,  # without the optical flow that runs during "still world"
     }
 
 
@@ -75,7 +75,7 @@ class OneBar:
         self._share = 0.0
         """Share of the stage that is done."""
         self._bar = 0.0
-        """Share of the whole that is done."""
+        """Share of the solve that is done."""
         self._entered = (0.0, 0.0)
         """Values of `_bar` and `_share` when the stage began."""
         self._worked = 0.0
@@ -84,7 +84,7 @@ class OneBar:
         self._told = self._began
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        """Reports a stage's progress as progress of the solve; only the message of a stage that is not in `weights`."""
+        """Reports a stage's progress as progress of the solve. A stage not in `weights` changes only the message."""
         name = stage.removeprefix(f"{WHOLE}: ")
         if name not in self._weights:
             self._report.progress(WHOLE, self._bar, 1.0, message)

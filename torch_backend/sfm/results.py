@@ -76,7 +76,7 @@ class Asked:
 
     shot: Shot
     frames: dict[str, Any]
-    """frames.json."""
+    """Contents of frames.json."""
     masks: dict[str, Mask]
     facts: dict[str, Any]
     """Part of solve.json that records the solve's settings."""

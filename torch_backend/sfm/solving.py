@@ -188,10 +188,10 @@ def _mask_sources(shot: Shot, config: SolveConfig) -> dict[str, str]:
 def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: dict[str, Mask]) -> str:
     """Key that identifies a solve. Masks and files enter by their contents, not by their paths."""
     settings = asdict(config)
-    new = ["ignore_mask", "people_mask"]  # earlier solves had none of these
-    new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # the file counts by what is in it
+    new = ["ignore_mask", "people_mask"]  # not in the keys of earlier solves, which stay valid
+    new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # `source` has the file's fingerprint
     new += [] if config.focal_mm else ["focal_mm", "sensor_mm", "refine_focal"]
-    new += ["retry"] if config.retry else []  # a solve without retries does not count as one with them
+    new += ["retry"] if config.retry else []  # a solve without retries has another key
     for name in new:
         settings.pop(name)
     return content_key(SOLVE_VERSION, settings, frames.get("key"), *source, *(mask.key for mask in masks.values()))

@@ -25,8 +25,8 @@ ENOUGH_MATCHES = 100
 """Matches that a pair of frames needs to start a solve, COLMAP's default. If typical pairs have that many and the solve
 still does not start, the cause is a lack of parallax."""
 MUCH_MOVES = 0.2
-"""Share of independently moving pixels from which on a clip's cameras are doubted. Correct solves measured 0.02 to
-0.08. A solve that started from a pair without parallax had 0.31, at an error of 0.9 pixels."""
+"""Share of independently moving pixels above which a clip's cameras are doubted. Correct solves had 0.02 to 0.08. A
+solve that started from a pair without parallax had 0.31, at an error of 0.9 pixels."""
 _TURNING = "The camera only turns on the spot: there is nothing to tell depth by."
 _RANGE_HINT = "Import a longer range, in which the camera moves sideways by a step or more."
 _BARE_HINT = "Choose a sharper range, or film with more light and texture in view."
