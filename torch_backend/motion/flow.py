@@ -57,8 +57,8 @@ class FlowConfig:
     gone_far: float = 0.5
     """Weight, relative to a moving match, of a point that is lost both four key frames before and four after."""
     better: float = 1.5
-    """Ratio of the squared picture difference at the still point's pixel to the one at the match, above which the match
-    counts as motion."""
+    """A match counts as motion if the squared picture difference at the still point's pixel is more than this many
+    times the difference at the match."""
     haste: float = 0.3
     """Exponent of a pair's distance in time in its weight as evidence of stillness: a swaying object also stands still
     for a moment."""

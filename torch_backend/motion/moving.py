@@ -255,7 +255,7 @@ def _own_score(
 def _followed(
     matches: Matches, key: int, own: dict[int, tuple[Map, Map, Map]], count: int, reach: int, config: FlowConfig
 ) -> tuple[Map, Map]:
-    """Score and weight of a key frame, averaged with its neighbours' along surfaces: a surface has one label."""
+    """Score and weight of a key frame, averaged with those of its neighbours so that a surface has one label."""
     score, sure, _ = own[key]
     total, weight = 2.0 * score * sure, 2.0 * sure
     for seen in neighbours(matches, key, count, config):

@@ -108,7 +108,7 @@ class Texture:
         """Mask of points at which motion by the tolerance would be visible."""
 
     def change(self, x: Map, y: Map, length: Map) -> Map:
-        """Mean squared difference to the position (x, y) away, from first derivatives; at most `_longest` away."""
+        """Mean squared difference to the position (x, y) away, by a linear model; longer ways count as `_longest`."""
         shorter = np.square(np.minimum(1.0, self._longest / np.maximum(length, 1e-6)))
         return shorter * (self._xx * x * x + 2 * self._xy * x * y + self._yy * y * y)
 

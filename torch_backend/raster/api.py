@@ -146,8 +146,8 @@ def rasterize(
     backend: 'cpu' (float32, compiled), 'cuda' (float32, compiled, NVIDIA; CPU tensors run the same kernels on fibers:
     very slow, for tests), 'reference' (torch, the inputs' float type and device, slow). 'auto' selects by the device of
     `means`, to which all inputs are moved. A call on a GPU does not synchronise with the host if viewmats and Ks are
-    also on the GPU, and it can be captured as a CUDA graph with its backward pass (see `cuda.py`). Such cameras are
-    therefore not checked: those with non-finite values or non-positive focal lengths give an empty image.
+    also on the GPU, and it can be captured as a CUDA graph with its backward pass (see `cuda.py`). Cameras on the GPU
+    are therefore not checked; non-finite values or non-positive focal lengths give an empty image.
 
     Raises ValueError for invalid arguments, NotImplementedError for a device without a body, RuntimeError if Warp
     cannot use the GPU.

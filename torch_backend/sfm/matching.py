@@ -118,7 +118,7 @@ def set_lens(request: Request, database: pycolmap.Database) -> bool:
 
 
 def wide_pairs(names: Sequence[str]) -> dict[str, list[str]]:
-    """Pairs of frames in the clip's order, more than a quadratic overlap has: about 20 a frame in any clip.
+    """Pairs of frames in the clip's order, more than with the quadratic overlap: about 20 a frame in any clip.
 
     Up to `ALL_PAIRS` frames: all pairs. Beyond: distances 1 to 8, then distances that grow by the root of two.
     """

@@ -55,7 +55,7 @@ class SolveConfig:
     features: int = 4096
     """Largest number of SIFT features per frame; the first octave is the upsampled one."""
     localise: bool = True
-    """Localise each frame that the import's step left out against the model; else those frames are interpolated."""
+    """Localise frames that the import's step left out, each against the model; else those frames are interpolated."""
     neighbours: int = 2
     """Number of registered frames on either side with which a frame to be localised is matched."""
     ignore_mask: str = ""
