@@ -57,7 +57,7 @@ def solve_key(shot: Shot, config: FlowConfig) -> str:
 
 @functools.lru_cache(maxsize=16)
 def _digest(file: Path, *_state: int) -> str:
-    """SHA-256 of a file, cached by its state: it is needed for each matte, and the files grow with the clip."""
+    """SHA-256 of a file, cached by inode, size and time: every matte needs it, and the files grow with the clip."""
     with open_regular(file) as handle:
         return hashlib.sha256(handle.read()).hexdigest()
 
@@ -90,7 +90,7 @@ def is_outdated(shot: Shot) -> bool:
 def motion_key(shot: Shot, with_found: bool = True) -> str:
     """Key that changes with every painted matte and, if `with_found`, with the detected mattes.
 
-    Painted mattes enter by their contents, so that a training run can resume in a copied shot.
+    The key uses the contents of painted mattes, so that a training run can resume in a copied shot.
     """
     found = record_of(shot.motion / _RECORD).get("key") if with_found and is_found(shot) else None
     painted = sorted(p for p in shot.painted.glob("*.png") if p.is_file())

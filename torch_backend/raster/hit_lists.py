@@ -73,8 +73,7 @@ def forget_demands() -> None:
 
 
 def outgrown(device: torch.device, cameras: int, width: int, height: int) -> int:
-    """Largest known number of hits of calls of this device and size if it exceeds the share `_FULL` of the list's
-    capacity; else 0."""
+    """Largest known number of hits of calls of this device and size if the list's capacity must grow for it; else 0."""
     demand = _demands.get((device, cameras, width, height))
     wanted = 0 if demand is None else int(demand.host[0])
     return wanted if demand is not None and wanted > _FULL * demand.capacity else 0

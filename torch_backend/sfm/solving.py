@@ -96,7 +96,7 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
     Raises JobError (SOLVE) if cameras cannot be found, and Cancelled.
     """
     _check(config, cameras)
-    for folder in (shot.frames, shot.colmap, *map(shot.masks, MASK_KINDS)):  # earlier files are replaced
+    for folder in (shot.frames, shot.colmap, *map(shot.masks, MASK_KINDS)):  # refuses links: earlier files are replaced
         shot.own(folder)
     settle_solve(shot)
     frames = load_frames(shot)
@@ -186,7 +186,7 @@ def _mask_sources(shot: Shot, config: SolveConfig) -> dict[str, str]:
 
 
 def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: dict[str, Mask]) -> str:
-    """Key that identifies a solve. Masks and files enter by their contents, not by their paths."""
+    """Key that identifies a solve. It uses the contents of masks and files, not their paths."""
     settings = asdict(config)
     new = ["ignore_mask", "people_mask"]  # not in the keys of earlier solves, which stay valid
     new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # `source` has the file's fingerprint
