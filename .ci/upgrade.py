@@ -1,10 +1,11 @@
-"""Installs the last release in a real Blender, the new zip over it, and removes it: nothing of the artist's may change.
+"""Tests that installing, upgrading and removing the extension in a real Blender leaves the artist's data unchanged.
 
     python3 .ci/upgrade.py BLENDER ZIP FOLDER
 
-FOLDER gets a Blender profile, a home folder, a shot and a .blend. The profile has preferences, files and another
-extension of an artist's. After each step all of that is compared with how it was: files by SHA-256, preferences by
-value, as Blender writes userpref.blend anew. In Blender this same file runs one step: `-- STEP FOLDER`.
+It installs the last release, then ZIP over it, then removes it. FOLDER receives a Blender profile, a home folder, a
+shot and a .blend. The profile has an artist's preferences, files and another extension. After each step all of them are
+compared with the state before: files by SHA-256, preferences by value, because Blender rewrites userpref.blend. In
+Blender this file runs one step: `-- STEP FOLDER`.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 LAST_RELEASE = "74149e5fcab7ac85a4366a387147237a435234a9"
-"""Commit of 0.2.0, which was never published: what its `extension build` makes stands for the last release."""
+"""Commit of 0.2.0, which was never published. The zip built from it represents the last release."""
 MODULE = "bl_ext.user_default.splannequin"
 BYSTANDER = "bl_ext.user_default.bystander"
 OURS = ("extensions/user_default/splannequin/", "extensions/.user/user_default/splannequin/")
 """Folders of the profile that belong to the add-on."""
 BLENDERS = ("config/userpref.blend", "extensions/user_default/.blender_ext/", "extensions/.cache/")
-"""What Blender writes anew when extensions change; preferences are compared by value."""
+"""Files that Blender rewrites when extensions change; preferences are compared by value."""
 BYSTANDER_FILES = {
     "blender_manifest.toml": """schema_version = "1.0.0"
 id = "bystander"
@@ -54,7 +55,7 @@ def unregister():
 
 
 class Harm(Exception):
-    """What a release must not do, in one sentence."""
+    """Raised if a release does something that it must not do; the message is one sentence."""
 
 
 def main(blender: str, archive: Path, folder: Path) -> int:
@@ -89,7 +90,7 @@ def main(blender: str, archive: Path, folder: Path) -> int:
 
 
 class Runs:
-    """A Blender, with the profile and the home folder that it uses."""
+    """Runs of a Blender with a separate profile and home folder."""
 
     def __init__(self, program: str, folder: Path) -> None:
         self.program, self.folder = program, folder
@@ -98,7 +99,7 @@ class Runs:
             place.mkdir(parents=True)
 
     def blender(self, *words: str) -> str:
-        """Runs Blender; returns what it printed."""
+        """Runs Blender and returns its output. Raises Harm if it fails."""
         environ = {**os.environ, "BLENDER_USER_RESOURCES": str(self.profile), "HOME": str(self.home)}
         for name in ("SPLANNEQUIN_HOME", "SPLANNEQUIN_BACKEND_PYTHON"):
             environ.pop(name, None)
@@ -117,14 +118,14 @@ class Runs:
         print(f"installed {what}", flush=True)
 
     def seen(self) -> dict[str, Any]:
-        """The state of all that is the artist's: files by SHA-256, preferences by value."""
+        """The state of the artist's data: files by SHA-256, preferences by value."""
         self.step("preferences")
         preferences = json.loads((self.folder / "preferences.json").read_text(encoding="utf-8"))
         files = {**files_of(self.profile, (*OURS, *BLENDERS)), **files_of(self.work, ())}
         return {"files": files, "home": files_of(self.home, (".cache/",)), "preferences": preferences}
 
     def compare(self, when: str, before: dict[str, Any], addon: str) -> None:
-        """Raises Harm if something of the artist's differs, or the installed version of the add-on is not `addon`."""
+        """Raises Harm if the artist's data differ, or if the installed version of the add-on is not `addon`."""
         after = self.seen()
         for part in ("files", "home", "preferences"):
             was, now = without_addon(before[part]), without_addon(after[part])
@@ -136,7 +137,7 @@ class Runs:
         found = re.search(r'^version = "(.+)"', manifest.read_text(encoding="utf-8"), re.M) if enabled else None
         if (found.group(1) if found else "") != addon or (not addon and manifest.parent.exists()):
             raise Harm(f"{when}: the add-on is not {addon or 'gone'}")
-        # An upgrade keeps what the artist set in the add-on's preferences.
+        # An upgrade must keep the artist's values in the add-on's preferences.
         ours, kept = (one["preferences"]["addons"].get(MODULE) for one in (before, after))
         lost = {key: value for key, value in (ours or {}).items() if kept is not None and kept.get(key) != value}
         if lost:
@@ -153,7 +154,7 @@ class Runs:
         return sorted(name for name in installed if name not in names and "__pycache__" not in name)
 
     def same_profile(self, start: dict[str, Any]) -> None:
-        """Raises Harm if the profile differs from what it was before the add-on was first installed."""
+        """Raises Harm if the profile differs from `start`, the state before the add-on was first installed."""
         end = self.seen()
         if end["preferences"] != start["preferences"]:
             raise Harm("removed: preferences differ from those before the first install")
@@ -163,14 +164,14 @@ class Runs:
 
 
 def without_addon(state: dict[str, Any]) -> dict[str, Any]:
-    """Preferences with those of all add-ons but ours; files as they are."""
+    """Preferences without our add-on's preferences; other states unchanged."""
     if "addons" not in state:
         return state
     return {**state, "addons": {name: values for name, values in state["addons"].items() if name != MODULE}}
 
 
 def files_of(folder: Path, leave_out: tuple[str, ...]) -> dict[str, str]:
-    """SHA-256 of each file below a folder, by its path in it, but for paths that begin with one of `leave_out`."""
+    """SHA-256 of each file below a folder by relative path, without paths that begin with an entry of `leave_out`."""
     found: dict[str, str] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -187,7 +188,7 @@ def version_of(archive: Path) -> str:
 
 
 def bystander(run: Runs, folder: Path) -> Path:
-    """Zip of an extension of the artist's."""
+    """Zip of another extension, installed by the artist."""
     source = folder / "bystander"
     source.mkdir()
     for name, text in BYSTANDER_FILES.items():
@@ -196,7 +197,7 @@ def bystander(run: Runs, folder: Path) -> Path:
 
 
 def last_release(run: Runs, archive: Path, folder: Path) -> Path:
-    """Zip of 0.2.0; in a clone without its commit (a shallow one), the new zip with that version in its manifest."""
+    """Zip of 0.2.0. In a shallow clone without that commit, the new zip with version 0.2.0 in its manifest."""
     source = folder / "last"
     command = ["git", "-C", str(ROOT), "archive", "--format=zip", "-o", str(folder / "last-source.zip"), LAST_RELEASE]
     if subprocess.run(command, capture_output=True).returncode == 0:
@@ -213,16 +214,16 @@ def last_release(run: Runs, archive: Path, folder: Path) -> Path:
 
 
 def built(run: Runs, source: Path, target: Path) -> Path:
-    """What Blender builds of a folder."""
+    """Zip that Blender builds from the folder `source`."""
     run.blender("--command", "extension", "build", "--source-dir", str(source), "--output-filepath", str(target))
     return target
 
 
-# In Blender.
+# The functions below run in Blender.
 
 
 def in_blender(step: str, folder: Path, *words: str) -> None:
-    """Runs one step; an exception ends Blender with a code."""
+    """Runs one step. An exception makes Blender exit with an error code."""
     import bpy
 
     file = folder / "work" / "artist.blend"
@@ -244,7 +245,7 @@ def in_blender(step: str, folder: Path, *words: str) -> None:
 
 
 def values_of(group: Any, path: str = "") -> dict[str, Any]:
-    """Value of each property of a group and the groups in it, by its path; not of what is only counted or running."""
+    """Values of the writable properties of a group and its nested groups, by path."""
     import bpy
 
     found: dict[str, Any] = {}
@@ -266,7 +267,7 @@ def values_of(group: Any, path: str = "") -> dict[str, Any]:
 
 
 def prepare(folder: Path) -> None:
-    """An artist's preferences, startup file, presets and scripts."""
+    """Creates an artist's preferences, startup file and presets."""
     import bpy
 
     preferences = bpy.context.preferences
@@ -282,7 +283,7 @@ def prepare(folder: Path) -> None:
 
 
 def work(folder: Path, file: Path) -> None:
-    """A shot in a scene that has things of the artist's, with the last release; saved."""
+    """Creates and saves a scene with an artist's object and a shot, in the last release."""
     import bpy
 
     spec = importlib.util.spec_from_file_location("make_shot", ROOT / "tests" / "addon" / "data" / "make_shot.py")
@@ -302,7 +303,7 @@ def work(folder: Path, file: Path) -> None:
 
 
 def look(step: str, folder: Path) -> None:
-    """What the artist finds in the file: with the new version, or without the add-on."""
+    """Checks the contents of the opened file, with the new version or without the add-on."""
     import bpy
 
     scene, names = bpy.context.scene, set(bpy.data.objects.keys())

@@ -1,4 +1,4 @@
-"""A Blender for the add-on: a bpy wheel that fits a Python of this machine, or a Blender on the PATH."""
+"""Finds a Blender for the add-on: a bpy wheel that fits a Python of this machine, or a Blender on the PATH."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from .errors import LauncherError
 from .interpreters import dotted, find_python
 
 BPY_WHEELS = {"5.0": (3, 11), "5.2": (3, 13), "4.5": (3, 11), "4.2": (3, 11)}
-"""Blender series with a pinned wheel in requirements/, the Python each one needs, in order of preference."""
+"""Blender series with a pinned wheel in requirements/, and the Python that each needs, in order of preference."""
 DEMO_WHEELS = ("5.0", "5.2", "4.5")
 OLDEST_BLENDER = (4, 2)
 
 
 @dataclass(frozen=True)
 class Blender:
-    """Something that runs the add-on's Python files: the interpreter of a bpy wheel, or a Blender on the PATH."""
+    """A program that runs the add-on's Python files: the interpreter of a bpy wheel, or a Blender on the PATH."""
 
     label: str
-    """What messages call it."""
+    """Name in messages."""
     command: tuple[str, ...]
-    """The command up to the script."""
+    """Command line before the script's path."""
 
     @property
     def is_wheel(self) -> bool:
@@ -67,7 +67,7 @@ def find_blender() -> tuple[str, str] | None:
 
 
 def blender_version(path: str) -> tuple[tuple[int, int], str] | None:
-    """((major, minor), whole version) of the Blender at `path`; None if it does not run, or is no Blender."""
+    """((major, minor), full version) of the Blender at `path`; None if it does not run or is another program."""
     try:
         done = subprocess.run([path, "--version"], capture_output=True, text=True, errors="replace", timeout=60)
     except (OSError, subprocess.TimeoutExpired):
@@ -79,7 +79,7 @@ def blender_version(path: str) -> tuple[tuple[int, int], str] | None:
 
 
 def named_blender(path: str) -> Blender:
-    """The Blender at a path that the user named. LauncherError if it is another program, or too old for the add-on."""
+    """The Blender at a user's path. Raises LauncherError if it is another program, or too old for the add-on."""
     place = os.path.abspath(path)
     if not os.path.isfile(place):
         raise LauncherError(f"There is no Blender at {place}: give the path of its program.", ExitCode.USAGE)
@@ -99,7 +99,11 @@ def program_at(path: str, version: str) -> Blender:
 
 
 def choose_wheels() -> list[tuple[str, str]]:
-    """(series, python) of the bpy wheels this machine can have: those of the Python at hand first, ready ones first."""
+    """(series, python) of the bpy wheels that this machine can run, in order of preference.
+
+    If wheels fit the running Python, they are the choices, those already set up first. Else the only choice is a wheel
+    that is already set up, with python "". Without such a wheel, the choices are all that fit a Python of the machine.
+    """
     at_hand = [(s, sys.executable) for s in DEMO_WHEELS if BPY_WHEELS[s] == sys.version_info[:2]]
     if at_hand:
         return sorted(at_hand, key=lambda wheel: not bpy_environment(wheel[0]).ready())
@@ -114,15 +118,15 @@ def choose_wheels() -> list[tuple[str, str]]:
 
 
 def python_for(series: str) -> str | None:
-    """A Python of the machine that the bpy wheel of `series` fits."""
+    """A Python of the machine that fits the bpy wheel of `series`; None if there is none."""
     needed = BPY_WHEELS[series]
     return find_python(lambda version: version == needed, (f"python{dotted(needed)}",))
 
 
 def get_blender(testing: bool = False, wheels: Path | None = None) -> tuple[Blender, float]:
-    """A Blender for the add-on, set up if need be, and the seconds that took. LauncherError if none can be had.
+    """A Blender for the add-on, set up if necessary, and the seconds of the set-up.
 
-    wheels: a folder to install from, in place of a package index.
+    `wheels` is a folder to install from instead of a package index. Raises LauncherError if no Blender is available.
     """
     choices = choose_wheels()
     refused: LauncherError | None = None
@@ -148,7 +152,7 @@ def get_blender(testing: bool = False, wheels: Path | None = None) -> tuple[Blen
 
 
 def set_up_wheel(series: str, testing: bool, wheels: Path | None = None) -> tuple[Blender, float]:
-    """The named bpy wheel, set up with a Python that fits it."""
+    """The bpy wheel of `series`, set up with a Python that fits it, and the seconds of the set-up."""
     environment = bpy_environment(series, testing)
     python = environment.python if environment.ready() else python_for(series)
     if python is None:

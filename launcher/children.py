@@ -1,4 +1,4 @@
-"""Processes that the launcher starts: found again on Ctrl-C, and gone when it is."""
+"""Child processes of the launcher: started, stopped on Ctrl-C, and ended when the launcher ends."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from .places import ROOT, WINDOWS
 
 
 def say(text: str) -> None:
-    """One line to the artist, at once."""
+    """Prints one line for the artist, unbuffered."""
     print(text, flush=True)
 
 
 def child_environ(**extra: str) -> dict[str, str]:
-    """Environment variables for a child: this checkout on its path, nothing of another Python or of where it stands."""
+    """Environment variables for a child: its Python path is this checkout, without user or working folders."""
     environ = {k: v for k, v in os.environ.items() if k not in ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP")}
     environ.update(PYTHONPATH=str(ROOT), PYTHONSAFEPATH="1", PYTHONNOUSERSITE="1")
     environ.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", **extra)
@@ -35,9 +35,9 @@ def child_environ(**extra: str) -> dict[str, str]:
 
 
 def start_child(command: Sequence[str], environ: dict[str, str], **streams: Any) -> subprocess.Popen[Any]:
-    """Starts a child in a process group of its own, so that Ctrl-C reaches it once, from here.
+    """Starts a child in a separate process group, so that it receives Ctrl-C once, from `stop_children`.
 
-    It stands beside its program, as in `contract.python_child`, unless `cwd` says where.
+    Its working folder is that of its program, as in `contract.python_child`, unless `cwd` is in `streams`.
     """
     streams.setdefault("stdin", subprocess.DEVNULL)
     streams.setdefault("cwd", os.path.dirname(os.path.abspath(command[0])))
@@ -53,14 +53,14 @@ def start_child(command: Sequence[str], environ: dict[str, str], **streams: Any)
 
 
 def stop_child(child: subprocess.Popen[Any]) -> None:
-    """`stop_children` of one."""
+    """`stop_children` for one child."""
     stop_children([child])
 
 
 def stop_children(children: Sequence[subprocess.Popen[Any]]) -> None:
-    """Asks children to stop as Ctrl-C would; takes them and their children down if they do not, or on a second Ctrl-C.
+    """Interrupts children as Ctrl-C would; kills them and their children after a timeout, or on a second Ctrl-C.
 
-    All are asked before any is waited for, so that together they take no longer than the slowest.
+    All children are interrupted before the wait begins, so that they stop in parallel.
     """
     living = [child for child in children if child.poll() is None]
     until = time.monotonic() + GRACE_SECONDS
@@ -76,7 +76,7 @@ def stop_children(children: Sequence[subprocess.Popen[Any]]) -> None:
 
 
 def _kill(child: subprocess.Popen[Any]) -> None:
-    """Ends a child and, where it has a group of its own, its children."""
+    """Kills a child and, except on Windows, the rest of its process group."""
     if WINDOWS:
         child.kill()
     else:
@@ -86,7 +86,7 @@ def _kill(child: subprocess.Popen[Any]) -> None:
 
 
 def wait_for_any(children: Sequence[subprocess.Popen[Any]], seconds: float) -> subprocess.Popen[Any] | None:
-    """The first child that has ended; None if none has after `seconds`. Can be interrupted on every system."""
+    """The first child that has ended; None if none ends within `seconds`. Ctrl-C interrupts it on every system."""
     until = time.monotonic() + seconds
     while True:
         for child in children:
@@ -98,13 +98,15 @@ def wait_for_any(children: Sequence[subprocess.Popen[Any]], seconds: float) -> s
 
 
 def tied_command(python: str, module: str, *words: str) -> list[str]:
-    """`python -m module words` for a child that ends when we do, however that comes about: its standard input must be a
-    pipe (`run_child(tied=True)`), which closes with us."""
+    """`python -m module words` for a child that ends with this process, even if this process is killed.
+
+    The child's standard input must be a pipe (`run_child(tied=True)`), which closes when this process ends.
+    """
     return [python, "-P", "-m", "torch_backend.tied", module, *words]
 
 
 def close_input(child: subprocess.Popen[Any]) -> None:
-    """Closes our end of an ended child's standard input."""
+    """Closes this process's end of an ended child's standard input."""
     if child.stdin is not None:
         with contextlib.suppress(OSError):
             child.stdin.close()
@@ -113,11 +115,13 @@ def close_input(child: subprocess.Popen[Any]) -> None:
 def run_child(
     command: Sequence[str], cwd: Path | None = None, tied: bool = False, log: BinaryIO | None = None, **environ: str
 ) -> int:
-    """Runs a child with our output; returns its exit code. On Ctrl-C it is cancelled and KeyboardInterrupt goes on.
+    """Runs a child that inherits this process's output; returns its exit code.
 
-    `cwd`: where it stands, if not beside its program.
-    `tied`: its standard input stays open as long as this process lives, however that ends; the child watches it.
-    `log`: an open file that takes its output instead.
+    Ctrl-C cancels the child, then raises KeyboardInterrupt.
+
+    `cwd`: working folder; default: the folder of the program.
+    `tied`: the child's standard input is a pipe that closes when this process ends, which the child watches.
+    `log`: open file for the child's output.
     """
     streams: dict[str, Any] = {"stdin": subprocess.PIPE} if tied else {}
     if cwd is not None:
@@ -127,7 +131,7 @@ def run_child(
     child = start_child(command, child_environ(**environ), **streams)
     try:
         while True:
-            # A wait without limit cannot be interrupted on Windows.
+            # On Windows, Ctrl-C cannot interrupt a wait without timeout.
             with contextlib.suppress(subprocess.TimeoutExpired):
                 return exit_code_of(child.wait(0.2))
     except KeyboardInterrupt:
@@ -139,8 +143,11 @@ def run_child(
 
 
 def _lines_of(child: subprocess.Popen[bytes]) -> Iterator[bytes]:
-    """Yields what a child prints, as it arrives. A thread reads it, also after a Ctrl-C: on Windows a read cannot be
-    interrupted, and a child whose output is not read blocks at its next print instead of ending."""
+    """Yields the lines that a child prints, as they arrive.
+
+    A thread reads them, also after Ctrl-C. On Windows a read cannot be interrupted, and a child whose output is not
+    read blocks at its next print instead of ending.
+    """
     lines: queue.Queue[bytes | None] = queue.Queue()
 
     def read() -> None:
@@ -158,8 +165,8 @@ def _lines_of(child: subprocess.Popen[bytes]) -> Iterator[bytes]:
 
 
 def exit_code_of(code: int) -> int:
-    """A child's return code as one of `ExitCode`: of one that a signal ended, CANCELLED or, with a word, INTERNAL."""
-    if code in (-signal.SIGINT, -signal.SIGTERM, 0xC000013A):  # the last: Ctrl-C on Windows
+    """A child's exit code, or, if a signal ended it, CANCELLED or INTERNAL. Prints an error for INTERNAL."""
+    if code in (-signal.SIGINT, -signal.SIGTERM, 0xC000013A):  # 0xC000013A: Ctrl-C on Windows
         return ExitCode.CANCELLED
     if code >= 0 and not (WINDOWS and code > 255):
         return code
@@ -170,11 +177,11 @@ def exit_code_of(code: int) -> int:
 BLENDERS_OWN = re.compile(
     r"\d\d:\d\d\.\d+ |Info: |Fra:|Saved: |Blender \d|Read blend: | ?Time: |\s*$|.*RuntimeWarning: |    "
 )
-"""Lines of Blender's that are no news to an artist; they go to the log."""
+"""Lines of Blender's output that do not concern an artist; they only go to the log."""
 
 
 def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
-    """`run_child(tied=True)` for Blender: all that it prints goes to `log`, what the add-on says also to the screen."""
+    """`run_child(tied=True)` for Blender. All output goes to `log`; the add-on's lines also go to the screen."""
     streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     child = start_child(command, child_environ(**environ), **streams)
     try:

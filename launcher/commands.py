@@ -1,4 +1,4 @@
-"""The commands that make something: freeze (and demo), setup, bench."""
+"""The commands freeze (and demo), setup and bench."""
 
 from __future__ import annotations
 
@@ -31,8 +31,10 @@ from .summary import read_summary
 
 
 def freeze(given: str, output: Path, options: Sequence[str]) -> int:
-    """A clip, or a shot folder, to frozen frames through the compositor: the backend's stations, then the bake in
-    Blender's environment. Of a shot folder the frames alone are frozen anew; see `contract.freezes_a_shot`."""
+    """Freezes a clip or a shot folder: runs the backend's steps, then the bake in Blender; returns an exit code.
+
+    For a shot folder only the frames are frozen again; see `contract.freezes_a_shot`.
+    """
     started = time.monotonic()
     if "://" not in given and not any(mark in given for mark in "#%*@") and not os.path.exists(given):
         raise LauncherError(
@@ -55,7 +57,7 @@ def freeze(given: str, output: Path, options: Sequence[str]) -> int:
     if "shot" not in summary or "take" not in summary:
         raise LauncherError(f"The backend left no figures in {output / 'summary.json'}: see the messages above.", 1)
     write_json(output / "summary.json", summary)
-    # The bake rewrites summary.json with what it adds; the wall time and the set-up are ours to add after it.
+    # The bake adds its figures to summary.json. Wall time and set-up are added after the bake.
     say(f"Compositing in {blender.label}")
     baking = time.monotonic()
     take = ["--shot", summary["shot"], "--take", summary["take"], "--output", str(output), "--tied"]
@@ -73,13 +75,13 @@ def freeze(given: str, output: Path, options: Sequence[str]) -> int:
 
 
 def take_of(shot: str, options: Sequence[str]) -> str:
-    """Name of the take that `freeze SHOT` with these options makes."""
+    """Name of the take that `freeze SHOT` creates with these options."""
     parser, _ = command_line("splannequin.py", BACKEND)
     return str(parser.parse_known_args(["freeze", shot, *options])[0].take)
 
 
 def _of_a_shot(shot: str, options: Sequence[str], seconds: float) -> dict[str, Any]:
-    """The figures of a shot folder that was frozen alone, in `seconds`: the take, and what it is worth."""
+    """Figures of a freeze of a shot folder that took `seconds`: the take and its quality."""
     folder = ShotFolder(shot)
     take = TakeFolder(folder.take(take_of(shot, options)))
     facts = read_json(take.facts)
@@ -94,11 +96,11 @@ def _of_a_shot(shot: str, options: Sequence[str], seconds: float) -> dict[str, A
 
 
 def closing_figures(summary: dict[str, Any], output: Path) -> None:
-    """The last lines of a freeze: how good, how long, where to look."""
+    """Prints the last lines of a freeze: files, duration and quality."""
     stages = summary["wall_seconds_by_stage"]
     say(f"Figures:       {output / 'summary.json'}")
     say("Wall seconds:  " + ", ".join(f"{name} {seconds:.0f}" for name, seconds in stages.items()))
-    if "registered" not in summary:  # a shot that was there: the backend has said how good its take is
+    if "registered" not in summary:  # a freeze of a shot folder: the backend has printed the take's quality
         say(f"{summary['wall_seconds']:.0f} s in all.")
         return
     psnr = summary["heldout_psnr_db"]
@@ -113,14 +115,14 @@ def closing_figures(summary: dict[str, Any], output: Path) -> None:
 
 
 def setup(series: Sequence[str], testing: bool, backend_only: bool, output: Path, wheels: str | None = None) -> int:
-    """Makes the environments: the backend's, and the named bpy wheels (the one that fits, if none is named).
+    """Sets up the environments of the backend and of bpy wheels; returns an exit code.
 
     Args:
-        series: Blender series of bpy wheels.
-        testing: with what `test` needs.
-        backend_only: no bpy wheel.
+        series: Blender series of the bpy wheels; empty: one that fits this machine.
+        testing: include the packages that `test` needs.
+        backend_only: set up no bpy wheel unless `series` names one.
         output: folder for summary.json.
-        wheels: folder to install from, in place of a package index.
+        wheels: folder to install from instead of a package index.
     """
     folder = None if wheels is None else Path(os.path.abspath(wheels))
     if folder is not None and not any(folder.glob("*.whl")):
@@ -140,7 +142,7 @@ def setup(series: Sequence[str], testing: bool, backend_only: bool, output: Path
 
 
 def bench(arguments: Sequence[str], output: Path) -> int:
-    """The benchmark of the method: what it does not know here goes to benchmarks/bench.py."""
+    """Runs benchmarks/bench.py with `arguments` after setting up its packages; returns its exit code."""
     started = time.monotonic()
     backend = backend_environment()
     setting_up = set_up(backend, sys.executable)
@@ -165,6 +167,6 @@ def bench(arguments: Sequence[str], output: Path) -> int:
 
 
 def _own_scenes(arguments: Sequence[str]) -> bool:
-    """True if a benchmark's arguments ask for no synthetic scene."""
+    """True if a benchmark's arguments need no synthetic scene."""
     named = {word.partition("=")[0] for word in arguments}
     return bool(named & {"--truth", "--shot"}) and not named & {"--size", "--quick", "--limits", "--hard"}

@@ -1,4 +1,4 @@
-"""What this machine can do, and what to do about what is missing."""
+"""The command doctor: checks what this machine can do, and advises on what is missing."""
 
 from __future__ import annotations
 
@@ -42,25 +42,25 @@ BLENDER_LIBRARIES = {
     "libICE.so.6": "libice6",
     "libGL.so.1": "libgl1",
 }
-"""What Blender opens on Linux and a bare server lacks: file, Debian package."""
+"""Libraries that Blender loads on Linux and that a server may lack: file name and Debian package."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the doctor."""
+    """One line of the doctor's output."""
 
     what: str
-    """What was examined."""
+    """Name of the checked item."""
     state: str
-    """ok, note (works without) or missing (does not)."""
+    """ok, note (the demo works without it) or missing (the demo needs it)."""
     text: str
-    """What was found, and what to do about it."""
+    """Result of the check and advice."""
 
 
 def doctor(output: Path, gpu: bool = False) -> int:
-    """Says what this machine can do and what to do about what is missing; exit code 9 if the demo cannot run.
+    """Prints what this machine can do and advice on what is missing; returns 9 if the demo cannot run, else 0.
 
-    gpu: the card is tested anew, and what was found goes to gpu.json in `output`.
+    With `gpu` the card is tested again, and the results are written to gpu.json in `output`.
     """
     backend = backend_environment()
     facts: dict[str, Any] = backend_facts(backend, gpu) if backend.ready() else {}
@@ -78,7 +78,7 @@ def doctor(output: Path, gpu: bool = False) -> int:
 
 
 def machine_findings() -> Iterator[Finding]:
-    """Python, system, cores, memory, disk."""
+    """Findings on Python, system, cores, memory and disk."""
     version = platform.python_version()
     wheels = [s for s in DEMO_WHEELS if BPY_WHEELS[s] == sys.version_info[:2]]
     fits = f"fits bpy {' and '.join(wheels)}" if wheels else "fits no bpy wheel (3.11 and 3.13 do)"
@@ -104,7 +104,7 @@ def machine_findings() -> Iterator[Finding]:
 
 
 def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
-    """NVIDIA cards: whether driver and card fit the pinned Warp and torch, and whether the backend uses them."""
+    """Findings on NVIDIA cards: whether driver and card fit the pinned Warp and torch, and whether they are used."""
     cards, trouble = nvidia_cards()
     if trouble:
         advice = "restart the machine; if it stays, install the driver anew"
@@ -119,7 +119,7 @@ def gpu_findings(facts: dict[str, Any]) -> Iterator[Finding]:
 
 
 def self_test_finding(facts: dict[str, Any], output: Path) -> Finding:
-    """How the card's self-test ended; all that it found goes to a file that can be sent."""
+    """Result of the card's self-test, whose details are written to gpu.json for a bug report."""
     if "gpu" not in facts:
         reason = facts.get("error") or "the backend is not set up: `python3 splannequin.py setup` makes it"
         return Finding("self-test", "note", f"not run: {reason}")
@@ -131,7 +131,7 @@ def self_test_finding(facts: dict[str, Any], output: Path) -> Finding:
 
 
 def gpu_finding(card: Card) -> Finding:
-    """One card against what Warp and torch need."""
+    """Finding on one card: whether it fits Warp and torch."""
     unfit = why_unfit(card)
     if unfit is not None:
         return Finding("gpu", "note", " ".join(unfit).strip())
@@ -139,11 +139,11 @@ def gpu_finding(card: Card) -> Finding:
 
 
 def backend_facts(backend: Environment, gpu: bool = False) -> dict[str, Any]:
-    """What the backend says about its own environment; with `gpu` it tests the card."""
+    """Facts that the backend reports about its environment; with `gpu` it tests the card."""
     command = python_child(backend.python, "torch_backend", "doctor", *(["--gpu"] if gpu else []))
     ran = subprocess.run(
         **command, capture_output=True, text=True, encoding="utf-8", errors="replace", env=child_environ()
-    )  # UTF-8, as `child_environ` has it speak
+    )  # `child_environ` sets the child's output to UTF-8
     try:
         return json.loads(ran.stdout[ran.stdout.index("{") :])
     except ValueError:
@@ -151,7 +151,7 @@ def backend_facts(backend: Environment, gpu: bool = False) -> dict[str, Any]:
 
 
 def backend_findings(backend: Environment, facts: dict[str, Any]) -> Iterator[Finding]:
-    """The backend's environment: made, torch's device, the video encoder."""
+    """Findings on the backend: its environment, torch's device and the video encoder."""
     if not facts:
         begun = "not finished" if backend.folder.is_dir() else "not made yet"
         yield Finding("backend", "note", f"{begun}: `python3 splannequin.py setup` makes it in {backend.folder}")
@@ -168,7 +168,7 @@ def backend_findings(backend: Environment, facts: dict[str, Any]) -> Iterator[Fi
 
 
 def opens(library: str) -> bool:
-    """True if the system finds this shared library."""
+    """True if the system can load this shared library."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -177,7 +177,7 @@ def opens(library: str) -> bool:
 
 
 def blender_findings() -> Iterator[Finding]:
-    """The bpy wheels that are set up or can be, the libraries they open, and a Blender on the PATH."""
+    """Findings on bpy wheels and the libraries that they load, and on a Blender on the PATH."""
     found = find_blender()
     packages = [package for name, package in BLENDER_LIBRARIES.items() if not opens(name)] if LINUX else []
     if packages:

@@ -1,4 +1,4 @@
-"""The virtual environments: what is in them, and how they are set up."""
+"""The virtual environments: their packages and their set-up."""
 
 from __future__ import annotations
 
@@ -48,61 +48,61 @@ from .places import REQUIREMENTS, ROOT, WINDOWS
 from .repair import drop_damaged, needs_cuda
 
 BACKEND_DISK_GB = 4.0
-"""Free disk that setting up the backend may need: the environment and pip's downloads (Linux, CPU build of torch)."""
+"""Free disk in GB for setting up the backend: environment and pip's downloads (Linux, CPU build of torch)."""
 CUDA_DISK_GB = 5.0
-"""What CUDA adds to that: the environment takes 6 GB then, not 1.5."""
+"""Additional free disk in GB with CUDA, which makes the environment 6 GB large instead of 1.5."""
 BPY_DISK_GB = 2.0
 TORCH_LOCKS = ("torch", "torch-cpu", "torch-cu130", "cuda")
-"""Locks of an environment with torch: PyPI's torch, those of its own index, and the libraries of PyPI's for Linux."""
+"""Locks of an environment with torch: PyPI's build, the builds of torch's index, and CUDA libraries of PyPI's build."""
 HEARTBEAT_SECONDS = 15.0
-"""A set-up that has printed nothing for this long says that it is still at work."""
+"""Longest silence of a set-up in seconds; then it prints that it is still at work."""
 
 
 @dataclass(frozen=True)
 class Environment:
-    """A virtual environment and what is installed in it."""
+    """A virtual environment and its packages."""
 
     name: str
-    """What messages call it."""
+    """Name in messages."""
     folder: Path
-    """Where it stands."""
+    """Folder of the environment."""
     requirements: tuple[str, ...]
-    """Names of the locks in requirements/ that it is made of: ("backend", "test")."""
+    """Names of the locks in requirements/ that are installed, such as ("backend", "test")."""
     probe: str
-    """Python source that imports what must work."""
+    """Python source that imports the packages that must work."""
     disk_gb: float
-    """Free disk that setting it up may need, in GB; without CUDA, if it has torch."""
+    """Free disk in GB for the set-up, without CUDA."""
     torch: bool = False
-    """It has torch, which is another one where there is a card for it."""
+    """True if it has torch, whose build depends on the machine's card."""
 
     @property
     def python(self) -> str:
-        """Its interpreter."""
+        """Path of the environment's interpreter."""
         return str(self.folder / ("Scripts/python.exe" if WINDOWS else "bin/python"))
 
     @property
     def state(self) -> Path:
-        """The launcher's notes on it: the stamp, the log of the last set-up."""
+        """Folder of the launcher's notes: the stamp and the log of the last set-up."""
         return self.folder / SETUP_NOTES
 
     @property
     def log(self) -> Path:
-        """pip's whole output of the last set-up."""
+        """File with the whole output of the last set-up."""
         return self.state / "setup.log"
 
     @property
     def stamp(self) -> Path:
-        """What the last finished set-up installed: JSON, hash by lock, and what `record_packages` found."""
+        """JSON file on the last finished set-up: hashes of the locks, and the result of `record_packages`."""
         return self.state / SETUP_STAMP
 
     @property
     def begun(self) -> Path:
-        """A file that stands here while packages are being written."""
+        """Marker file that exists while packages are being written."""
         return self.state / SETUP_BEGUN
 
     @property
     def locks(self) -> list[str]:
-        """Files in requirements/ that decide what is installed."""
+        """Files in requirements/ that determine the packages."""
         return [f"{name}.lock" for name in (*self.requirements, *(TORCH_LOCKS if self.torch else ()))]
 
     def hashes(self) -> dict[str, str]:
@@ -110,7 +110,7 @@ class Environment:
         return {name: hashlib.sha256((REQUIREMENTS / name).read_bytes()).hexdigest() for name in self.locks}
 
     def finished(self) -> dict[str, Any]:
-        """The stamp of the last finished set-up, {} if none finished or the venv was made anew since."""
+        """The stamp of the last finished set-up; {} if none finished or the venv was recreated since."""
         try:
             stamp = read_json(self.stamp)
             same = stamp["venv"] == (self.folder / "pyvenv.cfg").read_text(encoding="utf-8")
@@ -120,11 +120,11 @@ class Environment:
             return {}
 
     def changed(self) -> list[str]:
-        """Packages that were removed, exchanged or damaged since the last finished set-up."""
+        """Packages that were removed, replaced or damaged since the last finished set-up."""
         return changed_packages(self.folder, self.finished().get("packages", {}))
 
     def ready(self) -> bool:
-        """True if a finished set-up of exactly these locks stands here, unchanged. Starts no process."""
+        """True if a set-up of the current locks finished and is unchanged. Starts no process."""
         done = self.hashes().items() <= self.finished().get("files", {}).items()
         return done and os.path.exists(self.python) and not self.changed()
 
@@ -135,34 +135,34 @@ def home() -> Path:
 
 
 def backend_environment(testing: bool = False) -> Environment:
-    """The backend's environment, with the test tools on request."""
+    """The backend's environment, with the test tools if `testing`."""
     probe = "import torch, warp, pycolmap, OpenImageIO, av, cv2, safetensors, scipy, pxr.Usd"
     names = ("backend", "test") if testing else ("backend",)
     return Environment("the backend", home() / ".venv", names, probe, BACKEND_DISK_GB, torch=True)
 
 
 def bpy_environment(series: str, testing: bool = False) -> Environment:
-    """The environment of the bpy wheel of a Blender series ("5.0"), with pytest on request."""
+    """The environment of the bpy wheel of a Blender series ("5.0"), with pytest if `testing`."""
     names = (f"bpy-{series}", "test-bpy") if testing else (f"bpy-{series}",)
     return Environment(f"Blender {series}", home() / f".venv-bpy-{series}", names, "import bpy, numpy", BPY_DISK_GB)
 
 
 def bench_environment() -> Environment:
-    """The backend's environment with the benchmark's packages in it; `backend_environment` is to be ready before."""
+    """The benchmark's packages, installed into the backend's environment, which must be set up first."""
     probe = "import anny, ffmpeg, flip_evaluator, imageio, matplotlib, PIL, tqdm"
     return Environment("the benchmark's packages", home() / ".venv", ("bench",), probe, 1.0)
 
 
 def set_up(environment: Environment, python: str, wheels: Path | None = None) -> float:
-    """Makes `environment` with `python` unless it is ready; returns the seconds it took.
+    """Sets up `environment` with `python` unless it is ready; returns the seconds it took.
 
-    Raises LauncherError with the step, the log and what to do. What an interrupted set-up left is used again; packages
-    that pip had not finished writing, or that were changed since, are installed anew.
+    It continues an interrupted set-up. Packages that are incomplete or were changed since are installed again. Raises
+    LauncherError with the failed step, the log and advice.
 
     Args:
-        environment: what is made.
-        python: the interpreter that makes it.
-        wheels: a folder of wheels to install from, in place of any package index; None: from the index.
+        environment: the environment to set up.
+        python: the interpreter that creates it.
+        wheels: a folder of wheels to install from instead of a package index; None: the index.
     """
     started = time.monotonic()
     if environment.ready():
@@ -218,7 +218,7 @@ def _make(environment: Environment, python: str, wheels: Path | None) -> None:
             if needs_cuda(environment.folder):
                 install("installing PyTorch's CUDA libraries", *exactly, "-r", str(REQUIREMENTS / "cuda.lock"))
         else:
-            # Its dependencies are installed already, but for libraries of another CUDA: that index has them.
+            # Its dependencies are already installed, except libraries of another CUDA, which that index has.
             say(f"  the PyTorch of {index} is not in this version's list of hashes: pip checks what that index states")
             install("installing PyTorch", _torch_pin(), *own)
     _step(environment, "importing what was installed", [environment.python, "-P", "-c", environment.probe])
@@ -243,10 +243,10 @@ def _torch_pin() -> str:
 
 
 def _torch(environment: Environment, options: list[str], index: str) -> tuple[str, tuple[str, ...]]:
-    """The lock that torch is installed by, "" for none, and pip's options for its index.
+    """The lock for installing torch ("" for none), and pip's options for torch's index.
 
-    Where torch's own index is out of reach, or a folder of wheels is used, pip may still be set to a place that has
-    the build of that index; it is taken then, not PyPI's with 4 GB of CUDA.
+    Without `index`, because torch's index is unreachable or a folder of wheels is used, pip may still be configured
+    for a source of that index's build. That build is then preferred to PyPI's, which brings 4 GB of CUDA.
     """
     if index:
         version = python_version(environment.python) or NEEDED_PYTHON
@@ -264,9 +264,9 @@ def _torch(environment: Environment, options: list[str], index: str) -> tuple[st
 def torch_lock(
     index: str, python: tuple[int, int], system: str = sys.platform, machine: str = platform.machine()
 ) -> str:
-    """The lock with the hash of the torch that its own index has for a Python of this machine; "" if none has it."""
+    """The lock with the hash of the build in torch's `index` for this Python and system; "" if no lock has it."""
     if index not in (CPU_INDEX, CUDA_INDEX):
-        return ""  # the user's own, in SPLANNEQUIN_TORCH_INDEX
+        return ""  # the user's index, from SPLANNEQUIN_TORCH_INDEX
     lock, of = f"torch-{index.rpartition('/')[2]}.lock", "win_amd64" if system == "win32" else machine
     wheel = rf"-cp{python[0]}{python[1]}-\S+{re.escape(of)}\.whl"
     return lock if re.search(wheel, (REQUIREMENTS / lock).read_text(encoding="utf-8")) else ""
@@ -283,12 +283,12 @@ def _has_pip(environment: Environment) -> bool:
 
 
 def disk_gb(environment: Environment, index: str, system: str = sys.platform) -> float:
-    """Free disk in GB that setting an environment up may need, with the torch that comes of an index."""
+    """Free disk in GB for setting up an environment with the build of torch from an index."""
     return environment.disk_gb + (CUDA_DISK_GB if environment.torch and brings_cuda(index, system) else 0.0)
 
 
 def _make_room(environment: Environment, needed: float) -> None:
-    """Clears away a broken environment of ours. LauncherError if it is not ours, or the disk is too full."""
+    """Removes a broken environment of this launcher. Raises LauncherError for a foreign folder or too little disk."""
     folder = environment.folder
     if folder.is_dir() and any(folder.iterdir()) and not environment.state.is_dir():
         raise LauncherError(
@@ -307,12 +307,12 @@ def _make_room(environment: Environment, needed: float) -> None:
 
 
 def this_machines_index(system: str = sys.platform) -> str:
-    """Package index, beside pip's own, that this machine's torch comes from; empty for none."""
+    """Index from which this machine's torch is installed; empty for pip's default index."""
     return torch_index(system, program("nvidia-smi") is not None, lambda: any(c.fits for c in nvidia_cards()[0]))
 
 
 def _reachable_index() -> str:
-    """`this_machines_index` if it answers; pip would ask it in vain for every single package, minutes in all."""
+    """`this_machines_index` if it is reachable, else "". pip would retry an unreachable index for minutes."""
     index = this_machines_index()
     if index and not _reachable(index):
         say(f"{index} cannot be reached: torch comes from the usual index")
@@ -321,12 +321,12 @@ def _reachable_index() -> str:
 
 
 def _reachable(index: str) -> bool:
-    """True if a package index answers about torch within ten seconds; a folder (file:) does if it is there."""
+    """True if a package index answers a request for torch within ten seconds; always True for a folder (file:)."""
     try:
         with urllib.request.urlopen(f"{index.rstrip('/')}/torch/", timeout=10.0):  # noqa: S310  (the user's own)
             return True
     except urllib.error.HTTPError:
-        return True  # it answers: pip tells what is wrong
+        return True  # the server answers; pip will report the error
     except (OSError, ValueError):
         return urllib.parse.urlsplit(index).scheme == "file"
 
@@ -338,7 +338,7 @@ def _step(
     condense: Callable[[str], str | None] | None = None,
     wheels: Path | None = None,
 ) -> None:
-    """Runs one step of a set-up, its output to the log and what `condense` makes of each line to the screen."""
+    """Runs one step of a set-up. Its output goes to the log; `condense` selects and shortens lines for the screen."""
     started = time.monotonic()
     lines: queue.Queue[str | None] = queue.Queue()
     child = start_child(
@@ -346,7 +346,7 @@ def _step(
     )
 
     def read() -> None:
-        assert child.stdout is not None  # PIPE, above
+        assert child.stdout is not None  # started with PIPE
         for raw in child.stdout:
             lines.put(raw.decode("utf-8", "replace"))
         lines.put(None)
@@ -380,7 +380,7 @@ def _step(
     finally:
         close_input(child)
     if code:
-        printed = "\n".join([*output_lines[:5], *output_lines[-40:]])  # pip names its indexes first
+        printed = "\n".join([*output_lines[:5], *output_lines[-40:]])  # pip names its indexes in the first lines
         refuse(environment.name, environment.log, step, printed, wheels)
     if condense is None:
         say(f"  {time.monotonic() - started:5.0f} s  {step}: done")

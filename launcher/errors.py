@@ -1,4 +1,4 @@
-"""The one exception of the launcher."""
+"""The launcher's exception."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from torch_backend.contract import ExitCode
 
 
 class LauncherError(Exception):
-    """A failure of the launcher itself: what is wrong and where, and what to do, in one sentence."""
+    """A failure of the launcher. The message is one sentence: what is wrong, where, and what to do."""
 
     def __init__(self, message: str, exit_code: int = ExitCode.ENVIRONMENT) -> None:
         super().__init__(message)

@@ -1,4 +1,4 @@
-"""A host of a render farm: what enters a job's environment, and what starts its tasks."""
+"""Commands on a render farm's host: `farm-host` enters a job's environment, `farm-task` runs a task."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from .places import WINDOWS
 
 PYTHON_VARIABLE = "SPLANNEQUIN_BACKEND_PYTHON"
 BLENDER_VARIABLE = "SPLANNEQUIN_BLENDER_COMMAND"
-"""JSON list: what runs a script of the add-on, up to the script."""
+"""JSON list: the command that runs a script of the add-on, without the script."""
 
 
 def host(words: Sequence[str]) -> int:
-    """`farm-host`: sets this host up, if it is not, and tells the engine what tasks find it by (`openjd_env`)."""
+    """`farm-host`: sets up this host if necessary, and prints the variables of its tasks (`openjd_env`)."""
     parser = argparse.ArgumentParser(prog="splannequin.py farm-host", allow_abbrev=False)
     parser.add_argument("--python", default="", help="Python with the backend's packages (default: it is set up)")
     parser.add_argument("--home", default="", help="folder of the environments (default: this one)")
@@ -59,12 +59,12 @@ def host(words: Sequence[str]) -> int:
 
 
 def task(verb: str, words: Sequence[str]) -> int:
-    """Runs a verb of the backend in the Python that `host` found; where it can be, in the place of this process."""
+    """Runs a verb of the backend in the Python from `host`. Except on Windows it replaces this process."""
     python = os.environ.get(PYTHON_VARIABLE) or backend_environment().python
     if not os.path.isfile(python):
         print(f"openjd_fail: There is no backend at {python}: run `setup`, or enter the job's environment.", flush=True)
         return ExitCode.ENVIRONMENT
     if WINDOWS:
         return run_child(tied_command(python, "torch_backend", verb, *words), tied=True)
-    # A process between the engine and the task would have to hand on every signal; SIGKILL it could not.
+    # A process between the farm's engine and the task would have to forward every signal, and cannot forward SIGKILL.
     os.execve(python, [python, "-P", "-m", "torch_backend", verb, *words], child_environ())  # noqa: S606

@@ -1,4 +1,4 @@
-"""Pythons of this machine. Parses and runs under Python 3.8, so that an old Python can say which one is needed."""
+"""Finds Pythons on this machine. Runs under Python 3.8, so that an old Python can report which version is needed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NEEDED_PYTHON = (3, 11)
 
 
 def python_version(executable: str) -> tuple[int, int] | None:
-    """(major, minor) of the Python at `executable`; None if it does not run (a pyenv shim without a version, say)."""
+    """(major, minor) of the Python at `executable`; None if it does not run, such as a pyenv shim without a version."""
     try:
         found = subprocess.run(
             [executable, "-I", "-c", "import sys; print('%d %d' % sys.version_info[:2])"],
@@ -36,14 +36,14 @@ def dotted(version: tuple[int, int]) -> str:
 
 
 def find_python(accept: Callable[[tuple[int, int]], bool], names: Sequence[str]) -> str | None:
-    """The first Python of the machine whose version is accepted: this one, then `names` on the PATH, then pyenv's."""
+    """The first Python whose version is accepted: the running one, then `names` on the PATH, from pyenv and from py."""
     if accept(sys.version_info[:2]):
         return sys.executable
     candidates: list[str] = []
     for name in names:
         for folder in os.get_exec_path():
             found = shutil.which(name, path=folder)
-            if found and os.path.isabs(found):  # Windows offers the folder that we stand in first
+            if found and os.path.isabs(found):  # skips the working folder, which Windows searches first
                 candidates.append(found)
         wanted = name.replace("python", "")
         if wanted:
@@ -63,7 +63,7 @@ def find_python(accept: Callable[[tuple[int, int]], bool], names: Sequence[str])
 
 
 def hand_over_to_newer_python() -> int:
-    """Runs the launcher again under a Python that is new enough; says in one sentence if there is none."""
+    """Runs the launcher again under a newer Python and returns its exit code; prints an error if there is none."""
     newer = find_python(
         lambda version: version >= NEEDED_PYTHON,
         ("python3.11", "python3.13", "python3.12", "python3.14", "python3", "python"),
@@ -77,6 +77,6 @@ def hand_over_to_newer_python() -> int:
         )
         return 9
     command = [newer, str(ROOT / "splannequin.py"), *sys.argv[1:]]
-    if WINDOWS:  # on Windows execv starts a second process, for which the shell does not wait
+    if WINDOWS:  # execv would start a second process there, and the shell would not wait for it
         return subprocess.call(command)
     os.execv(newer, command)  # noqa: S606  (no shell is wanted)

@@ -38,12 +38,12 @@ COMMANDS = {
     "package": "build a release: the extension's zip, a repository folder, checksums and an SBOM",
     "farm": "shots as a job for a render farm, and what it will cost; its options are the backend's",
 }
-"""Command -> what it does."""
+"""Commands and their help texts."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """The grammar. What `freeze` and `demo` do not know goes to the backend, what `test` does not, to pytest, what
-    `bench` does not, to benchmarks/bench.py."""
+    """The argument parser. `main` passes unknown arguments on: of `freeze` and `demo` to the backend, of `test` to
+    pytest, of `bench` to benchmarks/bench.py."""
     top = argparse.ArgumentParser(
         prog="splannequin.py", description="Freeze time in a handheld clip.", allow_abbrev=False
     )
@@ -87,7 +87,7 @@ def _interrupt(number: int, frame: object) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # as in `cli.main`: no code page has all names of files
+        if isinstance(stream, io.TextIOWrapper):  # as in `cli.main`: a file name may not fit the console's code page
             stream.reconfigure(errors="backslashreplace")
     words = list(sys.argv[1:] if argv is None else argv)
     if words[:1] == ["farm-host"]:
@@ -112,9 +112,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     error = ""
     try:
         output.mkdir(parents=True, exist_ok=True)
-        # A summary of an earlier run must not pass for this one's.
+        # The summary of an earlier run must not be mistaken for this run's.
         (output / "summary.json").unlink(missing_ok=True)
-        tempfile.TemporaryFile(dir=output).close()  # said now, not after minutes of work
+        tempfile.TemporaryFile(dir=output).close()  # fails now if the folder is not writable, not after minutes of work
         code = dispatch(args, rest, output)
     except LauncherError as refused:
         error, code = str(refused), refused.exit_code
@@ -136,12 +136,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _place_of(given: str, options: Sequence[str], folder: Path = Path("output")) -> str:
-    """Folder in output/ for what `freeze` makes of a clip, or of a take of a shot: no two clips or shots share one. It
-    is called as they are; where another one's is called so, with a digest of the path."""
+    """Name of the folder in output/ for a freeze of a clip or shot; different inputs get different folders.
+
+    It is the name of the clip, or of shot and take. If another input already uses it, a digest of the path is appended.
+    """
     place = Path(given)
     name = place.stem
     if "://" not in given and is_shot(given):
-        if name == "shot":  # `--shot-name` as it is unless said: the folder around it has the name
+        if name == "shot":  # the default of `--shot-name`; the parent folder has the telling name
             name = place.absolute().parent.name
         name = f"{name}_{take_of(given, options)}"
     name = re.sub(r"[^\w.-]+", "_", name)
@@ -149,7 +151,7 @@ def _place_of(given: str, options: Sequence[str], folder: Path = Path("output"))
 
 
 def _is_anothers(folder: Path, given: str) -> bool:
-    """True if a folder holds what was made of another clip or shot than this one, as far as it tells."""
+    """True if a folder is known to hold results of another clip or shot than `given`."""
     wanted, shots = _absolute(given), list(folder.glob("*" + SHOT_SUFFIX))
     if "://" not in given and is_shot(given):
         shot_path = str(read_summary(folder).get("shot") or "")
@@ -163,7 +165,7 @@ def _absolute(given: str) -> str:
 
 
 def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:
-    """(sentence, exit code) of what the system refused, most often to write into the output folder."""
+    """(sentence, exit code) for an error of the system, usually that the output folder is not writable."""
     where = Path(os.fsdecode(failed.filename)) if isinstance(failed.filename, (str, bytes)) else output
     code = ExitCode.DISK if is_disk_full(failed) else ExitCode.USAGE
     if where != output and where not in output.parents and output not in where.parents:

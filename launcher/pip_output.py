@@ -1,4 +1,4 @@
-"""What pip prints, in an artist's words."""
+"""Translates pip's output into an artist's words."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .errors import LauncherError
 
 
 def condense_pip(line: str) -> str | None:
-    """pip's output, one line per package: `torch 2.13.0 (190.2 MB)`. None for what an artist need not read."""
+    """A line of pip's output in short, such as `torch 2.13.0 (190.2 MB)`; None for a line that is not shown."""
     wheel = re.match(
         r"(?:Downloading|Using cached|Processing) (?:\S*[/\\])?([^\s/\\]+)\.whl(?!\S)(?: (\(\d[^)]*\)))?", line
     )
@@ -31,28 +31,28 @@ BROKEN_CONNECTION = re.compile(
     r"connection broken by|ConnectionError|Max retries exceeded|Temporary failure|Name or service|getaddrinfo|"
     r"timed out|Network is unreachable|ProxyError|SSLError|IncompleteRead|RemoteDisconnected"
 )
-"""What pip says of an index that it cannot ask. What it says last is that no version was found."""
+"""pip's messages about an unreachable index. pip's last message would only say that no version was found."""
 
 
 SYSTEMS = (
     "it takes a 64-bit Python on Windows or Linux with a processor of Intel's or AMD's kind (x86-64), or on a Mac with "
     "Apple silicon"
 )
-"""Where all packages have wheels."""
+"""Systems for which all packages have wheels."""
 _OTHERS = (
     (r"win32", "a 32-bit Python on Windows"),
     (r"win-arm", "Windows on ARM"),
     (r"macosx-.*-x86_64", "a Mac with an Intel processor"),
     (r"linux-(aarch64|arm)", "Linux on ARM"),
 )
-"""Other systems, by the beginning of what `sysconfig.get_platform` says."""
+"""Other systems, by the beginning of `sysconfig.get_platform()`."""
 
 
 def lacking_system(system: str | None = None) -> str:
-    """A system for which some package has no wheel, in words; empty for the others.
+    """Name of a system for which some package has no wheel; empty for supported systems.
 
     Args:
-        system: as `sysconfig.get_platform` says it of a Python; None: of this one.
+        system: `sysconfig.get_platform()` of a Python; None: of the running one.
     """
     system = (system or sysconfig.get_platform()).replace("universal2", platform.machine())
     if re.fullmatch(r"win-amd64|linux-x86_64|macosx-.*-arm64", system):
@@ -61,14 +61,14 @@ def lacking_system(system: str | None = None) -> str:
 
 
 def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = None, system: str | None = None) -> None:
-    """Raises the sentence for a failed step of a set-up, from what it printed.
+    """Raises LauncherError for a failed step of a set-up, with a sentence derived from the step's output.
 
     Args:
-        name: the environment that is set up.
-        log: where pip's whole output is.
-        step: what failed.
-        output: what it printed.
-        wheels: the folder that packages come from, in place of an index.
+        name: name of the environment.
+        log: file with the whole output of the set-up.
+        step: the failed step.
+        output: output of the step.
+        wheels: the folder from which packages are installed instead of an index.
         system: as in `lacking_system`.
     """
     lines = [line.strip() for line in output.splitlines() if line.strip()] or ["no output"]
@@ -102,7 +102,7 @@ def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = N
 
 
 def _other_hash(output: str, wheels: Path | None) -> tuple[str, str]:
-    """What to say and do about a file whose SHA-256 is not in the lock, from what pip printed."""
+    """(problem, advice) for a file whose SHA-256 is not in the lock, from pip's output."""
     named = re.search(r"^([\w.-]+)\S* from (\S+)", output.partition("DO NOT MATCH THE HASHES")[2], re.M)
     package = named.group(1) if named else "a package"
     where = wheels or (named and urllib.parse.urlsplit(named.group(2)).hostname) or "the package index"
@@ -112,7 +112,7 @@ def _other_hash(output: str, wheels: Path | None) -> tuple[str, str]:
 
 
 def _unreachable(output: str) -> tuple[str, str]:
-    """What pip could not reach, and what to do about it, from what it printed."""
+    """(problem, advice) for an unreachable server, from pip's output."""
     named = re.search(r"host='([^']+)'", output)
     listed = re.search(r"Looking in indexes: (.*)", output)
     urls = [url.strip() for url in listed.group(1).split(",")] if listed else ["https://pypi.org/simple"]

@@ -1,4 +1,4 @@
-"""Where the project's files are, and what the system is. Runs under Python 3.8."""
+"""Locations of the project's files, and the operating system. Runs under Python 3.8."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-"""The checkout, or the folder that the extension is installed in."""
+"""The checkout, or the folder of the installed extension."""
 REQUIREMENTS = ROOT / "requirements"
 DEMO_CLIP = ROOT / "examples" / "sitting.mp4"
 WINDOWS = os.name == "nt"
 LINUX = sys.platform.startswith("linux")
 HERE = Path()
-"""Where the user stands, for children that are given paths as they were typed."""
+"""The user's working folder, for children that receive paths as the user typed them."""

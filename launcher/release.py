@@ -1,10 +1,10 @@
-"""The command `package`: the extension's zip, a repository folder for it, checksums and an SBOM, whole or not at all.
+"""The command `package`: builds the extension's zip, a repository folder for it, checksums and an SBOM.
 
-A package is a folder `splannequin-VERSION`, ready to be uploaded to any web server:
+A package is a folder `splannequin-VERSION`, written completely or not at all, ready for any web server:
 
     splannequin-VERSION.zip   the extension, built and validated by Blender
     index.json, index.html    Blender's listing of the folder, which makes it an extension repository
-    sbom.cdx.json             what a set-up downloads (`sbom`)
+    sbom.cdx.json             bill of materials of a set-up's downloads (`sbom`)
     SHA256SUMS                SHA-256 of each file
 
 Nothing in it is signed with a key.
@@ -37,12 +37,12 @@ from .places import ROOT, WINDOWS
 from .sbom import bill_of_materials
 
 LOCKS = ("backend", *TORCH_LOCKS, *(f"bpy-{series}" for series in sorted(BPY_WHEELS)))
-"""Locks of what a user's set-up downloads. Those of tests and benchmarks are not in the zip."""
+"""Locks of a user's set-up. Locks of tests and benchmarks are not in the zip."""
 SUMS = "SHA256SUMS"
 SBOM = "sbom.cdx.json"
 _LISTING = ("index.json", "index.html")
 _FILE_MODE = 0o100644 << 16
-"""Attributes of every file in the zip: a regular file, readable by all. Those on disk depend on the umask."""
+"""Attributes of every file in the zip: a regular file, readable by all. Attributes on disk depend on the umask."""
 
 
 @dataclass(frozen=True)
@@ -56,24 +56,24 @@ class Source:
     time: datetime.datetime
     """Time of that commit, in UTC."""
     changed: int
-    """How many files differ from the commit."""
+    """Number of files that differ from the commit."""
 
 
 def package(blenders: Sequence[str], output: Path) -> int:
-    """Builds the package of the tree that is checked out; returns an exit code.
+    """Builds the package of the checked-out tree; returns an exit code.
 
     Args:
-        blenders: programs of Blender. The first builds, all of them validate. None: the one that the launcher finds.
-        output: folder in which the package appears, with blender.log and summary.json.
+        blenders: paths of Blenders. The first builds, all of them validate. Empty: the Blender of `get_blender`.
+        output: folder for the package, blender.log and summary.json.
 
     Raises:
-        LauncherError: there is no new package; an older one of the same version stays as it was.
+        LauncherError: the package could not be built; an older one of the same version is unchanged.
     """
     started = time.monotonic()
     chosen = [named_blender(path) for path in blenders] or [get_blender()[0]]
     work = output / ".work"
     with locked(output / ".package.lock", lambda: say("another `package` is at work in this folder; waiting for it")):
-        shutil.rmtree(work, ignore_errors=True)  # of a run that was killed
+        shutil.rmtree(work, ignore_errors=True)  # left by a killed run
         try:
             source = copy_source(work / "source")
             product = read_manifest(source.folder / "blender_manifest.toml")
@@ -90,7 +90,7 @@ def package(blenders: Sequence[str], output: Path) -> int:
 
 
 def copy_source(folder: Path) -> Source:
-    """Copies the files of the checkout that Git tracks or would add, so that nothing else gets into a zip.
+    """Copies the files of the checkout that Git tracks or would add; other files must not get into a zip.
 
     Raises LauncherError if the launcher is not in a Git checkout, or Git fails.
     """
@@ -99,20 +99,20 @@ def copy_source(folder: Path) -> Source:
     if not (ROOT / ".git").exists():
         raise LauncherError(f"A package is built from a Git checkout, and {ROOT} is none: clone the repository.")
     commit, seconds = _git("log", "-1", "--format=%H %ct").decode().split()
-    # Named, as a user's settings may leave untracked files out of the status.
+    # The option is explicit because a user's settings may leave untracked files out of the status.
     status = _git("status", "--porcelain", "-z", "--no-renames", "--untracked-files=all")
     changed = [line for line in status.split(b"\0") if line]
     names = _git("ls-files", "-z", "--cached", "--others", "--exclude-standard").split(b"\0")
     for name in filter(None, map(os.fsdecode, names)):
         path = ROOT / name
-        if path.is_file() and not path.is_symlink():  # Blender packs no links
+        if path.is_file() and not path.is_symlink():  # Blender does not pack links
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(path.read_bytes())
     return Source(folder, commit, datetime.datetime.fromtimestamp(int(seconds), datetime.UTC), len(changed))
 
 
 def _git(*words: str) -> bytes:
-    # Without optional locks `git status` writes nothing into the checkout.
+    # --no-optional-locks keeps `git status` from writing into the checkout.
     command = [program("git") or "git", "--no-optional-locks", "-C", str(ROOT), *words]
     done = subprocess.run(command, capture_output=True)
     if done.returncode:
@@ -147,7 +147,7 @@ def _fill(
 
 
 def read_manifest(path: Path) -> dict[str, str]:
-    """id, version, name and licence (SPDX) of the extension. LauncherError if its manifest is damaged."""
+    """id, version, name and licence (SPDX) of the extension. Raises LauncherError if its manifest is damaged."""
     try:
         manifest = tomllib.loads(path.read_text(encoding="utf-8"))
         product = {key: str(manifest[key]) for key in ("id", "version", "name")}
@@ -158,7 +158,7 @@ def read_manifest(path: Path) -> dict[str, str]:
 
 
 class _Tool:
-    """Blender's tool for extensions, run with empty user folders, so that the user's Blender stays as it is."""
+    """Blender's tool for extensions, run with empty user folders, so that the user's Blender is not changed."""
 
     def __init__(self, user: Path, log: Path) -> None:
         self.user = user
@@ -166,7 +166,7 @@ class _Tool:
         log.write_bytes(b"")
 
     def run(self, blender: Blender, result: Path, *arguments: str) -> None:
-        """Runs one command of the tool. LauncherError if it fails, or leaves no file `result`."""
+        """Runs one command of the tool. Raises LauncherError if it fails or does not write the file `result`."""
         begin = self.log.stat().st_size
         with open(self.log, "ab") as log:
             command = blender.extension_tool(*arguments)
@@ -186,10 +186,10 @@ class _Tool:
 
 
 def repack(built: Path, target: Path, when: datetime.datetime) -> None:
-    """Writes Blender's zip anew with its files in order of name, one time and one set of attributes.
+    """Rewrites Blender's zip with its files in order of name, with one time and one set of attributes.
 
     Blender packs files in the order in which the disk lists them, with the time and attributes of each. The new zip has
-    the same bytes for the same commit, as long as the launcher's Python has the same zlib.
+    the same bytes for the same commit, if the launcher's Python has the same zlib.
 
     Args:
         built: the zip that Blender built.
@@ -218,7 +218,7 @@ def _write_sorted(built: Path, target: Path, when: datetime.datetime) -> None:
 
 
 def check_listing(folder: Path, archive: str, digest: str) -> None:
-    """LauncherError unless index.json lists the zip, and nothing else, with its size and SHA-256."""
+    """Raises LauncherError unless index.json lists only the zip, with its size and SHA-256."""
     try:
         listed = json.loads((folder / "index.json").read_text(encoding="utf-8"))["data"]
         facts = [(one["archive_url"], one["archive_size"], one["archive_hash"]) for one in listed]
@@ -236,12 +236,12 @@ def sha256(path: Path) -> str:
 
 
 def flush(folder: Path) -> None:
-    """Waits until the files of a folder, and their names in it, are on the disk."""
+    """Flushes a folder to disk: its files and its directory entries."""
     for path in folder.iterdir():
         if path.is_file():
             with open(path, "rb+") as file:
                 os.fsync(file.fileno())
-    if not WINDOWS:  # where a folder cannot be opened
+    if not WINDOWS:  # Windows cannot open a folder
         handle = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(handle)

@@ -1,4 +1,4 @@
-"""What a repair of an environment looks at: packages that are not whole, and what torch's build needs."""
+"""Checks for the repair of an environment: damaged packages, and CUDA libraries that torch needs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from torch_backend.contract import site_packages
 
 
 def drop_damaged(environment: Path, recorded: dict[str, Any]) -> list[str]:
-    """Has pip forget packages that are not whole, so that it installs them anew; returns their names.
+    """Removes the metadata of damaged packages, so that pip installs them again; returns their names.
 
-    pip writes a package's RECORD last: one without is unfinished. The contents of the others are compared with it, and
-    it with what the last set-up recorded.
+    pip writes a package's RECORD last, so a package without RECORD is unfinished. Else the files are compared with
+    RECORD, and RECORD with the hash from the last set-up.
 
     Args:
         environment: folder of the virtual environment.
-        recorded: what `record_packages` found after that set-up.
+        recorded: result of `record_packages` after the last set-up.
     """
     site, dropped = site_packages(environment), list[str]()
     for folder in sorted(site.glob("*.dist-info")) if site else ():
@@ -32,13 +32,13 @@ def drop_damaged(environment: Path, recorded: dict[str, Any]) -> list[str]:
 
 
 def _is_whole(folder: Path, record: str | None) -> bool:
-    """True if every file of a package has the hash that its RECORD names, and RECORD the given one, if one is given."""
+    """True if RECORD has the hash `record` (if not None), and every file of the package the hash in RECORD."""
     try:
         text = (folder / "RECORD").read_bytes()
         if record is not None and hashlib.sha256(text).hexdigest() != record:
             return False
         for row in csv.reader(text.decode("utf-8").splitlines()):
-            # A .pyc that a wheel brings is compiled anew by pip, and by Python.
+            # pip and Python recompile the .pyc files of a wheel.
             if len(row) > 1 and row[1].startswith("sha256=") and not row[0].endswith(".pyc"):
                 with open(folder.parent / row[0], "rb") as file:
                     digest = base64.urlsafe_b64encode(hashlib.file_digest(file, "sha256").digest())
@@ -50,7 +50,7 @@ def _is_whole(folder: Path, record: str | None) -> bool:
 
 
 def needs_cuda(environment: Path) -> bool:
-    """True if the torch that is installed asks for NVIDIA's libraries, as PyPI's build for Linux does."""
+    """True if the installed torch requires NVIDIA's libraries, as PyPI's build for Linux does."""
     site = site_packages(environment)
     metadata = "".join(p.read_text(encoding="utf-8") for p in site.glob("torch-*.dist-info/METADATA")) if site else ""
     return re.search(r"^Requires-Dist: (nvidia|cuda|triton)\b", metadata, re.M) is not None

@@ -1,4 +1,4 @@
-"""The bill of materials of a release: what a set-up downloads, from requirements/*.lock, as CycloneDX JSON."""
+"""The bill of materials of a release as CycloneDX JSON: packages of a set-up, from requirements/*.lock."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from torch_backend.contract import package_name
 from .errors import LauncherError
 
 LICENCES = "licences.toml"
-"""File in requirements/: package -> SPDX expression."""
+"""File in requirements/ that maps packages to SPDX expressions."""
 _PACKAGE = re.compile(r"(?P<name>[A-Za-z0-9][\w.-]*)==(?P<version>[^\s;\\]+)( ; (?P<marker>[^\\]+?))?( \\)?")
 _HASH = re.compile(r"    --hash=sha256:(?P<digest>[0-9a-f]{64})( \\)?")
 
 
 @dataclass(frozen=True)
 class Package:
-    """A package at one version, as a lock pins it."""
+    """A package at one version, pinned by a lock."""
 
     name: str
-    """Name as pip compares it."""
+    """Normalised name."""
     version: str
-    """Version, with the build of torch ("2.13.0+cpu")."""
+    """Version, including torch's build ("2.13.0+cpu")."""
     marker: str
-    """Systems and Pythons that it is installed on (PEP 508); empty for all."""
+    """PEP 508 marker of the systems and Pythons on which it is installed; empty for all."""
     hashes: tuple[str, ...]
     """SHA-256 of each wheel that a set-up may download."""
 
@@ -58,7 +58,7 @@ def read_lock(path: Path) -> list[Package]:
             packages[-1] = Package(last.name, last.version, last.marker, (*last.hashes, digest["digest"]))
         elif not line.startswith("#"):
             raise _damaged(path, f"line {number} is neither a package nor a hash")
-        # After a backslash another hash follows. In a file that was cut short none does.
+        # After a backslash a hash must follow; in a truncated file it is missing.
         if line.endswith("\\") and (number == len(lines) or not _HASH.fullmatch(lines[number])):
             raise _damaged(path, f"a hash is missing after line {number}")
     without = [one.name for one in packages if not one.hashes]
@@ -74,16 +74,16 @@ def _damaged(path: Path, why: str) -> LauncherError:
 def bill_of_materials(
     requirements: Path, locks: Sequence[str], product: dict[str, str], digest: str, time: str
 ) -> dict[str, Any]:
-    """A CycloneDX 1.6 document: the extension, and each package that a set-up may download.
+    """A CycloneDX 1.6 document of the extension and each package that a set-up may download.
 
-    The same input gives the same document: it has no serial number, and its time is that of the commit.
+    The same input gives the same document: it has no serial number, and its time is the commit's.
 
     Args:
         requirements: folder with the locks and the table of licences.
         locks: names of the locks, without suffix.
         product: id, version, name and licence (SPDX) of the extension.
         digest: SHA-256 of the extension's zip.
-        time: of the commit, ISO 8601 in UTC.
+        time: time of the commit, ISO 8601 in UTC.
 
     Raises:
         LauncherError: a lock is damaged, or a package has no licence in the table.
@@ -121,7 +121,7 @@ def bill_of_materials(
 
 
 def _licences(path: Path) -> dict[str, str]:
-    """Package -> SPDX expression."""
+    """Maps each package to its SPDX expression. Raises LauncherError if the file cannot be read."""
     try:
         return {package_name(name): str(text) for name, text in tomllib.loads(path.read_text(encoding="utf-8")).items()}
     except (OSError, ValueError) as error:
@@ -129,7 +129,7 @@ def _licences(path: Path) -> dict[str, str]:
 
 
 def _component(package: Package, locks: Sequence[str], licence: str) -> dict[str, Any]:
-    """A package as CycloneDX lists it. Its wheels differ by system, so the hashes are those of its distributions."""
+    """CycloneDX component of a package. Wheels differ by system, so hashes are attached to its distributions."""
     purl = f"pkg:pypi/{package.name}@{urllib.parse.quote(package.version)}"
     public = package.version.partition("+")[0]
     properties = [{"name": "splannequin:lock", "value": lock} for lock in locks]

@@ -1,4 +1,4 @@
-"""DIR/summary.json of a command, and what the jobs in DIR say of themselves."""
+"""Reads DIR/summary.json of a command, and the status of the jobs in DIR."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch_backend.contract import JOBS_FOLDER, SHOT_SUFFIX, STATUS_FILE, read_j
 
 
 def read_summary(output: Path) -> dict[str, Any]:
-    """DIR/summary.json, {} if there is none."""
+    """Contents of DIR/summary.json; {} if it is missing or unreadable."""
     try:
         return read_json(output / "summary.json")
     except (OSError, ValueError):
@@ -17,7 +17,7 @@ def read_summary(output: Path) -> dict[str, Any]:
 
 
 def failed_job(output: Path) -> str:
-    """The sentence of the newest job of the shots in `output`, if it failed; else nothing."""
+    """Error message of the newest job of the shots in `output` if that job failed; else empty."""
     try:
         found = output.glob(f"*{SHOT_SUFFIX}/{JOBS_FOLDER}/*/{STATUS_FILE}")
         statuses = sorted(found, key=lambda path: path.stat().st_mtime)

@@ -1,4 +1,4 @@
-"""All tests: ruff, pyright, the backend's tests, the add-on's in a bpy wheel."""
+"""The command test: runs ruff, pyright, the backend's tests, and the add-on's tests in a bpy wheel."""
 
 from __future__ import annotations
 
@@ -21,56 +21,56 @@ from .errors import LauncherError
 from .places import ROOT
 
 AT_ONCE = 2
-"""Legs that run beside each other where there are as many cores. More would make the tests wait for each other: a test
-takes little more than one core."""
+"""Largest number of legs that run in parallel, if there are as many cores. More legs would slow each other down: a test
+uses little more than one core."""
 NEWS_SECONDS = 60.0
-"""Legs whose output is kept until they end say this often how far they are."""
+"""Interval in seconds of progress lines while legs run in parallel, whose output is shown when they end."""
 
 
 BACKEND_APART = tuple(
     f"tests/backend/{name}" for name in ("cameras", "lens", "sfm", "motion", "raster", "footage", "card")
 )
-"""Half of the backend's tests by what they take: a leg of their own, beside which the others run. None of them needs
-the run that the others train once."""
+"""Folders with half of the backend's tests by duration: a separate leg in parallel to the other half. None of them
+needs the run that the other half trains once."""
 OTHER_INSTRUCTIONS = {
     "ATEN_CPU_CAPABILITY": "default",
     "SPLANNEQUIN_MARCH": "x86-64-v3",
     "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
     "OPENCV_CPU_DISABLE": "AVX2,AVX512-SKX",
 }
-"""Environment variables with which torch, our kernels, numpy and OpenCV compute as on an older processor: floats come
-out some 1e-7 otherwise. For processors of x86; on others torch's alone means something."""
+"""Environment variables that make torch, our kernels, numpy and OpenCV compute as on an older x86 processor, which
+changes floats by about 1e-7. On other processors only torch's variable has an effect."""
 SENSITIVE = (
     "tests/backend/freeze/views", "tests/backend/freeze/composite/test_compositor.py",
     "tests/backend/freeze/composite/test_honest.py", "tests/backend/freeze/composite/test_overscan.py",
     "tests/backend/freeze/composite/test_state.py", "tests/backend/raster",
 )  # fmt: skip
-"""Tests of what decides by floats, and of the kernels: those that `test --instructions` runs."""
+"""Tests of `test --instructions`: of code whose decisions depend on floats, and of the kernels."""
 ADDON_TESTS = ("tests/addon", "tests/addon_free")
-"""Those that run in Blender. The second need none: the backend's leg runs them too."""
+"""Tests that run in Blender. Those in tests/addon_free do not need it, so the backend's leg runs them too."""
 
 
 class Leg:
-    """One part of the tests: its command, and what became of it."""
+    """One part of the tests: its command and its result."""
 
     def __init__(
         self, name: str, command: list[str], report: Path | None = None, environ: dict[str, str] | None = None
     ) -> None:
         self.name = name
         self.environ = environ or {}
-        """Environment variables of its own."""
+        """Additional environment variables."""
         self.command = command if report is None else [*command, f"--junitxml={report}"]
         self.report = report
-        """Where pytest writes its counts; None for a checker."""
+        """pytest's XML report with the counts; None for a checker."""
         self.passed = self.failed = self.skipped = 0
         self.seconds = 0.0
 
     def run(self, backend_python: str) -> None:
-        """Runs it with our output, and counts: tests by pytest's report, a checker as one."""
+        """Runs the leg with this process's output, then counts: tests from pytest's report, a checker as one test."""
         run_legs([self], backend_python, None)
 
     def start(self, backend_python: str, log: Path | None, **environ: str) -> subprocess.Popen[bytes]:
-        """Its process; what that prints goes to `log`, or where ours does."""
+        """Starts the leg's process; its output goes to `log`, or to this process's output if `log` is None."""
         if self.report:
             self.report.unlink(missing_ok=True)
         environ = child_environ(SPLANNEQUIN_BACKEND_PYTHON=backend_python, **environ, **self.environ)
@@ -80,14 +80,14 @@ class Leg:
             return start_child(self.command, environ, cwd=ROOT, stdout=stream, stderr=subprocess.STDOUT)
 
     def ended(self, code: int, seconds: float) -> None:
-        """Counts, and says what came out."""
+        """Counts the results and prints them."""
         self.seconds = seconds
         if self.report is None:
             self.passed, self.failed = int(code == 0), int(code != 0)
         else:
             self._count(self.report)
             picked = any(word.startswith("-k") for word in self.command)
-            if code and not (code == 5 and picked) and not self.failed:  # 5: nothing ran
+            if code and not (code == 5 and picked) and not self.failed:  # 5: pytest ran no test
                 self.failed = 1
         say(f"=== {self.name}: {self.passed} passed, {self.failed} failed, {self.seconds:.0f} s")
 
@@ -106,14 +106,14 @@ class Leg:
 
 
 def run_legs(legs: Sequence[Leg], backend_python: str, logs: Path | None, at_once: int = 1) -> None:
-    """Runs legs in their order, up to `at_once` beside each other. On Ctrl-C all are stopped, and KeyboardInterrupt.
+    """Runs legs in order, up to `at_once` in parallel. On Ctrl-C all are stopped, and KeyboardInterrupt is raised.
 
     Args:
-        legs: each is told what came of it.
+        legs: each receives its result.
         backend_python: the backend's interpreter, for the add-on's tests.
-        logs: folder for the output of legs that share the machine, one file each; it is printed whole when the leg
-            ends. One leg alone prints as it goes.
-        at_once: how many may run at a time. None of them then takes more than its share of the cores.
+        logs: folder for the output of parallel legs, one file each, printed when the leg ends. A single leg prints
+            directly.
+        at_once: largest number of parallel legs, each of which uses its share of the cores.
     """
     waiting = list(legs)
     together = logs is not None and at_once > 1 and len(legs) > 1
@@ -144,23 +144,23 @@ def run_legs(legs: Sequence[Leg], backend_python: str, logs: Path | None, at_onc
 
 
 def progress(log: Path | None) -> str:
-    """How far a leg is by what it has printed: pytest's last "[ 34%]"."""
+    """Progress of a leg from its log: pytest's last "[ 34%]"."""
     shares = re.findall(r"\[ *(\d+%)\]", log.read_text(encoding="utf-8", errors="replace")) if log else []
     return shares[-1] if shares else "at work"
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     allowed = getattr(os, "sched_getaffinity", None)
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -> int:
-    """Runs ruff, pyright, the backend's tests and the add-on's in a bpy wheel; closes with `N passed, N failed`.
+    """Runs ruff, pyright, the backend's tests and the add-on's in a bpy wheel; the last line is `N passed, N failed`.
 
     Args:
-        pytest_args: pytest's; paths among them choose which tests run.
-        series: bpy wheels in which the add-on's tests run, and nothing else; none: all tests, in one that fits.
+        pytest_args: arguments for pytest; paths among them select tests.
+        series: bpy wheels for the add-on's tests; then only these tests run. Empty: all tests, in a wheel that fits.
         output: folder for summary, reports and logs.
     """
     paths = [a for a in pytest_args if not a.startswith("-") and (ROOT / a.split("::")[0]).exists()]
@@ -174,7 +174,7 @@ def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -
     legs: list[Leg] = []
     pytest = [backend.python, "-P", "-m", "pytest"]
     apart = BACKEND_APART if not pytest_args and not series else ()
-    if apart:  # the longest first, so that no core waits for one at the end
+    if apart:  # the longest leg first, so that no core is idle at the end
         legs.append(Leg("backend, one half", [*pytest, *apart], output / "junit-backend-half.xml"))
     if backend_paths:
         ignored = [f"--ignore={path}" for path in ("tests/addon", *apart)]
@@ -195,7 +195,7 @@ def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -
 
 
 def run_sensitive_tests(pytest_args: Sequence[str], output: Path) -> int:
-    """The tests of `SENSITIVE` with another instruction set than this processor's; closes as `run_tests`."""
+    """Runs the tests of `SENSITIVE` with an older instruction set than this processor's; output as `run_tests`."""
     backend = backend_environment(testing=True)
     set_up(backend, sys.executable)
     x86 = platform.machine().lower() in ("x86_64", "amd64")
@@ -211,7 +211,7 @@ def run_sensitive_tests(pytest_args: Sequence[str], output: Path) -> int:
 
 
 def checkers(python: str) -> list[Leg]:
-    """ruff and pyright, of the environment of `python`."""
+    """Legs of ruff and pyright from the environment of `python`."""
     project = ["--project", str(ROOT), "--pythonpath", python]
     return [
         Leg("ruff", [python, "-P", "-m", "ruff", "check", str(ROOT)]),

@@ -1,13 +1,13 @@
-"""Regenerates requirements/*.lock: every package that a set-up installs, pinned, with the SHA-256 of its wheels.
+"""Regenerates requirements/*.lock: all packages of a set-up, pinned, with the SHA-256 of their wheels.
 
     python -m venv /tmp/lock && /tmp/lock/bin/pip install uv
     python3 tools/lock_requirements.py --uv /tmp/lock/bin/uv
 
-A `.txt` in requirements/ is edited by hand: direct requirements, and constraints.txt for what these bring with them.
-Its `.lock` is complete: pip installs it with `--no-deps --require-hashes`. backend.txt becomes several: torch is
-installed alone, and its CUDA libraries only where the torch that was installed asks for them.
+A `.txt` in requirements/ is edited by hand: it lists direct requirements; constraints.txt limits their dependencies.
+Its `.lock` is complete: pip installs it with `--no-deps --require-hashes`. backend.txt becomes several locks, because
+torch is installed separately, and its CUDA libraries only if the installed torch requires them.
 
-uv asks PyPI. torch's builds on download.pytorch.org are locked from TORCH_WHEELS, a lock each.
+uv queries PyPI. Builds of torch on download.pytorch.org are locked from TORCH_WHEELS, one lock per build.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ from pathlib import Path
 
 REQUIREMENTS = Path(__file__).resolve().parent.parent / "requirements"
 PYTHONS = {"bpy-5.2": "3.13"}
-"""Lowest Python of a lock, where it is not 3.11."""
+"""Lowest Python of a lock if it is not 3.11."""
 WITHOUT_DEPENDENCIES = ("bench",)
-"""Lists that name every package themselves (see their first lines)."""
+"""Lists that name every package explicitly (see their first lines)."""
 CUDA = re.compile(r"(nvidia|cuda|triton)\b")
-"""Names of the packages that only torch with CUDA needs."""
+"""Pattern for names of packages that only torch with CUDA needs."""
 
 TORCH_WHEELS = {
-    # The CPU build of Linux. The file of cp311 x86_64 was hashed here; each other hash stands in at least two public
-    # repositories, looked up on 29 November 2026. torch cannot be fetched from its own index
-    # on the project's machines.
+    # The CPU build for Linux. The hash of cp311 x86_64 was computed from the file. Each other hash was found in at
+    # least two public repositories on 29 November 2026, because the project's machines cannot reach torch's index.
     "torch-2.13.0+cpu-cp311-cp311-manylinux_2_28_x86_64.whl": (
         "6746dbcbeb526eb61330b76b41ff1b4eb848951103a892eeb080dfa2b264667b"
     ),
@@ -54,8 +53,8 @@ TORCH_WHEELS = {
     "torch-2.13.0+cpu-cp314-cp314-manylinux_2_28_aarch64.whl": (
         "ca021f9eb2f8345c83fa03e3a04587308afb8df71bd472670b3ece00df58621c"
     ),
-    # The CUDA build of Windows. That of cp311 is missing: no two sources for it were found, so a set-up there says that
-    # torch is not pinned (`launcher.environments.pinned_torch`).
+    # The CUDA build for Windows. The wheel of cp311 is missing, because no two sources of its hash were found. A set-up
+    # with that Python prints that torch has no hash (`launcher.environments.torch_lock`).
     "torch-2.13.0+cu130-cp312-cp312-win_amd64.whl": "2efab1e83604ca628c6d85b9e188c153690980498d1297081a9dad704919303c",
     "torch-2.13.0+cu130-cp313-cp313-win_amd64.whl": "cf23236e9deed7d3510d14d9b9592d75d272ef7b35bbfee31a02bea339c73971",
     "torch-2.13.0+cu130-cp314-cp314-win_amd64.whl": "590b2a2b53ef295dcfcd703df17929bd579705bb0e42d9e43c462fe0f0b1e088",
@@ -83,11 +82,11 @@ def main() -> int:
 
 
 def compiled(uv: str, path: Path) -> list[str]:
-    """uv's answer to a list of requirements: an entry per package, its lines of hashes included."""
+    """Entries of a lock that uv computes from a list of requirements: one per package, including its hashes."""
     command = [uv, "pip", "compile", "-q", "--universal", "--generate-hashes", "--no-header", "--no-annotate"]
     command += ["--only-binary", ":all:", "--python-version", PYTHONS.get(path.stem, "3.11")]
     command += ["--no-deps"] if path.stem in WITHOUT_DEPENDENCIES else []
-    # Packages of the test's and the benchmark's lists lie beside the backend's.
+    # Packages of tests and benchmarks are installed into the backend's environment.
     command += ["-c", "backend.txt"] if path.stem in ("test", "bench") else []
     done = subprocess.run([*command, path.name], cwd=path.parent, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -96,19 +95,19 @@ def compiled(uv: str, path: Path) -> list[str]:
 
 
 def name_of(entry: str) -> str:
-    """Name of the package of an entry."""
+    """Name of an entry's package."""
     return entry.partition("==")[0]
 
 
 def of_build(pin: str, build: str) -> tuple[list[str], str]:
-    """Entry and notes for torch of its own index: the launcher looks up in the notes whether it has a wheel's hash."""
+    """Entry and notes for a build of torch's index. The launcher searches the notes for a wheel's file name."""
     wheels = {name: digest for name, digest in TORCH_WHEELS.items() if f"+{build}-" in name}
     entry = " \\\n".join([f"{pin}+{build}", *(f"    --hash=sha256:{digest}" for digest in wheels.values())])
     return [entry], "".join(f"#   {digest}  {name}\n" for name, digest in wheels.items())
 
 
 def write(stem: str, entries: list[str], notes: str = "") -> None:
-    """Writes a lock."""
+    """Writes requirements/STEM.lock."""
     head = f"# Made by tools/lock_requirements.py. Do not edit.\n{notes}"
     (REQUIREMENTS / f"{stem}.lock").write_text(head + "".join(f"{e}\n" for e in entries), encoding="utf-8")
 

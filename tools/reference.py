@@ -1,8 +1,8 @@
-"""Writes docs/reference.md from the tables of the program: commands, options, layers of a frozen frame.
+"""Writes docs/reference.md from the program's tables: commands, options, layers of a frozen frame.
 
     python3 tools/reference.py
 
-Standard library only. `tests/test_docs.py` fails while the page differs from the tables.
+Needs only the standard library. `tests/test_docs.py` fails if the page differs from the tables.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from torch_backend.contract import (  # noqa: E402
 
 PAGE = ROOT / "docs" / "reference.md"
 INTERNAL = ("farm-task", "run-job", "live")
-"""Verbs that programs start, not people."""
+"""Verbs that only programs start."""
 SIDES = {BACKEND: "backend", BLENDER: "Blender"}
-"""Side of the table of verbs -> what the reference calls its command line."""
+"""Names of the command lines in the reference, by side of the table of verbs."""
 
 
 def text() -> str:
@@ -48,18 +48,18 @@ _INTRODUCTION = [
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table, and an empty one."""
+    """Lines of a Markdown table, and an empty line."""
     lines = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
     return [lines[0], "|---" * len(head) + "|", *lines[1:], ""]
 
 
 def _escaped(words: str) -> str:
-    """Words in which Markdown sees no emphasis: t* is an instant."""
+    """`words` with asterisks escaped for Markdown, as in t*."""
     return words.replace("*", "\\*")
 
 
 def _commands() -> list[str]:
-    """Which command line has which commands."""
+    """Table of the commands and the command lines that have them."""
     sides = {name: ["launcher"] for name in LAUNCHED}
     helps = dict(LAUNCHED)
     for name, verb in VERBS.items():
@@ -80,7 +80,7 @@ def _commands() -> list[str]:
 
 
 def _rows(command: str, classes: Iterable[type]) -> Iterator[tuple[str, list[str]]]:
-    """(flag, cells of its row) for each option of a command's dataclasses: option, meaning, default, panel."""
+    """(flag, cells of its row) for each option of a command's dataclasses. Cells: option, meaning, default, panel."""
     for cls in classes:
         for one, spec in options_for(command, cls):
             if spec.flag.startswith("--"):
@@ -92,7 +92,7 @@ def _rows(command: str, classes: Iterable[type]) -> Iterator[tuple[str, list[str
 
 
 def _step_options() -> list[str]:
-    """Options of the four steps. One that several steps have stands in the first."""
+    """Table of the options of the four steps. An option of several steps is listed with the first."""
     rows: dict[str, list[str]] = {}
     for step, cls in STEP_PARAMS.items():
         for flag, cells in _rows(step, [cls]):
@@ -108,7 +108,7 @@ def _step_options() -> list[str]:
 
 
 def _other_options() -> list[str]:
-    """Options of every other command, and of `freeze` and `farm` besides those of the steps."""
+    """Table of the options of all other commands, and of `freeze` and `farm` without the steps' options."""
     rows: list[list[str]] = []
     for name, verb in VERBS.items():
         if name not in INTERNAL and not verb.now:
@@ -124,7 +124,7 @@ def _other_options() -> list[str]:
 
 
 def _layers() -> list[str]:
-    """Layers of a frozen frame."""
+    """Table of the layers of a frozen frame."""
     rows = (
         (f"`{one.shown}`", "Combined, Alpha" if one.name == "Combined" else one.name, one.stored, _escaped(one.content))
         for one in FRAME_LAYERS

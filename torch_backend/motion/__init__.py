@@ -1,1 +1,1 @@
-"""What moves by itself in a clip whose cameras are known: motion mattes, and points of what stands still."""
+"""Motion search in a clip with known cameras: motion mattes, and dense points of still surfaces."""

@@ -1,9 +1,9 @@
-"""The motion matte of a shot: per delivered frame what stands still, what moves by itself, and what is not known.
+"""The motion mattes of a shot: each labels the pixels of a delivered frame as still, unknown or moving.
 
-SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size: STILL, UNKNOWN or MOVING. motion.json beside
-them says which cameras they belong to; mattes of an earlier solve are not read, nor are the points of still surfaces
-that lie with them (`surface`). What an artist paints goes before what is found: SHOT/motion_paint/NNNNNN.png, which no
-solve touches.
+Files: SHOT/solve/motion/NNNNNN.png, grey, of the working frames' size, with values STILL, UNKNOWN or MOVING.
+motion.json in that folder records the cameras of the mattes. Mattes of an earlier solve and their points of still
+surfaces (`surface`) are not read. Painted mattes, SHOT/motion_paint/NNNNNN.png, take precedence over detected ones; a
+solve does not change them.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from .flow import FlowConfig
 from .surface import NO_SURFACE, SurfacePoints, read_surface
 
 STILL, UNKNOWN, MOVING = 0, 128, 255
-"""Values of a matte. Whoever reads one takes those nearer to another for that one."""
+"""Values of a matte. Readers round other values to the nearest of these."""
 MOTION_VERSION = 7
 PAINTED = PAINTED_FOLDER
-"""Of painted mattes, in the shot's folder."""
+"""Folder of painted mattes in the shot's folder."""
 _RECORD, _UNFINISHED = MOTION_FILE, MOTION_UNFINISHED_FILE
 _LABELS = np.array([STILL, UNKNOWN, MOVING], np.uint8)
 
 
 def solve_key(shot: Shot, config: FlowConfig) -> str:
-    """Identifies the cameras, frames and masks that a matte is made from; of a shot without them, what it has."""
+    """Key of the cameras, frames and masks that a matte is computed from. Missing files are left out of the key."""
     digests: list[str] = []
     for file in (shot.cameras, shot.listing):
         with contextlib.suppress(OSError, ValueError):
@@ -57,13 +57,13 @@ def solve_key(shot: Shot, config: FlowConfig) -> str:
 
 @functools.lru_cache(maxsize=16)
 def _digest(file: Path, *_state: int) -> str:
-    """SHA-256 of a file in the state that it is in: asked for with each matte, and the files grow with the clip."""
+    """SHA-256 of a file, cached by inode, size and time: every matte needs it, and the files grow with the clip."""
     with open_regular(file) as handle:
         return hashlib.sha256(handle.read()).hexdigest()
 
 
 def record_of(path: Path) -> dict[str, Any]:
-    """A record of this version; {} if there is none that can be read."""
+    """The record in a file; {} if it cannot be read or is of another version."""
     try:
         found = read_json(path)
     except (OSError, ValueError):
@@ -77,20 +77,20 @@ def record_of(path: Path) -> dict[str, Any]:
 
 
 def is_found(shot: Shot) -> bool:
-    """True if the shot has mattes of the solve that it has now."""
+    """True if the shot has mattes of its current solve."""
     return record_of(shot.motion / _RECORD).get("key") == solve_key(shot, FlowConfig())
 
 
 def is_outdated(shot: Shot) -> bool:
-    """True if the shot has mattes that are not read: of an earlier version of this program, of other cameras, or of a
-    search that was cancelled or killed."""
+    """True if the shot has unusable mattes: of another version of this program, of other cameras, or of an unfinished
+    search."""
     return any((shot.motion / name).is_file() for name in (_RECORD, _UNFINISHED)) and not is_found(shot)
 
 
 def motion_key(shot: Shot, with_found: bool = True) -> str:
-    """Changes when any matte does, found or painted; without those that were found, only when a painted one does.
+    """Key that changes with every painted matte and, if `with_found`, with the detected mattes.
 
-    Painted ones count by content: a shot that was copied is still the same shot, and a run of it goes on.
+    The key uses the contents of painted mattes, so that a training run can resume in a copied shot.
     """
     found = record_of(shot.motion / _RECORD).get("key") if with_found and is_found(shot) else None
     painted = sorted(p for p in shot.painted.glob("*.png") if p.is_file())
@@ -105,7 +105,7 @@ def _content(path: Path) -> str:
 def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
     """The matte of a frame: STILL, UNKNOWN or MOVING, [h, w] of the working frames; None if there is none.
 
-    Where an artist painted, that is it. JobError if a file of it is damaged.
+    Painted pixels replace detected ones. Raises JobError if a file is damaged.
     """
     path = shot.matte(frame)
     painted = shot.painted_matte(frame)
@@ -118,7 +118,7 @@ def load_motion(shot: Shot, frame: int) -> NDArray[np.uint8] | None:
 
 
 def load_surface(shot: Shot) -> SurfacePoints:
-    """Points of still surfaces of the solve that the shot has now; none if it was solved before they were kept."""
+    """Points of still surfaces of the shot's current solve; none if the solve predates such points."""
     return read_surface(shot.motion) if is_found(shot) else NO_SURFACE
 
 
@@ -128,7 +128,7 @@ def write_matte(path: Path, labels: NDArray[np.uint8]) -> None:
 
 
 def read_found(path: Path) -> NDArray[np.uint8]:
-    """[h, w] labels of a matte that was found. JobError if the file is damaged."""
+    """[h, w] labels of a detected matte. Raises JobError if the file is damaged."""
     pixels = _decoded(path, cv2.IMREAD_GRAYSCALE)
     if pixels is None or pixels.dtype != np.uint8:
         raise JobError(f"The motion matte {path} is damaged.", "Solve the camera again.", ExitCode.SOLVE)
@@ -136,7 +136,10 @@ def read_found(path: Path) -> NDArray[np.uint8]:
 
 
 def _painted(path: Path, found: NDArray[np.uint8] | None, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """`found` with what was painted over it: grey below 85 of 255 is still, above 170 moving, alpha to 0.5 nothing."""
+    """`found` with the painted labels over it.
+
+    Grey below 85 of 255 is still, above 170 moving, between unknown. Pixels with alpha up to 0.5 are not painted.
+    """
     pixels = _decoded(path, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype.type not in (np.uint8, np.uint16):
         raise JobError(
@@ -144,7 +147,7 @@ def _painted(path: Path, found: NDArray[np.uint8] | None, size: tuple[int, int])
         )
     scale = 255.0 / np.iinfo(pixels.dtype).max
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-    # Made small as it is stored: as floats a large picture would take four times its memory.
+    # Resized before the conversion to float, which would take four times the memory of a large picture.
     colour = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST_EXACT)).reshape(*size[::-1], -1)
     grey = colour[..., : 3 if pixels.shape[2] >= 3 else 1].astype(np.float32).mean(2) * scale
     labels = _LABELS[np.searchsorted([85.0, 170.0], grey, side="right")]
@@ -157,7 +160,7 @@ def _painted(path: Path, found: NDArray[np.uint8] | None, size: tuple[int, int])
 
 
 def _decoded(path: Path, how: int) -> NDArray[Any] | None:
-    """Pixels of a PNG; None if it holds no picture that can be read whole. JobError if it is too large."""
+    """Pixels of a PNG; None if the file is damaged or incomplete. Raises JobError if the picture is too large."""
     width, height = png_size(path)
     if width * height > MOST_PIXELS:
         raise too_large(path.name, width, height)

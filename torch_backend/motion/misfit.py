@@ -1,9 +1,9 @@
-"""What moves though no flow says so: a frame shows something unlike the world at rest.
+"""Misfit: detects movers that optical flow misses, as differences between a frame and the static scene.
 
-Dense flow smooths an arm before a wall, or an apple on a thread, into the motion of the wall. Two pictures tell what is
-there at rest: what a static model of the clip shows, and the median of other frames along the still surface. Each errs
-in its own places, the model at far skylines, the median at outlines, so a pixel is as unlike as the smaller of both
-differences says.
+Dense flow smooths a thin mover, such as an arm in front of a wall or an apple on a thread, into the motion of the wall.
+Two pictures predict the static scene: the render of a static model of the clip, and the median of other frames along
+the still surface. The model errs at far skylines and the median at outlines. The misfit of a pixel is therefore the
+smaller of both differences.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from .flow import Map, Mask
 from .still import Ray, fitted_brightness
 
 _BEHIND = 19.0
-"""`Ray.project` returns 20 times the inverse depth for points at or behind a camera."""
+"""Depth ratio of `Ray.project` above which a point counts as behind the other camera; the ratio is clamped to 20."""
 _SPARSE = 4
-"""Points from one that brightness is fitted to, to the next, in rows and columns."""
+"""Stride in rows and columns of the points to which brightness is fitted."""
 
 
 @dataclass(frozen=True)
 class MisfitConfig:
-    """What counts as unlike the world at rest. Chosen on tuning scenes `arm` 0, 1, 2 and `swinging` 0."""
+    """Thresholds of the misfit. Tuned on scenes `arm` 0, 1, 2 and `swinging` 0."""
 
     sigma: float = 4.0
     """Sigma of the low-pass of differences, in pixels of a picture 640 wide."""
     usual: float = 0.9
-    """Quantile of a frame's differences that is their unit. With the median, thresholds of equally many false pixels
-    differ by a factor of 1.9 between tuning scenes, with this by 1.5."""
+    """Quantile of a frame's differences that serves as unit of the misfit. Thresholds with equally many false pixels
+    differ between tuning scenes by a factor of 1.5 with this quantile, of 1.9 with the median."""
     weak: float = 1.3
-    """Misfit, in that unit, down to which an area extends that moves."""
+    """Misfit, in units of `usual`, down to which a moving area extends."""
     strong: float = 3.0
-    """Misfit that a pixel of the area has to reach. Lit edges of hasty frames reach 3, movers 5; with 2 lamps were
-    torn."""
+    """Misfit that one pixel of a moving area must reach. Bright edges in frames with fast camera motion reach 3, movers
+    5; with a threshold of 2, lamps were partly labelled as moving."""
     references: int = 13
-    """Key frames of the clip, evenly spaced, whose median is taken."""
+    """Number of key frames, evenly spaced over the clip, whose median is taken."""
     fewest: int = 5
-    """References that have to have a surface in their picture. With 2 the rim of a clip's view is called moving, where
-    a model has little to learn from either: `arm` 0 then loses 1.2 dB where nothing moves."""
+    """Number of references that must show a surface. With 2, the rim of the clip's view is labelled as moving, because
+    the static model has little data there: `arm` 0 then loses 1.2 dB in its still regions."""
 
 
 @dataclass(frozen=True)
@@ -55,21 +55,21 @@ class Sight:
     viewmat: NDArray[np.float64]
     """[4, 4] world-to-camera, solve units."""
     K: NDArray[np.float64]
-    """[3, 3] in flow pixels."""
+    """[3, 3] intrinsics in flow pixels."""
 
 
 def misfit(
     frame: Sight, inverse: Map, shown: NDArray[np.uint8], references: Sequence[Sight], grid: tuple[Map, Map],
     unit: float, config: MisfitConfig,
 ) -> Map:  # fmt: skip
-    """[h, w] float32 how unlike the world at rest a frame is, in units of what `usual` of the frame stays below.
+    """[h, w] float32 difference of a frame from the static scene, in units of its quantile `config.usual`.
 
     Args:
         inverse: [h, w] inverse depths of the frame's still points, in 1 / solve units.
-        shown: [h, w, 3] what a static model of the clip shows at the frame's camera.
-        references: other frames; pixels that too few of them have in their picture read 0.
+        shown: [h, w, 3] render of a static model of the clip at the frame's camera.
+        references: other frames; the misfit is 0 at pixels that too few of them show.
         grid: positions of the grid's points in flow pixels.
-        unit: points of the grid to one pixel of a picture 640 wide.
+        unit: grid points per pixel of a picture 640 wide.
     """
     median, number = _median(frame, inverse, references, grid)
     gaps: list[Map] = [np.max(np.abs(frame.colors - np.asarray(each, np.float32)), axis=-1) for each in (shown, median)]
@@ -79,9 +79,9 @@ def misfit(
 
 
 def _median(frame: Sight, inverse: Map, others: Sequence[Sight], grid: tuple[Map, Map]) -> tuple[Map, NDArray[Any]]:
-    """([h, w, 3] median of the others along the frame's still surfaces, [h, w] how many have those in their picture).
+    """([h, w, 3] median of the others along the frame's still surfaces, [h, w] number of others that show the surface).
 
-    Others are brought to the frame's brightness. Where none has a surface in its picture it is the frame itself.
+    The others' brightness is fitted to the frame's. Where none shows the surface, the median is the frame itself.
     """
     colors = frame.colors.astype(np.float32)
     brought: list[Map] = []
@@ -95,14 +95,14 @@ def _median(frame: Sight, inverse: Map, others: Sequence[Sight], grid: tuple[Map
         brought.append(np.where(visible[..., None], picture, np.float32(np.nan)))
     if not brought:
         return colors, np.zeros(inverse.shape, np.int64)
-    stack = np.sort(np.stack(brought), axis=0)  # NaN, outside, comes last
+    stack = np.sort(np.stack(brought), axis=0)  # sorts NaN, the invisible pixels, to the end
     number = np.count_nonzero(~np.isnan(stack[..., 0]), axis=0)
     middle = np.take_along_axis(stack, np.maximum(number - 1, 0)[None, ..., None] // 2, axis=0)[0]
     return np.where(number[..., None] > 0, middle, colors), number
 
 
 def _carried(frame: Sight, inverse: Map, other: Sight, grid: tuple[Map, Map]) -> tuple[Map, Mask]:
-    """([h, w, 3] float32 another frame's colours at this frame's still points, [h, w] which are in its picture)."""
+    """([h, w, 3] float32 colours of `other` at this frame's still points, [h, w] which points `other` shows)."""
     at, over = Ray(grid, (frame.viewmat, other.viewmat), (frame.K, other.K)).project(inverse)
     x, y = (np.clip(0.5 * p - 0.5, -1e4, 1e4).astype(np.float32) for p in at)
     height, width = inverse.shape
@@ -112,7 +112,7 @@ def _carried(frame: Sight, inverse: Map, other: Sight, grid: tuple[Map, Map]) ->
 
 
 def seeded(mask: Mask, seeds: Mask, least: int) -> Mask:
-    """The 4-connected areas of a mask that hold a seed and at least this many points."""
+    """The 4-connected areas of a mask that contain a seed and at least `least` points."""
     count, numbers, about, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     numbers = np.asarray(numbers, np.int32)
     keep = about[:, cv2.CC_STAT_AREA] >= least

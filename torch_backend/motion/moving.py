@@ -1,7 +1,7 @@
-"""From a solved clip to its motion mattes: key frames are tested, their scores follow surfaces through time, and areas.
+"""Computes the motion mattes of a solved clip: scores key frames, averages scores along surfaces, and labels areas.
 
-Keys are about ten frames a second, more in a short clip; the frames between two keys take theirs by flow. Frames go
-through a window of a few seconds, so a clip of any length takes the same memory.
+There are about ten key frames a second, more in a short clip. The frames between two keys take their scores from both
+keys by flow. Frames are processed in a window of a few seconds, so memory does not grow with the clip.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ _LARGEST_SCALE = 2.0
 _KEYS_PER_SECOND, _LEAST_KEYS = 10.0, 16
 _LEAST_SIDE = 64
 _LEFT_EVERY = 2
-"""Interval of the key frames in which residual motion is computed: sways are slow."""
+"""Residual motion is computed in every second key frame, because sways are slow."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
-"""Weights: more than the one adds nothing, below the other nothing is known."""
+"""Weight of a score at which it saturates, and weight below which a point is unknown."""
 _AHEAD = 32
-"""Most frames that are scored before the static model can label them. At 640 x 480 they take 100 MB."""
+"""Largest number of frames scored ahead of their labelling by the static model. At 640 x 480 they take 100 MB."""
 
 
 StaticViews = Callable[[int], NDArray[np.uint8] | None]
-"""Frame number -> what a static model of the clip shows from its camera, [h, w, 3] as the frames are; None: nothing."""
+"""Maps a frame number to a render of the clip's static model from that frame's camera, [h, w, 3], or to None."""
 
 
 class Clip:
-    """Frames and cameras of a solved shot, in the flow's size."""
+    """Frames and cameras of a solved shot at the flow's resolution."""
 
     def __init__(self, shot: Shot) -> None:
-        """JobError if it is not solved."""
+        """Raises JobError if the shot is not solved."""
         path = load_cameras(shot)
         seconds = {int(row["frame"]): float(row["seconds"]) for row in load_frames(shot)["frames"]}
         self._shot = shot
@@ -62,40 +62,40 @@ class Clip:
         self.unit = width / 640.0
         """Flow pixels in one pixel of a picture 640 wide."""
         self.keys = _keys([seconds.get(frame, float(n)) for n, frame in enumerate(self.frames)])
-        """Indices into `frames`."""
+        """Indices of the key frames in `frames`."""
         viewmats = np.array([c.viewmat for c in path.frames], np.float64).reshape(-1, 4, 4)
         Ks = np.array([[[c.K[0], 0, c.K[2]], [0, c.K[1], c.K[3]], [0, 0, 1]] for c in path.frames], np.float64)
         Ks *= np.array([width / path.width, height / path.height, 1.0])[None, :, None]
         self.viewmats, self.Ks = viewmats[self.keys], Ks[self.keys]
-        """Of the keys: [K, 4, 4] world-to-camera, solve units, and [K, 3, 3] in flow pixels."""
+        """Cameras of the keys: [K, 4, 4] world-to-camera, solve units, and [K, 3, 3] intrinsics in flow pixels."""
         self._cameras = viewmats, Ks
         self._guessed = [camera.source == "interpolated" for camera in path.frames]
         self.guessed = [self._guessed[i] for i in self.keys]
-        """Keys whose pose was not solved."""
+        """True for each key whose pose is interpolated."""
         points = load_points(shot)["xyz"].astype(np.float64)
         self.depths = [_typical_depth(points, viewmat) for viewmat in self.viewmats]
-        """Of the keys: median depth of the sparse points before the camera."""
+        """Median depth of the sparse points in front of each key's camera."""
         self._pictures: dict[int, tuple[NDArray[np.uint8], Sight]] = {}
         self._looks: dict[int, Look] = {}
 
     def picture(self, key: int) -> NDArray[np.uint8]:
-        """Grey picture of a key in the flow's size. JobError if the frame is damaged."""
+        """Grey picture of a key at the flow's resolution. Raises JobError if the frame is damaged."""
         return self.shown(key)[0]
 
     def shown(self, key: int) -> tuple[NDArray[np.uint8], Sight]:
-        """A key, as `frame` returns it."""
+        """`frame` of a key, cached."""
         if key not in self._pictures:
             self._pictures[key] = self.frame(self.keys[key])
         return self._pictures[key]
 
     def look(self, key: int) -> Look:
-        """It, prepared for comparison."""
+        """Picture of a key prepared for comparison, cached."""
         if key not in self._looks:
             self._looks[key] = Look(self.picture(key))
         return self._looks[key]
 
     def frame(self, index: int) -> tuple[NDArray[np.uint8], Sight]:
-        """Any frame: grey in the flow's size, as `picture`, and in colour on the grid, with its camera."""
+        """(grey picture at the flow's resolution, colours on the grid with the camera) of any frame."""
         pixels = read_frame(self._shot.plate(self.frames[index]))
         pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
         ignored = load_mask(self._shot, IGNORE, self.frames[index])
@@ -106,7 +106,7 @@ class Clip:
         return grey, Sight(colors, self._cameras[0][index], self._cameras[1][index])
 
     def references(self, count: int) -> dict[int, Sight]:
-        """Key -> so many keys of solved poses, evenly spaced."""
+        """Up to `count` keys with solved poses, evenly spaced, as a map from key to frame."""
         solved = [key for key, guessed in enumerate(self.guessed) if not guessed]
         if not solved:
             return {}
@@ -114,7 +114,7 @@ class Clip:
         return {key: self.frame(self.keys[key])[1] for key in sorted(chosen)}
 
     def is_guessed(self, index: int) -> bool:
-        """True if the pose of a frame was not solved."""
+        """True if the pose of a frame is interpolated."""
         return self._guessed[index]
 
     def forget(self, before: int) -> None:
@@ -125,7 +125,7 @@ class Clip:
 
 
 def _sized(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """A picture at another size: averaged where it shrinks."""
+    """A picture resized to `size`, area-averaged if it shrinks."""
     if pixels.shape[1::-1] == size:
         return pixels
     how = cv2.INTER_AREA if size[0] < pixels.shape[1] else cv2.INTER_CUBIC
@@ -133,7 +133,7 @@ def _sized(pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8
 
 
 def _keys(seconds: list[float]) -> list[int]:
-    """Indices of the key frames: evenly spaced, the first and the last frame among them."""
+    """Indices of the key frames: evenly spaced, including the first and the last frame."""
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
     stride = round(1.0 / (_KEYS_PER_SECOND * step)) if step > 0 else 1
     stride = max(1, min(stride, len(seconds) // _LEAST_KEYS))
@@ -141,7 +141,7 @@ def _keys(seconds: list[float]) -> list[int]:
 
 
 def _typical_depth(points: NDArray[Any], viewmat: NDArray[Any]) -> float:
-    """Median depth of points [P, 3] before a camera [4, 4]; 1 if there are none."""
+    """Median depth of the points [P, 3] in front of a camera [4, 4]; 1 if there are none."""
     z = points @ viewmat[2, :3] + viewmat[2, 3]
     z = z[z > 0]
     return float(np.median(z)) if len(z) else 1.0
@@ -149,30 +149,30 @@ def _typical_depth(points: NDArray[Any], viewmat: NDArray[Any]) -> float:
 
 @dataclass(frozen=True)
 class Scored:
-    """How surely the points of a frame move, by optical flow. Maps are [h, w] on the grid."""
+    """Motion scores of a frame from optical flow. Maps are [h, w] on the grid."""
 
     index: int
-    """Of the frame, in `Clip.frames`."""
+    """Index of the frame in `Clip.frames`."""
     picture: NDArray[np.uint8]
-    """Grey, in the flow's size."""
+    """Grey picture at the flow's resolution."""
     sight: Sight
     score: Map
-    """How surely a point moves, 0 to 1."""
+    """Confidence that a point moves, 0 to 1."""
     weight: Map
-    """How much is known of it."""
+    """Amount of evidence behind the score."""
     inverse: Map
     """Inverse depths of still points, 1 / solve units."""
     grid: tuple[Map, Map]
     """Positions of the grid's points in flow pixels."""
     evidence: KeyEvidence | None
-    """Of a key frame whose pose was solved."""
+    """Evidence of a key frame with a solved pose; None for other frames."""
 
 
 @contextlib.contextmanager
 def scored_ahead(
     clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter
 ) -> Generator[Iterator[Scored]]:
-    """`_scores`, computed by a thread from the start of the block on, at most `_AHEAD` frames before they are taken."""
+    """Context of an iterator of `_scores` that a thread computes at most `_AHEAD` frames ahead of the consumer."""
     scores = _scores(clip, config, written, report)
     with ThreadPoolExecutor(1, "optical flow") as pool:
         waiting = deque(pool.submit(next, scores, None) for _ in range(_AHEAD))
@@ -189,7 +189,7 @@ def scored_ahead(
 
 
 def _scores(clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter) -> Iterator[Scored]:
-    """All frames but the `written` ones, in order."""
+    """Scores of all frames that are not in `written`, in order."""
     keys, reach = clip.keys, config.reach * config.baselines[-1]
     groups = [range(keys[k - 1] + 1 if k else 0, keys[k] + 1) for k in range(len(keys))]
     wanted = [any(n not in written for n in group) for group in groups]
@@ -233,10 +233,9 @@ def _scores(clip: Clip, config: FlowConfig, written: Collection[int], report: Re
 def _own_score(
     clip: Clip, matches: Matches, key: int, config: FlowConfig, before: tuple[Map, Map] | None
 ) -> tuple[tuple[Map, Map, Map], tuple[Map, Map], Evidence]:
-    """((score, weight, inverse), what is left, evidence): how surely a key frame's points move, 0 to 1, how much is
-    known of them, and the inverse depths of still points.
+    """((score, weight, inverse), (score, weight) of residual motion, evidence) of a key frame, as in `Scored`.
 
-    Residual motion is computed unless that of the key `before` is passed, which is then followed to this key.
+    `before` is the residual motion of the key before, which is then followed to this key; if None, it is computed.
     """
     seen = neighbours(matches, key, len(clip.keys), config)
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
@@ -256,7 +255,7 @@ def _own_score(
 def _followed(
     matches: Matches, key: int, own: dict[int, tuple[Map, Map, Map]], count: int, reach: int, config: FlowConfig
 ) -> tuple[Map, Map]:
-    """Score and weight of a key frame with those of its neighbours followed to it: a surface has one label."""
+    """Score and weight of a key frame, averaged with those of its neighbours so that a surface has one label."""
     score, sure, _ = own[key]
     total, weight = 2.0 * score * sure, 2.0 * sure
     for seen in neighbours(matches, key, count, config):
@@ -272,7 +271,7 @@ def _between(
     clip: Clip, matches: Matches, picture: NDArray[np.uint8], key: int, final: dict[int, tuple[Map, Map]],
     own: dict[int, tuple[Map, Map, Map]],
 ) -> tuple[tuple[Map, Map], Map]:  # fmt: skip
-    """(score, weight) and inverse depths of still points of a frame between key - 1 and key, by flow to both."""
+    """((score, weight), inverse depths of still points) of a frame between `key` - 1 and `key`, by flow to both."""
     total = np.zeros(picture.shape, np.float32)[::2, ::2]
     weight, inverse, count = (np.zeros_like(total) for _ in range(3))
     for other in (key - 1, key):
@@ -286,7 +285,7 @@ def _between(
 
 
 class Labels:
-    """Labels frames by their scores and, if there is one, by a static model of the clip."""
+    """Labels frames by their scores and, if available, by renders of a static model of the clip."""
 
     def __init__(self, clip: Clip, static: StaticViews | None, config: FlowConfig) -> None:
         self._clip, self._static, self._config, self._rest = clip, static, config, MisfitConfig()
@@ -305,13 +304,13 @@ class Labels:
         least = round((config.blob * self._clip.width / 640) ** 2)
         moving = seeded(score > config.grow, score > config.seed, least)
         moving |= seeded(difference > rest.weak, difference > rest.strong, least)
-        still = seeded(~moving, ~moving, least)  # holes are filled
+        still = seeded(~moving, ~moving, least)  # fills small holes of moving areas
         unknown = known < _UNKNOWN
         unknown = seeded(unknown, unknown, least)
         return np.where(~still, np.uint8(255), np.where(unknown, np.uint8(128), np.uint8(0)))
 
     def _misfit(self, frame: Scored) -> Map:
-        """`misfit` of a frame on the grid; 0 without a static model and where the pose was guessed."""
+        """`misfit` of a frame on the grid; 0 without a static model or with an interpolated pose."""
         clip = self._clip
         shown = None
         if self._static is not None and not clip.is_guessed(frame.index):
@@ -324,10 +323,10 @@ class Labels:
 
 
 class _Spread:
-    """Spreads values within the areas of a picture, stopping at its edges: a guided filter (He 2010), grey."""
+    """Smooths values within the areas of a picture, stopping at its edges: a grey guided filter (He 2010)."""
 
     def __init__(self, picture: Map, radius: int, edge: float) -> None:
-        """`picture` [h, w] 0 to 255; differences below `edge` are none."""
+        """`picture` is the guide, [h, w], 0 to 255; differences below `edge` do not count as edges."""
         self._size = (2 * radius + 1, 2 * radius + 1)
         self._picture = picture
         self._mean = self._blur(picture)
@@ -337,7 +336,7 @@ class _Spread:
         return cv2.blur(values, self._size, borderType=cv2.BORDER_REFLECT)
 
     def __call__(self, values: Map) -> Map:
-        """[h, w] to the same."""
+        """Smoothed `values`, [h, w]."""
         mean = self._blur(values)
         slope = (self._blur(values * self._picture) - mean * self._mean) / self._variance
         level = mean - slope * self._mean

@@ -1,9 +1,9 @@
-"""Residual flow: finds sways that are too slow or too small to separate from the noise of a match.
+"""Residual flow: detects sways that are too slow or too small to separate from the noise of a match.
 
-Another key frame is warped over a key frame by the depth of still points. Still surfaces then coincide, and the flow
-that is left is several times more precise than a match over the whole distance. Depths are fitted once more to these
-matches. Residual flow that no depth explains is motion, if the pictures confirm it. Spans are a second and more,
-because sways grow with time.
+Another key frame is warped onto a key frame by the depth of still points. Still surfaces then coincide, and the
+residual flow is several times more precise than a match over the whole distance. Depths are fitted again to these
+matches. Residual flow that no depth explains is motion, if the pictures confirm it. The two frames are 0.4 to 1.6
+seconds apart (`FlowConfig.spans`), because the displacement of a sway grows with time.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from .flow import FlowConfig, Map, Mask, Seen, dense_flow, sample
 from .still import FEW, Look, Pair, StillTest, Texture, brightness, inside, outlines, still_points
 
 _FINEST, _STRIDE, _DESCENTS, _REFINEMENTS = 1, 4, 16, 2
-"""Settings of DIS: at half the size of the pictures and not finer, every fourth pixel."""
+"""Settings of DIS: finest scale is half the pictures' resolution, patches every fourth pixel."""
 _SPARSE, _TURNS = 4, 6
-"""Stride of the points to which the drift is fitted; iterations of its reweighted fit."""
+"""Stride of the points to which the drift is fitted, and iterations of that reweighted fit."""
 _NEAREST = 5.0
-"""Upper limit of inverse depth over its median: nearer points are clamped."""
+"""Upper limit of inverse depth relative to its median; the drift fit clamps nearer points."""
 _FLOOR = 2.0
-"""Squared difference of pictures that is below any noise."""
+"""Squared picture difference below the noise of any camera; added to ratios to keep them finite."""
 
 
 @dataclass
 class _Laid:
-    """A key frame and another one that was warped over it."""
+    """A key frame and another key frame that was warped onto it."""
 
     pair: Pair
-    """Its weight says how alike the pictures are at the match."""
+    """The two frames. `Pair.weight` is the similarity of the pictures at the match."""
     gained: Map
-    """[h, w] 0..1: how far the pictures bear the match out against the still point."""
+    """[h, w] 0..1: how strongly the pictures favour the match over the still point."""
     visible: float
-    """Square difference of the pictures that shows more than noise."""
+    """Noise of the pair as a squared picture difference; a larger change is visible."""
 
 
 class ResidualFlow:
-    """Motion of objects in key frames after the camera's is removed."""
+    """Motion of objects in key frames after camera motion is removed."""
 
     def __init__(self, picture: Callable[[int], NDArray[np.uint8]], test: StillTest, config: FlowConfig) -> None:
-        """`picture` gives key k as in `flow.Matches`."""
+        """`picture` returns key k as in `flow.Matches`."""
         self._picture, self._test, self._config = picture, test, config
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._dis.setFinestScale(_FINEST)
@@ -54,9 +54,10 @@ class ResidualFlow:
         self._dis.setVariationalRefinementIterations(_REFINEMENTS)
 
     def score(self, key: int, count: int, inverse: Map, depth: float) -> tuple[Map, Map]:
-        """(score, weight), [h, w] float32: how surely a key's points move, 0 to 1, and how much is known of them.
+        """(score, weight), [h, w] float32: confidence that a key's points move, 0 to 1, and its amount of evidence.
 
-        Of keys 0 to `count` - 1; `inverse` are the depths of still points, `depth` is the typical one, solve units.
+        Keys are 0 to `count` - 1. `inverse` are inverse depths of still points in 1 / solve units, `depth` is a typical
+        depth in solve units.
         """
         config = self._config
         look = self._test.look(key)
@@ -75,7 +76,7 @@ class ResidualFlow:
             seen = np.minimum(texture.change(x, y, length) / each.visible, 1.0)
             evidence.append(np.minimum(length / limit, config.most) * seen * each.gained * each.pair.weight)
             known += each.pair.weight
-        second = np.partition(np.stack(evidence), -2, axis=0)[-2]  # a single comparison may be an occlusion
+        second = np.partition(np.stack(evidence), -2, axis=0)[-2]  # the largest alone may be an occlusion
         faint = config.faint
         score = (second / (1.0 + config.rim * outlines(inverse)) - faint) / (config.clear - faint)
         return np.clip(score, 0.0, 1.0), np.minimum(known, 1.0)
@@ -90,18 +91,18 @@ class ResidualFlow:
         return float(np.clip(self._config.unusual * noise, least, self._config.most_left * least))
 
     def _left(self, key: int, other: int, at: tuple[Map, Map], within: Mask) -> Map:
-        """[h, w, 2] flow of a key frame to another one that is laid over it: its points are seen `at` places there."""
+        """[h, w, 2] flow from a key frame to `other` warped onto it. `at` are the key's still points in `other`."""
         one = self._picture(key)
         x, y = (cv2.resize(p, one.shape[::-1], interpolation=cv2.INTER_LINEAR) - np.float32(0.5) for p in at)
         brought = cv2.remap(self._picture(other), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        # Outside the other picture it is filled with this one, so that flow is zero there.
+        # Pixels outside the other picture are filled from this picture, so that their flow is zero.
         outside = cv2.resize((~within).astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST)
         cv2.copyTo(one, outside, brought)
         flow = np.nan_to_num(dense_flow(self._dis, one, brought))
         return np.asarray(cv2.resize(flow, within.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
     def _laid(self, key: int, other: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
-        """Another key frame warped over a key frame by inverse depths, with their residual flow."""
+        """Key frame `other` warped onto `key` by inverse depths, with their residual flow."""
         test = self._test
         pair = Pair.between(test, key, Seen(other, test.grid, np.zeros(inverse.shape, bool), 1), self._config)
         at, _ = pair.ray.project(inverse)
@@ -125,11 +126,10 @@ class ResidualFlow:
 
 
 def _drift(left: list[Map], telling: Mask, inverse: Map, unit: float) -> list[Map]:
-    """Smooth error of x and y over the whole picture, [h, w] each, as a poor pose, a rolling shutter or a lens causes
-    it.
+    """Smooth error of x and y over the picture, [h, w] each, caused by a poor pose, a rolling shutter or the lens.
 
-    A second-order polynomial, plus a term in inverse depth for an error of the camera's position, fitted robustly to
-    the residual flow `left` at the pixels `telling`. Movers are local, so a smooth fit leaves them in the residual.
+    The model is a second-order polynomial, plus a term in inverse depth for an error of the camera's position. It is
+    fitted robustly to the residual flow `left` at the pixels `telling`. Movers are local, so they stay in the residual.
     """
     height, width = telling.shape
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j].astype(np.float32)

@@ -1,7 +1,7 @@
-"""Tests whether a still point explains the matches of a surface: its depth, and how many matches say no.
+"""Tests whether a still point explains the matches of a surface: estimates its depth and counts contradicting matches.
 
-Where nothing is matched, or where flow smears the motion of what is in front over what is behind it, pictures are
-compared where the point would be seen if it stood still. Maps are on the grid of `flow`.
+Flow may find no match, or smear the motion of a foreground object over the background. The test then compares the
+pictures at the projection of the still point. Maps are on the grid of `flow`.
 """
 
 from __future__ import annotations
@@ -17,37 +17,41 @@ from numpy.typing import NDArray
 from .flow import FlowConfig, Map, Mask, Seen, sample
 
 FEW = 50
-"""Fewer points say nothing of a picture."""
+"""Smallest number of points for statistics of a picture."""
 _OUTLINE = 0.25
-"""Depths that differ by this share are two surfaces."""
+"""Relative difference of depths that makes a full outline between two surfaces."""
 _NEAR = 2
-"""Key frames so near show the same even if one is blurred."""
+"""Distance in key frames up to which pictures are comparable even if one is blurred."""
 _AGREES = 1.5
 """Factor on the tolerance up to which a match agrees with a still point."""
 _MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
-"""Square differences: above the one all are alike (hidden, or gone), by the other a point's own depth is preferred."""
+"""Squared picture differences: cap of a pair's cost (the point is hidden or gone), and cost added to every depth other
+than a point's own."""
 
 
 class Ray:
-    """Where points on a key frame's rays are seen in another one, by their inverse depth."""
+    """Projection of points on a key frame's rays into another view, by inverse depth."""
 
     def __init__(
         self, grid: tuple[Map, Map], views: tuple[NDArray[Any], NDArray[Any]], Ks: tuple[NDArray[Any], NDArray[Any]]
     ) -> None:
-        """`views` [4, 4] and `Ks` [3, 3] of the key frame and of the other one."""
+        """`views` [4, 4] and `Ks` [3, 3] of the key frame and of the other frame."""
         motion = views[1].astype(np.float64) @ np.linalg.inv(views[0].astype(np.float64))
         turn = (Ks[1] @ motion[:3, :3] @ np.linalg.inv(Ks[0])).astype(np.float32)
         self._far = [row[0] * grid[0] + (row[1] * grid[1] + row[2]) for row in turn]
         self._shift = (Ks[1] @ motion[:3, 3]).astype(np.float32)
 
     def project(self, inverse: Map) -> tuple[tuple[Map, Map], Map]:
-        """Positions in the other view of points at inverse depths, and 1 / depth there (before it: at least 1/20)."""
+        """Positions in the other view of points at inverse depths, and the points' depth ratio.
+
+        The ratio is the depth in the key frame over the depth in the other view; at most 20, also behind the camera.
+        """
         over = 1.0 / np.maximum(self._far[2] + inverse * self._shift[2], np.float32(0.05))
         x, y = ((self._far[i] + inverse * self._shift[i]) * over for i in (0, 1))
         return (x, y), over
 
     def slope(self, at: tuple[Map, Map], over: Map) -> tuple[Map, Map]:
-        """How fast such a position moves with the inverse depth."""
+        """Derivative of the position, as returned by `project`, with respect to inverse depth."""
         return (self._shift[0] - at[0] * self._shift[2]) * over, (self._shift[1] - at[1] * self._shift[2]) * over
 
 
@@ -58,10 +62,10 @@ class Look:
         self._smooth = cv2.GaussianBlur(picture, (0, 0), 1.0)
         half = picture.shape[1] // 2, picture.shape[0] // 2
         self.grid = cv2.resize(self._smooth, half, interpolation=cv2.INTER_AREA).astype(np.float32)
-        """[h, w] at the grid's points."""
+        """[h, w] smoothed picture at the grid's points."""
         steps = (np.diff(self.grid, axis=0), np.diff(self.grid, axis=1))
         self.sharpness = float(sum(np.mean(step * step) for step in steps))
-        """Mean square difference of neighbouring points."""
+        """Mean squared difference of neighbouring points."""
 
     def unlike(self, values: Map, at: tuple[Map, Map], gain: tuple[float, float]) -> Map:
         """Mean squared difference around each point between `values` and this picture at `at`, after `gain` (factor,
@@ -74,71 +78,72 @@ class Look:
 
 @dataclass
 class StillTest:
-    """What the test of a key frame stands on."""
+    """Inputs of the test of key frames."""
 
     look: Callable[[int], Look]
-    """Of any key."""
+    """Returns the prepared picture of any key."""
     viewmats: NDArray[Any]
     """[K, 4, 4] world-to-camera of the keys, solve units."""
     Ks: NDArray[Any]
-    """[K, 3, 3] in flow pixels."""
+    """[K, 3, 3] intrinsics in flow pixels."""
     guessed: list[bool]
-    """Keys whose pose was not solved."""
+    """True for each key whose pose is interpolated."""
     grid: tuple[Map, Map]
-    """Positions of the grid's points."""
+    """Positions x and y of the grid's points."""
     unit: float
     """Flow pixels in one pixel of a picture 640 wide."""
 
 
 class Texture:
-    """How a key frame's picture changes from place to place: where there is nothing to see, nothing can be told."""
+    """Local structure of a key frame's picture: motion cannot be measured in areas without texture."""
 
     def __init__(self, picture: Map, unit: float, config: FlowConfig) -> None:
-        # Derivatives per flow pixel: the grid's points are two apart.
+        # Scaled to derivatives per flow pixel: the grid's points are two flow pixels apart.
         gx, gy = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.0625), cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.0625)
         self._xx, self._xy, self._yy = (cv2.blur(p, (3, 3)) for p in (gx * gx, gx * gy, gy * gy))
         self._longest = 3.0 * unit
         self.nearly = 0.5 * (self._xx + self._yy) * unit**2
-        """Mean square difference to a place one pixel aside."""
+        """Mean squared difference to a position one pixel (of a picture 640 wide) away."""
         self.telling = self.nearly * config.tolerance**2 > config.contrast**2
-        """Where motion by the tolerance would be seen."""
+        """Mask of points at which motion by the tolerance would be visible."""
 
     def change(self, x: Map, y: Map, length: Map) -> Map:
-        """Mean square difference to the place that far aside, as far as it grows evenly."""
+        """Mean squared difference to the position (x, y) away, by a linear model; longer ways count as `_longest`."""
         shorter = np.square(np.minimum(1.0, self._longest / np.maximum(length, 1e-6)))
         return shorter * (self._xx * x * x + 2 * self._xy * x * y + self._yy * y * y)
 
 
 @dataclass
 class Pair:
-    """A key frame and another one."""
+    """A key frame and another key frame."""
 
     seen: Seen
     ray: Ray
     limit: float
-    """Matches farther than this from where the still point is seen may show motion; flow pixels."""
+    """Distance of a match from the projected still point above which it may show motion, in flow pixels."""
     other: Look
-    """The other's picture, and how its brightness becomes this one's."""
+    """Picture of the other key frame."""
     gain: tuple[float, float] = (1.0, 0.0)
+    """Factor and offset that fit the other picture's brightness to the key's."""
     matched: Map = field(init=False)
-    """Mean square difference of the pictures at the matches."""
+    """Mean squared difference of the pictures at the matches."""
     right: Mask = field(init=False)
-    """Where they show the same."""
+    """Mask of points at which the matches show the same surface."""
     weight: Map = field(init=False)
-    """[h, w] how far each match is trusted; 1 where it is found unless another is set."""
+    """[h, w] confidence in each match; by default 1 where it is found, else 0."""
 
     def __post_init__(self) -> None:
         self.weight = self.seen.found.astype(np.float32)
 
     @classmethod
     def between(cls, test: StillTest, key: int, seen: Seen, config: FlowConfig) -> Pair:
-        """A key frame and one in which it is seen again; how alike they look there is not known yet."""
+        """The pair of `key` and `seen.key`, before the pictures are compared: `matched` and `right` are not set."""
         ray = Ray(test.grid, (test.viewmats[key], test.viewmats[seen.key]), (test.Ks[key], test.Ks[seen.key]))
         limit = test.unit * (config.tolerance + config.per_link * (seen.links - 1))
         return cls(seen, ray, limit, test.look(seen.key))
 
     def miss(self, inverse: Map) -> tuple[tuple[Map, Map], Map, Map, Map]:
-        """Where still points are seen, and x, y and length of the matches' distance from there."""
+        """Projected positions of still points, and x, y and length of the smoothed offset of the matches from them."""
         at, _ = self.ray.project(inverse)
         x, y = (_smoothed(self.seen.at[i] - at[i], self.weight) for i in (0, 1))
         return at, x, y, np.hypot(x, y)
@@ -146,24 +151,24 @@ class Pair:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a key frame's matches say, on the grid."""
+    """Evidence from a key frame's matches, on the grid."""
 
     on: Map
-    """How much of them says still,"""
+    """Weight of the evidence that a point stands still."""
     off: Map
-    """and how much moving."""
+    """Weight of the evidence that a point moves."""
     inverse: Map
-    """1 / depth of the still point that explains them best, 1 / solve units."""
+    """Inverse depth of the still point that fits the matches best, in 1 / solve units."""
     agree: Map
-    """So many of them it explains."""
+    """Number of matches that the still point explains."""
     parallax: Map
-    """Flow pixels by which one of those would move with a depth twice as near: how well the depth is known."""
+    """Largest shift in flow pixels of these matches if the depth halved: the precision of the depth."""
 
 
 def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: FlowConfig) -> Evidence:
-    """What a key's matches say of still points.
+    """Evidence of stillness and motion from a key's matches.
 
-    `seen` are its matches, `depth` is the typical depth in its view, solve units.
+    `seen` are the key's matches, `depth` is a typical depth in its view, in solve units.
     """
     look = test.look(key)
     texture = Texture(look.grid, test.unit, config)
@@ -187,14 +192,14 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
 
 
 def outlines(inverse: Map) -> Map:
-    """[h, w] 0..1: how near points are to the outline of another surface, by inverse depths."""
+    """[h, w] 0..1: closeness of points to an outline between surfaces, from jumps of inverse depth."""
     block = np.ones((7, 7), np.uint8)
     jump = cv2.dilate(inverse, block) / np.maximum(cv2.erode(inverse, block), 1e-9) - 1.0
     return np.clip(jump / _OUTLINE, 0.0, 1.0)
 
 
 def _pair(test: StillTest, key: int, seen: Seen, texture: Texture, config: FlowConfig) -> Pair:
-    """A key frame and one in which it is seen again."""
+    """The pair of `key` and `seen.key`, with the comparison of their pictures."""
     look, pair = test.look(key), Pair.between(test, key, seen, config)
     pair.gain = brightness(look.grid, sample(pair.other.grid, seen.at), seen.found)
     pair.matched = pair.other.unlike(look.grid, seen.at, pair.gain)
@@ -203,9 +208,10 @@ def _pair(test: StillTest, key: int, seen: Seen, texture: Texture, config: FlowC
 
 
 def still_points(pairs: list[Pair], start: Map, depth: float, unit: float, turns: int = 4) -> Map:
-    """Inverse depth of the still point that explains the matches best, those far off hardly counting.
+    """Inverse depths [h, w] of the still points that fit the matches best, in 1 / solve units, at least 0.
 
-    [h, w], in 1 / solve units, at least 0; where the matches leave it open it is `start`. `depth` is typical.
+    The fit is robust: distant matches hardly count. Where the matches do not determine it, the inverse depth stays near
+    `start`. `depth` is a typical depth.
     """
     inverse = start.copy()
     stiff = np.float32((0.3 * unit * depth) ** 2)
@@ -227,7 +233,7 @@ def still_points(pairs: list[Pair], start: Map, depth: float, unit: float, turns
 def _counted(
     key: int, look: Look, texture: Texture, pairs: list[Pair], inverse: Map, config: FlowConfig
 ) -> tuple[Map, Map, Map, Map]:
-    """What the pairs say of still points at inverse depths: on, off, agree and parallax, as `Evidence`."""
+    """(on, off, agree, parallax) of still points at inverse depths, as in `Evidence`."""
     on, off, agree, parallax = (np.zeros_like(inverse) for _ in range(4))
     gone: dict[int, Mask] = {}
     for pair in pairs:
@@ -244,7 +250,7 @@ def _counted(
         better = pair.right & (difference > config.better * pair.matched + config.contrast**2)
         off += away & better & (texture.change(x, y, length) > config.contrast**2)
         weight = min(1.0, abs(after) / config.baselines[-1]) ** config.haste
-        # Flow over a plain wall carries what is before it along: a match there that looks like nothing says nothing.
+        # On a plain wall, flow follows the objects in front of it. A match whose pictures differ is no evidence there.
         smeared = found & ~away & ~alike & ~pair.right
         on += weight * ((found & ~away & ~smeared) + 0.5 * ((away & ~better) | (within & alike & ~found)))
         # A blurred picture matches no picture far from it in time, even where the scene stands still, so it is no
@@ -252,25 +258,29 @@ def _counted(
         if abs(after) <= _NEAR or look.sharpness >= config.blurred * pair.other.sharpness:
             gone[after] = within & ~alike & (~found | smeared)
     for step in config.baselines[:3]:
-        if step in gone and -step in gone:  # nowhere before and after: it is too fast for the flow. What is hidden
-            far = config.gone_far if step > _NEAR else 1.0  # behind something is so on one side as a rule.
+        # A point missing both before and after moves too fast for flow. A hidden point is usually hidden on one side.
+        if step in gone and -step in gone:
+            far = config.gone_far if step > _NEAR else 1.0
             off += far * (gone[step] & gone[-step])
     return on, off, agree, parallax
 
 
 def _smoothed(values: Map, weight: Map) -> Map:
-    """Mean of what is found around each point: a surface moves as one, flow errs here and there."""
+    """Weighted local mean of `values`, which reduces local errors of the flow."""
     return cv2.blur(values * weight, (5, 5)) / np.maximum(cv2.blur(weight, (5, 5)), 1e-3)
 
 
 def _like(unlike: Map, still: Mask, config: FlowConfig) -> float:
-    """Below how much pictures show the same: what is `still` tells how unlike a sharp and a blurred one are."""
+    """Threshold of the squared difference below which pictures show the same surface.
+
+    It rises with the median difference at `still` points, which differ if only one of the two pictures is sharp.
+    """
     usual = float(np.median(unlike[still])) if np.count_nonzero(still) >= FEW else 0.0
     return max(config.likeness**2, config.noise**2 * usual)
 
 
 def _best_depth(look: Look, pairs: list[Pair], depths: list[Map]) -> Map:
-    """Of the inverse depths, for each point the one at which it looks the same in the most neighbours."""
+    """For each point the candidate among `depths` (inverse) with the smallest picture difference to direct matches."""
     best, least = depths[0], np.zeros_like(depths[0])
     for number, inverse in enumerate(depths):
         cost, count = np.zeros_like(inverse), np.full_like(inverse, 1e-6)
@@ -287,17 +297,17 @@ def _best_depth(look: Look, pairs: list[Pair], depths: list[Map]) -> Map:
 
 
 def inside(at: tuple[Map, Map], shape: tuple[int, ...]) -> Mask:
-    """Which positions lie in a picture whose grid has a shape."""
+    """Mask of the positions inside a picture whose grid has the given shape."""
     return (at[0] >= 0) & (at[1] >= 0) & (at[0] < 2 * shape[1]) & (at[1] < 2 * shape[0])
 
 
 def brightness(values: Map, others: Map, found: Mask) -> tuple[float, float]:
-    """Factor and offset that make `others` look like `values` where they are `found`: exposure drifts in a clip."""
+    """Factor and offset that fit `others` to `values` at the `found` points, because exposure drifts in a clip."""
     return fitted_brightness(values[::4, ::4][found[::4, ::4]], others[::4, ::4][found[::4, ::4]])
 
 
 def fitted_brightness(a: Map, b: Map) -> tuple[float, float]:
-    """Factor and offset that make values `b` [P] look like `a`; 1 and 0 if they are few."""
+    """Factor and offset that fit values `b` [P] to `a` [P]; (1, 0) for fewer than `FEW` values."""
     if len(a) < FEW:
         return 1.0, 0.0
     spread = float(b.var())
@@ -308,14 +318,14 @@ def fitted_brightness(a: Map, b: Map) -> tuple[float, float]:
 
 
 def _surroundings(inverse: Map, sure: Mask) -> list[Map]:
-    """Depths that a point may have: its own, or that of what is behind or before it nearby, [h, w] each.
+    """Candidate inverse depths of each point, [h, w] each: its own, and the farthest and nearest in its neighbourhood.
 
-    Flow smears the motion of what is in front over what is behind it.
+    The neighbours' depths are candidates because flow smears foreground motion over the background.
     """
     own = np.where(sure, cv2.medianBlur(inverse, 5), 0.0).astype(np.float32)
     total, weight = own, sure.astype(np.float32)
     filled, certain = np.zeros_like(own), np.zeros_like(own)
-    for radius in (2, 6, 18, 54):  # the nearest that are sure count most
+    for radius in (2, 6, 18, 54):  # the nearest sure points count most
         size = (2 * radius + 1, 2 * radius + 1)
         share = (1.0 - certain) * np.minimum(1.0, cv2.blur(weight, size) * radius)
         filled += share * cv2.blur(total, size) / np.maximum(cv2.blur(weight, size), 1e-6)

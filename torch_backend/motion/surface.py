@@ -1,9 +1,8 @@
-"""Points of the surfaces that stand still, as dense as the pictures let: what the search for motion finds on its way.
+"""Dense points of still surfaces, a by-product of the motion search from which training initialises Gaussians.
 
-A wall, a jacket, a dark trouser leg hardly have a sparse point, so training would have nothing there to start from but
-a guess. The search for motion knows the depth of most of their pixels: the still point that explains their matches.
-What several matches agree on, under enough parallax, is kept by key frame beside the mattes, with which it comes and
-goes: SHOT/solve/motion/NNNNNN.npz.
+Sparse points are rare on a wall, a jacket or a dark trouser leg. The motion search knows the depth of most of their
+pixels, from the still point that explains their matches. Points that several matches confirm with enough parallax are
+stored per key frame in the mattes' folder, SHOT/solve/motion/NNNNNN.npz, and are valid as long as the mattes are.
 """
 
 from __future__ import annotations
@@ -21,28 +20,28 @@ from .misfit import Sight
 from .still import Evidence
 
 LEAST_AGREEING = 3
-"""Matches that have to agree on a point."""
+"""Smallest number of matches that agree with a kept point."""
 LEAST_PARALLAX = 5.0
-"""Pixels of a picture 640 wide by which its place in another frame would differ if it were twice as near: an error of
-one moves it by at most a fifth of its depth."""
+"""Smallest parallax of a kept point: its shift in another frame if its depth halved, in pixels of a picture 640 wide. A
+match error of one pixel then changes the depth by at most a fifth."""
 MOST_OFF = 0.5
 """Largest weight of moving evidence for a still point, relative to its still evidence."""
 AWAY = 6.0
-"""Pixels of a picture 640 wide from what is not known to stand still, at least."""
+"""Smallest distance of a kept point from pixels not labelled still, in pixels of a picture 640 wide."""
 PER_KEY = 2048
-"""Points kept of a key frame, at most."""
+"""Largest number of points kept per key frame."""
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points of still surfaces, [S]."""
+    """Points of still surfaces; S is their number."""
 
     xyz: NDArray[np.float32]
     """[S, 3] solve units."""
     rgb: NDArray[np.uint8]
-    """[S, 3] as the working frames show them."""
+    """[S, 3] colours of the working frames."""
     frames: NDArray[np.int64]
-    """[S] key frame in which each was found."""
+    """[S] number of the key frame in which each point was found."""
 
 
 NO_SURFACE = SurfacePoints(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
@@ -50,12 +49,12 @@ NO_SURFACE = SurfacePoints(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uin
 
 @dataclass(frozen=True)
 class KeyEvidence:
-    """What is known of a key frame."""
+    """Evidence of a key frame with its colours and camera."""
 
     evidence: Evidence
     """On the grid [h, w]."""
     grid: tuple[Map, Map]
-    """Positions x and y of its points in flow pixels."""
+    """Positions x and y of the grid's points in flow pixels."""
     sight: Sight
     """Colours on the grid, and the camera."""
 
@@ -67,8 +66,8 @@ def surface_points(
 
     Args:
         unit: flow pixels in one pixel of a picture 640 wide.
-        excluded: [H, W] of the working frame: none of that.
-        seed: of the draw.
+        excluded: [H, W] mask of working-frame pixels without points.
+        seed: random seed of the draw.
     """
     found, sight = key.evidence, key.sight
     known = (found.agree >= LEAST_AGREEING) & (found.parallax >= LEAST_PARALLAX * unit) & (found.inverse > 1e-6)
@@ -85,13 +84,13 @@ def surface_points(
 
 
 def write_surface(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) -> None:
-    """Keeps the points of a key frame, whole or not at all."""
+    """Writes the points of a key frame, whole or not at all."""
     with atomic_path(path) as half, half.open("wb") as handle:
         np.savez(handle, xyz=xyz, rgb=rgb)
 
 
 def read_surface(folder: Path) -> SurfacePoints:
-    """All points that a folder of mattes holds. A file that is damaged is left out: training can do without."""
+    """All points in a folder of mattes. Damaged files are skipped, because training does not depend on the points."""
     parts: list[tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]] = []
     for path in sorted(folder.glob("*" + SURFACE)):
         frame = frame_number(path.stem)
@@ -107,12 +106,12 @@ def read_surface(folder: Path) -> SurfacePoints:
 
 
 def is_damaged(path: Path) -> bool:
-    """True if a file of points is there and cannot be read."""
+    """True if a file of points exists but cannot be read."""
     return path.is_file() and _arrays(path) is None
 
 
 def _arrays(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]] | None:
-    """(xyz, rgb) of a file; None if they cannot be read, or are not what was written."""
+    """(xyz, rgb) of a file; None if it cannot be read or holds arrays of the wrong type, shape or values."""
     try:
         with open_arrays(path) as handle, np.load(handle, allow_pickle=False) as data:
             xyz, rgb = data["xyz"], data["rgb"]

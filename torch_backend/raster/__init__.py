@@ -1,4 +1,4 @@
-"""Gaussians and cameras in, images and per-Gaussian contributions out."""
+"""Rasteriser: renders images and per-Gaussian contributions from Gaussians and cameras."""
 
 from .api import rasterize
 from .settings import RasterOutput, RasterSettings

@@ -1,4 +1,4 @@
-"""The rasteriser's one public call."""
+"""The rasteriser's public function."""
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ def _shape(name: str, value: Tensor, expected: tuple[int | str, ...]) -> None:
 
 
 def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, body: str) -> None:
-    """Raise ValueError for cameras that do not fit. `body` 'cuda' leaves values on a GPU unread: it would stall."""
+    """Raise ValueError for invalid cameras. Values on a GPU are not checked for `body` 'cuda', to avoid a stall."""
     _shape("viewmats", viewmats, ("C", 4, 4))
     _shape("Ks", Ks, (viewmats.shape[0], 3, 3))
     if not 1 <= width <= SIDE_MAX or not 1 <= height <= SIDE_MAX:
@@ -34,7 +34,7 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, body: s
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise ValueError for Gaussians or settings that do not fit."""
+    """Raise ValueError for invalid Gaussians or settings."""
     _shape("means", scene.means, ("N", 3))
     n = scene.means.shape[0]
     _shape("quats", scene.quats, (n, 4))
@@ -55,7 +55,8 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _sh_degree(sh: Tensor | None, rest: Tensor | None, degree: int | None) -> int:
-    """Degree to evaluate: `degree`, or all that `sh` [N, K, 3], or `sh` [N, 1, 3] and `rest` [N, K - 1, 3], hold."""
+    """Degree to evaluate: `degree`, or if None the full degree of `sh` [N, K, 3] or of `sh` [N, 1, 3] with `rest`
+    [N, K - 1, 3]. Raises ValueError for invalid shapes or degrees."""
     if sh is None:
         if rest is not None:
             raise ValueError("sh_rest is given without sh")
@@ -94,7 +95,7 @@ def _body(backend: str, means: Tensor) -> str:
 
 
 def _run(body: str, scene: Scene) -> RasterOutput:
-    """What a body makes of a scene. Warp is imported only where it is needed: it takes a while."""
+    """Run a body on a scene. Warp is imported only when needed, because the import is slow."""
     if body == "reference":
         return reference.rasterize(scene)
     if body == "cuda":
@@ -127,27 +128,29 @@ def rasterize(
 ) -> RasterOutput:
     """Splat N Gaussians into C pinhole views.
 
-    means [N, 3] world; quats [N, 4] wxyz of any non-zero norm; log_scales [N, 3] natural logs of world units;
-    opacity_logits [N]; colors [N, D] any channels, and/or sh [N, K, 3], K = (degree + 1)^2 with degree 0 to 3: colour
-    = harmonics at the direction from camera to mean + 0.5, floored at 0 (a gradient passes the floor when it would
-    raise the colour), no ceiling. With both, the output has the 3 channels of `sh` first, then those of `colors`.
-    `sh_degree` uses the first bands only. Harmonics whose degree 0 lies apart from the rest, as an optimiser with two
-    rates has them, are given as sh [N, 1, 3] and sh_rest [N, K - 1, 3]: the CPU body then copies neither.
-    `with_depth`, `with_contributions` (weight_sum, weight_max) and `with_top` (top_ids, top_weights: mattes) fill the
-    outputs that cost extra. viewmats [C, 4, 4] world to camera, OpenCV axes;
-    Ks [C, 3, 3] px, pixel centres at +0.5, no skew; background [D] or None for black.
+    Gaussians: means [N, 3] world; quats [N, 4] wxyz of any non-zero norm; log_scales [N, 3] natural logs of world
+    units; opacity_logits [N]; colors [N, D] with any channels, and/or sh [N, K, 3], K = (degree + 1)^2, degree 0 to 3.
+    Colour of `sh`: the harmonics in the direction from camera to mean, plus 0.5, floored at 0, without ceiling. A
+    gradient passes the floor if descending it would raise the colour. With both, the output has the 3 channels of `sh`
+    first, then those of `colors`. `sh_degree` limits the degree. If degree 0 is a separate tensor, for example for an
+    optimiser with two rates, pass sh [N, 1, 3] and sh_rest [N, K - 1, 3]: the CPU body then copies neither.
+
+    Cameras: viewmats [C, 4, 4] world to camera, OpenCV axes; Ks [C, 3, 3] px, pixel centres at +0.5, no skew.
+    background is [D], or None for black. `with_depth`, `with_contributions` (weight_sum, weight_max) and `with_top`
+    (top_ids, top_weights: mattes) request outputs that cost extra.
 
     Returns a RasterOutput; its attributes give shapes and units. Gradients flow from colors, alphas and depth_expected
     to means, quats, log_scales, opacity_logits, colors, sh, sh_rest, viewmats and background. `constants.py` states the
     rules of culling and blending; NaN and infinite Gaussians are culled and get zero gradients.
 
-    backend: 'cpu' (float32, compiled), 'cuda' (float32, compiled, NVIDIA; with CPU tensors the same kernels run on
-    fibers: very slow, for tests), 'reference' (torch, the inputs' float type and device, slow), 'auto' picks by the
-    device of `means`. Inputs follow `means` to its device. On a GPU nothing waits for it, a call and its backward pass
-    can be captured as a CUDA graph (`cuda.py` says how), and cameras that are not finite or without positive focal
-    lengths give an empty image, because they cannot be checked without waiting; give viewmats and Ks on the GPU too.
-    Raises ValueError for arguments that do not fit, NotImplementedError for a device without a body, RuntimeError if
-    Warp cannot use the GPU.
+    backend: 'cpu' (float32, compiled), 'cuda' (float32, compiled, NVIDIA; CPU tensors run the same kernels on fibers:
+    very slow, for tests), 'reference' (torch, the inputs' float type and device, slow). 'auto' selects by the device of
+    `means`, to which all inputs are moved. A call on a GPU does not synchronise with the host if viewmats and Ks are
+    also on the GPU, and it can be captured as a CUDA graph with its backward pass (see `cuda.py`). Cameras on the GPU
+    are therefore not checked; non-finite values or non-positive focal lengths give an empty image.
+
+    Raises ValueError for invalid arguments, NotImplementedError for a device without a body, RuntimeError if Warp
+    cannot use the GPU.
 
     Source: Kerbl et al. 2023, "3D Gaussian Splatting"; Zwicker et al. 2001, "EWA Volume Splatting"; opacity
     compensation: Yu et al. 2024, "Mip-Splatting"; |gradient|: Ye et al. 2024, "AbsGS".

@@ -1,36 +1,37 @@
-"""The rules that every rasteriser body obeys, stated once.
+"""Constants and rules of culling, blending and projection that every rasteriser body follows.
 
-Culling (per Gaussian and camera); every test is phrased so that NaN fails it:
+Culling (per Gaussian and camera). A Gaussian is kept if all tests hold; each test is phrased so that NaN fails it:
   finite parameters; ``log_scales <= LOG_SCALE_MAX``; largest quaternion component > ``QUAT_MIN``; camera depth > near;
-  trace of the projected covariance < ``VARIANCE_MAX``; effective opacity > ``ALPHA_MIN``; the box of the ellipse
-  ``alpha >= ALPHA_MIN`` holds the centre of at least one pixel of the image's rectangle.
+  trace of the projected covariance < ``VARIANCE_MAX``; effective opacity > ``ALPHA_MIN``; the bounding box of the
+  ellipse ``alpha >= ALPHA_MIN`` meets the rectangle of the image's pixel centres.
 Blending (per pixel, front to back by camera depth, ties by index):
   skip where alpha < ``ALPHA_MIN``; clamp alpha to ``ALPHA_MAX`` (no gradient through the clamp); stop once the
   transmittance *before* a Gaussian is <= ``T_STOP``.
-Projection: EWA with ``LOW_PASS`` px^2 added to the diagonal; x/z and y/z clamped for the Jacobian to the frustum
-widened by ``FRUSTUM_MARGIN`` half-widths, measured from the principal point, with zero gradient outside.
+Projection: EWA with ``LOW_PASS`` px^2 added to the diagonal. For the Jacobian, x/z and y/z are clamped to the frustum
+widened by ``FRUSTUM_MARGIN`` half-widths on each side, with zero gradient outside. The frustum's limits are relative to
+the principal point.
 """
 
 import math
 
 ALPHA_MIN = 1.0 / 255.0
-"""A Gaussian whose alpha at a pixel is below this does not touch the pixel."""
+"""A Gaussian is skipped at a pixel where its alpha is below this."""
 ALPHA_MAX = 0.99
-"""Alpha is clamped here, so that 1 - alpha never vanishes."""
+"""Upper clamp of alpha, so that 1 - alpha stays positive."""
 T_STOP = 1e-4
 """(1 - ALPHA_MAX)^2: a pixel is finished once its transmittance is at or below this."""
 LOW_PASS = 0.3
 """Variance in px^2 added to both diagonal entries of every projected covariance."""
 FRUSTUM_MARGIN = 0.3
-"""Widening of the frustum for the Jacobian's clamp, as a share of tan(fov / 2): 1.3 in all when centred."""
+"""Widening of the frustum for the Jacobian's clamp; the limit of a centred frustum is 1.3 tan(fov / 2)."""
 QUAT_MIN = 1e-6
-"""Quaternions whose largest component is not above this in magnitude are culled."""
+"""Gaussians whose largest quaternion component has at most this magnitude are culled."""
 LOG_SCALE_MIN = -30.0
-"""Log-scales are clamped here from below; exp(-30) is no extent at all."""
+"""Lower clamp of log-scales; exp(-30) is a negligible extent."""
 LOG_SCALE_MAX = 30.0
 """Gaussians with a log-scale above this are culled."""
 VARIANCE_MAX = 1e12
-"""px^2: Gaussians whose projected variances sum to this or more are culled (float32 could not invert them)."""
+"""Gaussians whose projected variances sum to this or more, in px^2, are culled: float32 cannot invert them."""
 COMPENSATION2_MIN = 0.005**2
 """Floor of the squared opacity compensation of the antialiased mode; zero gradient below it."""
 DEPTH_EMPTY = 1e10
@@ -38,8 +39,8 @@ DEPTH_EMPTY = 1e10
 TILE = 16
 """Edge of a tile in pixels."""
 SIDE_MAX = 2**18
-"""Largest width and height of an image: float32 places nothing to less than 1/64 px beyond, and a column of tiles must
-fit 15 bits."""
+"""Largest width and height of an image. Beyond it float32 positions are coarser than 1/64 px, and the number of tiles
+in a column would exceed 15 bits."""
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 

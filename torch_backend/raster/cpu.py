@@ -1,6 +1,6 @@
-"""CPU body of the rasteriser: C++ snippets compiled by Warp, Python threads over chunks and tiles, own backward.
+"""CPU body of the rasteriser: C++ snippets compiled by Warp, run by Python threads over chunks and tiles.
 
-`native.py` says how snippets are compiled and run; `warm_up` compiles those of an image from the main thread.
+The backward pass is explicit. `native.py` compiles and runs the snippets; `warm_up` compiles them in advance.
 """
 
 import ctypes
@@ -18,7 +18,7 @@ from .reference import expected_depth
 from .settings import RasterOutput, Scene, camera_limits
 
 _HITS_MAX = 2**27
-"""So many hits take 1 GB, and 8 GB more for their gradients: beyond that a scene is broken rather than large."""
+"""Limit of hits: they take 1 GB, and 8 GB more for their gradients. A scene with more is broken rather than large."""
 _lock = threading.RLock()
 _kernels: dict[int, Launch] = {}
 _idle: list["_Workspace"] = []
@@ -26,7 +26,10 @@ _IDLE_MAX = 4
 
 
 def _compile(channels: int) -> Launch:
-    """Kernel of the stages that know no channels (channels = 0), or of blending. Called as f(block, stage, worker)."""
+    """Kernel of the stages independent of the channels (channels = 0), or of blending for `channels` channels.
+
+    It is called as f(block, stage, worker).
+    """
     with _lock:
         if channels not in _kernels:
             _kernels[channels] = (
@@ -38,7 +41,7 @@ def _compile(channels: int) -> Launch:
 
 
 def warm_up(channels: int = 3) -> None:
-    """Compile, or load from the cache, what images of `channels` channels (one more with depth) need.
+    """Compile, or load from the cache, the kernels for images of `channels` channels (one more with depth).
 
     Call it from the main thread before the first `rasterize` of a worker thread.
     """
@@ -47,14 +50,14 @@ def warm_up(channels: int = 3) -> None:
 
 
 class _Workspace:
-    """Scratch of one camera between its forward and backward pass; kept and reused, because fresh pages are slow."""
+    """Scratch memory of one camera, held from forward to backward pass. Reused, because fresh pages are slow."""
 
     def __init__(self):
         self.buffers: dict[str, Tensor] = {}
         self.block = source.Block()
 
     def need(self, name: str, count: int) -> None:
-        """Point the block's field `name` at room for `count` 4-byte values, 64-byte aligned; contents are undefined."""
+        """Set the block's field `name` to a buffer of `count` 4-byte values, 64-byte aligned, contents undefined."""
         buffer = self.buffers.get(name)
         if buffer is None or buffer.numel() < count:
             buffer = self.buffers[name] = torch.empty(max(64, count + count // 4), dtype=torch.int32)
@@ -62,7 +65,7 @@ class _Workspace:
 
 
 class _Lease:
-    """Holds a workspace and hands it back for reuse when nothing needs it any more."""
+    """Holds a workspace, and returns it to the pool when the lease is garbage-collected."""
 
     def __init__(self):
         with _lock:
@@ -80,7 +83,7 @@ def _point(block: source.Block, **tensors: Tensor | None) -> None:
 
 
 def _rest(sh: Tensor | None, rest: Tensor | None) -> int:
-    """Address of the harmonics above degree 0 of the first Gaussian: in a tensor of their own, or after its first."""
+    """Address of the first Gaussian's harmonics above degree 0: in `rest` if given, else behind degree 0 in `sh`."""
     if rest is not None:
         return rest.data_ptr()
     return 0 if sh is None else sh.data_ptr() + 3 * sh.element_size()
@@ -136,7 +139,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
 
 
 def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) -> None:
-    """Project, bin and blend one camera; the block's inputs and outputs are in place."""
+    """Project, bin and blend one camera. The block's pointers to inputs and outputs must be set."""
     block, threads = workspace.block, scene.settings.threads
     stages, blend = _compile(0), _compile(image_channels)
     address = ctypes.addressof(block)
@@ -161,10 +164,10 @@ def _forward_camera(workspace: _Workspace, scene: Scene, image_channels: int) ->
 
 
 class _Images(NamedTuple):
-    """What a call leaves: images of C cameras, figures of N Gaussians, as `RasterOutput` has them."""
+    """Outputs of a call: images of C cameras and figures of N Gaussians, with shapes as in `RasterOutput`."""
 
     image: Tensor
-    """[C, H, W, D]: channels of the scene, then with depth the sum of alpha T depth."""
+    """[C, H, W, D]: channels of the scene, then, with depth, the sum of alpha T depth."""
     alpha: Tensor
     median: Tensor
     """Empty without depth."""
@@ -177,7 +180,7 @@ class _Images(NamedTuple):
 
 
 class _Saved(NamedTuple):
-    """What the backward pass needs of the forward one: the differentiable inputs and the images."""
+    """Tensors saved for the backward pass: the differentiable inputs and the images."""
 
     means: Tensor
     quats: Tensor
@@ -191,7 +194,7 @@ class _Saved(NamedTuple):
     image: Tensor
     alpha: Tensor
     behind: Tensor
-    """[D] the background of every channel, 0 for depth."""
+    """[D]: background of every channel, 0 for depth."""
 
 
 class _Context(AutogradContext, Protocol):
@@ -203,7 +206,7 @@ class _Context(AutogradContext, Protocol):
 
 
 class _Rasterize(torch.autograd.Function):
-    """Autograd's view of the CPU body. Tensors are float32, contiguous, on the CPU."""
+    """Autograd function of the CPU body. Tensors are float32, contiguous, on the CPU."""
 
     @staticmethod
     def forward(
@@ -280,7 +283,8 @@ class _Rasterize(torch.autograd.Function):
             "grad_sh": sh,
             "grad_sh_rest": sh_rest,
         }
-        # The first camera's threads clear them: zeroing a million Gaussians' harmonics here takes a tenth of a step.
+        # The first camera's threads zero these tensors in parallel. Zeroing the harmonics of a million Gaussians on
+        # this thread would take a tenth of a step.
         empty = torch.empty_like if ctx.leases else torch.zeros_like
         out = {name: None if p is None else empty(p) for name, p in parameters.items()}
         grad_view = torch.zeros_like(viewmats)
@@ -324,7 +328,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def rasterize(scene: Scene) -> RasterOutput:
-    """All cameras of `scene` (float32, contiguous, CPU)."""
+    """Rasterise all cameras of `scene` (float32, contiguous, CPU)."""
     channels = scene.channels + int(scene.with_depth)
     if channels > source.MAX_CHANNELS:
         raise ValueError(f"{channels} channels, depth included; one call carries at most {source.MAX_CHANNELS}")

@@ -1,18 +1,18 @@
-"""C++ of the CPU body (`kernels/cpu/*.cpp`), put together as text for `warp.func_native`.
+"""C++ source of the CPU body (`kernels/cpu/*.cpp`), assembled as text for `warp.func_native`.
 
-Everything works on vectors of 16 floats (`F`), which Clang lowers to AVX-512, AVX2 or NEON. There is no libc here.
-One parameter block `P` (fields below, mirrored by a ctypes structure) carries pointers and sizes, so that a launch
-costs one pointer. Stages are functions of (block, worker); work is dealt out in fixed chunks or tiles, and every sum
-has a fixed order, so results do not depend on the number of workers.
+The code works on vectors of 16 floats (`F`), which Clang lowers to AVX-512, AVX2 or NEON. It cannot call libc. One
+parameter block `P` (fields below, mirrored by a ctypes structure) carries pointers and sizes, so that a launch passes
+one pointer. Stages are functions of (block, worker). Work is split into fixed chunks or tiles, and every sum has a
+fixed order, so results do not depend on the number of workers.
 
-Names: a *slot* is the place of a visible Gaussian (chunk * CHUNK + running number, in index order), a *rank* its place
-in depth order, a *hit* one (Gaussian, tile) pair. Hits are listed tile by tile, front to back; their per-hit results
-are stored slot by slot, so that the sum over a Gaussian's tiles reads consecutive memory.
+Terms: a *slot* is the place of a visible Gaussian (chunk * CHUNK + running number, in index order), a *rank* its place
+in depth order, a *hit* one (Gaussian, tile) pair. Hits are listed tile by tile, front to back. Their results are stored
+slot by slot, so that the sum over a Gaussian's tiles reads consecutive memory.
 
 A record holds, per slot: mean x, y; A = -log2(e) yy / (2 det); k = xy / yy; R = -log2(e) / (2 yy); log2 opacity; first
 and last y of the ellipse alpha >= 1/255; then the channels. The exponent of alpha in base 2 is
   log2 opacity + R dy^2 + A (dx - k dy)^2,
-the quadratic form of the conic by completed squares: no cancellation for long thin Gaussians.
+the quadratic form of the conic with completed squares, which avoids cancellation for long thin Gaussians.
 """
 
 import ctypes
@@ -25,12 +25,12 @@ from . import constants as k
 CHUNK = 1024
 """Gaussians per unit of work of the projection."""
 SPANS = 4 * CHUNK
-"""Tile spans that are remembered per chunk; those beyond are worked out again when needed."""
+"""Number of tile spans stored per chunk; further spans are recomputed when needed."""
 HEAD = 8
 """Floats of a record before its channels."""
 MOMENTS = 8
-"""Floats of a hit's gradient before its channels: sums of v, v e, v dy, v e^2, v e dy, v dy^2 with e = dx - k dy and
-v = d loss / d log alpha, then of |d loss / d mean x|, |d loss / d mean y|."""
+"""Floats of a hit's gradient before its channels: sums over pixels of v, v e, v dy, v e^2, v e dy, v dy^2, and of
+|d loss / d mean x|, |d loss / d mean y|. e = dx - k dy and v = d loss / d log alpha."""
 
 _F, _I, _P = ctypes.c_float, ctypes.c_int64, ctypes.c_uint64
 _FIELDS: list[tuple[str, type, str]] = [
@@ -144,14 +144,14 @@ def _block_text() -> str:
 
 
 _KERNELS = Path(__file__).with_name("kernels") / "cpu"
-"""Every stage is one of these files, or several: `blend.cpp` and `blend_backward.cpp` include the small ones."""
+"""Folder with one file per stage; `blend.cpp` and `blend_backward.cpp` include further small files."""
 
 PROJECT, SORT, COUNT, PREFIX, EMIT, WEIGHTS, PROJECT_BACKWARD = range(7)
 BLEND, BLEND_BACKWARD = range(2)
 
 
 def assemble(stages: list[str], extra: dict[str, object]) -> str:
-    """One snippet that switches over `stages`, with the constants of `constants.py` put in."""
+    """One snippet that switches over `stages`, with the values of `constants.py` and `extra` substituted."""
     values = {name: getattr(k, name) for name in dir(k) if name.isupper() or name.startswith("SH_")}
     values |= {"CHUNK": CHUNK, "SPANS": SPANS, "HEAD": HEAD, "MOMENTS": MOMENTS} | extra
     text = _block_text() + kernel_text(_KERNELS / "common.cpp")
@@ -175,10 +175,10 @@ def stages_source() -> str:
 
 
 def blend_source(channels: int) -> str:
-    """Blending, forward and backward, for images of `channels` channels (depth included)."""
+    """The stages of blending, forward and backward, for images of `channels` channels (depth included)."""
     names = ("blend", "blend_backward")
     return assemble([kernel_text(_KERNELS / f"{name}.cpp") for name in names], {"NCH": channels})
 
 
 MAX_CHANNELS = 64 - MOMENTS
-"""Channels, depth included, that one call can carry."""
+"""Largest number of channels per call, depth included."""

@@ -1,12 +1,12 @@
-"""CUDA body of the rasteriser: kernels compiled by Warp, own backward, no word to the host in between.
+"""CUDA body of the rasteriser: kernels compiled by Warp, an explicit backward pass, no synchronisation with the host.
 
-Needs no CUDA toolkit: Warp brings the compiler and caches what it made. With tensors on the CPU the very same kernels
-run on Warp's CPU fibers: slow, for tests on machines without a GPU. `hit_lists.py` says how long the list of hits is.
+It needs no CUDA toolkit: Warp brings the compiler and caches its output. CPU tensors run the same kernels on Warp's CPU
+fibers: slow, for tests on machines without a GPU. `hit_lists.py` determines the capacity of the list of hits.
 
-**CUDA graphs.** `rasterize` and its backward pass can be captured, for instance by `torch.cuda.graph`, after a call of
-the same shapes and its backward pass outside (they compile the kernels). The list then stays as large as it was at
-capture; look at `hits` now and then, and when its first number has outgrown the second, make a call outside, which
-learns of it, and capture again.
+**CUDA graphs.** `rasterize` and its backward pass can be captured, for instance by `torch.cuda.graph`. Before the
+capture, run a call of the same shapes and its backward pass, which compiles the kernels. A captured call keeps the
+capacity of its list. Check `hits` regularly: if its first number exceeds the second, enlarge the list by a call outside
+the graph, and capture again.
 """
 
 import threading
@@ -26,13 +26,13 @@ from .reference import expected_depth
 from .settings import RasterOutput, Scene
 
 MAX_CHANNELS = 64 - source.MOMENTS
-"""Channels, depth included, that one call can carry."""
+"""Largest number of channels per call, depth included."""
 _lock = threading.RLock()
 _kernels: dict[tuple[str, int], Any] = {}
 
 
 def _structure(wp: Any) -> Any:
-    """Warp type of the kernels' parameter structure; one for all modules."""
+    """Warp type of the kernels' parameter structure, shared by all modules."""
     if ("", 0) not in _kernels:
         types = {name: getattr(wp, kind) for name, kind in source.FIELDS.items()}
         _kernels["", 0] = wp.struct(type("RasterArgs", (), {"__annotations__": types, "__module__": __name__}))
@@ -44,8 +44,8 @@ def build(name: str, channels: int = 0) -> Any:
     with _lock:
         if (name, channels) in _kernels:
             return _kernels[name, channels]
-        # All kernels of a module at once: for one that came later Warp would compile the module again, and unload the
-        # code that CUDA graphs of the earlier ones still run.
+        # All kernels of a module are built at once. If one were added later, Warp would recompile the module and unload
+        # code that recorded CUDA graphs still run.
         texts = {name: source.blending(channels)[name]} if channels else source.stages()
         for each, text in texts.items():
             options = {"enable_backward": False, "grid_stride": False, "launch_bounds": source.BLOCK}
@@ -62,7 +62,7 @@ def module_name(name: str, channels: int = 0) -> str:
 
 
 def _refusal(device: torch.device) -> str | None:
-    """Why Warp cannot use `device`, and what to do; None if it can."""
+    """Message why Warp cannot use `device` and what to do; None if Warp can use it."""
     wp = initialised_warp()
     if device.type != "cuda" or (wp.is_cuda_available() and (device.index or 0) < wp.get_cuda_device_count()):
         return None
@@ -90,7 +90,7 @@ class _Launcher:
 
 
 class _Fibers:
-    """Switches Warp's CPU blocks on, for one caller at a time: shared memory is static there."""
+    """Context that enables Warp's CPU blocks. A lock admits one thread at a time, because shared memory is static."""
 
     def __init__(self, wp: Any):
         self.wp = wp
@@ -108,7 +108,8 @@ class _Fibers:
 def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
     """Parameter structure with the sizes and flags of a call.
 
-    The bare ctypes one: Warp's own around it takes ten times as long to set a field, and there are a hundred.
+    It is the bare ctypes structure, because setting one of its hundred fields through Warp's wrapper takes ten times as
+    long.
     """
     args = _structure(wp).ctype()
     args.n, args.cameras, args.width, args.height = (
@@ -122,10 +123,10 @@ def _arguments(wp: Any, scene: Scene, channels: int) -> Any:
     args.n_colors = 0 if scene.colors is None else scene.colors.shape[1]
     args.n_sh, args.bands = (0, 0) if scene.sh is None else (3, (scene.sh_degree + 1) ** 2)
     args.sh_stride = 0 if scene.sh is None else 3 * scene.sh.shape[1]
-    # 16-byte words: rows of 4 or 16 harmonics, unless a view begins between two words.
+    # Loads of 16-byte words need rows of 4 or 16 harmonics and an aligned first address.
     args.sh_aligned = int(scene.sh is not None and args.sh_stride % 12 == 0 and scene.sh.data_ptr() % 16 == 0)
     args.channels = channels
-    # Whole 32-byte sectors a record, whole warps' halves a gradient.
+    # A record fills whole 32-byte sectors, a gradient whole half-warps (16 floats).
     args.record_stride = -(-(source.HEAD + channels) // 8) * 8
     args.grad_stride = -(-(source.MOMENTS + channels) // 16) * 16
     args.antialiased, args.want_depth = int(scene.settings.antialiased), int(scene.with_depth)
@@ -142,7 +143,7 @@ def _point(args: Any, **tensors: Tensor | None) -> None:
 
 
 class _Maker:
-    """Makes tensors on one device."""
+    """Creates tensors on one device."""
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -155,22 +156,22 @@ class _Maker:
 
 
 class _Zeros(NamedTuple):
-    """What begins at zero in a call: parts of one tensor, since each operator of torch is a launch or two."""
+    """Tensors of a call that start at zero: parts of one tensor, because each torch operator costs launches."""
 
     tile_start: Tensor
     tile_end: Tensor
-    """Of `_Binned`."""
+    """For this field and `tile_start` see `_Binned`."""
     norms: tuple[Tensor, Tensor]
     """[C, N] each: where the backward pass writes `means2d_grad` and `means2d_absgrad`."""
     hits: Tensor
-    """[2] int64: hits of the call, and how many the list holds."""
+    """[2] int64: hits of the call, and capacity of the list."""
     weight_sum: Tensor | None
-    """[C, N] int64 parts; this one and the next for a call with contributions."""
+    """[C, N] int64, in units of 1 / WEIGHT_SCALE; None, like `weight_max`, without contributions."""
     weight_max: Tensor | None
 
     @classmethod
     def of(cls, scene: Scene) -> "_Zeros":
-        """For a call on this scene."""
+        """The zero tensors of a call on `scene`."""
         cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
         slots, tiles = cameras * n, cameras * -(-scene.width // TILE) * -(-scene.height // TILE)
         wanted = scene.with_contributions
@@ -196,15 +197,15 @@ class _Binned(NamedTuple):
     """The hits of a call, listed tile by tile, front to back. S slots, T tiles."""
 
     order: Tensor
-    """[S] int64: slots by depth."""
+    """[S] int64: slots in depth order."""
     ends: Tensor
-    """[S] int64: hits up to and with each rank."""
+    """[S] int64: number of hits up to and including each rank."""
     sorted_slot: Tensor
     """[capacity] int32: slot of each hit."""
     tile_start: Tensor
     """[T] int32: first hit of each tile."""
     tile_end: Tensor
-    """[T] int32"""
+    """[T] int32: end of each tile's hits, exclusive."""
 
 
 def _bin(launch: _Launcher, args: Any, demand: Demand, depth_key: Tensor, hit_count: Tensor, zeros: _Zeros) -> _Binned:
@@ -230,16 +231,16 @@ def _bin(launch: _Launcher, args: Any, demand: Demand, depth_key: Tensor, hit_co
 
 
 class _Images(NamedTuple):
-    """What a call leaves: images of C cameras, figures of N Gaussians, as `RasterOutput` has them."""
+    """Outputs of a call: images of C cameras and figures of N Gaussians, with shapes as in `RasterOutput`."""
 
     image: Tensor
-    """[C, H, W, D]: channels of the scene, then with depth the sum of alpha T depth."""
+    """[C, H, W, D]: channels of the scene, then, with depth, the sum of alpha T depth."""
     alpha: Tensor
     radii: Tensor
     means2d: Tensor
     hits: Tensor
     median: Tensor | None
-    """None, like those below, where nobody wants it."""
+    """None if not requested, like the fields below."""
     weight_sum: Tensor | None
     weight_max: Tensor | None
     top_id: Tensor | None
@@ -247,7 +248,7 @@ class _Images(NamedTuple):
 
 
 def _unfilled(make: _Maker, scene: Scene, zeros: _Zeros) -> _Images:
-    """Room for what a call leaves. `weight_sum` is of the kernels' integer parts still, `hits` are not counted."""
+    """Allocated outputs of a call. `weight_sum` receives the kernels' integers; `hits` is still zero."""
     cameras, n = scene.viewmats.shape[0], scene.means.shape[0]
     size = cameras, scene.height, scene.width
     return _Images(
@@ -265,7 +266,7 @@ def _unfilled(make: _Maker, scene: Scene, zeros: _Zeros) -> _Images:
 
 
 class _Saved(NamedTuple):
-    """What the backward pass needs of the forward one: the differentiable inputs, the images, the records."""
+    """Tensors saved for the backward pass: the differentiable inputs, the images and the records."""
 
     means: Tensor
     quats: Tensor
@@ -292,11 +293,11 @@ class _Context(AutogradContext, Protocol):
     norms: tuple[Tensor, Tensor]
     """[C, N] each: where the backward pass writes `means2d_grad` and `means2d_absgrad`."""
     capacity: int
-    """Hits that the call's list holds."""
+    """Capacity of the call's list of hits."""
 
 
 class _Rasterize(torch.autograd.Function):
-    """Autograd's view of the CUDA body. Tensors are float32, contiguous, on one device."""
+    """Autograd function of the CUDA body. Tensors are float32, contiguous, on one device."""
 
     @staticmethod
     def forward(
@@ -361,7 +362,7 @@ class _Rasterize(torch.autograd.Function):
         }
         out = {name: None if value is None else torch.empty_like(value) for name, value in inputs.items()}
         grad_view = torch.zeros_like(viewmats) if args.want_view else None
-        # Of what was saved all but the background is an input here, under the same name.
+        # The kernels take all saved tensors except the background under the same names.
         kept = {name: value for name, value in saved._asdict().items() if name != "background"}
         _point(
             args,
@@ -385,7 +386,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def warm_up(channels: int = 3, device: torch.device | str = "cuda") -> None:
-    """Compile, or load from the cache, what images of `channels` channels (one more with depth) need on `device`.
+    """Compile, or load from the cache, the kernels for images of `channels` channels (one more with depth) on `device`.
 
     Raises RuntimeError with what to do if Warp cannot use the GPU.
     """
@@ -401,9 +402,10 @@ def warm_up(channels: int = 3, device: torch.device | str = "cuda") -> None:
 
 
 def rasterize(scene: Scene) -> RasterOutput:
-    """All cameras of `scene` (float32, contiguous, on one device).
+    """Rasterise all cameras of `scene` (float32, contiguous, on one device).
 
-    Raises ValueError for too many channels, RuntimeError with what to do if Warp cannot use the GPU.
+    Raises ValueError for too many channels, cameras or Gaussians, RuntimeError with what to do if Warp cannot use the
+    GPU.
     """
     channels = scene.channels + int(scene.with_depth)
     if channels > MAX_CHANNELS:

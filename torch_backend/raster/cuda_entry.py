@@ -1,15 +1,15 @@
 # pyright: basic
-"""The Python side of a CUDA kernel: two functions whose source text Warp takes into the key of its compiled kernels.
+"""The Python side of a CUDA kernel: two functions whose source text is part of the key of Warp's kernel cache.
 
-Annotations would say nothing here (the types come from the parameter structure) and would have every kernel of every
-user compiled again; that is why this file is checked less strictly than its folder.
+The two functions have no annotations: their types come from the parameter structure, and changing their text would
+recompile every user's kernels. Pyright therefore checks this file less strictly than its folder.
 """
 
 from typing import Any
 
 
 def warp_kernel(wp: Any, name: str, text: str, module: Any, structure: Any, options: dict[str, Any]) -> Any:
-    """Warp kernel `name` of `module` with the body `text`; its argument is a `structure`, its task the thread."""
+    """Warp kernel `name` of `module` with the body `text`, whose arguments are a `structure` and the thread number."""
 
     def native(args, task): ...
 

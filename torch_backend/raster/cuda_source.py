@@ -1,16 +1,17 @@
 """C++ of the CUDA body (`kernels/cuda/*.cu`) for `warp.func_native`: NVRTC compiles it for GPUs, Clang for CPU fibers.
 
-The rules are those of `constants.py`, the formulas those of `kernels/cpu` (a record holds A, k, R: the conic by
-completed squares; gradients go by way of xc, yy and k). One thread works on one Gaussian, a block of BLOCK threads on
-one tile. In a tile, a warp owns four rows, two at a time: `SLOTS` pixels a thread, one in each pair of rows.
+It follows the rules of `constants.py` and the formulas of `kernels/cpu`: a record holds A, k, R (the conic with
+completed squares), and gradients are computed via xc, yy and k. One thread works on one Gaussian, a block of BLOCK
+threads on one tile. In a tile, a warp covers four rows, two at a time: each thread has `SLOTS` pixels, one in each pair
+of rows.
 
-Names: a *slot* is camera * N + Gaussian, a *rank* its place in depth order over all cameras, a *hit* one pair of a slot
-and a tile. A tile reads its hits from a list of fixed capacity. When the hits of a call outnumber the list, every tile
-instead walks through all ranks and tests which of them meet it: slower, but nothing is lost and the host is not asked.
+Terms: a *slot* is camera * N + Gaussian, a *rank* its place in depth order over all cameras, a *hit* one pair of a slot
+and a tile. A tile reads its hits from a list of fixed capacity. If a call has more hits than the list holds, every tile
+instead walks through all ranks and tests which of them meet it. That is slower, but exact and without synchronisation.
 
-The same text runs on fibers with these substitutes: a shuffle goes through memory and a barrier, so every thread of
-the block has to take part in it and the shortcuts of a single warp (`UNIFORM`, `WARP_ANY`) are not taken; atomics are
-plain, since fibers share one thread.
+Fibers run the same text with these substitutes. A shuffle goes through memory and a barrier, so every thread of the
+block takes part and the shortcuts of a single warp (`UNIFORM`, `WARP_ANY`) are not taken. Atomics are plain operations,
+because fibers share one thread.
 """
 
 import re
@@ -26,9 +27,9 @@ HEAD = 8
 MOMENTS = 8
 """Floats of a slot's gradient before its channels, as in `cpu_source.MOMENTS`."""
 WEIGHT_SCALE = 2.0**36
-"""Weights are summed as integers of this many parts, so that the sum does not depend on the order."""
+"""Weights are summed as integers in units of 1 / WEIGHT_SCALE, so that the sum does not depend on the order."""
 WIDE_FROM = 2**15 - 1
-"""From this many tiles on, tile numbers take 32 bits to sort instead of 16."""
+"""From this many tiles on, tile numbers are sorted as 32-bit integers instead of 16-bit ones."""
 
 POINTERS = {
     "const float*": (
@@ -97,11 +98,11 @@ FIELDS = {
     **dict.fromkeys(SIZES, "int32"),
     **dict.fromkeys(("near", "overscan_x", "overscan_y"), "float32"),
 }
-"""Fields of the parameter structure and their Warp types; pointers travel as integers."""
+"""Fields of the parameter structure and their Warp types; pointers are passed as integers."""
 _POINTER = {name: kind for kind, names in POINTERS.items() for name in names}
 
 _KERNELS = Path(__file__).with_name("kernels") / "cuda"
-"""Every kernel is one of these files, after `common.cu`."""
+"""Folder with one file per kernel; each is compiled after `common.cu`."""
 
 _A, _C2, _C3 = k.SH_C1, k.SH_C2, k.SH_C3
 _HARMONICS = [
@@ -142,13 +143,14 @@ _HARMONICS = [
     ),
     (f"{_C3[6]}f * dx * (sxx - 3.f * syy)", f"{3 * _C3[6]}f * (sxx - syy)", f"{-6 * _C3[6]}f * dx * dy", ""),
 ]
-"""Harmonic and its derivatives by the unit direction dx, dy, dz, where they are not 0."""
+"""Each harmonic and its derivatives with respect to the unit direction dx, dy, dz; empty if a derivative is 0."""
 
 
 def _harmonics(before: str, per_band: str, after: str) -> str:
-    """`per_band` for every harmonic there is, with @Y@ and what its derivatives @dY@ add put in, a degree at a time.
+    """`per_band` for every harmonic, with @Y@ (its value) and @dY@ (terms of its derivatives) substituted.
 
-    Four at a time stand between `before` and `after`, whose @q@ is where their coefficients begin; @i@ counts in those.
+    Each group of four harmonics is enclosed by `before` and `after`. @q@ is the offset of the group's coefficients, @i@
+    the offset of a coefficient within the group.
     """
     text = ""
     for four in range(0, 16, 4):
@@ -193,7 +195,7 @@ def _field(match: re.Match[str]) -> str:
 
 
 def _assemble(stage: str, **extra: object) -> str:
-    """The snippet of file `stage`, with the constants of `constants.py`. Its arguments: args, task (thread number)."""
+    """The snippet of file `stage` with constants substituted. Its arguments are args and task, the thread number."""
     values = {name: getattr(k, name) for name in dir(k) if name.isupper() and not name.startswith("SH_")}
     values |= {"BLOCK": BLOCK, "HEAD": HEAD, "MOMENTS": MOMENTS, "WEIGHT_SCALE": WEIGHT_SCALE} | extra
     text = kernel_text(_KERNELS / "common.cu") + kernel_text(_KERNELS / stage)
@@ -204,7 +206,7 @@ def _assemble(stage: str, **extra: object) -> str:
 
 
 def stages() -> dict[str, str]:
-    """Snippets of the stages that know no channels, by kernel name."""
+    """Snippets of the stages that do not depend on the number of channels, by kernel name."""
     return {f"raster_{name}": _assemble(f"{name}.cu") for name in ("project", "emit", "ranges", "project_backward")}
 
 

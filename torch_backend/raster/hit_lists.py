@@ -1,12 +1,11 @@
-"""How long the lists of hits are, so that no call of the CUDA rasteriser reads anything back.
+"""Capacity of the lists of hits, chosen so that calls of the CUDA rasteriser do not wait for the GPU.
 
-A list has a fixed capacity per call, so that nothing is read back. The first call of a device, camera
-count and image size waits for the number of its hits: no guess would do, from 4 tiles a Gaussian to 40. From then on
-the device keeps the most hits that such a call ever wanted, and sends the figure to the host without anyone waiting for
-it; more Gaussians than before are given as many each. A call with more hits than its list holds is slower, never wrong:
-its tiles then search all Gaussians in depth order (see `cuda_source.py`), and a later call has a larger list. A list
-takes a quarter of the card's free memory at most. `RasterOutput.hits` says, on the device, how many hits a call had and
-how many its list held.
+The first call of a device, camera count and image size waits for its number of hits, because a guess is not possible: a
+Gaussian has from 4 to 40 tiles. Afterwards the device keeps the largest number of hits of such calls and copies it to
+the host asynchronously. If a call has more Gaussians than before, the number is scaled up. A call with more hits than
+its list holds is slower but correct: its tiles search all Gaussians in depth order (see `cuda_source.py`), and a later
+call has a larger list. A list takes at most a quarter of the card's free memory. `RasterOutput.hits` holds, on the
+device, the number of hits of a call and the capacity of its list.
 """
 
 import threading
@@ -19,18 +18,18 @@ from .settings import Scene
 HITS_MAX = 2**27
 HITS_STEP = 2**12
 _FULL = 0.9
-"""Share of a list from which on it is made larger."""
+"""Filled share of a list above which its capacity is raised."""
 HIT_BYTES = 40
-"""Bytes of one hit: its tile and slot, both sorted, the order that sorts them, and the sort's own scratch."""
+"""Bytes of one hit: its tile and slot, before and after sorting, the permutation, and scratch memory of the sort."""
 _lock = threading.RLock()
 _demands: dict[tuple[torch.device, int, int, int], "Demand"] = {}
 
 
 class Demand:
-    """How many hits calls of one shape want: a running maximum on the device, and its echo on the host."""
+    """Number of hits of calls of one shape: a running maximum on the device, and its copy on the host."""
 
     def __init__(self, device: torch.device):
-        # Made for all later calls, so not a tensor of the inference mode that the first one may be in.
+        # Later calls reuse these tensors, so they must not be inference tensors even if the first call is in that mode.
         with torch.inference_mode(False):
             self.most = torch.zeros(1, dtype=torch.int64, device=device)
             self.echo = torch.zeros(1, dtype=torch.int64, pin_memory=device.type == "cuda")
@@ -38,8 +37,10 @@ class Demand:
         self.capacity = self.slots = 0
 
     def grow(self, hit_count: Tensor) -> None:
-        """Room for a third more than was wanted so far; before that is known, than the hits of this call, which are
-        waited for. hit_count: int32 [slots] on the device."""
+        """Raise the capacity to a third more than the largest number of hits so far.
+
+        The first call waits for its hits, int32 `hit_count` [slots] on the device, and uses their number instead.
+        """
         slots = hit_count.shape[0]
         demand = int(self.host[0]) if self.capacity else int(hit_count.sum(dtype=torch.int64))
         if self.slots and slots > self.slots:
@@ -51,13 +52,13 @@ class Demand:
             self.capacity = min(-(-wanted // HITS_STEP) * HITS_STEP, most)
 
     def report(self) -> None:
-        """Sends the maximum to the host after the work queued so far; until it arrives, the previous value is read."""
+        """Copy the maximum to the host, behind the work queued so far. Until then the host reads the previous value."""
         if not _capturing(self.most.device):
             self.echo.copy_(self.most, non_blocking=True)
 
 
 def _hits_at_most(device: torch.device) -> int:
-    """Hits whose list fits a quarter of what is free on the device."""
+    """Number of hits whose list takes a quarter of the device's free memory."""
     if device.type != "cuda":
         return HITS_MAX
     free, _ = torch.cuda.mem_get_info(device)
@@ -66,27 +67,26 @@ def _hits_at_most(device: torch.device) -> int:
 
 
 def forget_demands() -> None:
-    """Drops the lists' sizes: each is requested anew, by the memory that is free then."""
+    """Drop all capacities, so that the next calls choose them anew by the memory that is free then."""
     with _lock:
         _demands.clear()
 
 
 def outgrown(device: torch.device, cameras: int, width: int, height: int) -> int:
-    """Hits that calls of this device and size came to want, as far as the host knows, if that is more than they have
-    room for with a margin; else 0."""
+    """Largest known number of hits of calls of this device and size if the list's capacity must grow for it; else 0."""
     demand = _demands.get((device, cameras, width, height))
     wanted = 0 if demand is None else int(demand.host[0])
     return wanted if demand is not None and wanted > _FULL * demand.capacity else 0
 
 
 def listed(device: torch.device, cameras: int, width: int, height: int) -> int:
-    """Hits that calls of this device and size have room for now."""
+    """Current capacity of the list for calls of this device and size; 0 before the first call."""
     demand = _demands.get((device, cameras, width, height))
     return 0 if demand is None else demand.capacity
 
 
 def report_demands(device: torch.device) -> None:
-    """Has the host told what calls came to want: those that a CUDA graph carries out do not tell it themselves."""
+    """Copy the device's maxima to the host, which calls replayed by a CUDA graph do not do."""
     with _lock:
         for (of, *_), demand in _demands.items():
             if of == device:
@@ -98,7 +98,7 @@ def _capturing(device: torch.device) -> bool:
 
 
 def demand_of(scene: Scene, hit_count: Tensor) -> Demand:
-    """The demand of calls like this one, of hit_count int32 [slots], brought up to date."""
+    """The demand for calls of this scene's shape, updated with `hit_count`, int32 [slots]."""
     device, cameras = scene.means.device, scene.viewmats.shape[0]
     with _lock:
         key = (device, cameras, scene.width, scene.height)

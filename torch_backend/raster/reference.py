@@ -1,6 +1,6 @@
-"""Rasteriser oracle: plain torch, any float type and device, gradients by autograd.
+"""Reference body of the rasteriser: plain torch, any float type and device, gradients by autograd.
 
-Slow and clear. It states in tensor language what every other body must compute; `constants.py` holds the rules.
+It favours clarity over speed and defines what every other body must compute; `constants.py` holds the rules.
 Projection: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, section 4).
 """
 
@@ -25,11 +25,11 @@ from . import constants as k
 from .settings import RasterOutput, Scene, camera_limits
 
 _LANES = 2**20
-"""Most (pixel, Gaussian) pairs blended at once: a dozen arrays of this size are the memory that blending takes."""
+"""Largest number of (pixel, Gaussian) pairs blended at once. Blending takes a dozen arrays of this size."""
 
 
 class _FloorAtZero(torch.autograd.Function):
-    """max(x, 0) that lets a gradient through below 0 when descending it would raise x: black is no trap."""
+    """max(x, 0) whose gradient also passes at x <= 0 if a descent step would raise x, so that black can recover."""
 
     @staticmethod
     def forward(ctx: AutogradContext, x: Tensor) -> Tensor:
@@ -73,7 +73,7 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations [N, 3, 3] of quaternions [N, 4] wxyz of any non-zero norm."""
-    quats = quats / quats.detach().abs().amax(-1, keepdim=True)  # the norm's squares neither vanish nor overflow
+    quats = quats / quats.detach().abs().amax(-1, keepdim=True)  # avoids underflow and overflow of the norm's squares
     w, x, y, z = (quats / norm(quats, -1, keepdim=True)).unbind(-1)
     return torch.stack(
         (
@@ -108,7 +108,7 @@ class _Projected:
 
 
 def _finite_inputs(scene: Scene) -> Tensor:
-    """Mask [N] of Gaussians whose parameters all obey the rules that need no camera."""
+    """Mask [N] of Gaussians that pass the culling tests that do not need a camera."""
     ok = scene.means.isfinite().all(-1) & (scene.quats.abs().amax(-1) > k.QUAT_MIN)
     ok &= scene.quats.isfinite().all(-1) & (scene.log_scales <= k.LOG_SCALE_MAX).all(-1)
     ok &= ~scene.opacity_logits.isnan()
@@ -120,7 +120,7 @@ def _finite_inputs(scene: Scene) -> Tensor:
 
 
 def _colors(scene: Scene, index: Tensor, means: Tensor, viewmat: Tensor) -> Tensor:
-    """Channels [V, D] of the Gaussians `index` as this camera sees them."""
+    """Channels [V, D] of the Gaussians `index`, seen from this camera."""
     parts: list[Tensor] = []
     if scene.sh is not None:
         position = -viewmat[:3, :3].T @ viewmat[:3, 3]
@@ -147,7 +147,7 @@ class _Footprint:
 
 
 def _footprint(scene: Scene, camera: int, index: Tensor) -> _Footprint:
-    """Project the Gaussians `index`, all of them at positive depth."""
+    """Project the Gaussians `index`, which must have positive depth."""
     viewmat, K = scene.viewmats[camera], scene.Ks[camera].to(scene.means)
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -161,7 +161,7 @@ def _footprint(scene: Scene, camera: int, index: Tensor) -> _Footprint:
     B = J @ R @ (rotation_matrices(scene.quats[index]) * scales[:, None, :])
     raw = B @ B.transpose(-1, -2)
     xx, xy, yy = raw[:, 0, 0] + k.LOW_PASS, raw[:, 0, 1], raw[:, 1, 1] + k.LOW_PASS
-    # |b0 x b1|^2 is det(B B^T) without the cancellation of xx yy - xy^2.
+    # |b0 x b1|^2 equals det(B B^T), and avoids the cancellation in xx yy - xy^2.
     det_raw = cross(B[:, 0], B[:, 1]).square().sum(-1)
     det = det_raw + k.LOW_PASS * (raw[:, 0, 0] + raw[:, 1, 1]) + k.LOW_PASS**2
     opacity = torch.sigmoid(scene.opacity_logits[index])
@@ -187,7 +187,7 @@ def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
         radius = (wide * level.clamp_min(0)).sqrt().ceil()
         order = keep.nonzero()[:, 0]
         order = order[torch.sort(f.depth[order], stable=True).indices]
-    # Once more, those that stay alone: what overflowed and was culled would turn its zero gradient into NaN.
+    # Project only the kept Gaussians again: culled ones that overflowed would turn their zero gradient into NaN.
     index = candidates[order]
     f = _footprint(scene, camera, index)
     conic = torch.stack((f.yy, -f.xy, f.xx), -1) / f.det[:, None]
@@ -206,14 +206,14 @@ def _project(scene: Scene, camera: int, candidates: Tensor) -> _Projected:
 
 @torch.no_grad()
 def _hits(p: _Projected, across: int, down: int) -> tuple[Tensor, Tensor]:
-    """Which Gaussian may touch which of `across` x `down` tiles: (members [hits], counts [tiles]).
+    """Hits of the Gaussians on `across` x `down` tiles: (members [hits], counts [tiles]).
 
-    `members` are positions in `p`, tile after tile in raster order, front to back within each. A pair is dropped where
-    the ellipse alpha >= ALPHA_MIN misses the rectangle of the tile's pixel centres.
+    `members` are positions in `p`, tile after tile in raster order, front to back within each tile. A pair is left out
+    if the ellipse alpha >= ALPHA_MIN misses the rectangle of the tile's pixel centres.
     """
     last = torch.tensor((across - 1, down - 1), device=p.mean2d.device)
 
-    def tile(at: Tensor) -> Tensor:  # clamped as a float: a box may reach further than an int64
+    def tile(at: Tensor) -> Tensor:  # clamped as float, because a box may exceed the range of int64
         return (at.clamp(0, k.TILE * max(across, down)) / k.TILE).long().minimum(last)
 
     low, high = tile(p.mean2d - p.extent - 0.5), tile(p.mean2d + p.extent - 0.5)
@@ -228,44 +228,47 @@ def _hits(p: _Projected, across: int, down: int) -> tuple[Tensor, Tensor]:
 
 
 def _ellipse_meets_tile(p: _Projected, members: Tensor, tiles: Tensor) -> Tensor:
-    """Mask [hits]: does the ellipse of the Gaussian reach a pixel centre's rectangle of tiles [hits, 2] (x, y)?"""
+    """Mask [hits]: True if the Gaussian's ellipse reaches the rectangle of pixel centres of its tile.
+
+    `tiles` [hits, 2] are tile numbers (x, y).
+    """
     low = tiles * k.TILE + 0.5 - p.mean2d[members]
     high = low + (k.TILE - 1)
     a, b, c = p.conic[members].unbind(-1)
     inside = ((low <= 0) & (high >= 0)).all(-1)
     nearest = torch.full_like(a, torch.inf)
-    for x in (low[:, 0], high[:, 0]):  # on each edge the quadratic's minimum lies where its slope is 0, or at an end
+    for x in (low[:, 0], high[:, 0]):  # the minimum on an edge is where the slope is 0, or at an end of the edge
         y = torch.minimum(torch.maximum(-b * x / c, low[:, 1]), high[:, 1])
         nearest = torch.minimum(nearest, a * x * x + 2 * b * x * y + c * y * y)
     for y in (low[:, 1], high[:, 1]):
         x = torch.minimum(torch.maximum(-b * y / a, low[:, 0]), high[:, 0])
         nearest = torch.minimum(nearest, a * x * x + 2 * b * x * y + c * y * y)
-    # A little generous, since the pixels' own test decides.
+    # The margin is harmless, because each pixel is tested again during blending.
     return inside | ~(nearest > 2 * torch.log(p.opacity[members] / k.ALPHA_MIN) + 0.01)
 
 
 @dataclass
 class _Batch:
-    """Tiles of similar numbers of hits, padded to the most: B tiles, P pixels each, M hits."""
+    """Tiles with similar numbers of hits, padded to the largest: B tiles, P pixels each, M hits."""
 
     members: Tensor
-    """[B, M]: positions in _Projected, front to back; any where not `valid`."""
+    """[B, M]: positions in _Projected, front to back; arbitrary where not `valid`."""
     valid: Tensor
-    """[B, M]"""
+    """[B, M]: False for padding."""
     xs: Tensor
     """[B, TILE]: pixel centres of the columns; P = TILE * TILE in raster order."""
     ys: Tensor
-    """[B, TILE]: of the rows."""
+    """[B, TILE]: pixel centres of the rows."""
 
 
 def _blend(p: _Projected, batch: _Batch, left: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Blend the batch behind transmittance `left` [B, P].
 
-    Returns weights alpha T [B, P, M]; the transmittance after each [B, P, M] (no gradient; meaningless once at
-    T_STOP); the weights' sums of colour and depth [B, P, D + 1]; the transmittance after all [B, P].
+    Returns weights alpha T [B, P, M]; the transmittance after each hit [B, P, M] (no gradient; meaningless once it is
+    at T_STOP); the weighted sums of colour and depth [B, P, D + 1]; the transmittance after all hits [B, P].
     """
     members = batch.members
-    # Of the axes [tile, row, column, hit], dx lacks the rows and dy the columns: most of the exponent is cheap.
+    # Axes are [tile, row, column, hit]. dx has no row axis and dy no column axis, so most of the exponent is cheap.
     x, y = p.mean2d[members][:, None, None].unbind(-1)
     a, b, c = p.conic[members][:, None, None].unbind(-1)
     dx, dy = batch.xs[:, None, :, None] - x, batch.ys[:, :, None, None] - y
@@ -291,22 +294,22 @@ def _blend(p: _Projected, batch: _Batch, left: Tensor) -> tuple[Tensor, Tensor, 
 
 @dataclass
 class _Pixels:
-    """What blending leaves at P pixels of B tiles; no gradient in the last three."""
+    """Result of blending at P pixels of B tiles; no gradient in the last three fields."""
 
     sums: Tensor
     """[B, P, D + 1]: sum of alpha T times colour, and times depth."""
     left: Tensor
-    """[B, P]: transmittance."""
+    """[B, P]: remaining transmittance."""
     top: Tensor
-    """[B, P] int64: position in _Projected of the largest alpha T, -1 for none."""
+    """[B, P] int64: position in _Projected of the Gaussian with the largest alpha T, -1 for none."""
     top_weight: Tensor
-    """[B, P]: its alpha T."""
+    """[B, P]: the largest alpha T."""
     median: Tensor
-    """[B, P]: median depth, as RasterOutput has it."""
+    """[B, P]: median depth as in RasterOutput."""
 
 
 class _Camera:
-    """Blends one camera's tiles, batch by batch. To bound memory, the backward pass blends each batch once more."""
+    """Blends one camera's tiles, batch by batch. To bound memory, the backward pass recomputes each batch."""
 
     def __init__(self, scene: Scene, p: _Projected):
         self.scene, self.p = scene, p
@@ -318,7 +321,7 @@ class _Camera:
         self.starts = self.counts.cumsum(0) - self.counts
 
     def _batches(self) -> Iterator[Tensor]:
-        """All tiles, those with most hits first, as many at a time as _LANES allows."""
+        """Batches of all tiles, those with most hits first; `_LANES` limits the size of a batch."""
         order = self.counts.argsort(descending=True)
         counts, first = integers(self.counts[order]), 0
         while first < len(counts):
@@ -331,14 +334,14 @@ class _Camera:
         centres = torch.arange(k.TILE, dtype=self.dtype, device=self.device) + 0.5
         xs, ys = (at[:, None] * k.TILE + centres for at in (tiles % self.across, tiles // self.across))
         inside = ((ys < self.scene.height)[:, :, None] & (xs < self.scene.width)[:, None, :]).flatten(1)
-        # What overhangs the image is finished from the start.
+        # Pixels outside the image start as finished.
         left = torch.where(inside, 1.0, k.T_STOP).to(dtype=self.dtype, device=self.device)
         sums = left.new_zeros(*left.shape, self.p.colors.shape[1] + 1)
         top, top_weight = torch.full_like(left, -1, dtype=torch.int64), torch.zeros_like(left)
         return xs, ys, _Pixels(sums, left, top, top_weight, torch.full_like(left, k.DEPTH_EMPTY))
 
     def _tiles(self, tiles: Tensor) -> _Pixels:
-        """Blend `tiles` [B], in steps over their hits if even one tile has too many."""
+        """Blend `tiles` [B], in steps over their hits if a single tile exceeds `_LANES`."""
         xs, ys, out = self._empty(tiles)
         starts, counts = self.starts[tiles, None], self.counts[tiles, None]
         crossed = torch.zeros_like(out.left, dtype=torch.bool)
@@ -362,8 +365,8 @@ class _Camera:
         self.weight_max.scatter_reduce_(0, members, weights.amax(1).flatten(), "amax")
 
     def _pick(self, batch: _Batch, weights: Tensor, after: Tensor, out: _Pixels, crossed: Tensor) -> Tensor:
-        """Update top and median; returns where [B, P] the transmittance has reached 0.5, at which the median stays."""
-        weight, at = weights.max(-1)  # the first of equals
+        """Update top and median. Returns a mask [B, P] of pixels with transmittance <= 0.5, whose median is final."""
+        weight, at = weights.max(-1)  # returns the first of equal maxima
         larger = weight > out.top_weight
         out.top = torch.where(larger, batch.members.gather(1, at), out.top)
         out.top_weight = torch.where(larger, weight, out.top_weight)
@@ -389,7 +392,7 @@ class _Camera:
 
 
 def _watch_gradients(p: _Projected, gradient: Tensor, absgradient: Tensor) -> None:
-    """Have the backward pass write the densification figures of one camera into `gradient` and `absgradient` [N]."""
+    """Make the backward pass write one camera's densification figures into `gradient` and `absgradient` [N]."""
     if not p.mean2d.requires_grad:
         return
 
@@ -403,13 +406,13 @@ def _watch_gradients(p: _Projected, gradient: Tensor, absgradient: Tensor) -> No
 
 
 def expected_depth(depth_sum: Tensor, alphas: Tensor) -> Tensor:
-    """depth_sum / alphas, DEPTH_EMPTY where alpha is 0 (with zero gradient there)."""
+    """depth_sum / alphas; DEPTH_EMPTY with zero gradient where alpha is 0."""
     empty = ~(alphas > 0)
     return torch.where(empty, torch.full_like(depth_sum, k.DEPTH_EMPTY), depth_sum / alphas.masked_fill(empty, 1.0))
 
 
 def rasterize(scene: Scene) -> RasterOutput:
-    """All cameras of `scene`, one after the other."""
+    """Rasterise all cameras of `scene`, one after the other."""
     n, cameras = scene.means.shape[0], scene.viewmats.shape[0]
     zeros = scene.means.new_zeros
     gradient, absgradient, weight_sum, weight_max = zeros(4, cameras, n)
@@ -460,7 +463,7 @@ def rasterize(scene: Scene) -> RasterOutput:
 
 
 def anchor(colors: Tensor, scene: Scene) -> Tensor:
-    """Tie `colors` to every input, so that inputs that reach no pixel get zero gradients instead of none."""
+    """`colors` connected to every input, so that inputs without influence get zero gradients instead of None."""
     inputs = (
         scene.means,
         scene.quats,

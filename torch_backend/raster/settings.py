@@ -1,4 +1,4 @@
-"""What a caller says to the rasteriser and what comes back."""
+"""Settings, inputs and outputs of the rasteriser."""
 
 from dataclasses import dataclass, field
 
@@ -10,17 +10,18 @@ from ..native import default_threads
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """How to rasterise; everything that is not scene or camera."""
+    """Settings of the rasteriser apart from scene and camera."""
 
     near: float = 0.01
-    """Gaussians at or nearer than this camera depth are culled (units of a scene of unit camera extent)."""
+    """Gaussians at or nearer than this camera depth are culled, in world units; the default suits a scene whose cameras
+    have unit extent."""
     antialiased: bool = False
     """Scale opacities by sqrt(det / det_blurred), so that the low-pass does not thicken thin Gaussians."""
     absgrad: bool = True
-    """Also gather the sum over pixels of |d loss / d mean2d| in the backward pass (RasterOutput.means2d_absgrad)."""
+    """Also compute the sum over pixels of |d loss / d mean2d| in the backward pass (RasterOutput.means2d_absgrad)."""
     overscan: tuple[float, float] = (0.0, 0.0)
-    """Pixels left and right, and above and below, that the picture has around the camera's own frame. The Jacobian is
-    clamped by that frame's frustum, so overscan does not change the pixels within it."""
+    """Extra pixels around the camera's frame: on the left and on the right, above and below. The Jacobian is clamped to
+    the frame's frustum, so overscan does not change the pixels within the frame."""
     threads: int = field(default_factory=default_threads)
     """Worker threads of the CPU body. The result is bitwise the same for any number."""
 
@@ -37,12 +38,12 @@ class RasterOutput:
     depth_expected: Tensor | None
     """[C, H, W]: camera depth (planar) averaged with weights alpha T; 1e10 where alpha is 0. Differentiable."""
     depth_median: Tensor | None
-    """[C, H, W]: camera depth of the Gaussian at which the transmittance falls to 0.5 or below; of the largest
-    contributor where it never does; 1e10 where alpha is 0. No gradient."""
+    """[C, H, W]: camera depth of the Gaussian at which the transmittance falls to 0.5 or below. Where it stays above
+    0.5, depth of the Gaussian with the largest alpha T; 1e10 where alpha is 0. No gradient."""
     radii: Tensor
     """[C, N] int32: half the major axis, in px, of the ellipse alpha >= 1/255, rounded up; 0 = culled."""
     means2d: Tensor
-    """[C, N, 2]: projected means, px (pixel centres at +0.5); 0 where culled. No gradient flows through it."""
+    """[C, N, 2]: projected means, px (pixel centres at +0.5); 0 where culled. No gradient."""
     weight_sum: Tensor | None
     """[C, N]: sum over pixels of alpha T. No gradient."""
     weight_max: Tensor | None
@@ -50,21 +51,21 @@ class RasterOutput:
     means2d_grad: Tensor
     """[C, N]: |d loss / d mean2d| in 1/px. Zeros until a backward pass writes it in place; each pass overwrites."""
     means2d_absgrad: Tensor
-    """[C, N]: norm of (sum over pixels |d loss / d x|, sum |d loss / d y|), 1/px; as above. Zeros if settings.absgrad
-    is off."""
+    """[C, N]: norm of (sum over pixels |d loss / d x|, sum |d loss / d y|) in 1/px. Each backward pass overwrites it,
+    as it does `means2d_grad`. Zeros if settings.absgrad is off."""
     top_ids: Tensor | None = None
-    """[C, H, W] int32: index of the Gaussian with the largest alpha T at the pixel, the front one of equals; -1 where
-    alpha is 0."""
+    """[C, H, W] int32: index of the Gaussian with the largest alpha T at the pixel, the front one if several are equal;
+    -1 where alpha is 0."""
     top_weights: Tensor | None = None
-    """[C, H, W]: its alpha T; 0 where alpha is 0. No gradient."""
+    """[C, H, W]: the largest alpha T at the pixel; 0 where alpha is 0. No gradient."""
     hits: Tensor | None = None
-    """[2] int64, CUDA body only: (Gaussian, tile) pairs of the call, and how many its list holds. Where the first
-    exceeds the second, the call was slower, not wrong (`cuda.py`)."""
+    """[2] int64, CUDA body only: number of (Gaussian, tile) pairs of the call, and capacity of its list. If the first
+    exceeds the second, the call was slower but correct (`hit_lists.py`)."""
 
 
 @dataclass
 class Scene:
-    """Validated inputs of one call, as the bodies take them."""
+    """Validated inputs of one call, passed to the bodies."""
 
     means: Tensor
     quats: Tensor
@@ -84,7 +85,7 @@ class Scene:
     with_contributions: bool
     with_top: bool = False
     sh_rest: Tensor | None = None
-    """Harmonics above degree 0, [N, K - 1, 3], where `sh` is [N, 1, 3]: the CPU body reads them where they lie."""
+    """Harmonics above degree 0, [N, K - 1, 3], if `sh` is [N, 1, 3]. The CPU body reads both without copying."""
 
     @property
     def channels(self) -> int:
@@ -95,7 +96,8 @@ class Scene:
 def camera_limits(scene: Scene, camera: int, margin: float) -> tuple[float, float, float, float]:
     """Bounds of x/z and y/z for the Jacobian: (x_low, x_high, y_low, y_high) of a camera's widened frustum.
 
-    `margin` is a share of half the frame without overscan. Overscan beyond it widens the frustum to the picture's edge.
+    `margin` is a share of half the frame without overscan. Overscan larger than the margin widens the frustum to the
+    picture's edge.
     """
     K, (across, down), width, height = scene.Ks[camera], scene.settings.overscan, scene.width, scene.height
     fx, fy, cx, cy = (float(v) for v in torch.stack((K[0, 0], K[1, 1], K[0, 2], K[1, 2])))

@@ -1,14 +1,13 @@
-"""Mean SSIM of float32 images on the CPU, alone or in the photometric loss, with its gradient, in two passes over rows;
-C++ compiled by Warp.
+"""Mean SSIM of float32 images on the CPU, alone or in the photometric loss, with its gradient.
 
-The mathematics is that of `train.losses` (Wang et al. 2004; 11 x 11 Gaussian window, sigma 1.5, data_range 1, cut at
-the border and renormalised per axis). The renormalised blur of an axis is B = diag(r) S, with S the symmetric blur of
-zero-padded rows and r the reciprocal weight sum inside the image; so B^T = S diag(r), and the backward blur is the
-plain one of values multiplied by r first.
+C++ compiled by Warp computes it in two passes over rows, with the mathematics of `train.losses`: Wang et al. 2004,
+11 x 11 Gaussian window, sigma 1.5, data_range 1, cut at the border and renormalised per axis. The renormalised blur of
+an axis is B = diag(r) S, where S is the symmetric blur of zero-padded rows and r the reciprocal weight sum inside the
+image. Hence B^T = S diag(r): the backward blur is the plain blur of values multiplied by r.
 
-SSIM sees the variances only through var x + var y, so forward blurs four fields. They are of x - 0.5 and y - 0.5:
-variances do not notice, and float32 cancels less. The gradient is linear in the incoming one, so it is computed along
-with the value.
+SSIM depends on the variances only through var x + var y, so the forward pass blurs four fields. They are computed from
+x - 0.5 and y - 0.5, which leaves variances unchanged and reduces float32 cancellation. The gradient is linear in the
+incoming gradient, so it is computed together with the value.
 """
 
 import ctypes
@@ -28,7 +27,7 @@ WINDOW, SIGMA = 11, 1.5
 _HALF = WINDOW // 2
 _LANES = 16
 _ROWS = 4
-"""Rows per unit of work; blocked so that a row loaded serves all of them."""
+"""Rows per unit of work, so that each loaded row serves several output rows."""
 _FIELDS_FORWARD, _FIELDS_BACKWARD = 4, 3
 _FIELDS: list[tuple[str, type, str]] = [
     *[(n, ctypes.c_uint64, "const float*") for n in ("image", "target", "inverse_x", "inverse_y")],
@@ -49,9 +48,9 @@ _FIELDS: list[tuple[str, type, str]] = [
     ],
     *[(n, ctypes.c_float, "float") for n in ("share", "plain")],
 ]
-"""`length` = width * channels floats of a row, `padded` the same up to full vectors, `pitch` with `margin` zeros either
-side; `blurred` [3, height, padded] holds the gradient's fields between the passes, `scratch` a worker's rows. What is
-summed up is share * SSIM + plain * |x - y|."""
+"""`length` = width * channels is the number of floats of a row. `padded` is `length` rounded up to full vectors, and
+`pitch` is `padded` plus `margin` zeros on either side. `blurred` [3, height, padded] holds the gradient's fields
+between the passes, `scratch` a worker's rows. The kernel sums up share * SSIM + plain * |x - y|."""
 
 _SOURCE = Path(__file__).with_name("kernels") / "ssim.cpp"
 
@@ -63,7 +62,7 @@ class _Block(ctypes.Structure):
 
 
 def window_taps() -> list[float]:
-    """[WINDOW] weights of the Gaussian window, of sum 1."""
+    """[WINDOW] weights of the Gaussian window, normalised to sum 1."""
     weights = torch.exp(-0.5 * (torch.arange(-_HALF, _HALF + 1, dtype=torch.float64) / SIGMA).square())
     return [float(weight) for weight in weights / weights.sum()]
 
@@ -84,7 +83,7 @@ def _build() -> Launch:
 
 
 def _compile() -> Launch:
-    """The kernel; threads that ask for it at once wait for one compilation."""
+    """The kernel, compiled once even if several threads call at the same time."""
     with _lock:
         return _build()
 
@@ -96,7 +95,7 @@ def warm_up() -> None:
 
 @functools.lru_cache(maxsize=16)
 def _inverse(size: int, repeat: int, total: int) -> Tensor:
-    """[total] reciprocal weight sums of `size` positions, each `repeat` times, then zeros."""
+    """[total] reciprocal weight sums of `size` positions, each repeated `repeat` times, padded with zeros."""
     inside = torch.nn.functional.conv1d(
         torch.ones(1, 1, size, dtype=torch.float64),
         torch.tensor(window_taps(), dtype=torch.float64)[None, None],
@@ -108,7 +107,7 @@ def _inverse(size: int, repeat: int, total: int) -> Tensor:
 
 
 class _Local(threading.local):
-    """Buffers of the calling thread's last size, because fresh pages are slow. Margins of `scratch` stay zero."""
+    """Buffers of the calling thread, reused for images of the same size. Margins of `scratch` stay zero."""
 
     key: tuple[int, ...] = ()
     scratch: Tensor
@@ -121,8 +120,10 @@ _local = _Local()
 def _run(
     image: Tensor, target: Tensor, mix: tuple[float, float], want_gradient: bool, threads: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Mean of share * SSIM + plain * |x - y| (0-dim), mix = (share, plain), and its gradient by `image`, of contiguous
-    float32 [H, W, C]."""
+    """Mean of share * SSIM + plain * |x - y| (0-dim) of contiguous float32 [H, W, C], and its gradient for `image`.
+
+    `mix` is (share, plain).
+    """
     launch = _compile()
     height, width, channels = image.shape
     length = width * channels
@@ -163,7 +164,7 @@ def _run(
 
 
 class _Ssim(torch.autograd.Function):
-    """Autograd's view; only the first image has a gradient."""
+    """Autograd function; only the first image gets a gradient."""
 
     @staticmethod
     def forward(
@@ -175,7 +176,7 @@ class _Ssim(torch.autograd.Function):
             target = torch.where(ignored[..., None], image, target)
         value, gradient = _run(image, target, mix, ctx.needs_input_grad[0], threads)
         if ignored is not None and gradient is not None:
-            gradient.masked_fill_(ignored[..., None], 0.0)  # their neighbours' windows reach into them
+            gradient.masked_fill_(ignored[..., None], 0.0)  # windows of their neighbours cover ignored pixels
         ctx.save_for_backward(gradient)
         return value
 
@@ -187,7 +188,7 @@ class _Ssim(torch.autograd.Function):
 
 
 def supports(image: Tensor, target: Tensor) -> bool:
-    """Whether `ssim` takes these tensors: float32, dense, on the CPU, and no gradient asked for the target."""
+    """True if `ssim` supports these tensors: float32, dense, on the CPU, and no gradient for the target."""
     return not target.requires_grad and all(
         t.dtype == torch.float32 and t.device.type == "cpu" and t.layout == torch.strided for t in (image, target)
     )
@@ -196,9 +197,11 @@ def supports(image: Tensor, target: Tensor) -> bool:
 def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
     """Mean structural similarity (0-dim) of two float32 CPU images [H, W, C]; differentiable in the first.
 
-    `threads` workers (default: all cores); the result is bitwise the same for any number. Wang et al. 2004, "Image
-    quality assessment", with the window and borders described in this module. ValueError if the shapes differ, a side
-    is smaller than the window, or `supports` says no.
+    `threads` is the number of workers (default: all cores); the result is bitwise the same for any number.
+
+    Raises ValueError if the shapes differ, a side is smaller than the window, or `supports` returns False.
+
+    Source: Wang et al. 2004, "Image quality assessment", with the window and borders described in this module.
     """
     return applied(_Ssim, image, target, None, (1.0, 0.0), _checked(image, target, threads))
 
@@ -206,16 +209,16 @@ def ssim(image: Tensor, target: Tensor, threads: int | None = None) -> Tensor:
 def photometric(
     image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None = None, threads: int | None = None
 ) -> Tensor:
-    """`train.losses.photometric` of two float32 CPU images [H, W, C], in the passes of `ssim`; ignored: bool [H, W].
+    """`train.losses.photometric` of two float32 CPU images [H, W, C] by the kernel of `ssim`; ignored: bool [H, W].
 
-    ValueError as `ssim`.
+    Raises ValueError as `ssim`.
     """
     workers = _checked(image, target, threads)
     return dssim + applied(_Ssim, image, target, ignored, (-dssim, 1.0 - dssim), workers)
 
 
 def _checked(image: Tensor, target: Tensor, threads: int | None) -> int:
-    """How many workers. ValueError for what cannot be compared."""
+    """Number of workers. Raises ValueError for images that cannot be compared."""
     if image.ndim != 3 or image.shape != target.shape or min(image.shape[:2]) < WINDOW or image.shape[2] < 1:
         raise ValueError(
             f"SSIM needs two [H, W, C] images of one shape and at least {WINDOW} px, "

@@ -1,12 +1,11 @@
-"""Mean SSIM of float32 images on a GPU, alone or in the photometric loss, with its gradient: a Warp kernel in four
-passes, nothing read back.
+"""Mean SSIM of float32 images on a GPU, alone or in the photometric loss, with its gradient.
 
-The mathematics and the notation are those of `ssim`: separable blurs of x - 0.5, y - 0.5, x^2 + y^2 and x y, cut at the
-border and renormalised per axis; the backward blur is the plain one of values multiplied by the reciprocal weight sums
-first. Passes: 0 blurs down the columns, 1 along the rows and takes the score and the gradient's fields, 2 blurs these
-down, 3 along, and puts the gradient together. A thread is one value of one pixel. The sum is base + share * SSIM +
-plain * |x - y|, so that the loss of `train.losses` is one call without further torch operators. The same kernel runs on
-Warp's cpu device, where tests compare it with float64.
+A Warp kernel computes it in four passes without synchronising with the host. Mathematics and notation are those of
+`ssim`: separable blurs of x - 0.5, y - 0.5, x^2 + y^2 and x y, cut at the border and renormalised per axis. Pass 0
+blurs along the columns. Pass 1 blurs along the rows and computes the score and the gradient's fields. Passes 2 and 3
+blur these fields along columns and rows, and pass 3 assembles the gradient. Each thread computes one value of one
+pixel. The result is base + share * SSIM + plain * |x - y|, so that the loss of `train.losses` is one call without
+further torch operators. The same kernel runs on Warp's CPU device, where tests compare it with float64.
 """
 
 import functools
@@ -27,7 +26,7 @@ _SOURCE = Path(__file__).with_name("kernels") / "ssim.cu"
 
 @functools.lru_cache(maxsize=1)
 def kernel() -> Any:
-    """The Warp kernel of all passes; compiled for a device at its first launch there."""
+    """The Warp kernel of all passes. Warp compiles it at the first launch on a device."""
     initialised_warp()
     taps = ", ".join(f"{tap:.9g}f" for tap in window_taps())
     source = kernel_text(_SOURCE).replace("@HALF@", str(WINDOW // 2)).replace("@TAPS@", taps)
@@ -54,13 +53,13 @@ def kernel() -> Any:
 
 
 class _Ssim(torch.autograd.Function):
-    """Autograd's view; the gradient is linear in the incoming one, so it is computed along with the value."""
+    """Autograd function. The gradient is linear in the incoming gradient, so it is computed with the value."""
 
     @staticmethod
     def forward(
         ctx: AutogradContext, image: Tensor, target: Tensor, ignored: Tensor | None, mix: tuple[float, float, float]
     ) -> Tensor:
-        """`mix`: base, share, plain."""
+        """Mean of base + share * SSIM + plain * |x - y|; `mix` is (base, share, plain)."""
         image, target = image.contiguous(), target.contiguous()
         ignored = None if ignored is None else ignored.contiguous().view(torch.uint8)
         height, width, channels = image.shape
@@ -84,7 +83,7 @@ class _Ssim(torch.autograd.Function):
 
 
 def supports(image: Tensor, target: Tensor) -> bool:
-    """Whether `ssim` takes these tensors: float32, dense, on one device (CPU, CUDA), no gradient for the target."""
+    """True if `ssim` supports these tensors: float32, dense, on one CPU or CUDA device, no gradient for the target."""
     return not target.requires_grad and image.device == target.device and all(
         t.dtype == torch.float32 and t.device.type in ("cpu", "cuda") and t.layout == torch.strided
         for t in (image, target)
@@ -92,18 +91,18 @@ def supports(image: Tensor, target: Tensor) -> bool:
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity (0-dim) of two float32 images [H, W, C] of one device; differentiable in the first.
+    """Mean structural similarity (0-dim) of two float32 images [H, W, C] on one device; differentiable in the first.
 
-    ValueError if the shapes differ, a side is smaller than the window, or `supports` says no.
+    Raises ValueError if the shapes differ, a side is smaller than the window, or `supports` returns False.
     """
     _check(image, target)
     return applied(_Ssim, image, target, None, (0.0, 1.0, 0.0))
 
 
 def photometric(image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None = None) -> Tensor:
-    """`train.losses.photometric` of two float32 images [H, W, C] of one device; ignored: bool [H, W] there.
+    """`train.losses.photometric` of two float32 images [H, W, C] on one device; ignored: bool [H, W] on that device.
 
-    ValueError if the shapes differ, a side is smaller than the window, or `supports` says no.
+    Raises ValueError if the shapes differ, a side is smaller than the window, or `supports` returns False.
     """
     _check(image, target)
     if ignored is not None and (ignored.shape != image.shape[:2] or ignored.dtype != torch.bool):

@@ -1,1 +1,1 @@
-"""Structure from motion: COLMAP in a child process, its frames, masks and verdict."""
+"""Structure from motion: COLMAP in a child process, its input frames and masks, and the check of its result."""

@@ -19,7 +19,7 @@ WIDEST_ZOOM = 16.0
 
 
 def write_answers(request: Request, model: pycolmap.Reconstruction, poses: dict[str, dict[str, Any]]) -> None:
-    """Everything the parent needs, in formats that need no pycolmap."""
+    """Writes everything the parent needs, in formats that it reads without pycolmap."""
     folder = request.scratch / "model"
     folder.mkdir()
     colmap.write_binary(model, folder)
@@ -29,7 +29,7 @@ def write_answers(request: Request, model: pycolmap.Reconstruction, poses: dict[
 
 
 def write_points(request: Request, model: pycolmap.Reconstruction) -> None:
-    """points.npz of a model: what the parent filters."""
+    """Writes points.npz of a model, which the parent filters."""
     points = [point for _, point in sorted(colmap.points(model).items())]
     np.savez(
         request.scratch / POINTS_FILE,
@@ -42,7 +42,7 @@ def write_points(request: Request, model: pycolmap.Reconstruction) -> None:
 
 
 def focal_changes(model: pycolmap.Reconstruction) -> dict[str, float | None]:
-    """Name of each posed image -> `zoom.focal_change`, None where it is not known."""
+    """Maps the name of each posed image to its `zoom.focal_change`, or to None where that is unknown."""
     xyz, found = {number: p.xyz for number, p in colmap.points(model).items()}, dict[str, float | None]()
     camera = first_camera(model)
     for image in posed(model):
@@ -55,14 +55,14 @@ def focal_changes(model: pycolmap.Reconstruction) -> dict[str, float | None]:
 
 
 def write_undistortion(request: Request, camera: pycolmap.Camera, number: int) -> None:
-    """`undistortion` of a lens, as the parent reads it."""
+    """Writes a lens and its `undistortion` to undistort_N.npz, for the parent."""
     pinhole, where = undistortion(camera)
     file = request.scratch / f"undistort_{number}.npz"
     np.savez(file, pinhole=pinhole, where=where, model=camera.model_name, params=camera.params)
 
 
 def smallest_depths(model: pycolmap.Reconstruction, points: list[pycolmap.Point3D]) -> NDArray[np.float32]:
-    """[P]: the least depth of each point over the images that see it, in solve units."""
+    """[P]: smallest depth of each point over the images that see it, in solve units."""
     rows = {image.image_id: colmap.pose(image)[2] for image in posed(model)}
     return np.array(
         [min(float(rows[e.image_id] @ np.append(p.xyz, 1.0)) for e in p.track.elements) for p in points], np.float32
@@ -70,10 +70,12 @@ def smallest_depths(model: pycolmap.Reconstruction, points: list[pycolmap.Point3
 
 
 def undistortion(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """The pinhole camera of the undistorted frames, and where its pixels lie in the distorted ones.
+    """The pinhole camera of the undistorted frames, and the position of each of its pixels in the distorted frames.
 
-    Same size and principal point; the widest view in which no pixel falls outside of the distorted image (COLMAP's
-    blank_pixels = 0). Returns ([fx, fy, cx, cy], [H, W, 2] x and y in pixels, centres at +0.5).
+    The pinhole camera keeps the size and the principal point. Its view is the widest in which no pixel falls outside
+    the distorted image (COLMAP's blank_pixels = 0).
+
+    Returns ([fx, fy, cx, cy], [H, W, 2] x and y in pixels, centres at +0.5).
     """
     width, height = camera.width, camera.height
     cx, cy = camera.principal_point_x, camera.principal_point_y
@@ -100,12 +102,12 @@ def undistortion(camera: pycolmap.Camera) -> tuple[NDArray[np.float64], NDArray[
         return bool(((at >= low) & (at <= high)).all())
 
     low, high = 0.5, 2.0
-    while not inside(high) and high < WIDEST_ZOOM:  # a fisheye
+    while not inside(high) and high < WIDEST_ZOOM:  # only a fisheye needs more than 2
         high *= 2.0
     for _ in range(40):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if inside(middle) else (middle, high)
-    # A pinhole stays as it is, to the last bit.
+    # Exactly 1, so that a pinhole lens is not changed in its last bit.
     zoom = 1.0 if camera.is_undistorted() else high
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     where = distorted(grid.reshape(-1, 2), zoom).reshape(height, width, 2).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Runs the COLMAP worker as a child process: progress in, cancellation out, its last words if it dies."""
+"""Runs the COLMAP worker as a child process: reads its progress, cancels it, and reports its log's end if it dies."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ _POLL_SECONDS = 0.2
 _LAST_LINES = 3
 _FULL_BYTES = 16 << 20
 _COUNT = re.compile(rb"Process(?:ed|ing) \w+ \[(\d+)/(\d+)\]")
-"""How COLMAP's log counts images and blocks of pairs. (Its database must not be looked into meanwhile: a second copy of
-SQLite in one process breaks the first one's locks.)"""
+"""Lines of COLMAP's log that count images and blocks of pairs. (Reading progress from COLMAP's database instead is not
+safe: a second copy of SQLite in one process breaks the locks of the first copy.)"""
 
 
 def run_worker(request: Path, log: Path, report: Reporter, keep_log: bool = False) -> dict[str, Any]:
-    """Runs `worker.py` on a request file; returns its last message ({"result"} or {"failure"}).
+    """Runs `worker.py` on a request file and returns its last message ({"result"} or {"failure"}).
 
-    The worker is killed on cancellation and on any other exception here. JobError (ENVIRONMENT if a package cannot be
-    loaded, DISK if that is full, else SOLVE) if it dies by itself, with the end of COLMAP's log, which is kept in
-    `log`: with `keep_log` after what stands there.
+    The worker is killed on cancellation and on any other exception in this function. COLMAP's output is written to
+    `log`; with `keep_log` it is appended.
+
+    Raises JobError with the end of COLMAP's log if the worker dies: ENVIRONMENT if a package cannot be loaded, DISK if
+    the disk is full, else SOLVE.
     """
     environment = child_environment(Path(__file__).resolve().parents[2])
     command = python_child(sys.executable, "torch_backend.sfm.start_worker", str(request.absolute()))

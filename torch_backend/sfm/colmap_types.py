@@ -1,6 +1,6 @@
-"""Types for what pycolmap leaves without any: each function is that call and a cast. For `worker.py` alone.
+"""Typed wrappers of pycolmap calls: each function is one call and a cast. Only `worker.py` and its parts use them.
 
-Its stubs name bare `os.PathLike`, `dict` and containers that say nothing of what is in them.
+pycolmap's stubs name bare `os.PathLike`, `dict` and containers without the types of their elements.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,24 +30,24 @@ def points(model: pycolmap.Reconstruction) -> Mapping[int, pycolmap.Point3D]:
 
 
 def pose(image: pycolmap.Image) -> NDArray[np.float64]:
-    """[3, 4] world-to-camera of an image that has one."""
+    """[3, 4] world-to-camera matrix of an image that has a pose."""
     return cast(Any, image).cam_from_world().matrix()
 
 
 def write_binary(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """cameras.bin, images.bin, points3D.bin and what else COLMAP writes, into a folder that exists."""
+    """Writes cameras.bin, images.bin, points3D.bin and COLMAP's further files into an existing folder."""
     cast(Any, model).write_binary(folder)
 
 
 def open_database(file: Path) -> pycolmap.Database:
-    """A database, made if it is not there; to be closed."""
+    """Opens a database, creating it if it is missing. The caller closes it."""
     return _colmap.Database.open(file)
 
 
 def import_images(
     database: Path, folder: Path, mode: pycolmap.CameraMode, names: Sequence[str], reader: pycolmap.ImageReaderOptions
 ) -> None:
-    """Numbers images in the order of their names."""
+    """Adds images to the database, numbered in the order of `names`."""
     _colmap.import_images(database, folder, mode, names, reader)
 
 
@@ -59,7 +59,7 @@ def extract_features(
     reader: pycolmap.ImageReaderOptions,
     options: pycolmap.FeatureExtractionOptions,
 ) -> None:
-    """Features of images into the database, on the CPU."""
+    """Extracts features of images into the database, on the CPU."""
     _colmap.extract_features(
         database,
         folder,
@@ -77,7 +77,7 @@ def match_image_pairs(
     pairing: pycolmap.ImportedPairingOptions,
     geometry: pycolmap.TwoViewGeometryOptions,
 ) -> None:
-    """Matches of the pairs in a file, on the CPU."""
+    """Matches the pairs listed in a file, on the CPU."""
     _colmap.match_image_pairs(database, options, pairing, geometry, device=pycolmap.Device.cpu)
 
 
@@ -88,7 +88,7 @@ def incremental_mapping(
     options: pycolmap.IncrementalPipelineOptions,
     next_image: Callable[[], None],
 ) -> dict[int, pycolmap.Reconstruction]:
-    """Models by number; `next_image` is called whenever one has found its place."""
+    """Models by number. `next_image` is called after each image that is registered."""
     return _colmap.incremental_mapping(database, folder, into, options, next_image_callback=next_image)
 
 
@@ -100,7 +100,7 @@ def global_mapping(
 
 
 def calibrate_view_graph(database: Path) -> None:
-    """Focal lengths from what pairs share, into the database."""
+    """Estimates focal lengths from the two-view geometries and writes them to the database."""
     _colmap.calibrate_view_graph(database)
 
 
@@ -111,12 +111,12 @@ def triangulate_points(
     into: Path,
     options: pycolmap.IncrementalPipelineOptions,
 ) -> pycolmap.Reconstruction:
-    """Points of a model whose cameras are held; those that it had are cleared."""
+    """Triangulates the points of a model with its cameras fixed. Its former points are cleared."""
     return _colmap.triangulate_points(known, database, folder, into, True, options)
 
 
 def adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
-    """Bundle adjustment of a whole model, in place."""
+    """Runs bundle adjustment on a whole model, in place."""
     _colmap.bundle_adjustment(model, options)
 
 
@@ -126,6 +126,6 @@ def absolute_pose(
     camera: pycolmap.Camera,
     options: pycolmap.AbsolutePoseEstimationOptions,
 ) -> tuple[NDArray[np.float64], int] | None:
-    """World-to-camera pose [3, 4] from pixels [N, 2] and points [N, 3], and how many agree; None without any."""
+    """World-to-camera pose [3, 4] from pixels [N, 2] and points [N, 3], and its number of inliers; None on failure."""
     found = _colmap.estimate_and_refine_absolute_pose(xy, xyz, camera, options)
     return (found["cam_from_world"].matrix(), int(found["num_inliers"])) if found is not None else None

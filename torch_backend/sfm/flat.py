@@ -1,4 +1,4 @@
-"""Whether a solved scene is flat: a picture of a picture, which has no depth to freeze. numpy alone."""
+"""Detects a flat scene, such as a filmed photograph, which has no depth to freeze. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 THICKNESS = 0.01
-"""Most distance of a point from the common plane, as a share of the points' spread."""
+"""Largest distance of a point from the common plane, as a share of the points' spread."""
 FLAT_SHARE = 0.9
-"""Share of the points in one plane from which on a scene is flat. Measured: 0.04 to 0.06 in rooms, 0.99 in
-a pan over a photograph."""
+"""Smallest share of the points in one plane that makes a scene flat. Measured: 0.04 to 0.06 in rooms, 0.99 in a pan
+over a photograph."""
 _TRIES = 500
 _SAMPLE = 4000
 
 
 def plane_share(xyz: NDArray[Any]) -> float:
-    """Largest share of points [P, 3] that lie in one plane, found by random triples; 0 of fewer than four."""
+    """Largest share of points [P, 3] that lie in one plane, found by random triples; 0 for fewer than four points."""
     if len(xyz) < 4:
         return 0.0
     rng = np.random.default_rng(0)
@@ -35,7 +35,7 @@ def plane_share(xyz: NDArray[Any]) -> float:
 
 
 def flat_words(xyz: NDArray[Any]) -> tuple[str, str] | None:
-    """(what is wrong, what to do) where the points lie in one plane; None in a scene with depth."""
+    """(message, hint) if the points lie in one plane; None for a scene with depth."""
     share = plane_share(xyz)
     if share < FLAT_SHARE:
         return None

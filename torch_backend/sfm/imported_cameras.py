@@ -26,7 +26,7 @@ LEAST_AGREEMENT = 0.25
 """Least share of matched keypoints that triangulate to a point. Below it, imported cameras belong to another clip.
 Cameras of a rendered room: 0.93 (0.76 a frame off, 0.35 four frames off, 0.05 at random); of a real clip: 0.67."""
 POOR_AGREEMENT = 0.5
-"""Share below which the imported cameras are used, with a warning."""
+"""Share below which imported cameras are used with a warning."""
 
 
 @dataclass
@@ -34,15 +34,15 @@ class ImportedCameras:
     """Imported cameras, matched to the frames of a clip."""
 
     solve: imported.ImportedSolve
-    """What was read."""
+    """The solve read from the file."""
     matched: imported.Matched
-    """The frames' cameras."""
+    """Cameras of the frames."""
 
 
 def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> ImportedCameras:
-    """Reads cameras and matches them to the frames of a frames.json; tells `report` which are missing.
+    """Reads cameras, matches them to the frames of a frames.json, and warns `report` of missing ones.
 
-    JobError (SOLVE) if they cannot be read, are too few, or are of pictures of another shape.
+    Raises JobError (SOLVE) if the cameras cannot be read, are too few, or have another aspect ratio than the frames.
     """
     solve = imported.read(cameras)
     listed = frames["frames"]
@@ -56,25 +56,25 @@ def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> ImportedC
 def take_over(
     shot: Shot, frames: dict[str, Any], taken: ImportedCameras, options: dict[str, Any], scratch: Path, report: Reporter
 ) -> dict[str, Any]:
-    """Has the worker finish a solve with imported cameras: undistort the frames, and triangulate points where needed.
+    """Runs the worker on imported cameras: it undistorts the lenses and triangulates points if needed.
 
-    The file's own points are taken if enough of them come with errors and tracks to train from; else points are
-    triangulated with the cameras held, which also tells how well they fit.
+    The points in the file are used if enough of them have errors and tracks. Otherwise points are triangulated with the
+    cameras fixed, which also measures how well the cameras fit.
 
     Args:
         shot: an imported shot.
         frames: its frames.json.
-        taken: what `prepare` found.
+        taken: result of `prepare`.
         options: the worker's overlap and features.
-        scratch: folder that takes poses.json, points.npz, undistort_N.npz and model/, as after a solve.
+        scratch: folder that receives poses.json, points.npz, undistort_N.npz and model/, as after a solve.
         report: receives progress.
 
     Returns:
-        The worker's answer as after a solve; "given" says that it is none, and holds the kind of file; "world" is that
-        of the file's cameras.
+        The worker's answer as after a solve, with two more fields: "given" is the kind of the file, and "world" the
+        world of the file's cameras.
 
     Raises:
-        JobError: the worker broke off, or not one point agrees with the cameras.
+        JobError: the worker crashed, or no point agrees with the cameras.
     """
     source, matched = taken.solve, taken.matched
     size = (frames["width"], frames["height"])
@@ -97,7 +97,7 @@ def take_over(
     (scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
     if points is not None:
         answer = _keep_own(points, scratch, lenses, poses)
-    if not answer["points"]:  # the worker left nothing to read
+    if not answer["points"]:  # the worker wrote no files
         refuse_misfit(answer, 0)
     fx, fy, _, _, *bend = lenses[0].params
     return {
@@ -112,14 +112,14 @@ def take_over(
 
 
 def _own_points(taken: ImportedCameras, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
-    """The file's own points for pictures of `size` (w, h) as `imported.own_points`, if enough to train from."""
+    """`imported.own_points` for pictures of `size` (width, height); None if they are too few to train from."""
     points = imported.own_points(taken.solve, taken.matched, size)
     centres = np.array([camera_centre(camera.pose) for camera in taken.matched.cameras.values()])
     return points if points is not None and _enough(points, centres) else None
 
 
 def _request(shot: Shot, solved: list[str], known: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """The request to the worker. `solved` are names of pictures, `known` their cameras as the file has them."""
+    """The request to the worker. `solved` are names of pictures, `known` their cameras from the file."""
     return {
         "images": str(shot.raw),
         "solved": solved,
@@ -135,7 +135,7 @@ def _request(shot: Shot, solved: list[str], known: dict[str, Any], options: dict
 def _keep_own(
     points: dict[str, NDArray[Any]], scratch: Path, lenses: list[imported.Lens], poses: dict[str, dict[str, Any]]
 ) -> dict[str, Any]:
-    """Writes the file's own points and a model of them into `scratch`; the answer that the worker gives of its own."""
+    """Writes the file's points and their model into `scratch`; returns the figures that the worker would report."""
     angle = float(points.pop("angle"))
     save_arrays(scratch / POINTS_FILE, points)
     _write_model(scratch / "model", lenses, poses, points)
@@ -174,7 +174,7 @@ def doubts(answer: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _enough(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> bool:
-    """True if points of a file, with errors that were measured, are enough to train from."""
+    """True if the points of a file have measured errors and are enough to train from."""
     table = {name: points[name] for name in ("xyz", "rgb", "error", "track", "depth")}
     return bool((points["error"] > 0).any()) and len(filter_points(table, centres)["xyz"]) >= LEAST_POINTS
 

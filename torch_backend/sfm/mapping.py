@@ -1,4 +1,4 @@
-"""Cameras and points from the matches: COLMAP's mappers, their lens, and points between cameras that are known."""
+"""Computes cameras and points from the matches with COLMAP's mappers, and triangulates points for known cameras."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from .matching import extract, match
 from .request import SEED, Request, closing_database, say
 
 HELD_SHARE, HELD_WORSE, HELD_ERROR_PX = 0.9, 1.25, 1.0
-"""A usual lens replaces an implausible one if it registers this share of the frames, and its error is at most this many
-times as large, or at most this many pixels."""
+"""A usual lens replaces an implausible one if it registers the first value's share of the frames. Its error must also
+be at most the second value times as large, or at most the third value in pixels."""
 MASKED_INLIERS = (50, 15)
-"""Matches that a first pair and a further image need where masks leave few, half of COLMAP's: what would mislead is
-masked. A room of which 70 % of 320 x 240 pixels were masked: 26 of 30 images instead of 4."""
+"""Matches that a first pair and a further image need under masks: half of COLMAP's defaults. Masks leave few matches,
+but remove the misleading ones. With 70 % of a room's 320 x 240 pixels masked: 26 of 30 images instead of 4."""
 LONG_TRACK = 128
-"""Length of a track in images above which only a part of them is used to measure the triangulation angle."""
+"""Length of a track, in images, above which the triangulation angle is measured on a part of the images."""
 TRIANGULATE_LEAST_DEG = 1.0
 """Smallest angle under which a point is triangulated from known cameras."""
 
 
 def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruction]:
-    """Every model that the mapper finds, the largest first: incremental mapping, if the request has no other.
+    """Every model that the mapper finds, the largest first. The mapper is incremental unless the request says global.
 
-    With `hold_lens` the lens stays as it was before any picture was seen: a usual focal length, no distortion.
+    With `hold_lens` the lens keeps its initial values: a usual focal length, no distortion.
     """
     if request.mapper == "global":
         return build_globally(request, hold_lens)
     options = pycolmap.IncrementalPipelineOptions()
-    # One thread repeats bit for bit, and costs nothing: a clip of 75 frames is below what Ceres shares out.
+    # One thread makes results repeat bit for bit. It costs nothing: Ceres does not parallelise a clip of 75 frames.
     options.num_threads = 1
     options.random_seed = SEED
     options.mapper.random_seed = SEED
     options.triangulation.random_seed = SEED
-    # A clip of 75 frames needs no global adjustment every 10 % of growth. Each runs until it has settled, though: with
-    # two rounds of it, as with one of the local ones, a start from two frames that show little depth was kept, and a
-    # whole walk was solved wrongly at an error of 0.9 px (docs/decisions.md).
+    # A clip of 75 frames needs no global adjustment every 10 % of growth. Each adjustment keeps COLMAP's default number
+    # of rounds. With only two global rounds or one local round, the mapper kept a start from two frames with little
+    # depth, and a whole walk was solved wrongly at an error of 0.9 px (docs/decisions.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
-    # Ceres' default. With COLMAP's 0 an adjustment runs on, up to its 50th iteration, when it gains nothing any more.
+    # Ceres' default. With COLMAP's 0 an adjustment runs all 50 iterations even when it has converged.
     options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-6
-    if request.reuse:  # it has placed frames of a try before
+    if request.reuse:  # the database may hold frames that an earlier attempt placed
         options.image_names = request.solved
     if request.masks:
         options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = MASKED_INLIERS
@@ -67,8 +67,10 @@ def build(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruc
 
 
 def build_globally(request: Request, hold_lens: bool = False) -> list[pycolmap.Reconstruction]:
-    """Global mapping (GLOMAP): all rotations, then all places at once. As `build`; it wants a focal length beforehand,
-    and where none was told the pairs' own are taken."""
+    """Models as from `build`, by global mapping (GLOMAP): first all rotations, then all positions at once.
+
+    Global mapping needs an initial focal length. If the request has none, it is estimated from the image pairs.
+    """
     options = pycolmap.GlobalPipelineOptions()
     options.image_names = request.solved
     options.num_threads = options.mapper.num_threads = 1
@@ -90,18 +92,18 @@ def build_globally(request: Request, hold_lens: bool = False) -> list[pycolmap.R
 
 
 def _largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    # The first model that the mapper writes is often a fragment: the largest is meant.
+    # The first model that the mapper writes is often a fragment.
     models = [m for m in found.values() if m.num_reg_images() >= 2]
     return sorted(models, key=lambda m: (m.num_reg_images(), m.num_points3D()), reverse=True)
 
 
 def first_camera(model: pycolmap.Reconstruction) -> pycolmap.Camera:
-    """The lens of a solve of our own: all its images share one."""
+    """The lens of a solved model, which all its images share."""
     return next(iter(colmap.cameras(model).values()))
 
 
 def left_bend(model: pycolmap.Reconstruction) -> float:
-    """First radial coefficient that the model of a straightened clip would rather have: 0 if its lens is all out."""
+    """First radial coefficient that fits a model of undistorted frames best; 0 if no distortion is left in them."""
     freed = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params = True
@@ -112,22 +114,22 @@ def left_bend(model: pycolmap.Reconstruction) -> float:
 
 
 def posed(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """The images that have a place in the model."""
+    """The images that have a pose in the model."""
     return [image for image in colmap.images(model).values() if image.has_pose]
 
 
 def lens_of(camera: pycolmap.Camera) -> tuple[str, int, int, list[float]]:
-    """Model, width, height and parameters of a camera, as `lens_verdict` wants them."""
+    """Model, width, height and parameters of a camera, as arguments of `lens_verdict`."""
     return camera.model_name, camera.width, camera.height, [float(value) for value in camera.params]
 
 
 def lens_doubt(request: Request, model: pycolmap.Reconstruction) -> str:
-    """`lens_verdict.doubt_of` a model's lens."""
+    """`lens_verdict.doubt_of` for a model's lens."""
     return doubt_of(*lens_of(first_camera(model)), request.focal)
 
 
 def as_good(held: pycolmap.Reconstruction, free: pycolmap.Reconstruction) -> bool:
-    """True if a model explains the clip with a usual lens about as well as another with a lens of its own."""
+    """True if `held`, a model with a usual lens, explains the clip about as well as `free`, with an estimated lens."""
     if held.num_reg_images() < HELD_SHARE * free.num_reg_images():
         return False
     error = held.compute_mean_reprojection_error()
@@ -135,13 +137,13 @@ def as_good(held: pycolmap.Reconstruction, free: pycolmap.Reconstruction) -> boo
 
 
 def triangulation_angle(model: pycolmap.Reconstruction) -> float:
-    """Median over points (at most 2000) of the widest angle in degrees under which a point is seen."""
+    """Median, over at most 4000 points, of the widest angle in degrees between two rays to a point."""
     centres = {image.image_id: image.projection_center() for image in posed(model)}
     points = sorted(colmap.points(model).items())
     angles: list[float] = []
     for _, point in points[:: max(1, len(points) // 2000)]:
         track = point.track.elements
-        # Every two of them are compared: a long track is thinned out.
+        # Long tracks are thinned, because every two images of a track are compared.
         seen = np.array([centres[e.image_id] for e in track[:: 1 + len(track) // LONG_TRACK]])
         rays = seen - point.xyz
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -152,9 +154,9 @@ def triangulation_angle(model: pycolmap.Reconstruction) -> float:
 def triangulate(
     request: Request, lenses: list[pycolmap.Camera], poses: dict[str, tuple[int, NDArray[np.float64]]]
 ) -> pycolmap.Reconstruction:
-    """Features and matches of the solved images, then points from known cameras, which are held.
+    """Extracts and matches features of the solved images, then triangulates points with the known cameras fixed.
 
-    `poses` gives each image's lens, as an index, and its world-to-camera pose, [3, 4]; all solved images are in it.
+    `poses` holds every solved image: the index of its lens, and its world-to-camera pose, [3, 4].
     """
     single = len(lenses) == 1
     extract(request, request.solved, None, pycolmap.CameraMode.SINGLE if single else pycolmap.CameraMode.PER_IMAGE)
@@ -169,7 +171,7 @@ def triangulate(
                     model=lenses[lens].model, width=lenses[lens].width, height=lenses[lens].height,
                     params=lenses[lens].params, camera_id=stored.camera_id,
                 )  # fmt: skip
-                # Pairs are verified without the lens, as in a solve of our own, unless it bends their epipolar lines.
+                # Pairs are verified without the lens, as in a solve, unless distortion bends their epipolar lines.
                 camera.has_prior_focal_length = camera.model != pycolmap.CameraModelId.PINHOLE
                 database.update_camera(camera)
                 known.add_camera_with_trivial_rig(camera)
@@ -187,8 +189,10 @@ def triangulate(
 
 
 def agreement(request: Request, model: pycolmap.Reconstruction) -> float:
-    """Share of the keypoints matched between frames that found a point: with cameras held, errors alone look good
-    whatever the cameras are, since what does not fit them is left out."""
+    """Share of the matched keypoints that were triangulated to a point.
+
+    With fixed cameras the reprojection error looks good even for wrong cameras, because misfits are left out.
+    """
     matched: dict[int, list[NDArray[np.uint32]]] = {}
     with closing_database(request) as database:
         pairs, geometries = database.read_two_view_geometries()

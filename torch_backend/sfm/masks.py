@@ -1,8 +1,8 @@
-"""The masks of a solve: where nothing is matched, and what of them stays, undistorted as the frames are.
+"""Masks of a solve: no features are matched inside them, and later steps use them undistorted as the frames are.
 
-SHOT/solve/ignore/NNNNNN.png and SHOT/solve/people/NNNNNN.png, grey, of the working frames' size, white is covered.
-`ignore` is no part of the scene: not matched, not learnt, no plate to fill from. `people` is what alone may move: not
-matched, and still outside.
+Files: SHOT/solve/ignore/NNNNNN.png and SHOT/solve/people/NNNNNN.png, grey, of the working frames' size, white = masked.
+`ignore` covers what is not part of the scene: it is not matched, not trained on, and no source of fill pixels.
+`people` covers the only things that may move: it is not matched, and everything outside counts as still.
 """
 
 from __future__ import annotations
@@ -22,25 +22,27 @@ from ..shot import Shot, make_folder, write_atomic
 
 IGNORE, PEOPLE = MASK_KINDS
 MARGIN = 3.0
-"""Pixels of a picture 640 wide by which nothing is matched around a mask: a feature looks at what is around it."""
+"""Width of the unmatched margin around a mask, in pixels of a picture 640 wide: a feature depends on its surroundings.
+"""
 _RIM = 8.0
-"""Pixels of a picture 640 wide around what is ignored in which nothing is said to move."""
+"""Width of the rim around an ignored region that counts as still, in pixels of a picture 640 wide."""
 _INPAINT_PX = 3.0
 _MOST_FEATURES = 3.0
-"""Factor on the number of features of a mostly masked picture: masked features count until they are dropped."""
+"""Largest factor on the number of features of a masked picture: COLMAP counts masked features before it drops them."""
 
 _WIDE_SHARE = 0.25
-"""Masked share of the picture from which on more frames are matched with each other than their neighbours: what is left
-shows too little for the few pairs of a clip's usual overlap to hold it together. At 70 % of a ray-cast room a solve by
-those was off by 6 degrees at 0.5 px, and called good; with all pairs 0.14 degrees."""
+"""Masked share of the picture above which more pairs of frames are matched than the usual overlap. The unmasked rest
+shows too little for those few pairs to hold the clip together. With 70 % of a ray-cast room masked, the usual pairs
+gave cameras 6 degrees off at 0.5 px, rated Good; all pairs gave 0.14 degrees."""
 
 
 def write_matching(
     masks: dict[str, Mask], names: dict[int, str], folder: Path, undistort: Undistorter | None = None
 ) -> None:
-    """Writes COLMAP's masks: NAME.png of each picture, black where it finds no features; `names` by frame.
+    """Writes a COLMAP mask NAME.png for each picture, black where COLMAP may find no features.
 
-    `undistort`: what took the lens out of the pictures that are matched; None: they are as they were filmed.
+    `names` maps frame numbers to names of pictures. `undistort` is the map with which the pictures were undistorted
+    before matching; None if they were not.
     """
     make_folder(folder)
     for frame, name in names.items():
@@ -53,22 +55,22 @@ def write_matching(
 
 
 def more_features(masks: dict[str, Mask]) -> float:
-    """How many times as many features to ask for, so that as many are left outside of the masks."""
+    """Factor on the number of features that leaves the requested number outside the masks, at most `_MOST_FEATURES`."""
     return min(_MOST_FEATURES, 1.0 / max(1.0 - _covered(masks), 1e-3))
 
 
 def wants_wide(masks: dict[str, Mask]) -> bool:
-    """True if so much is masked that frames have to be matched with more than their neighbours."""
+    """True if so much is masked that more pairs of frames must be matched than the usual overlap."""
     return _covered(masks) >= _WIDE_SHARE
 
 
 def _covered(masks: dict[str, Mask]) -> float:
-    """Share of the picture that they cover, where they do not overlap."""
+    """Sum of the masks' shares of the picture: the covered share if the masks do not overlap."""
     return sum(mask.share for mask in masks.values())
 
 
 def write_undistorted(masks: dict[str, Mask], frame: int, undistort: Undistorter, solve: Path) -> None:
-    """Writes a frame's masks below a folder that stands for the shot's solve/, by the frames' own map."""
+    """Writes a frame's masks, undistorted with the frames' map, below `solve`, the staged solve/ folder of the shot."""
     width, height = next(iter(masks.values())).size
     planes = np.zeros((height, width, 3), np.uint8)
     for plane, kind in enumerate(MASK_KINDS):
@@ -90,14 +92,14 @@ def write_grey(path: Path, pixels: NDArray[np.uint8]) -> None:
 
 
 def facts_of(masks: dict[str, Mask], sources: dict[str, str]) -> dict[str, Any]:
-    """What solve.json keeps of them."""
+    """Facts about the masks that solve.json records: source, key and share of each kind."""
     return {
         kind: {"source": sources[kind], "key": mask.key, "share": round(mask.share, 4)} for kind, mask in masks.items()
     }
 
 
 def given_masks(shot: Shot) -> dict[str, dict[str, Any]]:
-    """Kind -> `facts_of` of the masks that the shot was solved with; {} if with none, or if that cannot be read."""
+    """`facts_of` the masks that the shot was solved with; {} without masks or if solve.json is unreadable."""
     try:
         facts = read_json(shot.solve_record).get("masks")
     except (OSError, ValueError):
@@ -108,14 +110,14 @@ def given_masks(shot: Shot) -> dict[str, dict[str, Any]]:
 
 
 def masks_key(shot: Shot, *kinds: str) -> list[Any]:
-    """Changes with the masks of the solve, of these kinds, or of all; empty if there are none."""
+    """Key that changes with the solve's masks of the given kinds (all kinds if none are given); empty without masks."""
     return [[kind, facts.get("key")] for kind, facts in given_masks(shot).items() if not kinds or kind in kinds]
 
 
 def load_mask(shot: Shot, kind: str, frame: int) -> NDArray[np.bool_] | None:
-    """Masked pixels of an undistorted frame, bool [H, W] of the working frames; None if the shot has no such mask.
+    """Masked pixels of an undistorted frame, bool [H, W]; None if the shot has no such mask.
 
-    JobError (SOLVE) if the file of a mask that it has is missing or damaged.
+    Raises JobError (SOLVE) if the shot has the mask but its file is missing or damaged.
     """
     if kind not in given_masks(shot):
         return None
@@ -131,14 +133,18 @@ def load_mask(shot: Shot, kind: str, frame: int) -> NDArray[np.bool_] | None:
 
 
 def painted_over(pixels: NDArray[np.uint8], ignored: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A picture [H, W, 3] with what is ignored, bool [H, W], and its rim taken over by what is around: flow would carry
-    a logo's own rest into its surroundings."""
+    """A picture [H, W, 3] with its ignored pixels, bool [H, W], and a margin inpainted from the surroundings.
+
+    Otherwise optical flow would spread the stillness of a logo into its surroundings.
+    """
     return np.asarray(cv2.inpaint(pixels, _wider(ignored, MARGIN), _INPAINT_PX, cv2.INPAINT_TELEA), np.uint8)
 
 
 def limited(labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None, people: NDArray[np.bool_] | None) -> None:
-    """Makes still, 0, of a motion matte [H, W] what no mask lets move, in place; around what is ignored, too: what is
-    hidden there at other times looks as if it moved."""
+    """Sets a motion matte [H, W] to still, 0, in place wherever the masks allow no motion.
+
+    The still area includes a rim around ignored pixels, where scene points that become hidden would seem to move.
+    """
     if ignored is not None:
         labels[_wider(ignored, _RIM) > 0] = 0
     if people is not None:
@@ -146,7 +152,7 @@ def limited(labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None, people
 
 
 def _wider(covered: NDArray[np.bool_], by: float) -> NDArray[np.uint8]:
-    """[H, W] 1 where something is covered within `by` pixels of a picture 640 wide, else 0."""
+    """`covered` dilated by `by` pixels of a picture 640 wide: [H, W], 1 or 0."""
     reach = round(by * covered.shape[1] / 640)
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return np.asarray(cv2.dilate(covered.astype(np.uint8), around), np.uint8)

@@ -1,4 +1,4 @@
-"""Features and matches of the frames in COLMAP's database, and what they tell before any camera is found."""
+"""Extracts and matches features in COLMAP's database, and measures the matches before cameras are computed."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .pure_rotation import is_pure_rotation
 from .request import Request, closing_database, say
 
 STILL_SHARE = 0.008
-"""Largest median flow between any two frames, as a share of the image width, below which the camera stands still."""
+"""The camera stands still if the median flow of every pair of frames is below this share of the image width."""
 LEAST_MATCHES = 15
-"""Matches that two frames have to have in common to tell anything; COLMAP's own number."""
+"""Number of matches below which a pair of frames is not evaluated; COLMAP's default."""
 ALL_PAIRS = 40
-"""Frames up to which every two are matched where many pairs are wanted: 780, about 20 a frame, as longer clips get."""
+"""Number of frames up to which a wide match takes all pairs: 780 pairs, about 20 a frame as in longer clips."""
 TURNING_SHARE = 0.8
-"""Share of image pairs explained by a homography above which a failed solve may be put down to a turning camera."""
+"""A camera may count as only rotating if homographies explain more than this share of the image pairs."""
 GUESSED_FOCAL = 1.2
-"""Focal length that COLMAP begins with, as a share of the longer side."""
+"""COLMAP's initial focal length, as a share of the longer side."""
 
 
 def extract(
@@ -33,7 +33,7 @@ def extract(
     camera_id: int | None,
     mode: pycolmap.CameraMode = pycolmap.CameraMode.SINGLE,
 ) -> None:
-    """SIFT features of `names` into the database; one camera for all, an existing one if `camera_id` is given."""
+    """Extracts SIFT features of `names` into the database. With `camera_id` the images use that existing camera."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = request.camera_model
     reader.camera_params = start_params(request)
@@ -47,18 +47,18 @@ def extract(
     options.sift.max_num_features = request.features
     if request.peak:
         options.sift.peak_threshold = request.peak
-    # Numbers given beforehand, in the clip's order: else the first thread to finish would choose them.
+    # Images are imported first so that their ids follow the clip's order, not the order in which threads finish.
     with closing_database(request):
-        pass  # makes the file
+        pass  # creates the file
     colmap.import_images(request.database, request.images, mode, names, reader)
     say(stage="features" if camera_id is None else "other features")
     colmap.extract_features(request.database, request.images, mode, names, reader, options)
 
 
 def start_params(request: Request) -> str:
-    """The lens before any picture was seen, as COLMAP's parameters in a row; empty: COLMAP's own guess.
+    """Initial lens as COLMAP's comma-separated parameters; empty if COLMAP guesses it.
 
-    With it pairs are verified through the lens: the epipolar lines of a fisheye are bent.
+    With an initial lens COLMAP verifies pairs through that lens, which a fisheye needs: its epipolar lines are curves.
     """
     focal, (width, height) = request.start_focal, request.size
     if not focal and request.camera_model == FISHEYE:
@@ -81,8 +81,10 @@ def match(request: Request) -> None:
 
 
 def match_anew(request: Request) -> None:
-    """Matches on from what a try before left: pairs that it had are not matched again, but they are verified again
-    where a lens is told beforehand now and was not then, or the other way about."""
+    """Adds wide pairs to the matches of an earlier attempt, whose pairs are not matched again.
+
+    Earlier pairs are verified again if only one of the two attempts has an initial focal length.
+    """
     pairs = wide_pairs(request.solved) if request.wide else {}
     solved = set(request.solved)
     with closing_database(request) as database:
@@ -99,8 +101,10 @@ def match_anew(request: Request) -> None:
 
 
 def set_lens(request: Request, database: pycolmap.Database) -> bool:
-    """Gives the one camera of a database the request's model; True if its focal length is told now and was not before,
-    or the other way about."""
+    """Sets the only camera of a database to the request's model.
+
+    Returns True if the camera gains or loses an initial focal length.
+    """
     old = database.read_all_cameras()[0]
     focal = start_params(request)
     camera = pycolmap.Camera.create_from_model_name(
@@ -114,8 +118,10 @@ def set_lens(request: Request, database: pycolmap.Database) -> bool:
 
 
 def wide_pairs(names: Sequence[str]) -> dict[str, list[str]]:
-    """Pairs of frames in the clip's order, more than a quadratic overlap has: every two of few frames; of many, those
-    1 to 8 apart and further ones at distances that grow by the root of two, about 20 a frame in any clip."""
+    """Pairs of frames in the clip's order, more than with the quadratic overlap: about 20 a frame in any clip.
+
+    Up to `ALL_PAIRS` frames: all pairs. Beyond: distances 1 to 8, then distances that grow by the root of two.
+    """
     distances = list(range(1, len(names) if len(names) <= ALL_PAIRS else 9))
     while distances[-1:] and distances[-1] < len(names):
         distances.append(round(distances[-1] * 2**0.5))
@@ -123,22 +129,22 @@ def wide_pairs(names: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _apart(names: Sequence[str], distances: Sequence[int]) -> dict[str, list[str]]:
-    """Each name -> those that come so many places after it."""
+    """Maps each name to the names that follow it at the given distances."""
     return {name: [names[at + d] for d in distances if at + d < len(names)] for at, name in enumerate(names)}
 
 
 @dataclass(frozen=True)
 class Common:
-    """How much the solved frames show of one another."""
+    """Overlap of the solved frames, measured on their matches."""
 
     flow_px: float
-    """Largest over their pairs of the median way in pixels of what two share."""
+    """Median displacement of a pair's matches in pixels, maximum over the pairs."""
     pairs: int
-    """Pairs that share enough to tell."""
+    """Number of pairs with at least `LEAST_MATCHES` matches."""
     matches: int
-    """What such a pair shares, in the middle of them."""
+    """Median number of matches of such a pair."""
     features: int
-    """Features of a frame, in the middle of them."""
+    """Median number of features of a frame."""
 
 
 def common(request: Request) -> Common:
@@ -151,7 +157,7 @@ def common(request: Request) -> Common:
 
 
 def only_rotates(request: Request) -> bool:
-    """True if the camera only turns on the spot: homographies explain what the frames share, and are rotations."""
+    """True if the camera only rotates: homographies explain the matches of most pairs, and these are rotations."""
     kinds = pycolmap.TwoViewGeometryConfiguration
     flat = {kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC}
     pairs = [pair for pair in _shared(request) if len(pair.matches)]
@@ -168,13 +174,13 @@ def only_rotates(request: Request) -> bool:
 
 @dataclass(frozen=True)
 class _Shared:
-    """What two solved frames have in common."""
+    """Verified matches of two solved frames."""
 
     matches: NDArray[np.uint32]
     kind: pycolmap.TwoViewGeometryConfiguration
     homography: NDArray[np.float64] | None
     shift: float
-    """Median way of the matches in pixels; 0 if there are none."""
+    """Median displacement of the matches in pixels; 0 if there are none."""
 
 
 def _shared(request: Request) -> list[_Shared]:

@@ -22,10 +22,10 @@ from . import colmap_types as colmap
 from .request import SEED, Request, closing_database, say
 
 MOST_PROCESSES = 4
-"""Each process has a copy of the database (0.5 MB a frame) and builds the search trees of its frames again."""
+"""Upper limit of processes: each needs a copy of the database (0.5 MB a frame) and its own search trees."""
 
 LEAST_PAIRS = 100
-"""Fewest pairs for which a process is started. Its start takes about a second, a pair 12 to 30 ms."""
+"""Smallest number of pairs per process. The start of a process takes about a second, a pair 12 to 30 ms."""
 
 BLOCK = 64
 """Pairs after which COLMAP reports progress and drops its search trees. 405 pairs take 9.5 CPU seconds in blocks of 8,
@@ -33,7 +33,7 @@ BLOCK = 64
 
 
 def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str = "other matches") -> None:
-    """Matches each image with those that it is listed with; what the database has of them stays."""
+    """Matches each image with its listed images. Matches that are already in the database are kept."""
     say(stage=stage)
     lines = [f"{name} {other}" for name, others in pairs.items() for other in others]
     count = max(1, min(request.threads, MOST_PROCESSES, len(lines) // LEAST_PAIRS))
@@ -44,7 +44,7 @@ def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str
         helpers = [stack.enter_context(_Helper(request, part, n)) for n, part in enumerate(parts[1:], start=1)]
         match_lines(request, parts[0])
         left = [line for helper in helpers if not helper.done() for line in helper.lines]
-    if left:  # of a helper that failed, for example for lack of memory
+    if left:  # pairs of a helper that failed, for example for lack of memory
         match_lines(request, left)
 
 
@@ -61,7 +61,7 @@ def match_lines(request: Request, lines: Sequence[str]) -> None:
 
 
 def one_thread() -> pycolmap.FeatureMatchingOptions:
-    """Options of a process that matches."""
+    """Matching options: one thread, no GPU."""
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = 1

@@ -1,4 +1,4 @@
-"""Frames that the mapper was not given, or did not place: each is placed against the model by itself."""
+"""Localises the frames that the mapper did not receive or did not place, each one separately against the model."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ LOCALISE_LEAST_RATIO = 0.4
 
 
 def localise(request: Request, model: pycolmap.Reconstruction) -> dict[str, dict[str, Any]]:
-    """Poses of all frames that can be had: {name: {"pose": 3x4 list, "source", "inliers"}}.
+    """Poses of all frames that can be placed: {name: {"pose": 3x4 list, "source", "inliers"}}.
 
-    Registered ones are the model's. Each other one is matched with its nearest registered frames on either side and
-    placed against their points (P3P in LO-RANSAC, then refined), if enough points agree.
+    Registered frames keep the model's poses. Each other frame is matched with its nearest registered frames on either
+    side and placed against their points (P3P in LO-RANSAC, then refined), if enough points agree.
     """
     poses: dict[str, dict[str, Any]] = {}
     ids: dict[str, int] = {}
@@ -48,7 +48,7 @@ def localise(request: Request, model: pycolmap.Reconstruction) -> dict[str, dict
 
 
 def _nearest_registered(request: Request, missing: list[str], ids: dict[str, int]) -> dict[str, list[str]]:
-    """The nearest registered frames on either side of each frame that is not."""
+    """Maps each `missing` frame to its nearest registered frames on either side."""
     at = {name: i for i, name in enumerate(request.order)}
     known = [i for i, name in enumerate(request.order) if name in ids]
     pairs: dict[str, list[str]] = {}
@@ -62,7 +62,7 @@ def _nearest_registered(request: Request, missing: list[str], ids: dict[str, int
 def _place(
     database: pycolmap.Database, model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str, others: list[int]
 ) -> dict[str, Any] | None:
-    """The pose of one image from its matches with registered ones, or None."""
+    """The pose of one image from its matches with registered images, or None."""
     image = database.read_image_with_name(name)
     if image is None or not database.exists_keypoints(image.image_id):
         return None

@@ -1,4 +1,4 @@
-"""Which sparse points are worth training from, and when a solve tells too little of depth."""
+"""Selects the sparse points for training, and refuses solves whose triangulation angles are too small."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ STILL_HINT = "A freeze needs a clip in which the camera moves sideways by a step
 
 
 def filter_points(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """The points to train from: error below 2 px, seen by 3 frames or more, before all cameras, no far outliers.
+    """The points to train from: error below 2 px, seen by 3 frames or more, in front of all cameras, no far outliers.
 
-    `points` holds xyz [P, 3], rgb, error, track and depth [P] (the least over its cameras); `centres` [C, 3] are the
-    cameras. Far means 20 times the median distance to the cameras' middle: points of distant windows are kept.
+    `points` holds xyz [P, 3], rgb, error, track and depth [P] (smallest over a point's cameras). `centres` [C, 3] are
+    camera centres. Far means 20 times the median distance from their median, which keeps points seen through windows.
     """
     distance = np.linalg.norm(points["xyz"] - np.median(centres, axis=0), axis=1)
     keep = (points["error"] < POINT_MAX_ERROR_PX) & (points["track"] >= POINT_LEAST_TRACK) & (points["depth"] > 0)
@@ -33,11 +33,11 @@ def filter_points(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> dic
 
 
 def narrow_words(angle_deg: float) -> str:
-    """That points are seen under too small an angle for depth, degrees in the middle of them."""
+    """Sentence that the triangulation angle, median in degrees, is too small for depth."""
     return f"The camera moves too little for depth: half of the points are seen under {angle_deg:.1f} degrees or less."
 
 
 def refuse_narrow(angle_deg: float) -> None:
-    """JobError if the points are seen under too small an angle (median, degrees) for depth."""
+    """Raises JobError if the median triangulation angle in degrees is too small for depth."""
     if angle_deg < LEAST_ANGLE_DEG:
         raise JobError(narrow_words(angle_deg), STILL_HINT, ExitCode.SOLVE)

@@ -1,4 +1,4 @@
-"""The stages of a solve as one bar with one estimate of the time left."""
+"""Combines the stages of a solve into one progress bar with one estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from ..contract import FORECAST, Reporter
 
 WHOLE = "solve"
-"""Name of the one stage that is reported."""
+"""Name of the single stage that is reported."""
 WORDS = {
     "start": "Starting: {}",
     "masks": "Reading masks: {}",
@@ -24,17 +24,17 @@ WORDS = {
     "still world": "Learning what stands still: {}",
     "motion": "Finding what moves: {}",
 }
-"""Stage, without "solve: ", in order -> what people read, with how far it is."""
+"""Stages in order, without "solve: ", and their messages; {} is replaced by the progress within the stage."""
 _PIXELS = 640 * 480
 """Size of the frames that the weights were measured with."""
 _LEAST_SHARE, _LEAST_SECONDS = 0.03, 3.0
-"""Part of the bar and time before the time left is told: earlier it is a guess."""
+"""Share of the bar and seconds before the first estimate of the remaining time; an earlier one would be a guess."""
 _EVERY = 2.0
 """Seconds between two estimates."""
 
 
 def weights_of(frames: Mapping[str, Any]) -> dict[str, float]:
-    """How long each stage takes, for a frames.json: about seconds on two cores. Stages that the solve skips too.
+    """Approximate duration of each stage in seconds on two cores, for a frames.json; includes skipped stages.
 
     Only the ratios count. They were measured on the bundled clip (74 frames of 640 x 480, all of them solved).
     """
@@ -52,39 +52,39 @@ def weights_of(frames: Mapping[str, Any]) -> dict[str, float]:
         "other features": 0.27 * size * others,
         "other matches": 0.1 * others,
         "undistort": 0.04 * size * every,
-        "still world": 0.03 * max(400.0, 2.0 * every),  # steps of its training
-        "motion": 0.26 * every,  # after the still world, during which flow has begun
+        "still world": 0.03 * max(400.0, 2.0 * every),  # seconds per training step, times the number of steps
+        "motion": 0.26 * every,  # without the optical flow that runs during "still world"
     }
 
 
 class OneBar:
-    """A reporter that shows the stages of a solve as one, whose share never falls.
+    """A reporter that shows the stages of a solve as one stage whose share never decreases.
 
-    A stage that is left out is jumped over; where one comes again, as in another try, the rest of the bar is shared by
-    it and all that follow.
+    The bar jumps over a skipped stage. If a stage repeats in a retry, it shares the rest of the bar with the stages
+    that follow.
     """
 
     def __init__(
         self, report: Reporter, weights: Mapping[str, float], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """`weights`: see `weights_of`; `clock` counts seconds."""
+        """`weights`: see `weights_of`. `clock` returns seconds."""
         self._report, self._clock = report, clock
         self._order = list(weights)
         self._weights = weights
         self._stage: str = ""
         self._share = 0.0
-        """Of the stage."""
+        """Share of the stage that is done."""
         self._bar = 0.0
-        """Share of the whole that is done."""
+        """Share of the solve that is done."""
         self._entered = (0.0, 0.0)
-        """The bar, and the share of the stage that was done, when the stage began."""
+        """Values of `_bar` and `_share` when the stage began."""
         self._worked = 0.0
-        """Weight of all that was done before this stage, also in tries that were given up."""
+        """Weight of all work before this stage, including failed attempts."""
         self._began = clock()
         self._told = self._began
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        """One stage's progress as the whole's; of what is no stage of the solve, the message alone."""
+        """Reports a stage's progress as progress of the solve. A stage not in `weights` changes only the message."""
         name = stage.removeprefix(f"{WHOLE}: ")
         if name not in self._weights:
             self._report.progress(WHOLE, self._bar, 1.0, message)
@@ -104,7 +104,7 @@ class OneBar:
         self._report.progress(WHOLE, self._bar, 1.0, WORDS[name].format(message or "begins"))
 
     def _work_in_stage(self) -> float:
-        """Weight of what was done since the stage began."""
+        """Weight of the work since the stage began."""
         return self._weights[self._stage] * (self._share - self._entered[1]) if self._stage else 0.0
 
     def _left(self) -> float:
@@ -113,7 +113,7 @@ class OneBar:
         return self._weights[self._stage] * (1.0 - self._share) + sum(self._weights[name] for name in after)
 
     def _tell(self, left: float, at_once: bool) -> None:
-        """Says how long the rest takes, at the pace of what was done."""
+        """Reports the remaining time, extrapolated from the pace so far."""
         now, worked = self._clock(), self._worked + self._work_in_stage()
         if worked < _LEAST_SHARE * (worked + left) or now - self._began < _LEAST_SECONDS:
             return
@@ -122,17 +122,17 @@ class OneBar:
             self.metric(FORECAST, {"of": WHOLE, "seconds_left": round((now - self._began) / worked * left, 1)})
 
     def metric(self, stage: str, values: Mapping[str, Any]) -> None:
-        """As it is."""
+        """Forwards to the wrapped reporter."""
         self._report.metric(stage, values)
 
     def image(self, label: str, path: str | Path) -> None:
-        """As it is."""
+        """Forwards to the wrapped reporter."""
         self._report.image(label, path)
 
     def warning(self, message: str, hint: str = "") -> None:
-        """As it is."""
+        """Forwards to the wrapped reporter."""
         self._report.warning(message, hint)
 
     def check_cancelled(self) -> None:
-        """As the one behind."""
+        """Forwards to the wrapped reporter."""
         self._report.check_cancelled()

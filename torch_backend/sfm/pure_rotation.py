@@ -1,4 +1,4 @@
-"""Detects a camera that only rotates, from the homographies between its frames. numpy alone."""
+"""Detects a camera that only rotates, from the homographies between its frames. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -6,32 +6,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 FOCALS = (0.4, 2.5)
-"""Range of focal lengths that are tried, as shares of the picture's width: 103 to 23 degrees wide."""
+"""Range of focal lengths that are tried, as shares of the picture's width: views 103 to 23 degrees wide."""
 GIVEN = 1.2
-"""Times by which a known focal length may be off: with one, a bend of the lens is made up for."""
+"""Factor by which a known focal length is varied in both directions, which compensates for lens distortion."""
 _STEPS = 48
 WIDEST = 0.25
-"""Share of the pairs that are tested: those with the largest shift."""
+"""Share of the pairs that is tested: the pairs with the largest shifts."""
 TRAVELLED = 0.2
-"""Largest share of the shift between two frames that translation may cause for the camera to count as only rotating.
-Measured in a rendered room: 0.02 turning, 0.5 to 0.7 walking past its walls."""
+"""Largest share of the shift between two frames that translation may cause if the camera counts as only rotating.
+Measured in a rendered room: 0.02 when turning, 0.5 to 0.7 when walking past its walls."""
 _NOISE = 0.004
-"""How far from a rotation noise makes one, as the ratio of its largest to its smallest singular value, less one."""
+"""Deviation from a rotation caused by noise alone: ratio of the largest to the smallest singular value, minus 1."""
 
 
 def is_pure_rotation(
     homographies: NDArray[np.float64], shifts: NDArray[np.float64], size: tuple[int, int], focal: float = 0.0
 ) -> bool:
-    """True if one focal length makes rotations of the homographies between the pairs that are farthest apart.
+    """True if some focal length turns the homographies of the pairs with the largest shifts into rotations.
 
-    A homography of a camera that turns is K R K^-1; one of a plane that a camera passes is R + t n^T / d between the
-    Ks, whose singular values differ by the way travelled as a share of the distance.
+    The homography of a rotating camera is K R K^-1. If the camera moves past a plane, it is K (R + t n^T / d) K^-1.
+    Its singular values then differ by the distance travelled, relative to the distance of the plane.
 
     Args:
-        homographies: [N, 3, 3], pixels to pixels, of pairs of frames that one explains.
-        shifts: [N], median way in pixels of what the pair has in common.
-        size: width and height of the frames, pixels; the axis goes through the middle.
-        focal: focal length in pixels if it is known; 0: any usual one is tried.
+        homographies: [N, 3, 3], pixels to pixels, of the pairs of frames that a homography explains.
+        shifts: [N], median displacement of the pair's matches in pixels.
+        size: width and height of the frames in pixels; the principal point is the centre.
+        focal: focal length in pixels if it is known; 0: the usual range is tried.
     """
     if not len(homographies):
         return False

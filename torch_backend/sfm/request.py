@@ -17,12 +17,12 @@ SEED = 0
 
 
 class Request:
-    """What the parent asks for, from its JSON."""
+    """The parent's request, read from its JSON file."""
 
     def __init__(self, path: Path) -> None:
         data = json.loads(path.read_text(encoding="utf-8"))
         self.data: dict[str, Any] = data
-        """The whole request, as in the file."""
+        """The complete request as in the file."""
         self.scratch = path.parent
         self.database = self.scratch / "database.db"
         self.images = Path(data["images"])
@@ -35,31 +35,31 @@ class Request:
         self.neighbours: int = data["neighbours"]
         self.threads: int = data["threads"]
         self.size: list[int] = data.get("size", [0, 0])
-        """Pixels of the images, for a lens that is told beforehand."""
+        """Width and height of the images in pixels, for an initial lens."""
         self.focal: float = data.get("focal_px", 0.0)
-        """Focal length that the lens is known to have, pixels; 0: not known."""
+        """Known focal length of the lens in pixels; 0: unknown."""
         self.start_focal: float = self.focal or data.get("start_focal_px", 0.0)
-        """Focal length with which the solve begins, pixels: one that may be so; 0: COLMAP's guess."""
+        """Initial focal length in pixels, known or likely; 0: COLMAP's guess."""
         self.hold_focal: bool = bool(self.focal) and bool(data.get("hold_focal"))
         self.hold_bend: bool = data.get("hold_bend", False)
-        """The pictures have no lens any more: the model's bend stays at nothing."""
+        """The images are already undistorted: the model's distortion is fixed at 0."""
         self.masks = data.get("masks", "")
-        """Folder of COLMAP's masks; empty: nothing is masked."""
+        """Folder of COLMAP's masks; empty: no masks."""
         self.match: list[str] = data.get("match", [])
-        """Pairs "name name" that this worker matches, and does nothing else; empty: it solves."""
+        """Pairs "name name". If there are any, this worker only matches them; if empty, it solves."""
         self.known: dict[str, Any] | None = data.get("known")
         self.peak: float = data.get("peak", 0.0)
-        """Least contrast of a feature; 0: COLMAP's own."""
+        """Smallest contrast of a feature; 0: COLMAP's default."""
         self.wide: bool = data.get("wide", False)
-        """Match more frames with each other than the overlap asks for."""
+        """Match more pairs of frames than `overlap` gives."""
         self.mapper: str = data.get("mapper", "incremental")
         """"incremental" or "global"."""
         self.reuse: bool = data.get("reuse", False)
-        """The database has the features and matches of a try before, and maybe frames that are not solved."""
+        """The database holds features and matches of an earlier attempt, possibly of frames outside `solved` too."""
 
 
 def say(**message: Any) -> None:
-    """One line to the parent."""
+    """Sends the parent one line of JSON."""
     sys.stdout.write(json.dumps(message) + "\n")
     sys.stdout.flush()
 

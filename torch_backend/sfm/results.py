@@ -1,4 +1,4 @@
-"""What a solve writes: undistorted frames, cameras, points and the record, from what COLMAP's worker left."""
+"""Writes the results of a solve: undistorted frames, cameras, points and the record, from the worker's files."""
 
 from __future__ import annotations
 
@@ -43,50 +43,50 @@ from .verdict import FAIR_ERROR_PX, quality_words
 
 SOLVE_VERSION = 1
 _WRITERS = 4
-"""Frames undistorted at once. Half of the time is spent in fsync: on two cores 4 take 0.62 to 0.76 of the time of 2, 8
-take 0.52 to 0.62. More would need too much memory: a 4K frame in floats takes 300 MB."""
+"""Number of threads that undistort frames. Half of the time is spent in fsync: on two cores 4 threads take 0.62 to 0.76
+of the time of 2, 8 threads 0.52 to 0.62. More would need too much memory: a 4K frame in floats takes 300 MB."""
 
 
 class SolveResult(TypedDict):
-    """What `solve_shot` returns, and summary.json repeats."""
+    """Result of `solve_shot`, repeated in summary.json."""
 
     frames: int
     """Source frames of the range; each has a camera."""
     solved_frames: int
-    """Frames given to the mapper."""
+    """Frames passed to the mapper."""
     registered: int
     """Of these, frames that the mapper placed."""
     localised: int
     """Further frames placed against the model."""
     interpolated: int
-    """Frames whose pose is interpolated or held."""
+    """Frames whose pose is interpolated, or copied from the nearest frame with a pose."""
     reprojection_error_px: float
-    """Mean over the model's observations."""
+    """Mean error over the model's observations, in pixels."""
     points: int
     """Points in points.npz."""
     focal_px: float
     """Focal length of the undistorted frames in pixels."""
     quality: str
-    """The same in words."""
+    """Summary in words, see `verdict.quality_words`."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What is to be solved."""
+    """Inputs of a solve."""
 
     shot: Shot
     frames: dict[str, Any]
-    """frames.json."""
+    """Contents of frames.json."""
     masks: dict[str, Mask]
     facts: dict[str, Any]
-    """Of the record: what the solve was asked for."""
+    """Part of solve.json that records the solve's settings."""
 
 
 def write_results(asked: Asked, answer: dict[str, Any], scratch: Path, staged: Staged, report: Reporter) -> SolveResult:
-    """Writes the solve's files, from what the worker left in `scratch`, to where they wait until they are whole.
+    """Writes the solve's files into `staged`, from the worker's files in `scratch`.
 
     Args:
-        answer: the worker's, `cameras.imported`'s where cameras were given.
+        answer: answer of the worker; for imported cameras, that of `imported_cameras.take_over`.
     """
     frames = asked.frames
     solved = sum(f["solve"] for f in frames["frames"])
@@ -129,7 +129,7 @@ def write_results(asked: Asked, answer: dict[str, Any], scratch: Path, staged: S
 
 
 def _record(answer: dict[str, Any], result: SolveResult) -> dict[str, Any]:
-    """What solve.json repeats of the worker's answer and of the result."""
+    """Fields of solve.json that repeat the worker's answer and the result."""
     return {
         "registered": result["registered"],
         "total_frames": result["frames"],
@@ -155,7 +155,7 @@ def _pinhole(file: Path) -> NDArray[np.float64]:
 
 
 def _lens(file: Path) -> dict[str, Any]:
-    """A lens of the working frames, as COLMAP names and orders it."""
+    """A lens of the working frames: COLMAP's model name and parameters."""
     with np.load(file, allow_pickle=False) as data:
         return {"model": str(data["model"]), "params": data["params"].tolist()}
 
@@ -163,9 +163,9 @@ def _lens(file: Path) -> dict[str, Any]:
 def _camera_path(
     frames: dict[str, Any], poses: dict[str, Any], pinholes: list[NDArray[np.float64]]
 ) -> tuple[CameraPath, list[int]]:
-    """A camera for every frame: registered, localised, or interpolated in time between those; and its lens's index.
+    """A camera for every frame (registered, localised, or interpolated in time), and the index of each frame's lens.
 
-    `pinholes` are fx, fy, cx, cy of each lens. A frame between two lenses has the nearer frame's.
+    `pinholes` are fx, fy, cx, cy of each lens. A frame without a pose gets the lens of the nearest frame with a pose.
     """
     listed = frames["frames"]
     names = [Path(f["file"]).name for f in listed]
@@ -182,7 +182,7 @@ def _camera_path(
 
 
 def _nearest(known: list[int], count: int) -> list[int]:
-    """The nearest of some ascending indices to each of 0 to `count` - 1; of two as near the lower."""
+    """For each of 0 to `count` - 1 the nearest of the ascending indices `known`; the lower one of two equally near."""
     spots = np.array(known)
     every = np.arange(count)
     above = np.searchsorted(spots, every).clip(0, len(spots) - 1)
@@ -195,7 +195,7 @@ def _centres(path: CameraPath) -> NDArray[np.float64]:
 
 
 def _undistort_all(asked: Asked, lenses: list[int], maps: list[Path], into: Staged, report: Reporter) -> None:
-    """Writes the undistorted frames and masks, lens by lens: a map takes 128 bytes per pixel."""
+    """Writes the undistorted frames and masks, one lens at a time, because a map takes 128 bytes per pixel."""
     done = 0
     for number, file in enumerate(maps):
         rows = [frame for frame, lens in zip(asked.frames["frames"], lenses, strict=True) if lens == number]
@@ -207,7 +207,7 @@ def _undistort_all(asked: Asked, lenses: list[int], maps: list[Path], into: Stag
 def _undistort(
     asked: Asked, listed: list[dict[str, Any]], file: Path, into: Staged, counts: tuple[int, int], report: Reporter
 ) -> None:
-    """Frames of one lens; `counts` are the frames done before these, and all there are."""
+    """Writes the frames of one lens. `counts` holds the number of frames done before, and of all frames."""
     before, total = counts
     with np.load(file, allow_pickle=False) as data:
         where = data["where"]
@@ -260,7 +260,7 @@ def _warnings(
         for camera, frame in zip(path.frames, frames["frames"], strict=True)
         if frame["solve"] and camera.source != "registered"
     ]
-    if lost and not given:  # given cameras were told of when they were matched
+    if lost and not given:  # missing imported cameras were reported when the file was matched
         warnings.append(
             (
                 f"The mapper did not register {len(lost)} solved frames: {frame_words(lost)}.",

@@ -1,8 +1,8 @@
-"""Retries of a solve that is refused or poor: one strategy after the other, each announced before it runs.
+"""Retries a solve that is refused or poor: one strategy after the other, each announced before it runs.
 
 Each attempt is a request to the worker in its own folder. COLMAP's database moves from one attempt to the next, so that
-features are extracted twice at most. Nothing is retried where no strategy can help: the camera stands still, only
-rotates, or moves too little for parallax.
+features are extracted twice at most. There is no retry if the camera stands still, only rotates, or moves too little
+for parallax, because no strategy can help then.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from .verdict import FAIR_SHARE, Fault, fault_of, quality_words
 DATABASE_FILE = "database.db"
 
 MORE_FEATURES = 2.0
-"""Factor on the number of features per frame; their contrast may then be as low as FAINT_PEAK."""
+"""Factor on the number of features per frame in the strategy "features", which also lowers the contrast limit."""
 FAINT_PEAK = 0.0025
-"""Least contrast of a feature when more are extracted; COLMAP's default is 0.0067."""
+"""Smallest contrast of a feature in the strategy "features"; COLMAP's default is 0.0067."""
 FIRST = "first"
 NO_FOCAL = {"start_focal_px": 0.0}
 
 
 @dataclass(frozen=True)
 class Strategy:
-    """A change of the request that may help."""
+    """A change of the request that may make the solve succeed."""
 
     name: str
     words: str
@@ -78,7 +78,7 @@ class Attempt:
 
 @dataclass(frozen=True)
 class RetriedSolve:
-    """The best attempt, and a list of all."""
+    """The best attempt, and a list of all attempts."""
 
     best: Attempt
     tries: list[dict[str, str]]
@@ -96,13 +96,13 @@ def solve_with_retries(
         request: the first request to the worker.
         frames: frames.json.
         retry: False solves once only.
-        scratch: folder with a subfolder per attempt; only that of the best keeps its files.
-        log: file for the output of COLMAP, of all attempts.
+        scratch: folder with a subfolder per attempt; only the best attempt's subfolder keeps its files.
+        log: file for COLMAP's output of all attempts.
         report: receives a warning for each retry: what is wrong, and what is tried next.
 
     Raises:
         JobError: even the best attempt is unusable, or the first one crashed.
-        Cancelled: also between two attempts.
+        Cancelled: the job was cancelled, also between two attempts.
     """
     best = last = _attempt(FIRST, request, frames, None, scratch, log, report)
     current, tries = dict(request), [_row(best.strategy, best.words)]
@@ -161,7 +161,7 @@ def next_strategy(best: Attempt, asked: dict[str, Any], done: set[str]) -> Strat
 
 
 def _other_lens(best: Attempt, asked: dict[str, Any]) -> Strategy | None:
-    """Another lens model: a fisheye only where the solve looks like one."""
+    """Strategy with another lens model; a fisheye only if the solve looks like one."""
     model = asked["camera_model"]
     if model == FISHEYE or asked.get("hold_bend") or "failure" in best.answer:
         return None
@@ -181,7 +181,7 @@ def _attempt(
     log: Path,
     report: Reporter,
 ) -> Attempt:
-    """One attempt. It takes over COLMAP's database from the attempt `before`."""
+    """Runs one attempt, which takes over COLMAP's database from the attempt `before`."""
     folder = scratch / strategy
     make_folder(folder)
     reuse = before is not None and (before.folder / DATABASE_FILE).is_file()

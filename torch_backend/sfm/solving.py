@@ -1,4 +1,4 @@
-"""Cameras from the working frames: COLMAP in a child process, then undistorted frames and plain files."""
+"""The solve: computes cameras from the working frames with COLMAP in a child process, and writes the results."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _LOG_END_BYTES = 16_384
 
 @dataclass
 class SolveConfig:
-    """How cameras are found."""
+    """Settings of a camera solve."""
 
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP camera model, one camera for all frames: SIMPLE_RADIAL, OPENCV for strong or tangential distortion, or
@@ -53,50 +53,50 @@ class SolveConfig:
     overlap: int = 15
     """Each solved frame is matched with those 1, 2, 4, ... 2^(overlap - 1) frames after it."""
     features: int = 4096
-    """Most SIFT features per frame, from the upsampled octave on."""
+    """Largest number of SIFT features per frame; the first octave is the upsampled one."""
     localise: bool = True
-    """Place frames that the step left out against the model, each by itself; else they are interpolated."""
+    """Localise frames that the import's step left out, each against the model; else those frames are interpolated."""
     neighbours: int = 2
-    """A frame to be placed is matched with this many registered frames on either side of it."""
+    """Number of registered frames on either side with which a frame to be localised is matched."""
     ignore_mask: str = ""
-    """Mask of what is no part of the scene, as `footage.masks.read_masks` takes it, or `MASK_FOUND`; empty: none."""
+    """Mask of pixels outside the scene, as for `footage.masks.read_masks`, or `MASK_FOUND`; empty: none."""
     people_mask: str = ""
-    """Mask of what alone may move; empty: everything may."""
+    """Mask of the only pixels that may move; empty: all may move."""
     focal_mm: float = 0.0
-    """Focal length of the lens in mm, with which the solve begins; 0: it is not known."""
+    """Initial focal length of the lens in mm; 0: unknown."""
     sensor_mm: float = 36.0
     """Width in mm of the part of the sensor that the picture shows."""
     refine_focal: bool = True
-    """Refine `focal_mm`; else it is held."""
+    """Refine `focal_mm`; else it is fixed."""
     st_map: str = ""
-    """File of an ST map that holds the lens; empty: the solve finds it."""
+    """File of an ST map that holds the lens distortion; empty: the solve estimates the distortion."""
     st_map_way: str = "undistort"
     """One of `contract.ST_MAP_WAYS`."""
     st_map_layer: str = ""
-    """Layer of the file; empty: red and green."""
+    """Layer of the ST map's file; empty: channels red and green."""
     retry: bool = True
-    """Try again in other ways where the solve is refused or poor, as `retries.solve_with_retries` does."""
+    """Retry a refused or poor solve with other strategies, see `retries.solve_with_retries`."""
 
 
 def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str = "") -> SolveResult:
     """Finds the camera of every frame of `shot` and writes the undistorted frames.
 
-    Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json: a
-    contract.CameraPath in COLMAP's world ("solve units"), OpenCV axes, world-to-camera, pinhole of the undistorted
-    frames. They take the place of an earlier solve when all of them are written; until then, and if this one fails,
-    that one stays. A shot already solved from the same frames with the same configuration is left alone.
+    Writes frames/NNNNNN.png, solve/points.npz, solve/colmap/, solve/cameras.json and, last, solve/solve.json.
+    cameras.json is a contract.CameraPath in COLMAP's world ("solve units"): OpenCV axes, world-to-camera, pinhole of
+    the undistorted frames. The files replace an earlier solve once all are written; if the solve fails, the earlier one
+    stays. A shot already solved from the same frames with the same configuration is not solved again.
 
-    With an ST map in `config` the frames are undistorted through it first, and the solve finds the focal length alone.
+    With an ST map in `config` the frames are undistorted first, and the solve estimates only the focal length.
 
-    With `cameras`, a path that `imported.read` understands, the cameras of that file are taken instead of solving: in
-    its world, frames without one interpolated.
+    With `cameras`, a path that `imported.read` can read, the cameras of that file replace the solve. They keep the
+    file's world; frames without a camera are interpolated.
 
-    `report` hears a metric `CAMERAS_KNOWN` at the end.
+    `report` receives the metric `CAMERAS_KNOWN` at the end.
 
-    Raises JobError (SOLVE) in one sentence if cameras cannot be found, and Cancelled.
+    Raises JobError (SOLVE) if cameras cannot be found, and Cancelled.
     """
     _check(config, cameras)
-    for folder in (shot.frames, shot.colmap, *map(shot.masks, MASK_KINDS)):  # earlier files are replaced
+    for folder in (shot.frames, shot.colmap, *map(shot.masks, MASK_KINDS)):  # refuses links: earlier files are replaced
         shot.own(folder)
     settle_solve(shot)
     frames = load_frames(shot)
@@ -115,13 +115,13 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
 
 
 def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Reporter) -> SolveResult:
-    """Solves, and puts the files in the place of those before."""
+    """Solves, and replaces the files of the earlier solve."""
     shot, frames = asked.shot, asked.frames
     imported_cameras = prepare(frames, cameras, report) if cameras else None
     lens = _lens_of_map(config, frames, report)
     _refuse_damaged(shot, frames)
-    # Undistorted frames are as large as the imported ones; features and matches take about 1 MB a frame, and copies of
-    # the database while pairs are matched up to 1.5 MB.
+    # Undistorted frames are as large as the imported ones. Per frame, features and matches take about 1 MB, and the
+    # copies of the database during matching up to 1.5 MB.
     size = (1.2 if lens is None else 2.4) * sum((shot.frames / f["file"]).stat().st_size for f in frames["frames"])
     need_disk(shot.root, size + 2.5 * (len(frames["frames"]) << 20), "The camera solve")
     scratch = shot.solve / "scratch"
@@ -150,7 +150,7 @@ def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Report
 def _mapped(
     asked: Asked, config: SolveConfig, lens: MapLens | None, scratch: Path, report: Reporter
 ) -> tuple[dict[str, Any], Path]:
-    """COLMAP's answer, and the folder in which its files lie."""
+    """COLMAP's answer, and the folder of its files."""
     shot, frames = asked.shot, asked.frames
     undistorted = None if lens is None else UndistortedFrames(shot, frames, lens, scratch / "straight", report)
     request = _request(shot, frames, config, asked.masks, scratch, undistorted)
@@ -162,7 +162,7 @@ def _mapped(
 
 
 def _facts(shot: Shot, config: SolveConfig, masks: dict[str, Mask], key: str) -> dict[str, Any]:
-    """What the record keeps of what was asked for."""
+    """The solve's settings that solve.json records."""
     return {
         "key": key,
         "masks": facts_of(masks, _mask_sources(shot, config)),
@@ -171,14 +171,14 @@ def _facts(shot: Shot, config: SolveConfig, masks: dict[str, Mask], key: str) ->
 
 
 def _lens_of_map(config: SolveConfig, frames: dict[str, Any], report: Reporter) -> MapLens | None:
-    """The lens that the ST map holds; None without one."""
+    """The lens from the ST map; None without an ST map."""
     if not config.st_map:
         return None
     return map_reading.read_lens(config.st_map, config.st_map_way, config.st_map_layer, frames, report)
 
 
 def _mask_sources(shot: Shot, config: SolveConfig) -> dict[str, str]:
-    """Kind of mask -> where it comes from; empty: there is none."""
+    """Maps each kind of mask to its source; an empty source means no mask."""
     ignored = config.ignore_mask
     if ignored == MASK_FOUND:
         ignored = str(shot.burnt_in) if shot.burnt_in.is_file() else ""
@@ -186,21 +186,21 @@ def _mask_sources(shot: Shot, config: SolveConfig) -> dict[str, str]:
 
 
 def _key(config: SolveConfig, frames: dict[str, Any], source: list[str], masks: dict[str, Mask]) -> str:
-    """Tells a solve from others. Masks count by what they cover, wherever they lie."""
+    """Key that identifies a solve. It uses the contents of masks and files, not their paths."""
     settings = asdict(config)
-    new = ["ignore_mask", "people_mask"]  # earlier solves had none of these
-    new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # the file counts by what is in it
+    new = ["ignore_mask", "people_mask"]  # not in the keys of earlier solves, which stay valid
+    new += ["st_map"] + ([] if config.st_map else ["st_map_way", "st_map_layer"])  # `source` has the file's fingerprint
     new += [] if config.focal_mm else ["focal_mm", "sensor_mm", "refine_focal"]
-    new += ["retry"] if config.retry else []  # a solve without retries does not count as one with them
+    new += ["retry"] if config.retry else []  # a solve without retries has another key
     for name in new:
         settings.pop(name)
     return content_key(SOLVE_VERSION, settings, frames.get("key"), *source, *(mask.key for mask in masks.values()))
 
 
 def _mark_motion_unfinished(shot: Shot) -> None:
-    """Has later steps find what moves if the job ends after the cameras are written and before the search begins.
+    """Marks the shot so that a later step searches for motion if the job ends between the solve and the search.
 
-    Mattes that belong to the shot's cameras are not made void by it: should the new solve not come to hold, they stay.
+    The mark does not invalidate mattes that match the shot's cameras. They stay valid if the new solve is discarded.
     """
     mark = shot.own(shot.motion) / MOTION_UNFINISHED_FILE
     if not mark.is_file():
@@ -209,7 +209,7 @@ def _mark_motion_unfinished(shot: Shot) -> None:
 
 
 def _log_end(log: Path) -> str:
-    """What COLMAP said last, for the job's own log."""
+    """The end of COLMAP's log, for the job's log."""
     try:
         with open_regular(log) as handle:
             handle.seek(max(0, os.fstat(handle.fileno()).st_size - _LOG_END_BYTES))
@@ -240,7 +240,7 @@ def _check(config: SolveConfig, cameras: str) -> None:
 
 
 def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | None:
-    """solve.json if it is of this key and the solve is whole: to solve again is how a damaged one is mended."""
+    """solve.json if its key is `key` and the solve is complete; else None, so that a damaged solve is repeated."""
     try:
         record = load_record(shot)
         if record.get("key") != key or not isinstance(record.get("result"), dict):
@@ -256,7 +256,7 @@ def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | 
 
 
 def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
-    """JobError (FOOTAGE) if a frame cannot be read: COLMAP would leave it out, and say so in its log alone."""
+    """Raises JobError (FOOTAGE) if a frame cannot be read: COLMAP would skip it and report that only in its log."""
     bad = [f["frame"] for f in frames["frames"] if not is_whole_png(shot.frames / f["file"])]
     if bad:
         raise JobError(
@@ -273,7 +273,7 @@ def _matching(
     scratch: Path,
     undistort: Undistorter | None = None,
 ) -> dict[str, Any]:
-    """What the worker is told of features and matches; writes its masks, of frames that went through `undistort`."""
+    """The request's fields about features and matches. Also writes COLMAP's masks, undistorted by `undistort`."""
     options: dict[str, Any] = {"overlap": config.overlap, "features": config.features}
     if not masks:
         return options
@@ -284,7 +284,7 @@ def _matching(
 
 
 def _focal_of_file(frames: dict[str, Any]) -> float:
-    """Focal length in pixels of the working frames that the footage's file tells; 0 if it does not."""
+    """Focal length in pixels of the working frames, from the footage's metadata; 0 if it has none."""
     focal = frames.get("reading", {}).get("focal_35mm")
     return focal_px(focal, frames["width"], frames["height"]) if focal else 0.0
 
@@ -297,7 +297,7 @@ def _request(
     scratch: Path,
     undistorted: UndistortedFrames | None,
 ) -> dict[str, Any]:
-    """What the worker is asked for at first: of frames whose lens was taken out before, no bend."""
+    """The first request to the worker. For frames that were undistorted first, the distortion is fixed at 0."""
     scale = 1.0 if undistorted is None else undistorted.focal_scale
     names: dict[bool, list[str]] = {True: [], False: []}
     for frame in frames["frames"]:

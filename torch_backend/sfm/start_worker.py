@@ -1,7 +1,7 @@
-"""Starts the child process in which COLMAP runs: `python -m torch_backend.sfm.start_worker REQUEST.json`.
+"""Entry point of the child process in which COLMAP runs: `python -m torch_backend.sfm.start_worker REQUEST.json`.
 
-Apart from `worker.py`, which loads pycolmap before its first line: a package that is missing or broken is told as one
-line of JSON, {"lacks": "what Python says of it"}, and not as a solve that broke.
+It is separate from `worker.py`, which imports pycolmap, so that it can report a missing or broken package as one line
+of JSON, {"lacks": "Python's message"}, instead of as a failed solve.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from ..contract import ExitCode
 
 
 def main(path: str) -> int:
-    """Runs the request of a file as `worker.main`; ENVIRONMENT if what that needs cannot be loaded."""
+    """Runs `worker.main` on a request file; returns ENVIRONMENT if a package that it needs cannot be loaded."""
     try:
         from . import worker
-    except Exception as error:  # a package that was half written raises anything
+    except Exception as error:  # a half-written package can raise any exception
         ours = isinstance(error, ImportError) and (error.name or "").startswith("torch_backend")
         if ours or isinstance(error, MemoryError):
             raise

@@ -1,4 +1,4 @@
-"""Whether a solve can be used: what is wrong with one that cannot, in which words, and how good one is that can."""
+"""Judges whether a solve can be used: the fault and message of an unusable solve, and the quality of a usable one."""
 
 from __future__ import annotations
 
@@ -17,24 +17,26 @@ REFUSED_SHARE = 0.5
 GOOD_SHARE, GOOD_ERROR_PX = 0.95, 1.2
 FAIR_SHARE, FAIR_ERROR_PX = 0.8, 1.5 * GOOD_ERROR_PX
 SHORT_SECONDS = 1.0
-"""A range shorter than this is told to be too short, where the camera moves too little in it."""
+"""If the camera moves too little, a range shorter than this is reported as too short."""
 SMEARED, SMEARED_SHARE = 0.3, 0.5
-"""A frame is smeared if its sharpness is below this share of what the sharpest quarter of the solved frames has. If
-this share of the frames without a place are, that is said."""
+"""A frame is smeared if its sharpness is below the first value's share of the solved frames' upper quartile. The
+message mentions it if at least the second value's share of the frames without a pose is smeared."""
 ENOUGH_MATCHES = 100
-"""Matches with which two frames could begin a solve, COLMAP's own number: if none can, it is for lack of parallax."""
+"""Matches that a pair of frames needs to start a solve, COLMAP's default. If typical pairs have that many and the solve
+still does not start, the cause is a lack of parallax."""
 MUCH_MOVES = 0.2
-"""Share of a clip's pixels that move by themselves from which on its cameras are doubted. Clips looked at leave 0.02
-to 0.08; a solve that had taken a start without depth left 0.31, at an error of 0.9 pixels."""
+"""Share of independently moving pixels above which a clip's cameras are doubted. Correct solves had 0.02 to 0.08. A
+solve that started from a pair without parallax had 0.31, at an error of 0.9 pixels."""
 _TURNING = "The camera only turns on the spot: there is nothing to tell depth by."
 _RANGE_HINT = "Import a longer range, in which the camera moves sideways by a step or more."
 _BARE_HINT = "Choose a sharper range, or film with more light and texture in view."
 
 
 def doubt_of(moving: float) -> tuple[str, str] | None:
-    """(what is wrong, what to do) with cameras that leave a share `moving` of the pixels moving by themselves; None if
-    nothing is. Cameras without parallax fit their matches, so that the only sign of a wrong solve is that everything
-    seems to move."""
+    """(message, hint) if the share `moving` of independently moving pixels is too large; else None.
+
+    Without parallax, wrong cameras fit their matches. The only sign of the error is that the whole scene seems to move.
+    """
     if moving < MUCH_MOVES:
         return None
     return (
@@ -47,14 +49,14 @@ def doubt_of(moving: float) -> tuple[str, str] | None:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a solve."""
+    """The fault of a solve."""
 
     kind: str
-    """still, turning or narrow: no solve can help. unmatched, few, bare or lens: refused, but another one may help.
-    poor: usable, but too few frames have a place in it, or they fit badly. bent: usable, with a usual lens instead of
-    one that folds the picture over."""
+    """still, turning or narrow: refused, and no retry can help. unmatched, few, bare or lens: refused, but a retry may
+    help. poor: usable, but too few frames have a pose, or they fit badly. bent: usable, with a usual lens instead of an
+    estimated lens that folds the picture over."""
     error: JobError
-    """What the artist is told if it stays so."""
+    """The error that is shown to the artist if no retry helps."""
 
     @property
     def refused(self) -> bool:
@@ -63,14 +65,14 @@ class Fault:
 
 
 def fault_of(answer: dict[str, Any], frames: dict[str, Any]) -> Fault | None:
-    """What is wrong with a worker's answer, {"result"} or {"failure"}, of the solved frames of frames.json; or None."""
+    """The fault of a worker's answer, {"result"} or {"failure"}; None if it has none. `frames` is frames.json."""
     if "failure" in answer:
         return _failure(answer, frames)
     found = answer["result"]
     solved = [f for f in frames["frames"] if f["solve"]]
     registered = found["registered"]
     if registered < min(LEAST_REGISTERED, len(solved)) or registered < REFUSED_SHARE * len(solved):
-        if found.get("turning"):  # a tripod's head: what was placed was placed by chance
+        if found.get("turning"):  # a camera on a tripod: the registered poses are accidental
             return _fault("turning", _TURNING, STILL_HINT)
         return _too_few(found, solved, frames["step"])
     try:
@@ -96,8 +98,11 @@ def fault_of(answer: dict[str, Any], frames: dict[str, Any]) -> Fault | None:
 
 
 def quality_words(registered: int, solved: int, error_px: float, given: bool = False, misled: bool = False) -> str:
-    """One sentence: Good, Fair or Poor, and the figures; cameras that were `given` are said to be. One whose
-    premise does not hold, of a flat scene or a lens that zooms, is `misled`: poor, however well its points fit."""
+    """One sentence: Good, Fair or Poor, and the figures.
+
+    `given` means imported cameras, which the sentence mentions. `misled` means a flat scene or a zooming lens: the
+    solve is Poor however well its points fit.
+    """
     share = registered / max(1, solved)
     if misled:
         word = "Poor"
@@ -115,7 +120,7 @@ def _fault(kind: str, message: str, hint: str) -> Fault:
 
 
 def _failure(answer: dict[str, Any], frames: dict[str, Any]) -> Fault:
-    """Where the mapper had nothing to begin with."""
+    """Fault of an answer {"failure"}: the mapper found no model."""
     flow = answer["flow_px"]
     if answer["failure"] == "still":
         if short := _short(frames):
@@ -145,14 +150,14 @@ def _failure(answer: dict[str, Any], frames: dict[str, Any]) -> Fault:
 
 
 def _short(frames: dict[str, Any]) -> str:
-    """That the imported range is too short, as a sentence's beginning; empty if it is not."""
+    """Beginning of a sentence that the imported range is too short; empty if it is not."""
     rows = frames["frames"]
     seconds = rows[-1]["seconds"] - rows[0]["seconds"]
     return f"The range of {len(rows)} frames ({seconds:.1f} s) is too short" if seconds < SHORT_SECONDS else ""
 
 
 def _too_few(found: dict[str, Any], solved: list[dict[str, Any]], step: int) -> Fault:
-    """Most frames have no place: how many have, which, and whether the others are smeared."""
+    """Fault of a solve that registered too few frames: how many, which ones, and whether the others are smeared."""
     numbers = [f["frame"] for f in solved]
     parts = [_spans(numbers, part) for part in found["parts"] if len(part) >= LEAST_REGISTERED]
     worked = f": {_span_words(parts[0])}" if parts else ""
@@ -167,7 +172,7 @@ def _too_few(found: dict[str, Any], solved: list[dict[str, Any]], step: int) -> 
 
 
 def _smeared_words(solved: list[dict[str, Any]], placed: set[int]) -> str:
-    """How many of the solved frames that have no place are smeared; empty if that is not why they have none."""
+    """Words for how many of the frames without a pose are smeared; empty if too few are to be the cause."""
     limit = SMEARED * float(np.quantile([f["sharpness"] for f in solved], 0.75))
     lost = [f["sharpness"] for f in solved if f["frame"] not in placed]
     smeared = sum(value < limit for value in lost)
@@ -177,7 +182,7 @@ def _smeared_words(solved: list[dict[str, Any]], placed: set[int]) -> str:
 
 
 def _spans(solved: list[int], names: list[str]) -> list[tuple[int, int, int]]:
-    """(first, last, how many) of each unbroken row of `solved` frames whose pictures are among `names`."""
+    """(first, last, count) of each run of consecutive `solved` frames whose pictures are among `names`."""
     placed = {int(Path(name).stem) for name in names}
     spans: list[tuple[int, int, int]] = []
     before = False
@@ -190,13 +195,13 @@ def _spans(solved: list[int], names: list[str]) -> list[tuple[int, int, int]]:
 
 
 def _span_words(spans: list[tuple[int, int, int]]) -> str:
-    """'12 to 41, 60 to 74', the longest four of them, in the clip's order."""
+    """The four longest spans in the clip's order, such as '12 to 41, 60 to 74'."""
     longest = sorted(sorted(spans, key=lambda span: span[2], reverse=True)[:4])
     return ", ".join(f"{first} to {last}" if last > first else f"{first}" for first, last, _ in longest)
 
 
 def _range_hint(parts: list[list[tuple[int, int, int]]], solved: list[int], step: int) -> str:
-    """What can help: a range that worked, and a smaller step only where there is one."""
+    """Hint that suggests the longest range that worked and, if the step is above 1, a smaller step."""
     best = max((span for part in parts for span in part), key=lambda span: span[2], default=(0, 0, 0))
     smaller = " A smaller step shows more of each to the next." if step > 1 else ""
     if best[2] < LEAST_REGISTERED or best[2] == len(solved):

@@ -1,18 +1,19 @@
-"""Entry point of COLMAP's child process, which `start_worker.py` starts.
+"""Main function of COLMAP's child process, which `start_worker.py` starts.
 
-A process of its own because pycolmap and OpenImageIO cannot share one (see footage/images.py), because COLMAP ends its
-process on a failed check, and because a process can be stopped at any moment. Nothing else imports its parts, which
-load pycolmap: `request.py`, `matching.py`, `pairs.py`, `mapping.py`, `placing.py`, `answers.py` and `colmap_types.py`.
+COLMAP runs in a separate process for three reasons: pycolmap and OpenImageIO cannot share a process (see
+footage/images.py), COLMAP aborts its process on a failed check, and a process can be stopped at any moment. Only the
+worker imports the modules that load pycolmap: `request.py`, `matching.py`, `pairs.py`, `mapping.py`, `placing.py`,
+`answers.py` and `colmap_types.py`.
 
-Standard input is held open by the parent: when it closes, the parent is gone and so is the worker. Standard output
-carries JSON lines: {"stage"} when one begins, with {"done", "total"} where COLMAP calls back; {"result": {...}} or
-{"failure": "reason"} at the end.
-Beside the request it writes: model/ (binary COLMAP model), points.npz, poses.json (cameras from world, 3x4) and, for
-each lens, undistort_N.npz (the lens, camera of the undistorted frames, where its pixels lie in the distorted ones).
+The parent holds standard input open; when it closes, the worker exits. Standard output carries JSON lines: {"stage"}
+when a stage begins, with {"done", "total"} if COLMAP reports progress; {"result": {...}} or {"failure": "reason"} at
+the end.
+In the request's folder it writes model/ (binary COLMAP model), points.npz, poses.json (world-to-camera, 3x4) and, for
+each lens, undistort_N.npz (the lens, the pinhole camera of the undistorted frames, and the map of their pixels).
 
 A request with "known" cameras ({"lenses": [{"model", "width", "height", "params"}], "images": {name: {"lens",
 "pose"}}, "triangulate"}) is not solved: the lenses are undistorted and, if requested, points are triangulated with the
-poses held. One with pairs to "match" has them matched in its copy of the database, and nothing else (`pairs.py`).
+poses fixed. For a request with pairs to "match", the worker only matches them in its copy of the database (`pairs.py`).
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from .request import SEED, Request, say
 
 
 def main(path: str) -> int:
-    """Runs the request; 0 unless something broke that no sentence covers."""
+    """Runs the request and returns 0. A failed solve is reported with `say`; any other error raises."""
     threading.Thread(target=_die_with_parent, args=(own_input(),), daemon=True).start()
     request = Request(Path(path))
     pycolmap.set_random_seed(SEED)
@@ -86,7 +87,7 @@ def main(path: str) -> int:
 
 
 def _result(models: list[pycolmap.Reconstruction], placed: int) -> dict[str, Any]:
-    """What is told of the models, the first of which is used; `placed` frames have a pose."""
+    """Figures of the solve for the parent. The first model is used; `placed` frames have a pose."""
     model, camera = models[0], first_camera(models[0])
     return {
         "registered": model.num_reg_images(),
@@ -103,7 +104,7 @@ def _result(models: list[pycolmap.Reconstruction], placed: int) -> dict[str, Any
 
 
 def _found(request: Request, first: pycolmap.Camera, model: pycolmap.Reconstruction) -> dict[str, Any]:
-    """The lens that was found at first, and the one that is used."""
+    """Figures of the lens that was found at first, and of the lens that is used."""
     camera = first_camera(model)
     return {
         "found_px": first.mean_focal_length(),
@@ -120,7 +121,7 @@ def _found(request: Request, first: pycolmap.Camera, model: pycolmap.Reconstruct
 
 
 def take_over(request: Request, known: dict[str, Any]) -> int:
-    """Undistorts the lenses of known cameras and triangulates points between them, if asked; 0."""
+    """Undistorts the lenses of known cameras and, if requested, triangulates points; returns 0."""
     lenses = [
         pycolmap.Camera(model=n["model"], width=n["width"], height=n["height"], params=n["params"])
         for n in known["lenses"]
@@ -152,7 +153,7 @@ def take_over(request: Request, known: dict[str, Any]) -> int:
 
 
 def _die_with_parent(told: int) -> None:
-    # Unbuffered: the interpreter could not close a buffer that a thread still reads.
+    # Unbuffered, because at exit the interpreter cannot close a buffer that a thread is still reading.
     while os.read(told, 64):
         pass
     os._exit(1)

@@ -1,4 +1,4 @@
-// share * SSIM + plain * |x - y|, its mean and its gradient on the CPU, in two passes over rows; `ssim.py` has the
+// Mean of share * SSIM + plain * |x - y| and its gradient on the CPU, in two passes over rows. `ssim.py` documents the
 // mathematics and the fields of P.
 
 typedef float F __attribute__((ext_vector_type(16)));

@@ -1,5 +1,5 @@
-// SSIM with or without L1, and the gradient, on a GPU, in four passes; `ssim_cuda.py` says what each does. A thread is one
-// value.
+// SSIM with or without L1, and its gradient, on a GPU, in the four passes that `ssim_cuda.py` describes. Each thread
+// computes one value.
 
 const int HALF = @HALF@;
 const float TAP[2 * HALF + 1] = {@TAPS@}, C1 = 1e-4f, C2 = 9e-4f, MID = 0.5f;

@@ -1,4 +1,4 @@
-// Sixteen hits at a time: the rows that each one touches, as bits, and what its ellipse is on each of the 16 rows.
+// Sixteen hits at a time: for each, the rows that it touches, as bits, and its ellipse on each of the 16 rows.
 
         unsigned live = 0;
         for (int i = 0; i < 16; i++) live |= (unsigned)any(T[i] > T_STOP) << i;

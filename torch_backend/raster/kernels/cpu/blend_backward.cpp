@@ -1,5 +1,5 @@
-// Blend stage 1: backward, front to back. `left` is what the Gaussians behind still add to d loss / d image . image.
-// Parallel over tiles.
+// Blend stage 1: backward, front to back, parallel over tiles. `left` is the part of d loss / d image . image that the
+// Gaussians behind still contribute.
 #include "tile.cpp"
 
 const long long GS = P.grad_stride;

@@ -1,5 +1,5 @@
-// Vectors of 16 floats, elementary functions and sums over lanes, before every stage of the CPU body. Names and units:
-// `cpu_source.py`, which also puts in what stands between @ signs.
+// Precedes every stage of the CPU body: vectors of 16 floats, elementary functions and sums over lanes. `cpu_source.py`
+// documents names and units, and replaces the names between @ signs.
 
 typedef float F __attribute__((ext_vector_type(16)));
 typedef int I __attribute__((ext_vector_type(16)));

@@ -1,4 +1,4 @@
-// Stage 2: hits of every tile, counted by each worker in its stretch.
+// Stage 2: each worker counts the hits of every tile in its stretch.
 #include "kept_spans.cpp"
 #include "stretch.cpp"
 

@@ -1,4 +1,4 @@
-// Stage 4: the hits, written to their places.
+// Stage 4: writes the hits to their places in the list.
 #include "kept_spans.cpp"
 #include "stretch.cpp"
 

@@ -1,4 +1,4 @@
-// One row of one hit, forward, without the parts that depth and top contributor add.
+// One row of one hit, forward, without the parts for depth and top contributor.
 #include "alpha.cpp"
 
                 for (int c = 0; c < NCH; c++) C[c][row] = fma(w, (F)channel[c], C[c][row]);

@@ -1,4 +1,4 @@
-// Sixteen Gaussians' parameters from memory, and spherical harmonics at the directions they are seen from.
+// Loads the parameters of sixteen Gaussians, and evaluates spherical harmonics at their viewing directions.
 
 const float* V = P.view;
 float gather[11][16];

@@ -1,4 +1,4 @@
-// The same from memory, where it was kept: pairs (tile row, first column | last column << 16).
+// Tile spans of one slot as in `spans.cpp`, from stored pairs if any: (tile row, first column | last column << 16).
 #include "spans.cpp"
 
 auto kept_spans = FN(int slot, auto&& visit) -> void {

@@ -1,4 +1,4 @@
-// Stage 3 (one worker): where every worker's hits of every tile begin.
+// Stage 3 (one worker): computes where the hits of each worker and tile begin.
 
 int at = 0; long long tiles = P.tiles_x * P.tiles_y;
 for (long long t = 0; t < tiles; t++) {

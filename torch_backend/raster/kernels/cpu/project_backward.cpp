@@ -1,5 +1,5 @@
-// Stage 6: gradients of the projection from the summed gradients of the hits. Parallel over chunks. The first camera
-// clears the rows of its chunk before it adds to them: they come uninitialised, and are still in the cache afterwards.
+// Stage 6: gradients of the projection from the summed gradients of the hits. Parallel over chunks. For the first
+// camera, the uninitialised rows of a chunk are zeroed just before gradients are added, which keeps them in the cache.
 #include "gather.cpp"
 
 const long long GS = P.grad_stride;

@@ -1,4 +1,4 @@
-// From world mean X, Y, Z, quaternion q* (wxyz), clamped log-scales l*: everything of the projection, on 16 Gaussians.
+// Projection of 16 Gaussians, from world mean X, Y, Z, quaternion q* (wxyz) and clamped log-scales l*.
 
 F pz = V[8] * X + V[9] * Y + V[10] * Z + V[11];
 F px = V[0] * X + V[1] * Y + V[2] * Z + V[3], py = V[4] * X + V[5] * Y + V[6] * Z + V[7];

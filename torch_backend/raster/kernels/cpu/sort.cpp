@@ -1,4 +1,4 @@
-// Stage 1 (one worker): first hit of every slot; slots that hit a tile in depth order, by a stable radix sort.
+// Stage 1 (one worker): computes the first hit of every slot, and sorts slots with hits by depth (stable radix sort).
 
 long long total = 0, n = 0;
 for (long long c = 0; c < P.chunks; c++)

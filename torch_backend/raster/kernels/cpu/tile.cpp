@@ -1,4 +1,4 @@
-// What both blending stages begin with.
+// Common beginning of both blending stages: access to rows of pixels, and sizes.
 
 const int NCH = @NCH@;
 // A tile's row of pixels, `each` floats a pixel: memory beyond the image is neither written nor read; zeros are read.

@@ -1,5 +1,5 @@
-// Median depth of the pixels whose transmittance stays above a half: that of the largest weight. They are few, and to
-// look for it in all of them doubles the time of blending, so their rows are gone through again.
+// Median depth of the pixels whose transmittance stays above 0.5: depth of the Gaussian with the largest weight. Such
+// pixels are few, so their rows are blended again. Tracking this depth for all pixels would double the blending time.
 
     unsigned uncrossed = 0;
     if (want_depth) for (int i = 0; i < rows; i++) uncrossed |= (unsigned)any(T[i] > 0.5f) << i;

@@ -1,4 +1,4 @@
-// Stage 5: sum and largest weight of every visible Gaussian over its tiles. Parallel over chunks.
+// Stage 5: sum and maximum of the weights of every visible Gaussian over its tiles. Parallel over chunks.
 
 for (long long chunk; (chunk = take()) < P.chunks;)
     for (long long s = chunk * @CHUNK@, e = s + P.chunk_count[chunk]; s < e; s++) {

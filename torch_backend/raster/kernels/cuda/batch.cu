@@ -1,4 +1,4 @@
-// Next hits of the tile into shared memory: record, rows in which the ellipse meets the tile's columns, and slot.
+// Loads the tile's next hits into shared memory: record, slot, and rows in which the ellipse meets the tile's columns.
 #include "spans.cu"
 
 while (at < stop) {

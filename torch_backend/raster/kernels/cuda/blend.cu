@@ -1,4 +1,4 @@
-// A block per tile: forward.
+// One block per tile: forward blending.
 #include "tile.cu"
 
 float C[SLOTS][NCH], best[SLOTS], median[SLOTS], largest[SLOTS];

@@ -1,4 +1,5 @@
-// A block per tile: backward, front to back. `left` is what the Gaussians behind still add to d loss / d image . image.
+// One block per tile: backward, front to back. `left` is the part of d loss / d image . image that the Gaussians behind
+// still contribute.
 #include "tile.cu"
 
 enum { GROUPS = (@MOMENTS@ + NCH + 15) / 16, GROUP = 16 };

@@ -1,5 +1,5 @@
-// What a GPU and Warp's CPU fibers call by different names, and elementary functions, before every stage of the CUDA body.
-// Names and units: `cuda_source.py`, which also puts in what stands between @ signs.
+// Precedes every stage of the CUDA body: names that differ between GPUs and Warp's CPU fibers, elementary functions.
+// `cuda_source.py` documents names and units, and replaces the names between @ signs.
 
 #if defined(__CUDA_ARCH__)
 #define SHARED __shared__

@@ -1,4 +1,4 @@
-// A thread per rank: write the hits, those of a large Gaussian by the whole block. Hits come in depth order.
+// One thread per rank: writes the hits in depth order. The whole block writes the hits of a large Gaussian.
 #include "spans.cu"
 
 SHARED int many, large[@BLOCK@], first[@BLOCK@], width[@BLOCK@];

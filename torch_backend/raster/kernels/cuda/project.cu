@@ -1,4 +1,4 @@
-// A thread per slot: project, cull, colour, count tile hits.
+// One thread per slot: project, cull, compute the colour, count tile hits.
 #include "spans.cu"
 #include "twelve.cu"
 

@@ -1,4 +1,4 @@
-// A thread per Gaussian, camera after camera: gradients of the projection from those of the moments.
+// One thread per Gaussian, camera after camera: gradients of the projection from the gradients of the moments.
 #include "shuffle.cu"
 #include "twelve.cu"
 

@@ -1,4 +1,4 @@
-// Everything of the projection, for world mean X, Y, Z, quaternion q* (wxyz), raw log-scales r*.
+// Projection of one Gaussian, from world mean X, Y, Z, quaternion q* (wxyz) and raw log-scales r*.
 
 float px = V[0] * X + V[1] * Y + V[2] * Z + V[3], py = V[4] * X + V[5] * Y + V[6] * Z + V[7];
 float iz = 1.f / pz, xn = px * iz, yn = py * iz;

@@ -1,4 +1,4 @@
-// A thread per place of the sorted list: where the tiles begin and end in it.
+// One thread per entry of the sorted list: finds where each tile begins and ends in the list.
 
 const long long at = task, tiles = (long long)P.tiles_x * P.tiles_y * P.cameras;
 if (at == 0) {

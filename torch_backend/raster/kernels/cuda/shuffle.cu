@@ -1,4 +1,4 @@
-// Values handed from thread to thread of a warp.
+// Exchange of values between the threads of a warp.
 
 #if defined(__CUDA_ARCH__)
 auto shuffle = [](float v, int mask) -> float { return __shfl_xor_sync(0xffffffffu, v, mask); };

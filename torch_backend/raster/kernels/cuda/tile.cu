@@ -1,4 +1,4 @@
-// What both blending stages begin with.
+// Common beginning of both blending stages: the pixels of a tile.
 #include "shuffle.cu"
 
 enum { NCH = @NCH@, SLOTS = 2, STRIDE = (@HEAD@ + NCH + 3) / 4 * 4 };
