@@ -1,4 +1,4 @@
-"""t* in the panel: starts at the current frame, stays within the clip, and outdates takes of another instant."""
+"""t* in the panel: it starts at the current frame and stays within the clip; a take of another instant is not done."""
 
 import json
 

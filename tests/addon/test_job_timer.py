@@ -270,7 +270,7 @@ def test_a_render_is_followed_by_its_handlers(addon, supervisor, watch, shot, sm
 
 
 def test_no_draw_is_interrupted_while_a_render_goes_on(small):
-    """If a render begins during a panel's draw, Blender 4.3 keeps Python from writing data until it is restarted."""
+    """If a render begins while a panel is drawn, Blender 4.3 refuses all later writes of Python to its data."""
     scene, run = small
     assert sys.getswitchinterval() >= 1.0
     run.finish(scene, is_cancelled=True)
@@ -344,7 +344,7 @@ def test_what_pulses_sets_the_pace_and_jobs_keep_theirs(supervisor, watch, monke
         return 0.01 if len(pulses) < 5 else None
 
     supervisor.pulse(turn)
-    supervisor.pulse(turn)  # once, however often it is asked for
+    supervisor.pulse(turn)  # the turn is registered only once
     try:
         waits = [supervisor.tick() for _ in range(4)]
         assert len(pulses) == 4 and len(looks) == 1, "jobs were looked at a moment ago"
@@ -366,7 +366,7 @@ def test_a_pulse_that_fails_does_not_stop_the_timer(supervisor, watch, capsys):
 
 @pytest.fixture
 def solving(addon, contract, supervisor, watch, shot):
-    """A solve that runs, of a shot whose cameras stand on the disk, and `tell`, which writes what it says."""
+    """A running solve of a shot whose cameras are on the disk, and `tell`, which writes an event of the solve."""
     job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
     job.process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     events = []

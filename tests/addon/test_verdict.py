@@ -1,4 +1,4 @@
-"""The panel shows what a run's and a take's verdict say; how frozen frames are made travels with the settings."""
+"""The panel shows the verdicts of runs and takes; settings of the frozen frames are part of the preset."""
 
 import json
 
@@ -94,7 +94,7 @@ def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(ad
     props.develop = True
     assert steps.STEPS["bake"].params(with_shot).develop == "off", "its frames are of before instants were developed"
     props.develop = False
-    for frames in ([6], []):  # of a ramp with many instants none is
+    for frames in ([6], []):  # a ramp with many instants has no developed one
         add(take, developed=frames)
         assert steps.STEPS["bake"].params(with_shot).develop == "on"
 
