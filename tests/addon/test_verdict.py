@@ -1,4 +1,5 @@
-"""The panel shows the verdicts of runs and takes; settings of the frozen frames are part of the preset."""
+"""The panel shows the verdicts of runs and takes. Freeze uses the panel's rendering settings, Bake those of the
+take."""
 
 import json
 
