@@ -1,4 +1,4 @@
-"""Developed instants: what they show, what they may not lose, what is kept of them and when it is used."""
+"""Developed instants: their picture, protection against losses, storage and use."""
 
 import dataclasses
 import math
@@ -48,7 +48,7 @@ T_STAR = 105
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory, quiet):
-    """As everywhere, but of few steps: developing is for a run that is not as sharp as its pictures yet."""
+    """As in other tests, but with few steps: developing improves runs that are not yet as sharp as their pictures."""
     world = build_world(tmp_path_factory.mktemp("young"))
     paint_motion(world)
     summary = train_shot(world.shot, TrainParams(iterations=250, holdout=8, max_gaussians=1500), quiet())
@@ -57,7 +57,7 @@ def trained(tmp_path_factory, quiet):
 
 @pytest.fixture(scope="module")
 def made(trained, quiet):
-    """(run, scene, the field's own instant, the developed one, which is kept)."""
+    """(run, scene, instant of the field, developed instant, which is stored)."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     report = quiet()
@@ -74,7 +74,7 @@ def field(run, scene, t_star=T_STAR):
 
 
 def shown(run, scene, frozen, frame):
-    """[H, W, 3] from the pose of a frame, over grey."""
+    """[H, W, 3]: render from the pose of a frame over grey."""
     i = scene.frames.index(frame)
     K = scene.camera_at(scene.width, scene.height)[i]
     image = render_frozen(
@@ -84,7 +84,7 @@ def shown(run, scene, frozen, frame):
 
 
 def scores(world, run, scene, frozen, frames=(102, 105, 110, 115)):
-    """(dB of what moves at t*, dB of what does not), against the truth, from several poses."""
+    """(dB of moving pixels at t*, dB of static pixels), compared with the truth from several poses."""
     off = {"moving": [], "still": []}
     for frame in frames:
         truth = world.image(frame - 101, (T_STAR - 101) / 15)
@@ -148,14 +148,14 @@ def test_developed_gaussians_travel_with_those_they_descend_from(made):
 
 
 def halves(run, frozen):
-    """Rows of what moves: (those on the left, those on the right)."""
+    """Rows of moving Gaussians: (left half, right half)."""
     rows = run.model.open_rows()
     x = frozen.state["means"][rows, 0]
     return rows[x < x.median()], rows[x >= x.median()]
 
 
 def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
-    """The field without half of what moves, as if it had never learnt that."""
+    """The field lacks half of the moving Gaussians, as if it had never learnt them."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen = field(run, scene)
@@ -173,13 +173,13 @@ def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
     assert abs(deep[0] / deep[1] - 1.0) < 0.1
     before, after = (scores(world, run, scene, each) for each in (halved, mended))
     assert after[0] > before[0] + 1.0 and after[1] > before[1] - 0.3
-    for frame in (101, 112):  # at other times nobody knows where it was
+    for frame in (101, 112):  # at other times their position is unknown
         moved = SceneFlow(run, scene, mended, T_STAR).moved(mended.state, frame)
         assert bool((torch.sigmoid(moved["opacity_logits"][added]) < 1e-6).all())
 
 
 def test_floaters_are_hidden_and_nothing_that_stands_still(trained):
-    """Part of what moves in a colour that plate t* does not have there."""
+    """A part of the moving Gaussians has a colour that plate t* does not show there."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen = field(run, scene)
@@ -194,7 +194,7 @@ def test_floaters_are_hidden_and_nothing_that_stands_still(trained):
 
 
 def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
-    """Written, read again, and refused where a row is gone."""
+    """The instant is written, read again, and refused if a row is missing."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, t_star = field(run, scene, 109), 109
@@ -223,7 +223,7 @@ def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
 
 
 def in_tatters(run, frozen):
-    """(the scene with part of the wall opened by mistake and faded at t*, rows of that part)."""
+    """(scene with a part of the wall wrongly opened and faded at t*, rows of that part)."""
     wall = torch.arange(len(frozen.support))[frozen.motion < 0.5]
     wall = wall[frozen.state["means"][wall, 0] > frozen.state["means"][wall, 0].median()]
     run.model.gaussians.open[wall] = True
