@@ -458,7 +458,7 @@ def test_overscan_goes_on_around_the_same_frame(world, made):
     middle = (slice(down, -down), slice(across, -across))
     around = [world.seen_at(frame + step)[1] for step in (-1, 0, 1)]  # neighbouring plates affect the result
     still = ~dilate(np.any([*around, world.truth(world.output(frame, t_star))[1]], axis=0), 16)
-    still[:4] = still[-4:] = still[:, :4] = still[:, -4:] = False  # mattes end softly at the plate's own border
+    still[:4] = still[-4:] = still[:, :4] = still[:, -4:] = False  # mattes fade at the plate's border
     for name in ("linear", "st", "matte", "plate", "source"):
         np.testing.assert_array_equal(getattr(wide, name)[middle][still], getattr(inside, name)[still], err_msg=name)
     assert (wide.color[middle] - inside.color).abs().mean() < 2e-3
