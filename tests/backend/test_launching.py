@@ -28,7 +28,7 @@ from torch_backend.native import (
 
 
 def adding():
-    """out[i] += value, by a kernel of its own."""
+    """Kernel that computes out[i] += value."""
     initialised_warp()
 
     def add(out: wp.uint64, value: wp.float32, tid: wp.int32): ...

@@ -41,8 +41,7 @@ def clip(tmp_path_factory, tools):
 def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
     """Scene points project through the solved cameras and the map's lens to where the real lens showed them.
 
-    Errors stay below a quarter of a pixel, also at the corners. The burnt-in mask of the import is undistorted by the map
-    like the frames.
+    Errors stay below a quarter of a pixel, also at the corners. The map also undistorts the import's burnt-in mask.
     """
     shot, poses, folder = clip
     config = SolveConfig(
