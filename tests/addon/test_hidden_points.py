@@ -34,7 +34,7 @@ def test_a_file_saved_while_scrubbing_shows_the_points_when_it_is_opened(addon, 
 
 
 def test_a_copy_that_no_handler_saw_shows_the_points_when_it_is_opened(addon, scrubbed, shot, tmp_path):
-    """An autosave is such a copy: it runs no handlers."""
+    """An autosave runs no handlers."""
     module = addon("freeze.hidden_points")
     bpy.app.handlers.save_pre.remove(module._restore)
     try:

@@ -111,7 +111,7 @@ def test_a_bake_whose_frames_are_there_comes_in_in_turns(addon, contract, superv
 
 
 def ended_bake(addon, contract, supervisor, watch, shot, scene: str, uid: int = 0):
-    """Let a bake end whose frames exist; the job names its scene, and with `uid` the scene's session number."""
+    """Let a bake end whose frames exist. The job stores the scene's name and, in this session, its number `uid`."""
     job = addon("process.jobs").new_job(shot, "freeze", contract.FreezeParams(take="freeze"))
     (job.folder / contract.SCENE_FILE).write_text(scene, encoding="utf-8")
     job.scene_uid = uid

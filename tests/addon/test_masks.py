@@ -74,7 +74,7 @@ def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file
 
 @pytest.mark.parametrize("share", [1.0, 0.4])
 def test_a_drawn_masks_values_are_those_of_its_picture(addon, shot, drawn, share):
-    """The solve thresholds masks at 0.5; a view transform such as AgX would change which values exceed it."""
+    """The solve thresholds masks at 0.5. A view transform such as AgX would move values across this threshold."""
     drawn.layers[0].alpha = share
     found = read(addon("solve.drawn_masks").render(drawn, shot, "people") / "000006.png")[..., 0]
     height, width = found.shape

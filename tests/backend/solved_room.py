@@ -159,7 +159,7 @@ def solved(tmp_path_factory):
 
 @pytest.fixture
 def again(solved, tmp_path):
-    """Copy of the solved shot, and a COLMAP model to solve it from, which is faster than from its pictures.
+    """Copy of the solved shot, and its COLMAP model. A solve from this model is faster than one from the pictures.
 
     Its frames are still distorted, as if another lens had been used.
     """

@@ -179,7 +179,7 @@ def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
 
 
 def test_a_caller_does_itself_what_no_worker_has_begun():
-    """Late or sleeping workers delay nobody."""
+    """Late or sleeping workers must not delay the caller."""
     crew, done, hold = native._Crew(), [], threading.Event()
 
     def busy(_address, _stage, _worker):
@@ -255,7 +255,7 @@ def test_a_caller_that_gets_no_threads_does_it_all_itself(monkeypatch):
 
 
 def test_workers_may_have_workers():
-    """A task that consists of tasks never waits for a thread that waits for it."""
+    """A task that runs workers itself must not deadlock."""
     done = []
 
     def inner(_address, stage, worker):

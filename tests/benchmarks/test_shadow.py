@@ -34,7 +34,7 @@ def test_the_shadow_lies_opposite_of_the_lamp_and_a_screen_takes_it_away(view):
     middle = of.ball - TO_LAMP * of.ball[2] / TO_LAMP[2]
     assert abs(middle[2]) < 1e-9 and left[pixel(view, middle)] == 0.0
     assert left[pixel(view, [0.5, -0.3, 0.0])] == 1.0 and left[pixel(view, [-0.6, 0.4, 0.0])] == 1.0
-    # The lamp's height determines how much longer than wide a ball's shadow is.
+    # A ball's shadow is elongated; the ratio depends on the lamp's height.
     slope = np.linalg.norm(TO_LAMP) / TO_LAMP[2]
     assert 1e-4 * (1.0 - left).sum() == pytest.approx(np.pi * RADIUS**2 * slope * 1.25, rel=0.15)
     screen = floor(1.2, 0.5, of.ball[:2] + TO_LAMP[:2] * 0.9)

@@ -49,7 +49,7 @@ def _checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def checkout(_checkout: Path, tmp_path: Path) -> Path:
-    """New repository with the files of this one."""
+    """New Git repository with a copy of this repository's files."""
     return Path(shutil.copytree(_checkout, tmp_path / "checkout"))
 
 

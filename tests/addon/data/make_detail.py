@@ -5,8 +5,8 @@
 Their warps go to detail/warp/. The linear plates that they are composited from, with values from -0.2 to 50, go to
 detail/plate/. Frame numbers are 5 and 6.
 
-The left third shows the unchanged plate, the middle third the plate moved by fractions of a pixel, the right third the
-plate blended with another picture. The sizes 56 and 42 are chosen because pixel centres are inexact in float32 there.
+The left third shows the unchanged plate. In the middle third the plate is moved by fractions of a pixel. In the right
+third it is blended with another picture. At the sizes 56 and 42, pixel centres are inexact in float32.
 
 detail_ap1/ holds frame 6 and its warp again, as written for ACEScg footage.
 """

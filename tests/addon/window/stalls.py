@@ -3,8 +3,8 @@
     python tests/addon/window/stalls.py --blender BLENDER --shot SHOT.splannequin
 
 BLENDER has the extension installed, as for press_steps.py. The shot has a trained run and a take, and is copied. Prints
-in milliseconds the timer turns over 10 ms with their longest calls, and, for comparison, the start of a render in the
-same scene before the extension has added anything.
+the timer turns over 10 ms in milliseconds, with their longest calls. For comparison, also prints the start of a render
+in the same scene without the extension's objects.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ def test_farthest_points_spread_and_skip_duplicates():
 
 
 def test_nearest_far_from_the_origin():
-    """Thousands of units away, products of coordinates would cancel; so the centre is subtracted first."""
+    """Thousands of units away, products of coordinates lose precision, so the centre is subtracted first."""
     g = torch.Generator().manual_seed(5)
     points, queries = torch.rand(40, 3, generator=g), torch.rand(300, 3, generator=g)
     far = torch.tensor([3000.0, -2000.0, 500.0])

@@ -23,7 +23,7 @@ BROKEN = {
 
 
 def answer(tmp_path, tools, monkeypatch, package):
-    """Error of a child process in whose environment pycolmap has this content."""
+    """Error of a child process that imports a pycolmap module with this content."""
     (tmp_path / "packages").mkdir()
     (tmp_path / "packages" / "pycolmap.py").write_bytes(package)
     (tmp_path / "request.json").write_text(json.dumps({"images": str(tmp_path)}))

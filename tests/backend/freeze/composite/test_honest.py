@@ -96,7 +96,7 @@ def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
 
 
 def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
-    """At the plate's time the board was in front of the wall; there the frozen render shows static Gaussians."""
+    """At the plate's time the model shows the board where the frozen render shows the static wall."""
     none = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
     made, alone = make(world, none), make(world, none, **BLIND)
     gone = erode(world.seen_at(FRAME)[1], 6) & ~dilate(world.truth(world.output(FRAME, T_STAR))[1], 6)

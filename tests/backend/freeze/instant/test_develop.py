@@ -262,7 +262,7 @@ def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(train
 
 
 def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
-    """Gaussians that sway need a matte to stay open with `doubted`; Gaussians that moved far never do."""
+    """`doubted` closes Gaussians that sway outside of moving mattes, but never those that moved far."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, blind = field(run, scene), lambda frame: torch.zeros(scene.height, scene.width)
