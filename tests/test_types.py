@@ -70,7 +70,7 @@ def annotated_calls(tree: ast.AST) -> list[int]:
 
 
 def test_properties_of_the_addon_are_assigned_so_that_their_type_is_known():
-    """`splannequin_addon/properties.py` describes the way."""
+    """`splannequin_addon/properties.py` explains how."""
     for path in sorted((ROOT / "splannequin_addon").rglob("*.py")):
         assert not annotated_calls(ast.parse(path.read_text(encoding="utf-8"))), path
     assert annotated_calls(ast.parse("class A:\n    name: StringProperty()")) == [2]

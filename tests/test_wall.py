@@ -144,11 +144,11 @@ OTHER_FOLDERS = {
     ("splannequin_addon/process/environment.py", ".splannequin"),
     ("torch_backend/cameras/imported.py", "colmap/sparse/0"),  # of another program
 }
-"""(file, name) of names that equal names of the shot folder but mean something else."""
+"""(file, name) for names that equal a name in the shot folder but mean something else."""
 
 
 def layout_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """(line, name) of names of the shot folder that a file spells: file names anywhere, folder names in joined
+    """(line, name) for each name of the shot folder that a file spells: file names anywhere, folder names in joined
     paths."""
     joined = {id(n.right) for n in ast.walk(tree) if isinstance(n, ast.BinOp) and isinstance(n.op, ast.Div)}
     docs = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}

@@ -161,7 +161,7 @@ def test_what_a_process_begins_with_while_it_is_being_removed_is_put_back(addon,
 
 @pytest.fixture
 def system(addon, tmp_path, monkeypatch):
-    """Blender's preference for online access, switched off; with a folder for the environment and a pip without
+    """Blender's system preferences with online access off. The environment's folder is temporary, and pip finds no
     packages."""
     monkeypatch.setattr(addon("process.backend"), "folder", lambda: tmp_path / "backend")
     monkeypatch.setenv("PIP_NO_INDEX", "1")

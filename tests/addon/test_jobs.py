@@ -352,7 +352,7 @@ def test_a_job_that_is_stopped_is_alive_and_can_be_ended_by_another_blender(addo
 @pytest.mark.skipif(os.name == "nt", reason="a link needs a privilege there")
 @pytest.mark.parametrize("what", ["the folder", "one job"])
 def test_jobs_behind_a_link_are_not_looked_at(addon, contract, empty_shot, tmp_path, what):
-    """The add-on writes an end status into the folder of a dead job. Behind a link, this could be another shot's folder."""
+    """The add-on writes an end status into a dead job's folder. Behind a link, this could be another shot's folder."""
     jobs = addon("process.jobs")
     folder = jobs.new_job(empty_shot, "train", contract.TrainParams()).folder
     os.utime(folder / "request.json", (1, 1))

@@ -144,7 +144,7 @@ TO_AP1 = np.linalg.inv([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01
 
 
 def with_detail(shot, probe):
-    """Shot with a take of data/detail and its EXR plates; `probe` is the linear Rec.709 light of the contract's `PROBE`."""
+    """Shot with a take of data/detail and its EXR plates; `probe`: linear Rec.709 light of the contract's `PROBE`."""
     take = shot / "takes" / "detail"
     shutil.copytree(DATA / "detail", take)
     footage = {"file": str(DATA / "detail" / "plate" / "000005.exr"), "beside": "", "size": [56, 42], "first": 5}
@@ -176,7 +176,7 @@ def test_light_passes_an_aces_scene_within_a_thousandth(root, shot, tmp_path):
 
 
 def test_working_frames_with_a_shoulder_give_their_light_to_an_aces_scene(root, shot, tmp_path):
-    """The shoulder applies to Rec.709 channels, so light is converted from the scene's space and back. Light reaches 60."""
+    """The shoulder applies to Rec.709 channels, so light of up to 60 is converted from the scene's space and back."""
     told_of = with_detail(shot, [0.78125, 0.390625, 0.1953125]) / "takes" / "detail" / "take.json"
     facts = json.loads(told_of.read_text())
     facts["footage"]["unlike"] = "its pixels are not square"

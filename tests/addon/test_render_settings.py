@@ -217,8 +217,8 @@ def test_a_setting_that_moves_is_refused_before_anything_is_rendered(addon, cont
 
 
 def test_a_file_that_is_saved_while_it_is_baked_holds_the_artists_settings(addon, contract, baked, tmp_path):
-    """Covers a save during the bake, whose handler restores the settings, and a copy written with the bake's
-    settings."""
+    """A save during the bake runs a handler that restores the settings. A file saved without handlers is repaired on
+    load."""
     scene, file, crashed = baked, tmp_path / "saved.blend", tmp_path / "crashed.blend"
     region(scene, True)
     scene.render.filepath = "//mine/f_##"

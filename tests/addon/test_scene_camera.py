@@ -142,7 +142,7 @@ def test_cameras_that_cannot_be_the_clips_are_refused(addon, contract, chosen, s
 
 
 def test_frames_that_nobody_tracked_are_left_out(addon, scene):
-    """Outside its keys a camera stands still and is not tracked; a pause between its keys counts as tracked."""
+    """Frames outside the camera's keys are not tracked. A pause between two keys counts as tracked."""
     module, evaluated = addon("solve.camera_samples"), addon("shot.seen_camera").evaluated
 
     def left(camera, frames, span):

@@ -1,4 +1,4 @@
-"""States in which an artist met a disabled button or an empty panel: available buttons and shown text."""
+"""Panels in states where artists found a disabled button or an empty panel: which buttons and text they show."""
 
 import json
 import shutil

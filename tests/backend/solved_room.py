@@ -96,7 +96,7 @@ def _noise(rng, size, sigma):
 
 @functools.lru_cache(maxsize=1)
 def the_room():
-    """Room shared by all tests, because its textures take time."""
+    """Room shared by all tests, because making its textures takes time."""
     return Room()
 
 

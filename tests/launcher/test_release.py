@@ -161,7 +161,7 @@ def test_a_package_that_comes_to_nothing_leaves_the_one_before(
 
 @pytest.mark.parametrize("megabytes", [1, 5, 7, 9])
 def test_a_full_disk_is_one_sentence_and_no_package(checkout: Path, blender_program, tmp_path: Path, megabytes: int):
-    """The disk fills during copying, during Blender's packing, during writing of the zip, or just not."""
+    """The disk fills during copying, during Blender's packing, during writing of the zip, or is just large enough."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "none", str(disk)]

@@ -76,7 +76,7 @@ def on_a_shot(
     Args:
         script: file of the script that Blender runs.
         text: description of the script, for --help.
-        play: script of the artist; `plan` holds the shot's and a work folder, and the content of `told` is printed.
+        play: script of the artist; `plan` holds the shot's folder and a work folder, and `told` is printed at the end.
         needs: requirements on the shot, for --help.
         display: X display to open.
         good: whether the results are a success, provided that nothing failed.

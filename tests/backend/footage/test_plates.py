@@ -119,7 +119,7 @@ def test_light_beyond_white_and_below_black_passes(tmp_path, shot_of, kind):
     for picture in pictures:
         picture[10:20, 10:20], picture[30:36, 30:36] = 50.0, -0.01
         picture[0, 0] = np.nan
-    shot = shot_of(write_sequence(tmp_path / "f", pictures, "exr"))  # has the working size, whose frames are rounded
+    shot = shot_of(write_sequence(tmp_path / "f", pictures, "exr"))  # size of the working frames, which are rounded
     plates = Plates(shot)
     assert plates.deep and plates.note == ""
     got, want = plates.linear(1003).numpy(), np.nan_to_num(pictures[2].astype(np.float32))

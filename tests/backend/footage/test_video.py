@@ -117,7 +117,7 @@ def test_interlaced_clips_become_whole_pictures_and_say_so(interlaced, top_first
 
 
 def woven(frames, top_first=True):
-    """Combine each two frames as the fields of one frame."""
+    """Interlace each pair of frames as the two fields of one frame."""
     out = []
     for first, second in zip(frames[::2], frames[1::2], strict=True):
         both = first.copy()

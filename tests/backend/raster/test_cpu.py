@@ -12,7 +12,7 @@ from torch_backend.raster import RasterSettings
 
 
 def test_a_median_depth_is_where_half_is_crossed_or_that_of_the_largest_weight(tools):
-    """Some pixels reach an alpha of one half, others do not: 37 x 21 px, 60 Gaussians, with and without the top contributor."""
+    """Some pixels reach an alpha of one half, others do not: 37 x 21 px, 60 Gaussians, `with_top` or not."""
     for with_top in (False, True):
         scene = tools.cloud(60, 37, 21, seed=11, with_depth=True, with_top=with_top)
         cpu, ref = scene.run("cpu"), scene.run("reference")

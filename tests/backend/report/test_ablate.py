@@ -74,7 +74,7 @@ def brightened(step, made=None):
 
 
 def test_steps_that_variants_share_are_made_once(instants, clip):
-    """With `develop` switched off, earlier steps are reused; with a frame rule switched off, all steps are."""
+    """Switching `develop` off reuses the earlier steps; switching a frame rule off reuses all steps."""
     made = Counter[str]()
     with replaced("instant.repairs", "develop", functools.partial(brightened, made=made)):
         today = instants.make(frozenset())

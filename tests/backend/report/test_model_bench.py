@@ -14,7 +14,7 @@ from torch_backend.shot import Shot, write_json
 def test_a_trained_run_is_judged_frozen_and_developed_on_frames_that_it_has_not_seen(trained, tmp_path):
     world, _ = trained
     command = [str(world.shot.root), "--run", "main", "--results", str(tmp_path), "--t-star", "103", "--develop"]
-    # Without a large `instant_share`, developing makes so sharp a run worse on plate t*, and its result is discarded.
+    # Without a large `instant_share`, developing makes this sharp run worse on plate t*, and its result is discarded.
     assert main([*command, "--develop-set", "steps=40", "gain=-99", "instant_share=0.6", "--held", "1"]) == 0
     result = json.loads((tmp_path / "model.json").read_text())
     figures = result["figures"]

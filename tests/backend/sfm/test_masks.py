@@ -72,7 +72,7 @@ def test_the_camera_is_solved_from_what_is_not_masked(masked):
 
 
 def test_the_mask_lies_over_the_undistorted_frames_as_over_the_filmed_ones(masked):
-    """The mask is the board's outline; with another undistortion map, it would not end at the board."""
+    """The mask ends at the board's outline. With another undistortion map, it would not."""
     shot, *_ = masked
     lens = read_json(shot.solve_record)["lenses"][0]["params"]
     focal, cx, cy, k = lens[0], *lens[1:4]

@@ -1,5 +1,4 @@
-"""Moving areas of mattes: Gaussians there go on trial and count less before; others stay closed; mattes are part of
-keys."""
+"""Moving areas of mattes: only Gaussians there go on trial, nothing else opens, and mattes are part of a run's key."""
 
 import numpy as np
 import pytest

@@ -130,8 +130,7 @@ def test_what_is_near_or_around_the_point_does_not_smear(quiet):
 
 
 def test_colours_are_those_that_the_clip_saw():
-    """The harmonics of degree 1 are red seen from below and blue from above. A clip filmed from below gives red
-    everywhere."""
+    """Harmonics make a splat red from below and blue from above. A clip that saw it from below gives red everywhere."""
     gaussians = splats(POINT + np.array([[0.0, 0.0, -4.0]]), [[0.5, 0.5, 0.5]], 0.3, 6.0)
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 2] = (0.8, 0.0, -0.8)  # times z of the ray from the camera to the splat
