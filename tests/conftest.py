@@ -1,4 +1,4 @@
-"""Loaded by the backend's tests and, inside a bpy wheel, by the add-on's: standard library and pytest only."""
+"""Shared by the backend's tests and, inside a bpy wheel, the add-on's: only imports standard library and pytest."""
 
 import importlib.util
 import os
@@ -10,7 +10,7 @@ import pytest
 if importlib.util.find_spec("hypothesis"):
     from hypothesis import settings
 
-    # No test depends on how fast the machine is, and every run tries the same examples.
+    # Tests must not depend on the machine's speed, and every run tries the same examples.
     settings.register_profile("splannequin", deadline=None, derandomize=True, max_examples=50)
     settings.load_profile("splannequin")
 
@@ -21,7 +21,8 @@ CUSTOM = ("sitecustomize", "usercustomize")
 
 @pytest.fixture(autouse=True)
 def as_it_was_scheduled():
-    """A test that leaves the process real-time, as root's SVT-AV1 does, starves all that comes after it: it fails."""
+    """Fail a test that leaves the process with real-time scheduling, as SVT-AV1 does as root; later tests would
+    starve."""
     yield
     if hasattr(os, "sched_getscheduler") and os.sched_getscheduler(0) != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
@@ -30,12 +31,14 @@ def as_it_was_scheduled():
 
 @pytest.fixture
 def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
-    """hostile(folder, ...) puts modules into folders and stands in the first; returns the file that they write when
-    they are imported."""
+    """hostile(folder, ...): writes modules into folders and changes to the first folder.
+
+    Returns the file that the modules write when they are imported.
+    """
     marker = tmp_path / "a module of a shot was imported"
 
     def plant(*folders: Path) -> Path:
-        monkeypatch.delenv("PYTHONSAFEPATH", raising=False)  # of who runs the tests; a user has none
+        monkeypatch.delenv("PYTHONSAFEPATH", raising=False)  # may be set for the tests; users do not set it
         monkeypatch.setenv("PYTHONPATH", "")
         for folder in folders:
             folder.mkdir(parents=True, exist_ok=True)
@@ -69,8 +72,10 @@ esac
 
 @pytest.fixture
 def nvidia_smi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """nvidia_smi(row, ...) puts a stand-in of NVIDIA's tool on the PATH that lists "name, driver, compute capability";
-    code: its exit code, old: it does not know the last column."""
+    """nvidia_smi(row, ...): puts a stand-in of NVIDIA's tool on the PATH that lists "name, driver, compute capability".
+
+    `code` is its exit code. With `old`, it does not support the last column.
+    """
 
     def put(*rows: str, code: int = 0, old: bool = False) -> None:
         folder = tmp_path / f"bin {len(list(tmp_path.iterdir()))}"

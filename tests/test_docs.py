@@ -1,4 +1,4 @@
-"""What the documents refer to is there, and their tables are those of the code."""
+"""References of the documents exist, and their tables equal those of the code."""
 
 import re
 from pathlib import Path
@@ -23,7 +23,7 @@ def text_of(page: Path) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """As GitHub makes them from headings."""
+    """Anchors of a page's headings, as GitHub creates them."""
     headings = re.findall(r"^#+ (.+)$", text_of(page), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 
@@ -42,7 +42,7 @@ def test_links_and_pictures_are_there(page: Path):
 
 
 def test_what_contributors_are_sent_to_is_there():
-    """Every file and folder between backticks; `NAME` stands for the reader's own."""
+    """Every file and folder between backticks; `NAME` stands for the reader's own name."""
     page = text_of(ROOT / "CONTRIBUTING.md")
     named = [word for word in re.findall(r"`([^`\n]+)`", page) if "NAME" not in word]
     paths = {word for word in named if re.fullmatch(r"[\w.-]+(/[\w.-]+)+/?|\w+\.(py|toml)", word)}
@@ -52,7 +52,7 @@ def test_what_contributors_are_sent_to_is_there():
 
 
 def test_every_test_that_a_page_names_is_there():
-    """`file.py::test`, `::test` of the file before it in the row, or `test` alone."""
+    """Notations: `file.py::test`, `::test` of the previous file in the row, or `test` alone."""
     tests = "".join(text_of(path) for path in (ROOT / "tests").rglob("test_*.py"))
     for page in PAGES:
         for file, name in re.findall(

@@ -1,5 +1,8 @@
-"""Whatever is read of a shot or of footage is looked at first: a pipe would hold a program up for ever, a device or a
-sparse file fill its memory. `open_regular`, `open_arrays` and `regular_file` of the contract look."""
+"""Files of shots and footage are checked before they are read.
+
+A pipe would block a program forever; a device or a sparse file would fill its memory. The contract's `open_regular`,
+`open_arrays` and `regular_file` do the check.
+"""
 
 import ast
 from collections.abc import Iterator
@@ -10,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LOOKS = {"open_regular", "open_arrays", "regular_file"}
 OPENS = {"ImageInput.open", "ImageBuf", "images.load", "av.open", "safe_open", "np.load", "np.fromfile", "cv2.imread"}
-"""Ends of the names of functions that open a file by its path, or read one that is open."""
+"""Ends of the names of functions that open a file by its path, or read an open file."""
 OWN = {
     "torch_backend/kernel_text.py": "the package's own files",
     "torch_backend/contract/hosts.py": "the package's own files",
@@ -24,11 +27,11 @@ OWN = {
     "torch_backend/contract/writing.py": "files that this process writes",
     "splannequin_addon/process/environment.py": "the log of a set-up that this Blender started",
 }
-"""What may read without looking, and why: a module, or one function of it."""
+"""Modules, or single functions, that may read without a check, with the reason."""
 
 
 def unseen(source: str) -> Iterator[tuple[str, str]]:
-    """(function, call) of each call in a module that opens a file by its path without a look."""
+    """(function, call) of each call in a module that opens a file by its path without a check."""
     tree = ast.parse(source)
     inside = {
         id(node): scope.name
@@ -45,7 +48,7 @@ def unseen(source: str) -> Iterator[tuple[str, str]]:
         and isinstance(item.context_expr, ast.Call)
         and ast.unparse(item.context_expr.func).rpartition(".")[2] in LOOKS
     }
-    # A path that was looked at may have got a name before.
+    # A checked path may have been assigned to a name before.
     looked |= {
         node.targets[0].id
         for node in ast.walk(tree)
@@ -62,7 +65,7 @@ def unseen(source: str) -> Iterator[tuple[str, str]]:
         writes = any(isinstance(mode, str) and set(mode) & set("wax+") for mode in modes)
         by_path = any(name == end or name.endswith(f".{end}") for end in OPENS) or name == "open"
         opens = (by_path and not writes) or name.rpartition(".")[2] in ("read_text", "read_bytes")
-        # ImageBuf of pixels and of a specification opens nothing.
+        # ImageBuf of pixels or of a specification opens no file.
         if name.endswith("ImageBuf") and first.startswith(("np.", "spec", "sheet")):
             opens = False
         if opens and not any(f"{look}(" in first for look in LOOKS) and first not in looked:

@@ -1,4 +1,4 @@
-"""What the add-on's functions are told, as types; and that Blender's types are for the checker alone."""
+"""Parameter types of the add-on's functions; Blender's type stubs are only for the type checker."""
 
 import ast
 import importlib.util
@@ -7,9 +7,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 MOST = 0.05
-"""Share of the add-on's parameters whose type may be open."""
+"""Largest allowed fraction of the add-on's parameters with an open type."""
 RECORDS = ("dict[str, Any]", "Mapping[str, Any]")
-"""What was read from JSON: whoever takes a value out of it looks at what it is."""
+"""Types of data read from JSON, whose values are checked when they are used."""
 OPEN = {
     "bake/freeze_group.py: _factor(socket)": "Blender's types know the plain subtype of a socket alone",
     "bake/render_settings.py: _picture(value)": "the value of any setting",
@@ -22,11 +22,12 @@ OPEN = {
     "scene/scene_setup.py: _same(other)": "the value of any setting",
     "scene/sequences.py: show_sequence(user)": "an image user, or a node that has the same in itself",
 }
-"""Parameters that are `Any` -> why."""
+"""Map from each parameter of type `Any` to the reason."""
 
 
 def parameters(tree: ast.AST) -> Iterator[tuple[str, str, str]]:
-    """(function, parameter, type) of every function of a file but `self` and `cls`; the type is empty without one."""
+    """(function, parameter, type) of every function of a file, except `self` and `cls`; the type is empty if
+    missing."""
     for node in ast.walk(tree):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             told = node.args
@@ -37,12 +38,12 @@ def parameters(tree: ast.AST) -> Iterator[tuple[str, str, str]]:
 
 
 def is_open(kind: str) -> bool:
-    """True of a type that says nothing, in whole or in part."""
+    """True if a type contains `Any` or is missing."""
     return not kind or any(isinstance(n, ast.Name) and n.id == "Any" for n in ast.walk(ast.parse(kind)))
 
 
 def addon_parameters() -> list[tuple[str, str]]:
-    """(parameter, type) of all of the add-on's."""
+    """(parameter, type) of all parameters of the add-on."""
     folder = ROOT / "splannequin_addon"
     return [
         (f"{path.relative_to(folder).as_posix()}: {function}({name})", kind)
@@ -63,19 +64,19 @@ def test_every_open_parameter_of_the_addon_has_a_reason():
 
 
 def annotated_calls(tree: ast.AST) -> list[int]:
-    """Lines of what is annotated with a call, which is no type to a checker."""
+    """Lines of annotations that are calls, which a type checker does not accept as types."""
     found = [n for n in ast.walk(tree) if isinstance(n, ast.AnnAssign)]
     return [n.lineno for n in found if any(isinstance(part, ast.Call) for part in ast.walk(n.annotation))]
 
 
 def test_properties_of_the_addon_are_assigned_so_that_their_type_is_known():
-    """`splannequin_addon/properties.py` says how."""
+    """`splannequin_addon/properties.py` explains how."""
     for path in sorted((ROOT / "splannequin_addon").rglob("*.py")):
         assert not annotated_calls(ast.parse(path.read_text(encoding="utf-8"))), path
     assert annotated_calls(ast.parse("class A:\n    name: StringProperty()")) == [2]
 
 
 def test_blenders_types_are_nothing_that_this_python_can_import():
-    """A package of types in folders of bpy's own names would pass for Blender where there is none."""
+    """A package of type stubs named like bpy would be mistaken for Blender."""
     if importlib.util.find_spec("_bpy") is None:
         assert importlib.util.find_spec("bpy") is None

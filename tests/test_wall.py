@@ -1,4 +1,4 @@
-"""The wall between Blender and the backend, and what no file of the project may do: read from the source."""
+"""The wall between Blender and the backend, and calls that no file of the project may contain: read from the source."""
 
 import ast
 import functools
@@ -34,8 +34,10 @@ STATIONS = (
     "freeze",
     "live",
 )
-"""In the order of docs/architecture.md: a station imports only stations before it. `footage/plates.py` and
-`motion_search.py` are late."""
+"""Stations in the order of docs/architecture.md; a station imports only stations before it.
+
+`footage/plates.py` and `motion_search.py` come late in this order.
+"""
 ROOMS = (
     "access",
     "properties",
@@ -55,10 +57,12 @@ ROOMS = (
     "command_line",
     "registration",
 )
-"""Of the add-on, in the order of docs/architecture.md: a room imports only rooms before it, and no file of another
-step's `step.py`, which only the registration knows."""
+"""Rooms of the add-on in the order of docs/architecture.md; a room imports only rooms before it.
+
+Only the registration imports the `step.py` of a step.
+"""
 LEVELS = 8
-"""Most files of the add-on that import one another in a row."""
+"""Longest allowed chain of imports between files of the add-on, counted in files."""
 CODE_RUNNING_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib", "yaml"}
 NETWORK_SERVERS = {"http.server", "socketserver", "xmlrpc.server", "wsgiref"}
 
@@ -82,7 +86,7 @@ def dotted(node: ast.expr) -> str:
 
 
 def imports(tree: ast.AST, package: list[str]) -> Iterator[tuple[int, str]]:
-    """(line, dotted name from the repository root) of everything a file imports, at whatever depth."""
+    """(line, dotted name from the repository root) of everything a file imports, at any depth."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
@@ -101,18 +105,18 @@ class _RunTime(ast.NodeTransformer):
 
 
 def run_time(source: str) -> ast.AST:
-    """A file without what it imports for the type checker alone: no arrow to what has to be there before it."""
+    """Syntax tree of a file without imports that only the type checker needs, which do not affect the load order."""
     return _RunTime().visit(ast.parse(source))
 
 
 @functools.cache
 def imported_at_run_time(path: Path) -> list[str]:
-    """Dotted names that a file imports, but for the type checker's."""
+    """Dotted names that a file imports at run time."""
     return [name for _, name in imports(run_time(path.read_text(encoding="utf-8")), package_of(path))]
 
 
 def station_of(parts: Sequence[str]) -> str:
-    """The station of a module of the backend, by the parts of its name below the backend."""
+    """Station of a backend module, from the parts of its name below the backend."""
     whole = ".".join(parts[:2])
     return whole if whole in STATIONS else parts[0]
 
@@ -134,18 +138,18 @@ LAYOUT = {
     if name.endswith(("_FILE", "_FILES", "_FOLDER", "_LOG", "_SUFFIX"))
     for value in (told if isinstance(told, tuple) else (told,))
 }
-"""Names in a shot folder, as the contract spells them."""
+"""Names in a shot folder, as spelled in the contract."""
 OTHER_FOLDERS = {
     ("splannequin_addon/process/environment.py", "summary.json"),  # of the launcher, in an environment
     ("splannequin_addon/process/environment.py", ".splannequin"),
     ("torch_backend/cameras/imported.py", "colmap/sparse/0"),  # of another program
 }
-"""(file, name) of what is called like something of the shot, and is not."""
+"""(file, name) for names that equal a name in the shot folder but mean something else."""
 
 
 def layout_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """(line, name) of what a file spells of the shot's layout: names of files anywhere, of folders where paths are
-    joined."""
+    """(line, name) for each name of the shot folder that a file spells: file names anywhere, folder names in joined
+    paths."""
     joined = {id(n.right) for n in ast.walk(tree) if isinstance(n, ast.BinOp) and isinstance(n.op, ast.Div)}
     docs = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
     for node in ast.walk(tree):
@@ -173,7 +177,7 @@ def not_for_the_backend(name: str) -> bool:
 
 
 def dangers(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """(line, what) of whatever runs what a file says or serves the network; ruff finds eval, exec and shells."""
+    """(line, what) of calls that execute file contents or serve the network; ruff finds eval, exec and shells."""
     for line, name in imports(tree, []):
         if name.split(".")[0] in CODE_RUNNING_MODULES or any(name.startswith(server) for server in NETWORK_SERVERS):
             yield line, f"import of {name}"
@@ -189,11 +193,11 @@ def dangers(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 PYTHON = re.compile(r"(.*\.)?(python|executable)(\(\))?|str\(bpy\)")
-"""Source of an expression that is the path of a Python."""
+"""Source of an expression for the path of a Python interpreter."""
 
 
 def unsafe_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """(line, command) of Pythons that are started without -P (or -I): they take modules from where they stand."""
+    """(line, command) of Python processes without -P (or -I), which import modules from their working folder."""
     shown = {
         id(argument)
         for node in ast.walk(tree)
@@ -213,7 +217,7 @@ def unsafe_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def unplaced_children(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """(line, call) of processes that stand wherever this one does."""
+    """(line, call) of child processes without an explicit working folder."""
     for node in ast.walk(tree):
         started = isinstance(node, ast.Call) and dotted(node.func) == "subprocess.Popen"
         if started and not {None, "cwd"} & {k.arg for k in node.keywords}:
@@ -248,7 +252,7 @@ def test_the_scan_sees_an_unsafe_child(source: str, unsafe: bool):
 
 
 def asks_the_version(tree: ast.AST) -> bool:
-    """True of a file that does one thing or another by Blender's version."""
+    """True for a file whose behaviour depends on Blender's version."""
     return any(isinstance(n, ast.Attribute) and ast.unparse(n) == "bpy.app.version" for n in ast.walk(tree))
 
 
@@ -328,7 +332,7 @@ def test_only_the_contract_spells_the_layout_of_a_shot():
 
 
 def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
-    """Groups of modules that import each other, however indirectly; `arrows`: module -> those it imports."""
+    """Groups of modules that import each other, directly or indirectly; `arrows` maps a module to its imports."""
 
     def reached(start: str) -> set[str]:
         found, waiting = set(), [start]
@@ -349,7 +353,7 @@ def test_the_scan_sees_a_circle():
 
 
 def test_only_one_file_of_the_addon_imports_others_for_the_type_checker():
-    """Of bpy's types any file may: what a room needs to know of a later one, it asks `access`."""
+    """Every file may import bpy's types. A room that needs data of a later room gets it through `access`."""
 
     for_types = {
         path.name
@@ -364,7 +368,7 @@ def test_only_one_file_of_the_addon_imports_others_for_the_type_checker():
 
 @functools.cache
 def addon_modules() -> dict[str, set[str]]:
-    """Module of the add-on, by its dotted name below the add-on -> the modules of the add-on that it imports."""
+    """Map from each add-on module, by its dotted name below the add-on, to the add-on modules that it imports."""
     paths = {}
     for path in sources("splannequin_addon"):
         parts = path.relative_to(ROOT / "splannequin_addon").with_suffix("").parts
@@ -380,12 +384,12 @@ def addon_modules() -> dict[str, set[str]]:
 
 
 def level(module: str, arrows: dict[str, set[str]]) -> int:
-    """How many modules stand in the longest row of imports that begins with this one, itself counted."""
+    """Length of the longest chain of imports that starts with this module, which counts as one."""
     return 1 + max((level(other, arrows) for other in arrows[module]), default=0)
 
 
 def backwards(arrows: dict[str, set[str]]) -> list[str]:
-    """Imports that go from a room to one that does not come before it."""
+    """Imports from a room to one that does not come before it."""
     order = {room: place for place, room in enumerate(ROOMS)}
     wrong = []
     for module, others in arrows.items():
@@ -450,7 +454,7 @@ def packages(top: str) -> list[str]:
 
 
 def part_of(name: str, package: str) -> str:
-    """The file or folder of a package that a dotted name lies in; "" beyond it. The late station is one by itself."""
+    """File or folder of a package that contains a dotted name; "" outside. `footage.plates` counts separately."""
     parts = name.split(".")
     if parts[:3] == ["torch_backend", "footage", "plates"] and package == "torch_backend":
         return "footage.plates"
@@ -459,7 +463,7 @@ def part_of(name: str, package: str) -> str:
 
 @pytest.mark.parametrize("package", [*packages("launcher"), *packages("torch_backend"), *packages("benchmarks")])
 def test_no_files_and_folders_of_a_package_import_each_other(package: str):
-    """At whatever depth, and not even for the names of types: who can name a class of the other knows it."""
+    """At any depth, and also for type names: a file that names another's class depends on it."""
     arrows: dict[str, set[str]] = {}
     for path in sources(package.replace(".", "/")):
         module = [*package_of(path), *([] if path.stem == "__init__" else [path.stem])]

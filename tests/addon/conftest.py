@@ -1,6 +1,7 @@
-"""Runs inside real bpy: a wheel (`.venv-bpy-X.Y/bin/python -m pytest tests/addon`) or a Blender (.ci/blender_tests.py).
+"""Fixtures for tests inside real bpy: a wheel (`.venv-bpy-X.Y/bin/python -m pytest tests/addon`) or a Blender
+(.ci/blender_tests.py).
 
-The package is registered once, under the name that Blender gives an installed extension; every test starts from
+The package is registered once, under the name that Blender gives an installed extension. Every test starts from
 Blender's factory startup file.
 """
 
@@ -47,7 +48,7 @@ def package() -> Iterator[types.ModuleType]:
 
 @pytest.fixture(scope="session")
 def addon(package: types.ModuleType) -> Callable[[str], types.ModuleType]:
-    """addon("process.jobs") is the add-on's module of that name."""
+    """addon(name): the add-on's module of that name, such as addon("process.jobs")."""
     return lambda name: importlib.import_module(f"{package.__name__}.splannequin_addon.{name}")
 
 
@@ -73,7 +74,7 @@ def layers() -> Callable[[int], dict[str, np.ndarray]]:
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1 in float64."""
+    """sRGB encoding of linear values (IEC 61966-2-1), in float64."""
     linear = np.clip(linear.astype(np.float64), 0.0, 1.0)
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
 
@@ -85,7 +86,7 @@ def pictures() -> types.SimpleNamespace:
 
 @pytest.fixture
 def run(addon, capfd):
-    """run(*arguments) is (exit code, standard output, standard error)."""
+    """run(*arguments): runs the command line; returns (exit code, standard output, standard error)."""
 
     def call(*arguments) -> tuple[int, str, str]:
         capfd.readouterr()
@@ -113,7 +114,7 @@ def _frozen_world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def frozen_world(_frozen_world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with tiny.splannequin, trained and frozen at 105 by a real backend, and truth.json: a module's own."""
+    """Module-scoped folder with tiny.splannequin, trained and frozen at 105 by a real backend, and truth.json."""
     return Path(shutil.copytree(_frozen_world, tmp_path_factory.mktemp("world") / "frozen"))
 
 
@@ -124,7 +125,7 @@ def new_take() -> Callable[[Path, str], Path]:
 
 @pytest.fixture
 def previews() -> Callable[[Path, str], None]:
-    """previews(shot, take) writes the previews that the backend leaves beside frozen frames."""
+    """previews(shot, take): writes the preview files that the backend writes with frozen frames."""
 
     def write(shot: Path, take: str = "freeze") -> None:
         folder = shot / "takes" / take / "preview"

@@ -1,4 +1,4 @@
-"""The doors to what Blender's types leave open give what Blender has."""
+"""Typed access to Blender's data returns the values that Blender holds."""
 
 import bpy
 import pytest

@@ -1,4 +1,4 @@
-"""Floor, origin and scale: the buttons on a scene (the maths: tests/addon_free)."""
+"""Buttons for floor, origin and scale, on a scene (tests/addon_free tests the maths)."""
 
 import json
 
@@ -14,7 +14,7 @@ def maths(addon):
 
 def test_the_first_guess_stands_on_the_floor(addon, contract):
     cameras = addon("solve.cameras")
-    tilt = np.radians(25.0)  # looking down on a table: the camera's up leans forward
+    tilt = np.radians(25.0)  # the camera looks down at a table: its up vector leans forward
     right, down = np.array([1.0, 0, 0]), -np.array([0, np.sin(tilt), np.cos(tilt)])
     viewmat = np.eye(4)
     viewmat[:3, :3] = [right, down, np.cross(right, down)]
@@ -48,7 +48,7 @@ def built(addon, scene, shot):
 
 
 def world(addon, scene, shot) -> np.ndarray:
-    """The solve's points where they stand, [P, 3], from the file and the root."""
+    """Solved points [P, 3] in world space: points.npz transformed by the root."""
     bpy.context.view_layer.update()
     matrix = np.array(addon("solve.cameras").find(scene, shot, "EMPTY").matrix_world, dtype=np.float64)
     return np.load(shot / "solve" / "points.npz")["xyz"] @ matrix[:3, :3].T + matrix[:3, 3]
@@ -92,7 +92,7 @@ def test_selected_objects_serve_as_points(addon, built, shot):
         bpy.ops.splannequin.align_floor(selected=True)
     for empty in empties:
         empty.select_set(True)
-    addon("solve.cameras").find(built, shot, "EMPTY").select_set(True)  # ours does not count
+    addon("solve.cameras").find(built, shot, "EMPTY").select_set(True)  # the shot's root is not counted
     root = addon("solve.cameras").find(built, shot, "EMPTY")
     bpy.context.view_layer.update()
     relative = [root.matrix_world.inverted() @ e.matrix_world.translation for e in empties]

@@ -13,7 +13,7 @@ def chain(addon):
 
 @pytest.fixture
 def solved(scene, frozen_world):
-    """The tiny shot without its run and take."""
+    """The tiny shot without runs and takes."""
     shot = frozen_world / "tiny.splannequin"
     for folder in ("runs", "takes"):
         shutil.rmtree(shot / folder, ignore_errors=True)
@@ -28,14 +28,14 @@ def watch(addon, scene, shot):
 
 
 def ended_job(addon, contract, watch, step, state="done"):
-    """The newest job of a step has ended."""
+    """Make the newest job of a step an ended one."""
     job = addon("process.jobs").new_job(watch.shot, step, contract.STEP_PARAMS[step]())
     job.status = contract.Status(step, state, 0, 0.0, 1.0, 0.0)
     watch.jobs[step] = job
 
 
 def begun(chain, watch, ahead, step="solve"):
-    """Steps are done one after the other, and this one is at work."""
+    """Register a chain of steps with `step` running and `ahead` still to run."""
     found = chain.Chain(list(ahead), chain.contract.WholeWay({}), step)
     chain._chains[watch.shot] = found
     return found
@@ -84,7 +84,7 @@ def test_the_next_step_begins_when_the_one_before_is_done_and_its_shot_is_chosen
     ended_job(addon, contract, watch, "solve", "running")
     assert chain._turn(watch.shot, found) is True and pressed == []
     ended_job(addon, contract, watch, "solve")
-    addon("shot.selection").add(scene)  # another shot of the scene is chosen
+    addon("shot.selection").add(scene)  # chooses another shot of the scene
     assert chain._turn(watch.shot, found) is True and pressed == []
     addon("shot.selection").choose(scene, 0)
     assert chain._turn(watch.shot, found) is True and pressed == ["train"]
@@ -112,5 +112,5 @@ def test_the_bar_goes_by_what_the_running_job_says_of_itself(addon, contract, ch
     job.status.stage, job.status.eta_seconds = "solve", 50.0
     share, left = chain.progress(watch.shot)
     assert left == pytest.approx(150.0, abs=1.0) and share < 0.05
-    job.status.eta_seconds = 100.0  # the machine is busy: twice as long
+    job.status.eta_seconds = 100.0  # a busy machine: the estimate doubles
     assert chain.progress(watch.shot)[1] == pytest.approx(300.0, abs=2.0)

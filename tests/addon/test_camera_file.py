@@ -1,4 +1,4 @@
-"""Cameras of Alembic, FBX and USD files: written by this Blender, read by another one, against the camera itself."""
+"""Cameras in Alembic, FBX and USD files: written by this Blender, read by another, compared with the source camera."""
 
 import json
 
@@ -10,7 +10,8 @@ FIRST, LAST = 5, 7  # of the test shot, whose frames are 16 x 12
 
 
 def animated(scene, name, film=(24.0, 18.0), end=1.0):
-    """A camera that moves over the shot's frames, as files can tell it: film back as the frames, shift, no zoom."""
+    """Camera that moves over the shot's frames and uses only what files can store: film back of the frames' shape,
+    shift."""
     data = bpy.data.cameras.new(name)
     data.sensor_width, data.sensor_height, data.lens = *film, 28.0
     data.sensor_fit, data.shift_x, data.shift_y = "HORIZONTAL", 0.12, -0.07
@@ -24,14 +25,14 @@ def animated(scene, name, film=(24.0, 18.0), end=1.0):
 
 
 def seen(addon, scene, camera):
-    """Its samples, which `test_scene_camera` holds against Blender's projection."""
+    """The camera's samples. `test_scene_camera` compares such samples with Blender's projection."""
     evaluated, sample_of = addon("shot.seen_camera").evaluated, addon("solve.camera_samples").sample_of
     numbers = range(FIRST, LAST + 1)
     return [sample_of(n, *evaluated(scene, camera.name, n, (16, 12))[:2], (16, 12)) for n in numbers]
 
 
 def export(path):
-    """The whole scene as a file."""
+    """Export the whole scene as a file."""
     if path.suffix == ".abc":
         if not bpy.app.alembic.supported:
             pytest.skip("this Blender was built without Alembic")
@@ -48,7 +49,7 @@ def export(path):
 
 @pytest.fixture
 def filmed(scene, shot):
-    """The scene with the shot's size, rate and range, without its own camera."""
+    """Scene with the shot's size, rate and range, without the scene's default camera."""
     scene.splannequin.shot_path, scene.splannequin.cameras_from = str(shot), "FILE"
     scene.render.resolution_x, scene.render.resolution_y = 16, 12
     fps = json.loads((shot / "shot.json").read_text(encoding="utf-8"))["fps"]
@@ -61,7 +62,7 @@ def filmed(scene, shot):
 
 @pytest.mark.parametrize("ending", [".abc", ".usdc", ".fbx"])
 def test_a_camera_comes_back_from_a_file(addon, filmed, shot, tmp_path, ending):
-    """And nothing of the file comes into the artist's."""
+    """Reading the file adds no data-block to the artist's file."""
     camera = animated(filmed, "match")
     file = tmp_path / f"set é{ending}"
     export(file)
@@ -82,14 +83,14 @@ def test_a_camera_comes_back_from_a_file(addon, filmed, shot, tmp_path, ending):
 
 @pytest.fixture
 def reading(addon, filmed, tmp_path):
-    """reading() has a file of the scene read by this Blender, as its child does it; returns what it writes."""
+    """reading(): exports the scene, reads the file in this Blender as the child does, and returns the result."""
     if not bpy.app.alembic.supported:
         pytest.skip("this Blender was built without Alembic")
 
     def read():
         file = tmp_path / "set.abc"
         export(file)
-        for item in list(filmed.objects):  # else the imported ones get other names
+        for item in list(filmed.objects):  # avoids renamed imports
             bpy.data.objects.remove(item)
         scene = bpy.data.scenes.new("empty")
         render = filmed.render
@@ -153,7 +154,7 @@ def test_the_timer_waits_for_the_other_blender_and_ends_it_when_given_up(addon, 
 
 
 def test_the_command_line_reads_it(addon, filmed, shot, tmp_path, capfd):
-    """Up to where the backend, which has matched the cameras, finds that the test shot has no pictures as filmed."""
+    """Cameras are matched by the backend, which then finds that the test shot lacks the pictures as filmed."""
     animated(filmed, "match")
     file = tmp_path / "set.fbx"
     export(file)

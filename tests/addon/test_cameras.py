@@ -1,4 +1,4 @@
-"""Axes, lens and keys of the solved camera: against values worked out by hand, and against a render."""
+"""Axes, lens and keys of the solved camera, compared with hand-computed values and with a render."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ def poses_of(shot: Path) -> tuple[list[dict], int, int]:
 
 def test_identity_camera_looks_along_z_with_y_down(addon):
     matrix = addon("scene.axes").camera_to_world(np.eye(4))
-    # Blender's camera looks along its -z and has y up: in OpenCV's world that is +z and -y.
+    # Blender's camera looks along -z with y up: +z and -y in OpenCV's world.
     np.testing.assert_allclose(matrix @ [0, 0, -1, 0], [0, 0, 1, 0])
     np.testing.assert_allclose(matrix @ [0, 1, 0, 0], [0, -1, 0, 0])
     np.testing.assert_allclose(matrix @ [1, 0, 0, 0], [1, 0, 0, 0])
@@ -100,7 +100,7 @@ def test_lens_is_keyed_where_it_changes(addon, scene, shot):
 def test_quaternions_take_the_short_way(addon, scene, shot):
     poses, width, height = poses_of(shot)
     frames = []
-    for n in range(40):  # a full turn: somewhere the decomposition flips its sign
+    for n in range(40):  # a full turn, during which the decomposition flips its sign
         angle = 2 * np.pi * n / 39
         viewmat = np.eye(4)
         viewmat[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -161,7 +161,7 @@ def test_second_build_replaces_and_keeps_the_roots_place(addon, scene, shot):
 
 
 def rewrite(shot: Path, **lens) -> list[dict]:
-    """Another solve of the same clip: all is moved, and the last frame perhaps has a K of its own."""
+    """Write another solve of the same clip: all poses moved, with optional changes to the last frame's lens."""
     poses, width, height = poses_of(shot)
     for pose in poses:
         pose["viewmat"][3] += 0.5
@@ -260,7 +260,7 @@ def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_pa
         bpy.data.objects.remove(item)
     addon("solve.arrival").load_camera(scene, shot)
     poses, width, height = poses_of(shot)
-    scale = 6  # a picture of 96 x 72, so that a centroid is worth a tenth of a pixel
+    scale = 6  # a picture of 96 x 72, where the tolerance of a centroid is a tenth of a pixel
     scene.render.resolution_x, scene.render.resolution_y = width * scale, height * scale
     root = addon("solve.cameras").find(scene, shot, "EMPTY")
     point = np.array([[-0.5, 0.2, 0.3]])
@@ -279,7 +279,7 @@ def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_pa
     scene.render.filepath = str(tmp_path / "ball.png")
     bpy.ops.render.render(write_still=True)
     weight = pictures.read(tmp_path / "ball.png").mean(axis=2)
-    weight = np.where(weight > 0.2, weight, 0.0)  # the dark is dithered
+    weight = np.where(weight > 0.2, weight, 0.0)  # removes dithering of dark pixels
     assert weight.max() > 0.5, "the ball is in the picture"
     rows, columns = np.mgrid[0 : height * scale, 0 : width * scale] + 0.5
     found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum() / scale
@@ -289,7 +289,7 @@ def test_a_rendered_ball_lands_on_the_projected_pixel(addon, scene, shot, tmp_pa
 
 
 def test_an_artists_camera_is_read_in_solve_units(addon, contract, scene, shot):
-    """A camera that copies the solved one, lens included, gives the solve back; its own lens and size are kept."""
+    """A camera that copies the solved camera, with its lens, reproduces the solve; its lens and size are kept."""
     cameras = addon("solve.cameras")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
@@ -359,7 +359,7 @@ def test_motion_blur_takes_the_scenes_shutter_and_only_on_a_camera_of_the_artist
 
 @pytest.fixture
 def moving(scene, shot):
-    """The scene, with a camera that moves over frames 1 to 5, and the timer's watch of its shot."""
+    """Scene with a camera that moves over frames 1 to 5."""
     scene.splannequin.shot_path = str(shot)
     scene.frame_end = 5
     camera = scene.objects["Camera"]
@@ -370,13 +370,13 @@ def moving(scene, shot):
 
 
 def path_of(addon, scene, shot) -> list[float]:
-    """How far the camera is to one side, by frame."""
+    """Sideways camera position by frame."""
     path = run_out(addon("freeze.own_camera").sample_path(scene, "Camera", shot, 64))
     return [round(frame.viewmat[3], 4) for frame in path.frames]
 
 
 def test_a_camera_moves_in_a_scene_that_is_not_shown(addon, moving, shot):
-    """The window's scene has the same camera: what Blender evaluates there is not what this one is read from."""
+    """A camera that is shared with the window's scene is read from its own scene's evaluation."""
     wanted = path_of(addon, moving, shot)
     assert len(set(wanted)) == 5
     other = bpy.data.scenes.new("B")
@@ -392,7 +392,7 @@ def test_a_camera_moves_in_a_scene_that_is_not_shown(addon, moving, shot):
 
 @pytest.mark.parametrize("how", ["disabled", "excluded"])
 def test_a_camera_that_blender_does_not_evaluate_is_refused(addon, contract, moving, shot, how):
-    """It would stand still."""
+    """Without evaluation the camera would seem to stand still."""
     wanted = path_of(addon, moving, shot)
     moving.camera = None
     if how == "disabled":
@@ -407,9 +407,9 @@ def test_a_camera_that_blender_does_not_evaluate_is_refused(addon, contract, mov
 
 @pytest.fixture
 def read_on(addon, moving, shot):
-    """The camera is being read by the timer: its first turns are over."""
+    """Watch of a shot whose camera the timer is reading; the first turns have run."""
     timer, takes = addon("process.job_timer"), addon("freeze.takes")
-    moving.frame_end = 100000  # more than a turn reads
+    moving.frame_end = 100000  # more frames than one turn reads
     moving.frame_set(77)
     turns = addon("freeze.own_camera").sample_path(moving, "Camera", shot, 64)
     timer.work(shot, "freeze", takes.reading(moving.session_uid, shot, "freeze", turns, 100000))
@@ -479,7 +479,8 @@ def test_a_keyed_instant_is_followed_frame_by_frame(addon, scene, shot):
 
 
 def test_points_keep_their_own_colours(addon, scene, shot):
-    """What is drawn over the view: Blender itself draws loose points black, so the object shows its bounds only."""
+    """Points are drawn over the view with colours. Blender draws loose points black, so the object shows only its
+    bounds."""
     cameras = addon("solve.cameras")
     cameras.build(scene, shot)
     cloud = cameras.find(scene, shot, "MESH")

@@ -1,4 +1,4 @@
-"""CG among the frozen is seen by the camera of the take, or refused. Scenes share nothing that one of them changes."""
+"""CG is rendered with the take's camera, or refused. Scenes do not share data that one of them changes."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 
 @pytest.fixture
 def solved(addon, scene, shot):
-    """The clip's own take in the compositor, behind the solved camera."""
+    """Scene with the clip's take in the compositor and the solved camera."""
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
     addon("solve.arrival").load_camera(scene, shot)
@@ -21,7 +21,7 @@ def solved(addon, scene, shot):
 
 @pytest.fixture
 def own(addon, contract, solved, shot, new_take):
-    """own(): a take "mine" seen from a camera of the artist's, which is not the scene's; the camera."""
+    """own(): adds a take "mine" seen by a separate artist's camera; returns that camera."""
 
     def make() -> bpy.types.Object:
         camera = bpy.data.objects.new("Mine", bpy.data.cameras.new("Mine"))
@@ -182,7 +182,7 @@ def test_a_take_baked_in_a_copy_of_a_scene_leaves_the_other_scenes(addon, solved
 
 
 def test_a_group_copied_by_hand_stays_as_it_is(addon, solved, shot, new_take):
-    """Into another scene's tree, with its nodes: Ctrl-C, Ctrl-V."""
+    """The copy goes into another scene's tree together with its nodes (Ctrl-C, Ctrl-V)."""
     new_take(shot, "second")
     compat = addon("compat")
     node = addon("bake.freeze_group").group_node(compat.compositor_tree(solved))

@@ -1,4 +1,4 @@
-"""The freeze in the scene's compositor: nothing of the artist's is touched, and the pixels are the backend's."""
+"""The freeze in the scene's compositor: artists' nodes stay unchanged, and the pixels equal the backend's."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def take(addon, shot):
 
 @pytest.fixture
 def artists_tree(addon, scene):
-    """A tree with a few nodes, links and values of the artist's own; its output shows a constant colour, blurred."""
+    """Artist's tree with nodes, links and values; its output shows a blurred constant colour."""
     compat = addon("compat")
     tree = compat.new_compositor_tree(scene, "Artist")
     colour = tree.nodes.new("CompositorNodeRGB")
@@ -32,7 +32,7 @@ def artists_tree(addon, scene):
 
 
 def snapshot(tree, without: str = "") -> tuple[dict, set]:
-    """Nodes with their places and unlinked values, and links, of a tree, but those of a node."""
+    """Nodes of a tree with locations and unlinked values, and its links; one node can be left out."""
     nodes = {}
     for node in tree.nodes:
         if node.name == without:
@@ -134,7 +134,7 @@ def test_pictures_read_ahead_are_those_that_come_in(addon, scene, artists_tree, 
 
 def test_a_picture_read_ahead_is_read_again_before_the_next_bake(addon, scene, shot, tmp_path, pictures):
     bake, plate = addon("bake.insertion"), shot / "frames" / "000005.png"
-    for value in (40, 200):  # the first bake ended without coming in
+    for value in (40, 200):  # stands for a first bake that ended before insertion
         pictures.write(plate, np.full((12, 16, 3), value, np.uint8))
         assert len(list(bake.read_ahead(scene, shot, "freeze"))) == 2
     image = next(i for i in bpy.data.images if i.filepath.endswith(".png"))
@@ -278,14 +278,14 @@ def test_frames_of_another_size_are_fitted(addon, scene, take, shot, tmp_path, l
 
 
 def assert_quarters(found: np.ndarray, small: np.ndarray) -> None:
-    """Each quarter of a picture of 32 x 24 shows what that of one of 16 x 12 does."""
+    """Check that each quarter of a 32 x 24 picture has the mean colour of the same quarter of a 16 x 12 picture."""
     quarters = [picture.reshape(2, -1, 2, picture.shape[1] // 2, 3).mean((1, 3, 4)) for picture in (found, small)]
     np.testing.assert_allclose(*quarters, atol=0.06)
 
 
 @pytest.fixture
 def graded(addon, scene, shot):
-    """graded(file): a tree of the artist's that shows a sequence, two stops brighter, and its alpha elsewhere."""
+    """graded(file): builds an artist's tree that shows a sequence two stops brighter, and also blurs it elsewhere."""
 
     def build(file: Path, kind: str = "CompositorNodeImage"):
         compat = addon("compat")
@@ -406,7 +406,8 @@ def test_a_plate_of_another_size_is_taken_where_it_has_the_renders(addon, scene,
 def test_a_take_fills_the_frame_at_any_percentage(
     addon, scene, take, shot, tmp_path, layers, pictures, mix, baked, rendered
 ):
-    """Inserted at one percentage, rendered at another: half of 32 x 24 pixel by pixel, all of it to the border."""
+    """The take is inserted at one percentage and rendered at another: exact at half of 32 x 24, filled to the border at
+    full."""
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = 32, 24, baked
     addon("scene.scene_setup").keep_plate_colours(scene)
@@ -424,7 +425,7 @@ def test_a_take_fills_the_frame_at_any_percentage(
         return
     assert found.shape == (24, 32, 3)
     assert_quarters(found, expected)
-    if mix:  # the plate's border fades where Blender has no other way to scale
+    if mix:  # at Mix 0 the plate's border fades where Blender cannot scale otherwise
         border = np.concatenate([found[0, 2:], found[-1, 2:]])
         inner = np.concatenate([expected[0, 1:], expected[-1, 1:]])
         assert border.mean() == pytest.approx(inner.mean(), abs=0.03), "as strong as the rest"
@@ -434,7 +435,7 @@ def test_a_take_fills_the_frame_at_any_percentage(
 def test_a_take_of_another_shape_fits_the_width_as_the_camera_sees_it(
     addon, scene, take, shot, tmp_path, layers, pictures, width, height
 ):
-    """Cut above and below in a wider frame, bars in a higher one: against the nearest pixels."""
+    """A wider frame cuts the take above and below; a higher one adds bars. Compared with the nearest pixels."""
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
     addon("scene.scene_setup").keep_plate_colours(scene)
     addon("bake.compositor").insert(scene, take, shot / "frames" / "000005.png")
@@ -484,8 +485,8 @@ def over(front: np.ndarray, back: np.ndarray) -> np.ndarray:
 
 
 def in_front(cg: float | np.ndarray, frozen: np.ndarray, softness: float = 0.0) -> np.ndarray:
-    """[H, W, 1]: 1 for CG up to half a hundredth of the frozen depth behind it, 0 from a hundredth more; with softness
-    by itself further at both ends."""
+    """[H, W, 1]: 1 for CG up to 0.5 % behind the frozen depth, 0 from 1.5 % behind; `softness` widens the ramp at both
+    ends."""
     begin, end = 1.005 * frozen - softness, 1.015 * frozen + softness
     t = np.clip((end - cg) / (end - begin), 0.0, 1.0)
     return (t * t * (3.0 - 2.0 * t))[..., None]
@@ -497,9 +498,9 @@ def in_front(cg: float | np.ndarray, frozen: np.ndarray, softness: float = 0.0) 
 def test_cg_stands_in_front_and_behind_by_depth(
     addon, scene, take, tmp_path, layers, pictures, alpha, softness, bright
 ):
-    """A wall of CG at depth 12 among frames whose depth grows downwards: pixel by pixel the nearer is in front.
+    """CG is a wall at depth 12, the frozen depth grows downwards: at each pixel, the nearer of the two is in front.
 
-    A black one is a caught shadow, which falls on what is up to 5 % nearer, too.
+    Black CG is a caught shadow, which also falls on surfaces up to 5 % nearer.
     """
     compositor, compat = addon("bake.compositor"), addon("compat")
     compositor.insert(scene, addon("bake.take_files").take_of(take.folder, depth_scale=2.0))
@@ -519,7 +520,7 @@ def test_cg_stands_in_front_and_behind_by_depth(
 
 
 def test_cg_softness_0_changes_no_bit(addon, scene, take, tmp_path):
-    """Float pictures by the group's steps of CG Softness at 0, and by the same group without these steps."""
+    """Float pictures with CG Softness at 0 equal those of the same group without its softness nodes."""
     addon("bake.compositor").insert(scene, take)
     node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
     node.inputs["CG"].default_value = (0.25, 0.125, 0.0, 0.5)
@@ -569,7 +570,7 @@ def test_wipe_and_mattes_let_the_plate_through(addon, scene, take, shot, tmp_pat
 
 
 def with_a_wall(addon, scene, tmp_path, pictures, place: tuple[float, float, float], samples: int) -> np.ndarray:
-    """Frame 6 with a green wall of 400 x 400 that faces the camera, its middle at a place before that."""
+    """Render frame 6 with a green wall of 400 x 400 facing the camera, centred at `place` in camera space."""
     scene.frame_set(6)
     for other in [o for o in scene.objects if o.type == "MESH" and not o.hide_render]:
         bpy.data.objects.remove(other)
@@ -596,7 +597,7 @@ def with_a_wall(addon, scene, tmp_path, pictures, place: tuple[float, float, flo
 
 
 def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, scene, take, shot, tmp_path, pictures):
-    """The scene's own render, through its own depth pass, from the solved camera."""
+    """The scene's render and depth pass are used, from the solved camera."""
     compat = addon("compat")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
@@ -612,7 +613,7 @@ def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, sce
     found = with_a_wall(addon, scene, tmp_path, pictures, (0.0, 0.0, -12.0), samples=1)
     depth = make_depth(6)
     green = (found[..., 1] > 0.99) & (found[..., 0] < 0.01)
-    sure = np.abs(depth - 12.0) > 0.2  # where it is in front or behind wholly
+    sure = np.abs(depth - 12.0) > 0.2  # pixels where the wall is entirely in front or behind
     assert (green == (depth > 12.0))[sure & (np.arange(16) > 0)[None, :]].all()
     assert 10 < green.sum() < 150
     addon("process.begin").remove_all(scene, shot)
@@ -620,25 +621,25 @@ def test_a_cube_is_hidden_by_what_is_nearer_and_hides_what_is_farther(addon, sce
 
 
 EDGE = 7.7
-"""Column at which the rendered wall begins: it covers 0.3 of the pixels of column 7."""
+"""Column at which the rendered wall begins; the wall covers 0.3 of each pixel in column 7."""
 
 
 @pytest.mark.parametrize("far", [3.0, 12.0, 60.0])
 def test_a_half_covered_edge_of_cg_is_blended_by_its_coverage(addon, scene, shot, tmp_path, pictures, layers, far):
-    """A wall rendered in front of all that is frozen, within it and behind it, against the composite worked out."""
+    """A wall in front of all frozen depths, among them and behind them, compared with the computed composite."""
     cameras = addon("solve.cameras")
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.set_up_scene = True
     addon("solve.arrival").load_camera(scene, shot)
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     addon("bake.insertion").combine_cg(scene, shot)
-    place = (EDGE - 9.0) / 20.0 * far + 200.0, 0.0, -far  # K: f 20, middle 9
+    place = (EDGE - 9.0) / 20.0 * far + 200.0, 0.0, -far  # focal length 20, principal point x 9
     found = with_a_wall(addon, scene, tmp_path, pictures, place, samples=256)
     covered = np.clip(np.arange(16) + 1.0 - EDGE, 0.0, 1.0)[None, :, None]
     frozen, nearer = layers(6)["rgba"], in_front(far, layers(6)["depth"])
     cg = np.broadcast_to(covered * np.array([0.0, 1.0, 0.0, 1.0]), frozen.shape)
     expected = nearer * over(cg, frozen) + (1.0 - nearer) * over(frozen, cg)
-    sure = np.abs(layers(6)["depth"] / far - 1.005) > 0.015  # elsewhere a millimetre decides
+    sure = np.abs(layers(6)["depth"] / far - 1.005) > 0.015  # elsewhere a millimetre decides which is in front
     assert np.abs(light_of(found) - expected[..., :3])[sure & (np.arange(16) > 0)].max() < 0.04
     assert cameras.find(scene, shot, "CAMERA") == scene.camera
 

@@ -1,4 +1,4 @@
-"""Shots whose files are not what we write: no read of Blender's hangs, raises or draws them."""
+"""Shots with damaged or foreign files: no read in Blender hangs or raises, and no damaged value is drawn."""
 
 import copy
 import json
@@ -20,7 +20,7 @@ WEIRD = [
 
 @pytest.fixture
 def full_shot(addon, contract, shot) -> Path:
-    """The test shot with a paused run, measurements, and a job of every kind that has ended."""
+    """Test shot with a paused run, measurements, and an ended job of every kind."""
     (shot / "runs" / "main" / "metrics.jsonl").write_text('{"seconds": 1.0, "heldout_psnr_db": 20.0}\n' * 3)
     jobs = addon("process.jobs")
     for kind, cls in contract.PARAMS.items():
@@ -38,7 +38,7 @@ def full_shot(addon, contract, shot) -> Path:
 
 
 def files_of(shot: Path) -> list[Path]:
-    """What Blender's main thread reads of a shot."""
+    """Files of a shot that Blender's main thread reads."""
     named = ["shot.json", "frames/frames.json", "solve/solve.json", RUN, TAKE, "runs/main/metrics.jsonl"]
     jobs = sorted(p for p in (shot / "jobs").glob("*/*") if "train" in p.parent.name)
     return [*(shot / name for name in named), *jobs]
@@ -46,7 +46,7 @@ def files_of(shot: Path) -> list[Path]:
 
 @pytest.fixture
 def look(addon, scene):
-    """look(shot) does all that Blender does with a shot that is chosen, and returns every text that it would draw."""
+    """look(shot): does all that Blender does with a chosen shot; returns every text that Blender would draw."""
     supervisor, jobs, steps, listing = (
         addon("process.job_timer"),
         addon("process.jobs"),
@@ -92,7 +92,7 @@ def test_a_whole_shot_is_not_damaged(look, full_shot, addon):
 
 
 def mutated(told: object, random_: random.Random) -> object:
-    """A JSON value with one part of it changed, left out, or put elsewhere."""
+    """Copy of a JSON value with one part changed or removed."""
     told = copy.deepcopy(told)
     if not isinstance(told, (dict, list)) or not told or random_.random() < 0.15:
         return random_.choice(WEIRD)
@@ -135,7 +135,7 @@ def test_files_with_anything_in_them_are_passed_over_or_told(look, full_shot):
 def test_files_that_are_none_hold_nothing_up(look, full_shot, what, tmp_path):
     ended = threading.Event()
     watchdog = threading.Thread(target=lambda: ended.wait(60) or os._exit(3), daemon=True)
-    watchdog.start()  # a read of a pipe waits for ever, and takes no exception
+    watchdog.start()  # a read of a pipe blocks forever, and no exception can interrupt it
     for path in files_of(full_shot):
         before = path.read_bytes()
         path.unlink()
@@ -144,7 +144,7 @@ def test_files_that_are_none_hold_nothing_up(look, full_shot, what, tmp_path):
         elif what == "zero":
             path.symlink_to("/dev/zero")
         elif what == "socket":
-            os.chdir(path.parent)  # a socket's path may be 100 letters long
+            os.chdir(path.parent)  # a socket's path may have at most 100 characters
             socket.socket(socket.AF_UNIX).bind(path.name)
             os.chdir(tmp_path)
         elif what == "folder":
@@ -181,7 +181,7 @@ def test_a_line_without_end_does_not_fill_the_memory(full_shot, addon, contract)
     jobs = addon("process.jobs")
     job = next(job for job in jobs.latest(full_shot).values() if job.kind == "train")
     with open(job.folder / "events.jsonl", "r+b") as events:
-        events.truncate(1 << 40)  # a hole: no disk is used
+        events.truncate(1 << 40)  # a sparse file, which uses no disk space
     events = jobs.poll(job, 0.05)
     assert not events and job.read_to < 1 << 32
     long = b'{"type": "' + b"x" * (3 * contract.LONGEST_LINE) + b'"}\n'

@@ -1,4 +1,4 @@
-"""Setting the backend up from the preferences: a real launcher that fails for want of a network, and removal."""
+"""Setting up the backend from the preferences, with a real launcher that fails without a network, and removal."""
 
 import os
 import subprocess
@@ -23,7 +23,8 @@ def test_a_set_up_without_packages_says_which_step_failed_and_retry_goes_on(
     addon, root, tmp_path, monkeypatch, hostile
 ):
     environment = addon("process.environment")
-    trap = hostile(tmp_path, tmp_path / "bäckend")  # modules where a child could stand: none is imported
+    # modules in folders where a child process could run; none may be imported
+    trap = hostile(tmp_path, tmp_path / "bäckend")
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
@@ -66,7 +67,7 @@ def test_what_is_not_ours_is_not_removed(addon, tmp_path):
 
 @pytest.fixture
 def made(addon, tmp_path, monkeypatch):
-    """A folder with an environment of ours, where Set Up Backend would put it."""
+    """Folder with an environment of ours, at the place where Set Up Backend would create it."""
     folder = tmp_path / "backend"
     (folder / ".venv" / ".splannequin").mkdir(parents=True)
     (folder / ".venv" / "package.py").touch()
@@ -75,7 +76,8 @@ def made(addon, tmp_path, monkeypatch):
 
 
 def test_removal_does_not_wait_for_the_files(addon, made):
-    """Deleting gigabytes takes longer than Blender may stand still; what was left of an earlier one goes, too."""
+    """Deletion of gigabytes runs in a thread, so that Blender stays responsive. Remains of earlier removals are deleted
+    too."""
     environment = addon("process.environment")
     (made / ".venv-removed-before").mkdir()
     deleted_by: set[str] = set()
@@ -109,10 +111,10 @@ def test_what_a_job_works_with_is_not_removed(addon, contract, made, shot):
 
 
 def at_work(folder) -> subprocess.Popen[bytes]:
-    """A process that runs in the environment in `folder`, and has begun.
+    """Start a process from the environment in `folder`, and wait until it runs.
 
-    No Python: `sys.executable` of a Debian's Blender is what its PATH has, which may be pyenv's script; that starts
-    another program in its place, whose command line no longer names the environment.
+    The process is a shell. `sys.executable` of Debian's Blender may be pyenv's script, which replaces itself with
+    another program whose command line does not name the environment.
     """
     shell = folder / ".venv" / "bin" / "sh"
     if not shell.exists():
@@ -125,7 +127,7 @@ def at_work(folder) -> subprocess.Popen[bytes]:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows moves no folder of which a program runs")
 def test_what_a_process_of_others_works_with_is_not_removed(addon, made):
-    """A job of another Blender, or of a command line: nothing in this Blender knows of it."""
+    """A job of another Blender or of a command line is unknown to this Blender."""
     with at_work(made) as other:
         try:
             with pytest.raises(RuntimeError, match=rf"stays: another Blender.*\(process {other.pid}\)"):
@@ -159,7 +161,8 @@ def test_what_a_process_begins_with_while_it_is_being_removed_is_put_back(addon,
 
 @pytest.fixture
 def system(addon, tmp_path, monkeypatch):
-    """Blender's own setting of online access, off; a folder for the environment, and a pip that finds nothing."""
+    """Blender's system preferences with online access off. The environment's folder is temporary, and pip finds no
+    packages."""
     monkeypatch.setattr(addon("process.backend"), "folder", lambda: tmp_path / "backend")
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
@@ -211,14 +214,14 @@ def test_a_backend_that_was_changed_since_its_set_up_is_not_started(addon, contr
     monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(python))
     assert backend.python() == str(python)
     (site / "two.py").unlink()
-    environment._seen.clear()  # as Blender begins
+    environment._seen.clear()  # clears the cache, as after a start of Blender
     with pytest.raises(contract.JobError, match="changed since it was set up: two") as refused:
         backend.python()
     assert "Press Repair" in refused.value.hint
 
 
 def test_check_says_what_the_backend_can_do(addon):
-    """The real backend's doctor, in words."""
+    """Check Backend shows the findings of the real backend's doctor as text."""
     assert bpy.ops.splannequin.check_backend() == {"FINISHED"}
     lines = addon("ui.preferences")._findings
     assert "torch 2." in lines[0]

@@ -1,4 +1,4 @@
-"""What the presets say of themselves, and what the panel asks for after a solve."""
+"""Estimates shown with the presets, and the panel's requests after a solve."""
 
 import bpy
 import numpy as np

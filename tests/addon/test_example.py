@@ -1,4 +1,4 @@
-"""examples/make_example.py on a tiny shot: a small file that works wherever its folder is moved."""
+"""examples/make_example.py on a tiny shot writes a small file that works after its folder is moved."""
 
 import importlib.util
 import os

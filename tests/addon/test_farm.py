@@ -1,4 +1,4 @@
-"""Export for Farm, the button and the verb, with the real backend; and a bake in parts, by several at once."""
+"""Export for Farm as button and command, with the real backend; and a bake in parts by several processes at once."""
 
 import json
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 
 @pytest.fixture
 def imported(shot, contract):
-    """The shot, as an import leaves its record."""
+    """Shot with the record that an import writes."""
     there = contract.ShotFolder(shot)
     frames = [{"frame": n, "file": f"raw/{n:06d}.png"} for n in range(5, 8)]
     record = json.loads(there.listing.read_text()) if there.listing.is_file() else {"width": 64, "height": 36}
@@ -43,7 +43,7 @@ def test_the_button_writes_a_job_with_what_the_artist_set(scene, imported, tmp_p
 
 
 def test_the_button_is_on_once_there_is_something_to_export(scene, shot):
-    """In a script, too, where no timer looks at the folder."""
+    """Also in a script, where no timer reads the folder."""
     scene.splannequin.shot_path = str(shot)
     (shot / "shot.json").rename(shot / "away")
     assert not bpy.ops.splannequin.export_for_farm.poll()
@@ -89,7 +89,7 @@ def test_a_bake_in_parts_is_the_bake_at_once(run, shot, tmp_path):
     made = {p.name: p.read_bytes() for p in (parts / "composited").iterdir()}
     assert made == {p.name: p.read_bytes() for p in (whole / "composited").iterdir()} and len(made) == 3
     assert json.loads((parts / "summary.json").read_text())["composited_frames"] == 3
-    bpy.ops.wm.read_homefile(use_empty=True)  # shot.blend is no file of the artist's
+    bpy.ops.wm.read_homefile(use_empty=True)  # shot.blend is not the artist's file
     assert run(*bake, tmp_path / "alone")[0] == 0
     assert made == {p.name: p.read_bytes() for p in (tmp_path / "alone" / "composited").iterdir()}
     assert not [name for name, data in made.items() if b"tEXtFrame" in data], "its digits are those of the range"

@@ -1,4 +1,4 @@
-"""What a shot.blend shows that was baked without a window (looked at in real ones: Blender 4.3 and 5.2)."""
+"""The view of a shot.blend that was baked without a window (also checked by eye in Blender 4.3 and 5.2)."""
 
 import json
 import os
@@ -9,7 +9,7 @@ import pytest
 
 @pytest.fixture
 def bake(addon, shot, tmp_path, previews):
-    """bake(t_star, ...) bakes the shot's take at that instant and opens the file; returns its scene."""
+    """bake(t_star, ...): bakes the shot's take at that instant, opens the file and returns its scene."""
 
     previews(shot)
 

@@ -1,4 +1,4 @@
-"""Which steps of the panel are open: the one at hand, and what the artist opened or closed."""
+"""Open steps of the panel: the current step, and steps that the artist opened or closed."""
 
 import json
 import shutil

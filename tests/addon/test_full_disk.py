@@ -1,4 +1,4 @@
-"""A bake on a disk that is full: said, exit code 8, and every picture that was there stays. On a small file system."""
+"""A bake on a full disk (a small file system): an error message, exit code 8, and all earlier pictures stay."""
 
 import os
 import subprocess
@@ -22,14 +22,14 @@ def small_disk(tmp_path: Path):
 
 
 def fill(disk: Path, left: int) -> None:
-    """Fills a disk but for some bytes."""
+    """Fill a disk up to `left` bytes."""
     found = os.statvfs(disk)
     (disk / "filler").write_bytes(bytes(max(found.f_bavail * found.f_frsize - left, 0)))
 
 
 @pytest.fixture
 def artists_file(scene, tmp_path):
-    """artists_file(format): a file whose pictures take some 100 kB."""
+    """artists_file(format): saves a file whose pictures have about 100 kB each."""
 
     def make(kind: str) -> Path:
         scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 480, 360, 100
@@ -56,7 +56,7 @@ def test_a_full_disk_is_said_and_earlier_frames_stay(addon, shot, small_disk, ar
     fill(small_disk, min(map(len, good.values())) // 2)
     capfd.readouterr()
     assert main(bake) == 8
-    said = capfd.readouterr().err.splitlines()[-1]  # Blender and its libraries may print some before
+    said = capfd.readouterr().err.splitlines()[-1]  # Blender and its libraries may print lines before
     assert said.startswith(f"Error: No space left in {folder}: ")
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == good
     next(folder.iterdir()).write_bytes(b"")
@@ -67,7 +67,7 @@ def test_a_full_disk_is_said_and_earlier_frames_stay(addon, shot, small_disk, ar
 def test_a_file_that_a_full_disk_cuts_off_is_said_and_the_earlier_one_stays(
     addon, shot, small_disk, artists_file, capfd
 ):
-    """Of a compressed file Blender 5.2 says that it is saved."""
+    """Blender 5.2 reports a truncated compressed file as saved."""
     bpy.context.preferences.filepaths.use_file_compression = True
     bake = ["bake", "--shot", shot, "--output", small_disk, "--blend", artists_file("PNG")]
     bake = [str(word) for word in bake]

@@ -1,4 +1,4 @@
-"""Frames that the solve did not find show on the timeline, and leave it with the shot."""
+"""Interpolated camera frames are marked on the timeline; the markers leave with the shot."""
 
 import json
 
@@ -7,7 +7,7 @@ import pytest
 
 
 def path_of(contract, sources: str):
-    """A camera path from frame 1 on: r registered, l localised, i interpolated."""
+    """Camera path from frame 1; letters of `sources`: r registered, l localised, i interpolated."""
     words = {"r": "registered", "l": "localised", "i": "interpolated"}
     pose = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
     frames = [contract.CameraFrame(n, pose, [9, 9, 4, 4], words[c]) for n, c in enumerate(sources, start=1)]
@@ -20,8 +20,8 @@ def path_of(contract, sources: str):
         ("rrrr", (), []),
         ("riir", (), [(2, 3)]),
         ("iirlri", (), [(1, 2), (6, 6)]),
-        ("ririr", (2, 4), []),  # a frame step, and nothing failed
-        ("riiir", (2, 4), [(2, 4)]),  # the one in the middle did
+        ("ririr", (2, 4), []),  # a frame step of 2: no frame failed
+        ("riiir", (2, 4), [(2, 4)]),  # frame 3 failed
         ("rllr", (), []),
     ],
 )
@@ -32,7 +32,7 @@ def test_ranges_of_frames_that_failed(addon, contract, sources, left_out, ranges
 
 @pytest.fixture
 def failed(addon, contract, scene, shot):
-    """The shot, solved over frames 5 to 12, of which 7 to 9 and 12 are guesses and 10 is localised."""
+    """Shot solved over frames 5 to 12: frames 7 to 9 and 12 are interpolated, frame 10 is localised."""
     path = contract.CameraPath.load(shot / "solve" / "cameras.json")
     frames = []
     for n, source in enumerate("rriiilri", start=5):

@@ -1,16 +1,18 @@
-"""What artists expect of any add-on: plain names that the search finds, tooltips, undo, no keymap, icons that exist."""
+"""Conventions of add-ons: plain names that the search finds, tooltips, undo, no keymap, existing icons."""
 
 import ast
 
 import bpy
 
 CHANGES_NO_SCENE = {
-    "import_clip", "solve_camera", "train", "freeze", "bake", "all_steps",  # start jobs, whose ends are undo steps
-    "add_splats", "add_surface", "add_light",  # the same: the timer reads the file
+    # start jobs that push an undo step when they end
+    "import_clip", "solve_camera", "train", "freeze", "bake", "all_steps",
+    "add_splats", "add_surface", "add_light",  # as above: the timer reads the file
     "render", "cancel", "live", "open_log", "set_up", "cancel_setup", "check_backend", "remove_backend",
-    "write_stmaps", "export_cameras", "export_for_farm", "remove_run", "remove_take", "clear_motion",  # files on disk
-    "matte_from_mask", "remove_matte", "combine_takes",  # start a job, which writes files
-    "check_move",  # looks, and says what it saw
+    # write or remove files on disk
+    "write_stmaps", "export_cameras", "export_for_farm", "remove_run", "remove_take", "clear_motion",
+    "matte_from_mask", "remove_matte", "combine_takes",  # start a job that writes files
+    "check_move",  # only reports
 }  # fmt: skip
 
 
@@ -38,7 +40,7 @@ def test_all_operators_are_in_our_name(package):
 
 
 def test_no_keymap_is_touched(package, root):
-    """Nothing is bound to a key: neither here, as headless Blender has no key configuration, nor in the source."""
+    """No key is bound in the source; headless Blender has no key configuration to check."""
     for config in bpy.context.window_manager.keyconfigs if bpy.context.window_manager else ():
         for keymap in config.keymaps:
             assert not [i for i in keymap.keymap_items if i.idname.startswith("splannequin.")]
@@ -47,7 +49,7 @@ def test_no_keymap_is_touched(package, root):
 
 
 def test_the_search_finds_every_operator(addon):
-    """It finds what stands in a menu."""
+    """Blender's search lists the operators of menus."""
     menu = addon("ui.menu")
     listed = [name for group in menu.entries() for name in group]
     assert len(set(listed)) == len(listed)
@@ -65,7 +67,7 @@ def test_an_operator_that_is_in_no_group_of_the_menu_comes_last(addon, monkeypat
 
 
 def icons_in(tree: ast.AST) -> set[str]:
-    """Texts given to `icon=`, assigned to `icon`, or after a sentence for `wrap`."""
+    """Texts passed as `icon=`, assigned to `icon`, or passed as fourth argument of `wrap`."""
     values = [k.value for n in ast.walk(tree) if isinstance(n, ast.Call) for k in n.keywords if k.arg == "icon"]
     values += [n.value for n in ast.walk(tree) if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "icon"]
     values += [
@@ -84,7 +86,7 @@ def test_icons_exist_in_this_blender(addon, root):
     for path in (root / "splannequin_addon").rglob("*.py"):
         used |= icons_in(ast.parse(path.read_text(encoding="utf-8")))
     assert {"CHECKMARK", "INFO", "FREEZE"} <= used
-    used.discard("WARNING")  # a dialog's, of which there are others
+    used.discard("WARNING")  # icon of a dialog, which accepts other names
     assert used <= known, sorted(used - known)
 
 

@@ -1,4 +1,4 @@
-"""The command line of the Blender side, in this process: exit codes, what it leaves, and a baked file that renders."""
+"""The add-on's command line, in this process: exit codes, output files, and a baked file that renders."""
 
 import argparse
 import importlib
@@ -25,7 +25,7 @@ from bpy.app.handlers import persistent
     ],
 )
 def test_a_summary_of_another_bake_or_a_damaged_one_is_written_anew(run, shot, tmp_path, found):
-    """As a bake into the folder of an earlier one finds it."""
+    """The output folder holds the summary of an earlier bake."""
     out = tmp_path / "out"
     out.mkdir()
     (out / "summary.json").write_text(found)
@@ -88,7 +88,7 @@ def test_bake_into_an_artists_file_keeps_its_settings(run, shot, tmp_path, addon
 
 @pytest.mark.parametrize("kind", ["script", "driver"])
 def test_python_in_the_artists_file_does_not_run(run, shot, tmp_path, kind):
-    """Whatever the preferences say: a file on a command line may be a stranger's."""
+    """Python never runs, whatever the preferences: a file on a command line may come from a stranger."""
     ran = tmp_path / "ran"
     call = f"open({ran.as_posix()!r}, 'w').close()"
     if kind == "script":
@@ -208,7 +208,7 @@ def test_a_bake_ends_with_the_launcher_that_started_it(shot, tmp_path, root, sta
 
 
 def told_of(parser: argparse.ArgumentParser) -> dict[str, dict[str, tuple]]:
-    """Verb -> option -> (help, choices, default, value, required) of what --help prints of it."""
+    """Map from verb to option to (help, choices, default, value, required), as printed by --help."""
     verbs = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices
     return {
         verb: {
@@ -232,7 +232,7 @@ def test_both_command_lines_print_the_same_options_for_the_same_verb(addon, pack
     assert ours.keys() - theirs.keys() == {"bake"}
     assert theirs.keys() - ours.keys() == {"take", "run-job", "live", "farm-task"}
     for verb in ours.keys() & theirs.keys():
-        if "--device" in ours[verb]:  # here the preferences are asked where nothing is said
+        if "--device" in ours[verb]:  # without this option the add-on uses its preferences
             said, choices, default, *rest = ours[verb]["--device"]
             assert said.endswith("(default: as the preferences say)") and default == ""
             ours[verb]["--device"] = (said.replace("as the preferences say", "auto"), choices, "auto", *rest)
@@ -257,7 +257,7 @@ def test_freeze_of_a_shot_is_the_step_alone(run, root, tmp_path):
 
 def test_what_was_asked_for_reaches_the_backend(addon, contract, monkeypatch, tmp_path):
     headless = addon("command_line.headless")
-    monkeypatch.setattr(addon("process.backend"), "device", lambda: "cpu")  # as the preferences say
+    monkeypatch.setattr(addon("process.backend"), "device", lambda: "cpu")  # stands for a choice in the preferences
 
     def asked(*words):
         return headless.asked(headless.parser().parse_args([str(w) for w in words]))

@@ -1,4 +1,4 @@
-"""Scrubbing hides the shot's points for a while: no file, undo or crash may leave them hidden."""
+"""Scrubbing temporarily hides the shot's points; files, undo and crashes must not leave them hidden."""
 
 import bpy
 import pytest
@@ -12,7 +12,7 @@ def with_shot(scene, shot):
 
 @pytest.fixture
 def scrubbed(addon, with_shot, shot):
-    """The scene while its shot is scrubbed, as far as the points go."""
+    """The scene while its shot is scrubbed, reduced to hiding the points."""
     addon("solve.arrival").load_camera(with_shot, shot)
     addon("freeze.hidden_points").begin(with_shot, shot)
     yield with_shot
@@ -34,7 +34,7 @@ def test_a_file_saved_while_scrubbing_shows_the_points_when_it_is_opened(addon, 
 
 
 def test_a_copy_that_no_handler_saw_shows_the_points_when_it_is_opened(addon, scrubbed, shot, tmp_path):
-    """As an autosave, which runs no handlers."""
+    """An autosave runs no handlers."""
     module = addon("freeze.hidden_points")
     bpy.app.handlers.save_pre.remove(module._restore)
     try:

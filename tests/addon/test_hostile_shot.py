@@ -1,4 +1,4 @@
-"""A shot that came with Python modules in its folders: no button runs them. Real backends in and around it."""
+"""A shot with Python modules in its folders: no button runs them. Real backends run in the shot and outside."""
 
 import os
 import time
@@ -8,7 +8,8 @@ import pytest
 
 @pytest.fixture
 def trap(hostile, shot, tmp_path, monkeypatch):
-    """The shot with modules in every folder that a child could stand in, and the file that they write if imported."""
+    """Adds modules to every folder of the shot where a child could run; returns the file that they write when
+    imported."""
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     return hostile(shot, tmp_path / "temporary", shot / "jobs", shot / "frames", shot / "solve", shot / "runs" / "main")
 
@@ -33,7 +34,7 @@ def test_scrubbing(addon, trap, shot, root):
 def test_st_maps(addon, contract, trap, shot):
     asked = addon("solve.stmaps").begin(shot)
     asked.wait()
-    with pytest.raises(contract.JobError):  # the shot has no lens
+    with pytest.raises(contract.JobError):  # the shot has no lens distortion
         addon("solve.stmaps").answer(asked)
     assert not trap.exists(), trap.read_text()
 
@@ -58,7 +59,7 @@ def test_a_job(addon, contract, trap, hostile, shot, root):
 
 
 def test_a_child_stands_beside_its_interpreter(addon, contract):
-    """Windows looks for libraries where it stands, and keeps that folder from being moved."""
+    """Windows loads libraries from the working folder, and locks that folder against moving."""
     python = addon("process.backend").python()
     child = contract.python_child(python, "torch_backend", "doctor")
     assert child["cwd"] == os.path.dirname(os.path.abspath(python))

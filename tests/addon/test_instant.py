@@ -1,4 +1,4 @@
-"""t* in the panel: it starts where the artist is, stays within the clip, and a take that is not of it is not done."""
+"""t* in the panel: it starts at the current frame and stays within the clip; a take of another instant is not done."""
 
 import json
 
@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture
 def with_shot(scene, shot, addon):
-    """The shot of frames 5 to 7 in the scene, as an import leaves it."""
+    """Scene with the shot of frames 5 to 7, as after an import."""
     scene.splannequin.shot_path = str(shot)
     return scene
 
@@ -111,7 +111,7 @@ def test_a_freeze_that_has_ended_is_seen_through_the_solved_camera(addon, contra
     step = addon("process.steps").STEPS["freeze"]
     assert step.finish(with_shot, job) == [] and plate.show_background_image, "it is another camera's view"
     job.result["camera_path"] = ""
-    for _ in range(2):  # frozen again
+    for _ in range(2):  # twice: the shot is frozen again
         assert len(step.finish(with_shot, job)) == 1
         plate, frozen = camera.data.background_images
         assert not plate.show_background_image and frozen.show_background_image

@@ -1,4 +1,4 @@
-"""The timer: work of Blender's own in turns, questions to the backend, jobs that end, renders that are followed."""
+"""The timer: Blender's own work in turns, requests to the backend, ended jobs, and renders that it follows."""
 
 import dataclasses
 import json
@@ -66,14 +66,14 @@ def test_what_the_last_turn_begins_goes_on(supervisor, watch, shot):
 
 
 def test_a_shot_that_cannot_be_read_for_a_moment_is_read_again(contract, supervisor, watch, shot):
-    """Its files are what they were: on a network disk that was away, or replaced on Windows while they were read."""
+    """Size and time of the file stay equal: the network disk was away, or Windows replaced the file during a read."""
     file = contract.ShotFolder(shot).info_path
     whole = file.read_bytes()
     assert watch.state.info
     file.write_bytes(b"{")
     assert supervisor.refresh(watch) and not watch.state.info
     assert "cannot be read" in watch.failures["import"][0]
-    assert not supervisor.refresh(watch)  # nothing new to be drawn
+    assert not supervisor.refresh(watch)  # nothing new to draw
     damaged = file.stat()
     file.write_bytes(whole)
     os.utime(file, ns=(damaged.st_atime_ns, damaged.st_mtime_ns))
@@ -92,7 +92,7 @@ def test_one_that_breaks_does_not_end_the_timer_for_the_others(supervisor, capfd
 
 
 def test_a_bake_whose_frames_are_there_comes_in_in_turns(addon, contract, supervisor, watch, shot):
-    """Read a picture, read the next, change the compositor, render: Blender stands still in each."""
+    """The turns are: read a picture, read the next, change the compositor, render. Blender blocks during each turn."""
     params = contract.FreezeParams(take="freeze")
     job = addon("process.jobs").new_job(shot, "freeze", params)
     job.status = contract.Status("freeze", "done", 0, 0.0, 1.0, 0.0)
@@ -111,8 +111,7 @@ def test_a_bake_whose_frames_are_there_comes_in_in_turns(addon, contract, superv
 
 
 def ended_bake(addon, contract, supervisor, watch, shot, scene: str, uid: int = 0):
-    """A bake whose frames are there has ended just now; it was asked for in the scene of that name, in this session if
-    it has a number."""
+    """Let a bake end whose frames exist. The job stores the scene's name and, in this session, its number `uid`."""
     job = addon("process.jobs").new_job(shot, "freeze", contract.FreezeParams(take="freeze"))
     (job.folder / contract.SCENE_FILE).write_text(scene, encoding="utf-8")
     job.scene_uid = uid
@@ -122,7 +121,7 @@ def ended_bake(addon, contract, supervisor, watch, shot, scene: str, uid: int = 
 
 
 def until_it_renders(supervisor, watch):
-    """The turns of a bake, but for that in which Blender renders."""
+    """Run the turns of a bake up to the one that renders."""
     for _ in range(3):
         if watch.work is not None and not watch.notes.get("bake"):
             supervisor.tick()
@@ -156,7 +155,7 @@ def test_a_bake_of_a_scene_that_is_gone_comes_into_those_of_the_shot(addon, cont
 
 
 def test_a_bake_comes_into_its_scene_though_that_is_renamed_meanwhile(addon, contract, supervisor, watch, scene, shot):
-    """While its job runs, and in the turns in which it comes in; others have its names since."""
+    """It is renamed during the job and between the turns. Another scene gets its old name."""
     uid = scene.session_uid
     scene.name = "renamed"
     other = bpy.data.scenes.new("Scene")
@@ -187,7 +186,7 @@ def test_a_bake_of_a_scene_that_has_another_shot_now_is_only_told_of(addon, cont
 
 
 def test_a_job_keeps_the_name_of_its_scene(addon, contract, scene, shot):
-    """In its folder, where it is found again."""
+    """The name is stored in the job's folder, where a later session finds it."""
     scene.name, scene.splannequin.shot_path, scene.splannequin.take_name = "Comp é", str(shot), "freeze"
     job = addon("process.begin").begin(scene, "bake")
     with pytest.raises(contract.JobError):  # the shot has no run
@@ -215,7 +214,7 @@ def test_a_job_names_the_blend_that_it_was_started_from_in_every_other_one(addon
 
 
 def test_a_job_that_had_ended_before_it_was_met_renders_nothing(addon, contract, supervisor, scene, shot, monkeypatch):
-    """Even if what it wrote is too long to be read at the first look."""
+    """This holds even if the job's events are too many for the first read."""
     jobs = addon("process.jobs")
     job = jobs.new_job(shot, "freeze", contract.FreezeParams(take="freeze"))
     (job.folder / contract.STEP_FILE).write_text("bake")
@@ -226,7 +225,7 @@ def test_a_job_that_had_ended_before_it_was_met_renders_nothing(addon, contract,
     (job.folder / contract.STATUS_FILE).write_text(json.dumps(status.__dict__))
     monkeypatch.setattr(jobs, "_FIRST_LOOK_SECONDS", -1.0)
     scene.splannequin.shot_path = str(shot)
-    scene.frame_start = scene.frame_end  # if it renders nevertheless, that is not long
+    scene.frame_start = scene.frame_end  # keeps an unwanted render short
     watch = supervisor.watch_of(shot)
     assert not watch.jobs["bake"].ended, "there is more to read"
     for _ in range(5):
@@ -237,7 +236,7 @@ def test_a_job_that_had_ended_before_it_was_met_renders_nothing(addon, contract,
 
 @pytest.fixture
 def small(addon, scene, tmp_path):
-    """A scene of three small frames, and a render of it that has begun."""
+    """Scene of three small frames with a render that has begun."""
     scene.render.resolution_x = scene.render.resolution_y = 32
     scene.frame_end = 3
     scene.render.filepath = str(tmp_path / "out" / "f_####")
@@ -271,7 +270,7 @@ def test_a_render_is_followed_by_its_handlers(addon, supervisor, watch, shot, sm
 
 
 def test_no_draw_is_interrupted_while_a_render_goes_on(small):
-    """Blender 4.3 takes Python's right to write away for good if a render begins while a panel is drawn."""
+    """If a render begins while a panel is drawn, Blender 4.3 refuses all later writes of Python to its data."""
     scene, run = small
     assert sys.getswitchinterval() >= 1.0
     run.finish(scene, is_cancelled=True)
@@ -280,7 +279,8 @@ def test_no_draw_is_interrupted_while_a_render_goes_on(small):
 
 @pytest.fixture
 def movie_to_nowhere(scene, tmp_path):
-    """The scene writes a movie into a folder that cannot be made: Blender tells no end of such a render."""
+    """Scene that writes a movie into a folder that cannot be created: Blender calls no handler at the end of its
+    render."""
     (tmp_path / "file").write_text("")
     settings = scene.render.image_settings
     if hasattr(settings, "media_type"):
@@ -293,7 +293,7 @@ def movie_to_nowhere(scene, tmp_path):
 
 
 def test_a_render_that_tells_no_end_is_over(addon, supervisor, watch, shot, small):
-    """As Blender leaves it where it cannot begin a movie's file."""
+    """Blender leaves this state if it cannot create a movie file."""
     scene, run = small
     addon("bake.progress").began(shot, run)
     supervisor.tick()
@@ -325,7 +325,7 @@ def test_another_file_ends_what_blender_itself_was_doing(supervisor, watch, shot
 
 
 def test_undo_takes_back_what_a_step_said_of_the_scene(supervisor, watch):
-    """The nodes that it tells of are gone."""
+    """The nodes that the message describes no longer exist."""
     bpy.ops.ed.undo_push(message="before")
     bpy.context.scene.frame_end += 1
     bpy.ops.ed.undo_push(message="a step")
@@ -344,7 +344,7 @@ def test_what_pulses_sets_the_pace_and_jobs_keep_theirs(supervisor, watch, monke
         return 0.01 if len(pulses) < 5 else None
 
     supervisor.pulse(turn)
-    supervisor.pulse(turn)  # once, however often it is asked for
+    supervisor.pulse(turn)  # the turn is registered only once
     try:
         waits = [supervisor.tick() for _ in range(4)]
         assert len(pulses) == 4 and len(looks) == 1, "jobs were looked at a moment ago"
@@ -366,7 +366,7 @@ def test_a_pulse_that_fails_does_not_stop_the_timer(supervisor, watch, capsys):
 
 @pytest.fixture
 def solving(addon, contract, supervisor, watch, shot):
-    """A solve that runs, of a shot whose cameras stand on the disk, and `tell`, which writes what it says."""
+    """A running solve of a shot whose cameras are on the disk, and `tell`, which writes an event of the solve."""
     job = addon("process.jobs").new_job(shot, "solve", contract.SolveParams())
     job.process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     events = []

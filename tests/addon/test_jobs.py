@@ -1,4 +1,4 @@
-"""Jobs as the add-on sees them, on real backend processes: followed, cancelled, found again, missed when they die."""
+"""Jobs in the add-on, on real backend processes: followed, cancelled, reopened, and noticed when their process dies."""
 
 import dataclasses
 import json
@@ -14,7 +14,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def python(addon) -> str:
-    """The backend's Python. These tests need one: no backend is a failure, not a reason to skip."""
+    """Path of the backend's Python. These tests need one: without a backend they fail instead of being skipped."""
     return addon("process.backend").python()
 
 
@@ -27,7 +27,7 @@ def empty_shot(addon, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def start_import(addon, contract, empty_shot, python, root):
-    """start_import(source, first, last) is a started import job."""
+    """start_import(source, first, last): starts an import job and returns it."""
     started = []
 
     def start(source: Path, first: int | None = None, last: int | None = None):
@@ -164,13 +164,14 @@ def test_the_childs_environment_is_free_of_blenders_python(addon, monkeypatch, r
 
 
 def test_an_answer_that_no_pipe_holds_is_read_while_it_is_given(addon, tmp_path):
-    """Linux holds 64 KB for who does not read, Windows 4: a traceback of a library that cannot be loaded is longer."""
+    """An unread pipe holds 64 KB on Linux and 4 KB on Windows; the traceback of a library that fails to load is
+    longer."""
     (tmp_path / "torch_backend").mkdir()
     words = "import sys; sys.stderr.write('x' * 300000); sys.stdout.write('y' * 300000)"
     (tmp_path / "torch_backend" / "__main__.py").write_text(f"{words}; sys.stdout.buffer.write(bytes([255]))")
     asked = addon("process.children").ask(sys.executable, tmp_path, "doctor")
     until = time.monotonic() + 30.0
-    while not asked.ended and time.monotonic() < until:  # as the timer looks, which waits for nothing
+    while not asked.ended and time.monotonic() < until:  # like the timer, which never blocks
         time.sleep(0.05)
     try:
         assert asked.ended and asked.answer("{}") == "y" * 300000 + "\N{REPLACEMENT CHARACTER}"
@@ -220,13 +221,13 @@ def test_a_job_with_broken_files_is_passed_over(addon, contract, empty_shot):
 
 @pytest.fixture
 def sleeper():
-    """sleeper(*words) is a process that does nothing for a minute, with these words in its command line."""
+    """sleeper(*words): starts a process that waits for a minute, with these words in its command line."""
     started = []
 
     def start(*words: str) -> subprocess.Popen:
         command = [sys.executable, "-c", "import time; print(flush=True); time.sleep(60)", *words]
         started.append(subprocess.Popen(command, start_new_session=True, stdout=subprocess.PIPE))
-        started[-1].stdout.readline()  # before, the system may still show it without its command line
+        started[-1].stdout.readline()  # until then, the system may list the process without its command line
         return started[-1]
 
     yield start
@@ -237,7 +238,7 @@ def sleeper():
 
 
 def believed_running(jobs, contract, shot, pid: int, started: float, host: str):
-    """A train job whose status names a process, and that was asked to stop a minute ago."""
+    """Train job whose status names the process `pid`, and that was cancelled a minute ago."""
     job = jobs.new_job(shot, "train", contract.TrainParams())
     now = time.time()
     job.status = contract.Status("train", "running", pid, now - 900, started, now - 600, host=host)
@@ -285,7 +286,7 @@ def test_a_job_of_another_computer_is_neither_dead_nor_ended(addon, contract, em
         job.beat = beat
         jobs.poll(job)
         assert job.state == "running" and (job.folder / "status.json").read_bytes() == before
-    (empty_shot / "lock.json").unlink()  # by hand, as the artist is told if that computer is gone
+    (empty_shot / "lock.json").unlink()  # the artist is told to delete it by hand if that computer is gone
     job.beat = (job.status.heartbeat, time.monotonic() - 600)
     jobs.poll(job)
     assert job.state == "failed" and (job.folder / "status.json").read_bytes() == before, "what it wrote stays its own"
@@ -320,7 +321,7 @@ def test_a_step_is_refused_while_another_process_writes_into_the_shot(
     )
     told = contract.Status("train", "done", worker.pid, 0.0, started, 0.0, exit_code=0, host=contract.computer_name())
     contract.write_json(ending.folder / "status.json", dataclasses.asdict(told))
-    jobs.refuse_second_writer(empty_shot)  # its process has told its end, and lets go in a moment
+    jobs.refuse_second_writer(empty_shot)  # the process that reported its end will release the lock soon
     worker.kill()
     worker.wait()
     contract.write_json(empty_shot / "lock.json", dataclasses.asdict(writer))
@@ -351,7 +352,7 @@ def test_a_job_that_is_stopped_is_alive_and_can_be_ended_by_another_blender(addo
 @pytest.mark.skipif(os.name == "nt", reason="a link needs a privilege there")
 @pytest.mark.parametrize("what", ["the folder", "one job"])
 def test_jobs_behind_a_link_are_not_looked_at(addon, contract, empty_shot, tmp_path, what):
-    """One that seems dead is told so in its own folder, which would be another shot's."""
+    """The add-on writes an end status into a dead job's folder. Behind a link, this could be another shot's folder."""
     jobs = addon("process.jobs")
     folder = jobs.new_job(empty_shot, "train", contract.TrainParams()).folder
     os.utime(folder / "request.json", (1, 1))

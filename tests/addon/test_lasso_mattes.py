@@ -1,4 +1,4 @@
-"""Mattes from a mask in Blender: its polygons, the backend's job, what the panel lists, the node that picks one."""
+"""Mattes from a mask in Blender: its polygons, the backend's job, the panel's list, and the node that selects one."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ WIDTH, HEIGHT = 64, 48
 
 
 def mask_of(name, corners, width=WIDTH, height=HEIGHT, handle="VECTOR"):
-    """A mask with a closed spline through pixels of a picture, top left first."""
+    """Mask with a closed spline through pixel positions, counted from the top left."""
     mask = bpy.data.masks.new(name)
     spline = mask.layers.new(name="one").splines.new()
     spline.use_cyclic = True
@@ -26,7 +26,7 @@ def mask_of(name, corners, width=WIDTH, height=HEIGHT, handle="VECTOR"):
 
 
 def filled(polygon, width, height):
-    """[H, W] bool: pixels whose centres lie within, by counting crossings."""
+    """[H, W] bool: pixels whose centres lie inside the polygon, by counting edge crossings."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     inside = np.zeros((height, width), bool)
     for (ax, ay), (bx, by) in zip(polygon, [*polygon[1:], polygon[0]], strict=True):
@@ -48,7 +48,7 @@ def test_polygons_are_what_blender_renders_of_a_mask(addon, shot, handle, size):
     rendered = read(file)[..., 0] > 0.5
     (polygon,) = addon("freeze.mattes").polygons(mask, width, height)
     drawn = filled(polygon, width, height)
-    # Blender blurs a mask's edge outwards by a pixel.
+    # Blender blurs a mask's edge outwards by one pixel.
     assert (drawn & rendered).sum() / drawn.sum() > 0.995
     for axis in (0, 1):
         ends = [np.flatnonzero(one.any(axis))[[0, -1]] for one in (drawn, rendered)]
@@ -67,7 +67,7 @@ def world(frozen_world):
 
 @pytest.fixture
 def chosen(scene, world):
-    """The world's shot, chosen, at the frame of the outline."""
+    """Scene settings with the world's shot chosen, at the frame of the outline."""
     props = scene.splannequin
     props.shot_path, props.take_name = str(world[0]), "freeze"
     scene.frame_set(107)
@@ -88,7 +88,7 @@ def test_a_mask_becomes_a_matte_of_every_frame_which_a_node_picks(addon, scene, 
     addon("process.job_timer").refresh(state)
     assert state.state.takes["freeze"]["mattes"] == {"red patch": [107]}
 
-    scene.frame_set(109)  # drawn again elsewhere it adds to what there is
+    scene.frame_set(109)  # a lasso on another frame is added to the existing matte
     assert bpy.ops.splannequin.matte_from_mask() == {"FINISHED"}
     lassos = addon("shot.inventory").mattes(addon("freeze.mattes").take_of(shot, "freeze"))
     assert lassos == {"red patch": [107, 109]}

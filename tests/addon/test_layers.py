@@ -1,5 +1,7 @@
-"""Frames made of plates in the compositor: what was invented, the splats alone, and the freeze as a warp of the
-artist's own linear plate, with values beyond white and below black."""
+"""Plate-based frames in the compositor: the invented pixels, the splats alone, and the freeze as a warp.
+
+The warp is applied to the artist's own linear plate, with values above white and below black.
+"""
 
 import json
 import shutil
@@ -19,7 +21,7 @@ SIZE = made.WIDTH, made.HEIGHT
 
 @pytest.fixture
 def detailed(scene, shot):
-    """The shot, with a take of detailed frames, `detail`; the scene has their size."""
+    """The shot with a take `detail` of plate-based frames; the scene has their size."""
     scene.render.resolution_x, scene.render.resolution_y = SIZE
     folder = shot / "takes" / "detail"
     shutil.copytree(DATA / "detail", folder, ignore=shutil.ignore_patterns("plate"))
@@ -31,7 +33,7 @@ def detailed(scene, shot):
 
 @pytest.fixture
 def graded(addon, scene, detailed):
-    """The artist's tree: their linear EXR plate, multiplied by 2 with less blue, then the output."""
+    """Artist's tree: a linear EXR plate, multiplied by 2 with less blue, then the output."""
     folder = detailed.parent / "the plate"
     shutil.copytree(DATA / "detail" / "plate", folder)
     compat = addon("compat")
@@ -93,13 +95,13 @@ def test_the_grade_goes_on_behind_the_warped_plate_and_goes_before_it(addon, sce
     addon("bake.insertion").insert_freeze(scene, detailed, "detail")
     node = node_of(addon, scene)
     assert compat.output_socket(graded).links[0].from_node == node and addon("bake.freeze_group").wants_warp(scene)
-    moved = made.WIDTH * 2 // 3  # beyond, other things than the plate are in the picture, and they are not graded
+    moved = made.WIDTH * 2 // 3  # columns from here on are not pure plate, and are not graded
     expected = made.moved(made.plate(6) * GRADE, 6)
     assert relative(render(scene, tmp_path)[:, :moved, :3], expected[:, :moved]) < 1e-3
 
 
 def test_a_plate_of_another_size_is_brought_to_that_of_the_warp(addon, scene, detailed, graded, tmp_path):
-    """Plate and render half as large as the warp: the whole picture is what the plate is."""
+    """Plate and render are half as large as the warp. The plate has one colour, so the whole picture must have it."""
     compat, small = addon("compat"), np.zeros((made.HEIGHT // 2, made.WIDTH // 2, 4), np.float32)
     small[..., 0], small[..., 3] = 40.0, 1.0
     picture = bpy.data.images.new("small", made.WIDTH // 2, made.HEIGHT // 2, float_buffer=True, is_data=True)
@@ -137,7 +139,7 @@ def test_the_warp_is_switched_and_removed_without_a_trace(addon, scene, detailed
 
 
 def test_freeze_as_warp_is_undone_and_done_again(addon, scene, detailed, graded, tmp_path):
-    """Also in what is rendered: the take's own frames are halves, the warped plate is not."""
+    """The rendered picture changes too: the take's frames are half floats, the warped plate is not."""
     scene.splannequin.shot_path, scene.splannequin.take_name = str(detailed), "detail"
     assert bpy.ops.splannequin.insert_freeze() == {"FINISHED"}
 
@@ -225,7 +227,7 @@ def test_what_is_invented_is_tinted_and_the_rest_is_not(addon, scene, detailed, 
 
 @pytest.fixture
 def with_passes(shot):
-    """The shot, with a take `passes` of one frame."""
+    """The shot with a take `passes` of one frame."""
     folder = shot / "takes" / "passes"
     shutil.copytree(DATA / "passes", folder)
     facts = {"version": 1, "take": "passes", "run": "main", "t_star_frame": 6, "query": "nearest", "frames": 1}
@@ -302,7 +304,7 @@ def test_a_take_of_splats_alone_says_that_it_cannot_tell(addon, scene, shot, lay
 
 
 def test_a_group_of_an_older_file_gets_the_new_sockets_and_keeps_its_own(addon, scene, detailed, graded, tmp_path):
-    """As 0.5 left it: without them, with links and values of the artist's."""
+    """A group of version 0.5 lacks the sockets; the artist's links and values are kept."""
     compat = addon("compat")
     addon("bake.insertion").insert_freeze(scene, detailed, "freeze")
     node = node_of(addon, scene)

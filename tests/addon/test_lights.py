@@ -1,4 +1,4 @@
-"""The light of a take in Blender: what Cycles shows in each direction, the artist's world given back, undone."""
+"""Light of a take in Blender: Cycles' render in each direction, restoring the artist's world, and undo."""
 
 import json
 import shutil
@@ -18,13 +18,14 @@ COLORS = {
     (0, 0, 1): (0.6, 0.2, 0.8),
     (0, 0, -1): (0.3, 0.9, 0.9),
 }
-"""Direction in the axes of the scene that the panorama was made for -> light."""
+"""Map from direction to linear light, in the scene axes that the panorama was written for."""
 
 
 def write_light(shot: Path, contract, placement: dict, key: str = KEY) -> Path:
-    """A panorama of the take, as the backend leaves it: each direction in the colour of the nearest axis."""
+    """Write a panorama of the take in the backend's format: each direction has the colour of the nearest axis."""
     height, width = 128, 256
-    u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height  # v from below, as Blender's rows
+    # v counts from below, like Blender's rows
+    u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
     longitude, latitude = 2 * np.pi * (0.5 - u), np.pi * (v - 0.5)
     x = np.cos(latitude)[:, None] * np.cos(longitude)
     y = np.cos(latitude)[:, None] * np.sin(longitude)
@@ -36,7 +37,7 @@ def write_light(shot: Path, contract, placement: dict, key: str = KEY) -> Path:
     path = folder.light(key)
     path.parent.mkdir(exist_ok=True)
     image = bpy.data.images.new("made", width, height, float_buffer=True)
-    image.colorspace_settings.is_data = True  # else it is saved as sRGB
+    image.colorspace_settings.is_data = True  # otherwise Blender saves it as sRGB
     image.pixels[:] = pixels.ravel()
     image.filepath_raw, image.file_format = str(path), "OPEN_EXR"
     image.save()
@@ -48,7 +49,7 @@ def write_light(shot: Path, contract, placement: dict, key: str = KEY) -> Path:
 
 @pytest.fixture
 def lit(scene, shot, addon, contract):
-    """The shot's root, turned and scaled in the scene, and a panorama of its take that was made for where it stands."""
+    """Root of the shot, rotated and scaled in the scene, with a panorama written for this placement."""
     scene.splannequin.shot_path = str(shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
     root = addon("shot.scene_objects").part(scene, shot, "root")
@@ -64,7 +65,8 @@ def add(addon, scene, shot, key=KEY):
 
 
 def shown(scene, folder: Path, side: int) -> dict[tuple[int, int, int], np.ndarray]:
-    """What Cycles renders of the world alone about the three axes of one side, 1 or -1: linear light."""
+    """Linear light that Cycles renders of the world around three axes, all positive (side 1) or all negative (side
+    -1)."""
     for item in [o for o in scene.objects if o.type in ("MESH", "LIGHT")]:
         bpy.data.objects.remove(item)
     camera = bpy.data.objects.new("looking", bpy.data.cameras.new("looking"))
@@ -214,7 +216,7 @@ def test_the_button_has_it_made_at_the_cursor(scene, addon, contract, frozen_wor
     folder = contract.TakeFolder(shot / "takes" / "freeze")
     image = bpy.data.images.load(str(folder.light(job.result["key"])))
     assert tuple(image.size) == (1024, 512) and image.is_float
-    wall = (root.matrix_world.to_3x3() @ Vector((0, 0, 1))).normalized()  # the solve looks along z
+    wall = (root.matrix_world.to_3x3() @ Vector((0, 0, 1))).normalized()  # the solve's camera looks along z
     column = int(1024 * (0.5 - np.arctan2(wall.y, wall.x) / (2 * np.pi)))
     row = int(512 * (0.5 + np.arcsin(wall.z) / np.pi))
     red = np.array(image.pixels[:]).reshape(512, 1024, 4)[row, column, :3]

@@ -1,4 +1,4 @@
-"""What a 3D view asks the live session for, and a session that cannot begin. Drawing is seen in window/scrub.py."""
+"""Requests of a 3D view to the live session, and sessions that fail to start. window/scrub.py tests the drawing."""
 
 import os
 import sys
@@ -41,21 +41,22 @@ def test_a_view_through_the_solved_camera_is_the_solved_camera(addon, contract, 
 
 
 def _answer(session, asked):
-    """What the backend says when it has drawn a view."""
+    """Answer a request as the backend does after drawing a view."""
     pixels = np.zeros(5 * asked.width * asked.height, np.float32).tobytes()
     size = {"width": asked.width, "height": asked.height}
     session._take_in({"kind": "frame", "seq": asked.seq, "t_star": 6, **size}, pixels)
 
 
 def test_a_view_at_rest_is_asked_for_sharper_and_then_made_of_plates(addon, contract, shot, monkeypatch):
-    """One request at a time, none while the view changes; the artist's switch is followed both ways."""
+    """Only one request is open at a time, none while the view changes. Switching detail on or off takes effect at
+    once."""
     viewport, live = addon("freeze.viewport"), addon("freeze.live")
     session = live.Session(shot, "main")
     monkeypatch.setattr(viewport, "_session", session)
     monkeypatch.setattr(viewport, "_moved", {})
 
     def look(t_star=6.0, detail=True, rested=True):
-        """One drawing of the region; returns what it newly asked for, None if nothing."""
+        """Draw the region once; return the (width, detail) of a new request, or None."""
         before = session.wanted(1)
         if rested and 1 in viewport._moved:
             viewport._moved[1] -= 1.0
@@ -146,7 +147,7 @@ def test_without_a_run_nothing_begins(addon, contract, shot, scene):
 
 
 def test_a_session_that_cannot_begin_says_why_and_ends(addon, shot, root):
-    """A real backend on a shot without a run."""
+    """A real backend is started on a shot without a run."""
     session = addon("freeze.live").open_session(shot, "nothing", addon("process.backend").python(), root)
     until = time.monotonic() + 120
     while session.open and time.monotonic() < until:
@@ -157,7 +158,7 @@ def test_a_session_that_cannot_begin_says_why_and_ends(addon, shot, root):
 
 
 def _stand_in(tmp_path, name, body):
-    """A program in place of the backend's Python, to see what becomes of a child that would live on."""
+    """Write a program that stands in for the backend's Python, to test a child that would not end by itself."""
     program = tmp_path / name
     program.write_text(f"#!/bin/sh\n{body}\n")
     program.chmod(0o755)

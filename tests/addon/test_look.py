@@ -1,4 +1,4 @@
-"""What leaves the compositor: the frozen frame with grain, the plate untouched, all or a part. Pixels of renders."""
+"""Rendered output of the compositor: frozen frame with grain, and the unchanged plate, fully or partly shown."""
 
 import shutil
 from pathlib import Path
@@ -30,7 +30,7 @@ def linear_of(display: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def grainy(addon, scene, shot):
-    """The group over a take with grain, 32-bit EXR out; grainy(factor) is the two rendered frames [2, H, W, 4]."""
+    """Group over a take with grain, 32-bit EXR output. grainy(factor) renders the two frames as [2, H, W, 4]."""
     folder = shot / "takes" / "grain"
     shutil.copytree(grains.FOLDER, folder)
     compositor = addon("bake.compositor")
@@ -64,21 +64,21 @@ def test_grain_at_1_is_the_plates_and_another_one_on_every_frame(grainy):
     assert abs(np.corrcoef(shown[0].ravel(), shown[1].ravel())[0, 1]) < 0.1
     added, double = with_grain - clean, twice - clean
     np.testing.assert_allclose(double, 2.0 * added, atol=1e-6)
-    # Half covered, half the grain: it is premultiplied as the picture is.
+    # Alpha 0.5 halves the grain: it is premultiplied like the picture.
     ratio = added[:, :, half:, :3].std(axis=(0, 1, 2)) / added[:, :, :half, :3].std(axis=(0, 1, 2))
     np.testing.assert_allclose(ratio, 0.5, rtol=0.1)
 
 
 def test_grain_does_not_cover_what_stands_behind(addon, scene, grainy):
     node = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene))
-    node.inputs["CG"].default_value = (0.0, 1.0, 0.0, 1.0)  # far behind, seen where the frame covers half
+    node.inputs["CG"].default_value = (0.0, 1.0, 0.0, 1.0)  # far behind, visible where the frame's alpha is 0.5
     grey, half = linear_of(np.float64(grains.VALUE)), grains.WIDTH // 2
     mean = grainy(1.0)[:, :, half:, :3].mean(axis=(0, 1, 2))
     np.testing.assert_allclose(mean, [0.5 * grey, 0.5 * grey + 0.5, 0.5 * grey], atol=2e-3)
 
 
 def test_grain_at_0_leaves_every_bit(addon, scene, grainy, shot):
-    """Against the same group over frames that have no grain layer at all."""
+    """Compared with the same group when its grain node is bypassed."""
     clean = grainy(0.0)
     group = addon("bake.freeze_group").group_node(addon("compat").compositor_tree(scene)).node_tree
     mix = group.nodes["Grain"]
@@ -105,7 +105,7 @@ def test_a_take_without_grain_still_bakes_and_one_with_it_takes_its_place(addon,
 
 
 def ramp() -> np.ndarray:
-    """[48, 64, 3] uint8: every level of every channel, each beside others."""
+    """[48, 64, 3] uint8: every level of every channel, in varying combinations."""
     level = np.arange(256)
     rows = np.stack([level, level[::-1], (level * 7) % 256], axis=1)
     picture = np.tile(rows, (12, 1)).reshape(48, 64, 3)
@@ -122,7 +122,7 @@ SETTINGS = {
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("kind", ["PNG", "OPEN_EXR", "OPEN_EXR_MULTILAYER"])
 def test_the_plate_passes_through_untouched(addon, scene, shot, pictures, setting, kind):
-    """Within 1/255 in an sRGB PNG and 1e-3 in linear EXR of 32 bits, though the frozen frame differs everywhere."""
+    """Errors are below 1/255 in an sRGB PNG and 1e-3 in 32-bit linear EXR; the frozen frame differs everywhere."""
     compositor, compat = addon("bake.compositor"), addon("compat")
     source = ramp()
     for n in (5, 6):
@@ -149,7 +149,7 @@ def test_the_plate_passes_through_untouched(addon, scene, shot, pictures, settin
 
 
 def read_layers(addon, path: Path, folder: Path) -> np.ndarray:
-    """The picture of a multilayer EXR, which `Image.pixels` does not give: through a compositor of its own."""
+    """Picture of a multilayer EXR, rendered through a separate compositor because `Image.pixels` does not give it."""
     scene = bpy.data.scenes.new("reader")
     compat = addon("compat")
     tree = compat.new_compositor_tree(scene, "reader")

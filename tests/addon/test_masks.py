@@ -1,4 +1,4 @@
-"""Masks on the panel: what the solve is asked for, and a mask drawn in Blender as pictures over the clip's frames."""
+"""Masks on the panel: parameters passed to the solve, and a drawn mask rendered as pictures over the clip's frames."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from tests.addon.data.pixels import read
 
 @pytest.fixture
 def drawn():
-    """A mask of a rectangle in the left half of the picture."""
+    """Mask of a rectangle in the left half of the picture."""
     mask = bpy.data.masks.new("people é")
     spline = mask.layers.new(name="one").splines.new()
     spline.use_cyclic = True
@@ -74,7 +74,7 @@ def test_a_drawn_mask_is_rendered_for_every_frame_and_leaves_nothing_in_the_file
 
 @pytest.mark.parametrize("share", [1.0, 0.4])
 def test_a_drawn_masks_values_are_those_of_its_picture(addon, shot, drawn, share):
-    """The solve cuts at half: a view transform would make half of what is drawn at 0.4 (AgX) or darker."""
+    """The solve thresholds masks at 0.5. A view transform such as AgX would move values across this threshold."""
     drawn.layers[0].alpha = share
     found = read(addon("solve.drawn_masks").render(drawn, shot, "people") / "000006.png")[..., 0]
     height, width = found.shape
@@ -119,7 +119,7 @@ def test_what_a_killed_blender_left_of_a_mask_is_removed_by_the_next_one_and_a_l
 
 @pytest.fixture
 def rendering(addon, scene, shot, drawn):
-    """The timer renders the masks of a solve; its first frame is done."""
+    """Watch of a shot whose masks the timer is rendering for a solve; the first frame is done."""
     timer = addon("process.job_timer")
     scene.splannequin.shot_path, scene.splannequin.people_from, scene.splannequin.people_drawn = (
         str(shot),
@@ -167,7 +167,7 @@ def test_no_solve_begins_for_another_shot_than_its_masks_are_of(addon, scene, re
 
 
 def test_a_mask_follows_the_frames_that_its_clip_shows(addon, scene, shot, drawn, tmp_path, pictures):
-    """The shot's frame 5 is the first file of the sequence, which the movie clip shows at frame 1 of the scene."""
+    """Frame 5 of the shot is the first file of the sequence. The movie clip shows this file at scene frame 1."""
     for number in (5, 6, 7):
         pictures.write(tmp_path / f"take.{number:04d}.png", np.zeros((12, 16, 3), np.uint8))
     info = shot / "shot.json"
@@ -183,7 +183,7 @@ def test_a_mask_follows_the_frames_that_its_clip_shows(addon, scene, shot, drawn
 
 @pytest.mark.parametrize("how", ["moved", "linked"])
 def test_a_mask_follows_its_clip_wherever_the_project_lies(addon, scene, shot, tmp_path, pictures, how):
-    """shot.json names the footage as it was imported; Blender, as the artist has opened it since."""
+    """shot.json stores the path of the footage at import; the artist opened it in Blender under another path."""
     plates = tmp_path / "project" / "plates"
     plates.mkdir(parents=True)
     for number in (1001, 1002):
@@ -202,7 +202,7 @@ def test_a_mask_follows_its_clip_wherever_the_project_lies(addon, scene, shot, t
 
 
 def test_a_mask_follows_its_clip_in_a_shot_that_counts_from_a_start_of_its_own(addon, shot, tmp_path, pictures):
-    """The file 0005 is frame 1005 of the shot, and frame 1 of a scene whose clip starts there."""
+    """File 0005 is frame 1005 of the shot. A clip that starts there shows it at scene frame 1."""
     for number in (5, 6):
         pictures.write(tmp_path / f"take.{number:04d}.png", np.zeros((12, 16, 3), np.uint8))
     info, listing = shot / "shot.json", shot / "frames" / "frames.json"

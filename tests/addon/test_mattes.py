@@ -1,4 +1,4 @@
-"""The motion matte in Blender: shown as a sequence, painted on a copy, kept in the shot whole or not at all."""
+"""Motion matte in Blender: shown as a sequence, painted on a copy, and saved to the shot completely or not at all."""
 
 import json
 import os
@@ -13,7 +13,7 @@ WIDTH, HEIGHT = 16, 12
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """A PNG of [H, W] or [H, W, C] uint8, top row first."""
+    """Encode [H, W] or [H, W, C] uint8, top row first, as a PNG."""
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
     height, width, channels = pixels.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
@@ -27,7 +27,7 @@ def png(pixels: np.ndarray) -> bytes:
 
 
 def unpacked(data: bytes) -> np.ndarray:
-    """[H, W, C] uint8 of a PNG whose rows have filter 0."""
+    """Decode a PNG with row filter 0 to [H, W, C] uint8."""
     width, height, depth, kind = struct.unpack(">IIBB", data[16:26])
     start = data.index(b"IDAT")
     size = struct.unpack(">I", data[start - 4 : start])[0]
@@ -37,7 +37,7 @@ def unpacked(data: bytes) -> np.ndarray:
 
 
 def labels(frame: int) -> np.ndarray:
-    """A still frame with a mover at the top left, of another size in each frame."""
+    """Matte of a still frame with a mover at the top left; the mover's size depends on the frame."""
     found = np.zeros((HEIGHT, WIDTH), np.uint8)
     found[:frame, :4] = 255
     found[-2:, -2:] = 128
@@ -92,7 +92,7 @@ def test_painting_goes_on_where_it_was_saved(matted, addon):
     mattes = addon("solve.mattes")
     (matted / "motion_paint").mkdir()
     painted = np.full((HEIGHT, WIDTH, 2), 255, np.uint8)
-    painted[:, 8:, 1] = 0  # nothing is painted there
+    painted[:, 8:, 1] = 0  # nothing is painted in columns from 8 on
     (matted / "motion_paint" / "000006.png").write_bytes(png(painted))
     image = mattes.paint_image(matted, 6)
     assert (values(image)[:, :8] == 255).all() and (values(image)[:, 8:] == labels(6)[:, 8:]).all()
@@ -156,7 +156,7 @@ def test_nothing_is_written_through_a_link(matted, tmp_path):
 
 
 def test_paint_is_found_after_the_file_was_saved_and_opened(matted, addon, tmp_path):
-    """Its shot is remembered relative to the .blend."""
+    """The image stores its shot's path relative to the .blend file."""
     mattes = addon("solve.mattes")
     bpy.ops.splannequin.paint_motion()
     bpy.ops.splannequin.save_motion()
@@ -169,7 +169,7 @@ def test_paint_is_found_after_the_file_was_saved_and_opened(matted, addon, tmp_p
 
 
 def paint_below(image, value: float) -> None:
-    """Paints the three lowest rows."""
+    """Paint the three lowest rows."""
     pixels = np.empty(len(image.pixels), np.float32)
     image.pixels.foreach_get(pixels)
     pixels.reshape(HEIGHT, WIDTH, 4)[:3, :, :3] = value
@@ -184,11 +184,12 @@ def reopen(folder) -> None:
 
 @pytest.mark.parametrize("saved", [False, True])
 def test_paint_that_was_not_saved_yet_is_kept_by_the_blend(matted, addon, saved):
-    """Whether or not some of it was saved into the shot before; Save Paint then keeps it, and drops the copy."""
+    """This holds with and without an earlier save to the shot. Save Paint then writes the paint and unpacks the
+    image."""
     mattes = addon("solve.mattes")
     bpy.ops.splannequin.paint_motion()
     image = mattes.find_image(matted, 6)
-    image.use_fake_user = True  # as an Image Editor that shows it
+    image.use_fake_user = True  # an Image Editor that shows it does the same
     if saved:
         paint_below(image, 0.0)
         bpy.ops.splannequin.save_motion()
@@ -224,7 +225,7 @@ def test_what_was_rubbed_out_and_not_saved_stays_rubbed_out(matted, addon):
 
 
 def unpacked_image(shot):
-    """An image to paint frame 6 on, as older files have it: Blender opens it black."""
+    """Image for painting frame 6 as stored by older versions, without packed pixels: Blender opens it black."""
     image = bpy.data.images.new("Motion", WIDTH, HEIGHT)
     image["splannequin_matte"], image["splannequin_matte_shot"] = 6, str(shot)
     image.use_fake_user = True
@@ -242,7 +243,7 @@ def test_the_black_image_of_an_older_file_is_the_matte_again(matted, addon):
 
 
 def test_a_black_image_is_never_taken_for_paint(matted, addon):
-    """One that came from another file, say: it is filled when its matte is to be painted, and not saved before."""
+    """An image from another file can be black. Save refuses it; Paint fills it with the matte."""
     mattes = addon("solve.mattes")
     image = unpacked_image(matted)
     with pytest.raises(RuntimeError, match=r"Nothing is painted on frame 6"):

@@ -1,5 +1,7 @@
-"""Motion blur of a camera's move against Cycles' own: pictures that Cycles renders, at the poses that the backend
-composites frames at."""
+"""Motion blur of a camera move, compared with Cycles' motion blur.
+
+Cycles renders the scene at the sub-frame poses at which the backend composites.
+"""
 
 import json
 import os
@@ -19,7 +21,7 @@ FLIP = Matrix.Diagonal((1.0, -1.0, -1.0, 1.0))
 
 
 def picture(scene, folder: Path) -> np.ndarray:
-    """[H, W, 3] scene-linear: the scene as it renders."""
+    """[H, W, 3] scene-linear: render of the scene."""
     scene.render.filepath = str(folder / "one.exr")
     bpy.ops.render.render(write_still=True)
     return read(scene.render.filepath)[::-1, :, :3].astype(np.float64)
@@ -31,7 +33,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.fixture
 def wall(scene):
-    """A chequered wall that glows, and a camera that travels and turns along curves; Cycles renders them."""
+    """Emissive chequered wall and a camera that moves and turns along curves, rendered by Cycles."""
     for one in list(scene.objects):
         bpy.data.objects.remove(one)
     scene.world = None

@@ -1,4 +1,4 @@
-"""What moves, tinted over the plate behind the solved camera: drawn from the mattes, and gone with the shot."""
+"""Tinted overlay of moving areas over the plate of the solved camera: built from the mattes, removed with the shot."""
 
 import os
 
@@ -22,7 +22,7 @@ def toggle():
 
 
 def frames(addon, shot):
-    """Frame -> [H, W, 4] of the tinted frames on the disk, as Blender reads them, top row first."""
+    """Map from frame to its tinted picture [H, W, 4] on the disk, top row first, as Blender reads it."""
     found = {}
     for path in sorted(addon("solve.mattes").overlay_folder(shot).iterdir()):
         found[int(path.stem)] = np.rint(read(path) * 255).astype(int)
@@ -49,7 +49,7 @@ def test_it_is_tinted_where_something_moves_and_clear_where_the_plate_stands_sti
 
 
 def test_the_plate_is_seen_below_it_and_the_freeze_again_afterwards(addon, scene, loaded, previews):
-    """In a shot.blend the freeze stands before the plate."""
+    """In a shot.blend, the freeze covers the plate."""
     previews(loaded)
     addon("command_line.first_view").set_up(scene, loaded, "freeze")
     camera = addon("solve.cameras").find(scene, loaded, "CAMERA").data

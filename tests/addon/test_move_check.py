@@ -1,4 +1,4 @@
-"""What a camera's pictures will lack, asked of a real backend before anything is frozen."""
+"""Check of a camera move before the freeze: a real backend reports the areas that its pictures will lack."""
 
 import shutil
 
@@ -16,7 +16,7 @@ def world(frozen_world):
 
 @pytest.fixture
 def move(addon, scene, world):
-    """The world's shot with its camera in the scene, and a smoothed one to freeze from."""
+    """The world's shot with its camera in the scene, and a smoothed copy of the camera as freeze path."""
     scene.splannequin.shot_path = str(world)
     scene.splannequin.set_up_scene = True
     scene.splannequin.t_star, scene.splannequin.choose_t_star = 105, True

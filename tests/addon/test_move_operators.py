@@ -1,4 +1,4 @@
-"""Camera moves through their operators: the keys, the path that Freeze reads, undo, two shots in a file."""
+"""Operators for camera moves: keys, the path that Freeze reads, undo, and two shots in one file."""
 
 import json
 import shutil
@@ -13,7 +13,7 @@ FIRST, LAST = 5, 44
 
 @pytest.fixture
 def shaky(addon, scene, shot):
-    """A shot with 40 frames of a shaky walk past its points, its camera in the scene, the root moved and scaled."""
+    """Shot with 40 frames of a shaky walk past its points; its camera is in the scene, its root is moved and scaled."""
     return with_walk(addon, scene, shot)
 
 
@@ -37,7 +37,7 @@ def with_walk(addon, scene, shot, seed=0):
 
 
 def path_read(addon, scene, shot):
-    """What a take would be asked for with."""
+    """Camera path that Freeze would send to the backend."""
     turns = addon("freeze.own_camera").sample_path(scene, addon("freeze.own_camera").name_of(scene), shot, 0)
     while True:
         try:
@@ -119,7 +119,7 @@ def test_orbit_leaves_the_path_around_the_middle_and_comes_back(addon, scene, sh
         places.append(np.array(camera.matrix_world))
     np.testing.assert_allclose(places[0], standing, atol=1e-4)
     np.testing.assert_allclose(places[2], places[0], atol=1e-4)
-    # The middle of the picture is not the middle of the lens: fx 22.5, cx 9, cy 5, 16 x 12 pixels.
+    # The principal point is not the picture's centre: fx 22.5, cx 9, cy 5, 16 x 12 pixels.
     ray = np.array(standing)[:3, :3] / 2.0 @ [(8 - 9) / 22.5, -(6 - 5) / 22.5, -1.0]
     pivot = np.array(standing)[:3, 3] + 6.0 * ray
     for place in places:
@@ -141,7 +141,7 @@ def test_the_takes_depth_is_asked_first_and_then_the_points(addon, scene, shaky)
     z = addon("freeze.middle_depth").of_frame(shaky / "takes" / "freeze" / "000006.exr")
     assert operators.found_depth(scene, path, 6, path.poses[1]) == z > 0
     xyz = addon("solve.cameras").points_of(shaky)[0]
-    by_points = operators.found_depth(scene, path, 25, path.poses[20])  # no such frame is in the take
+    by_points = operators.found_depth(scene, path, 25, path.poses[20])  # the take does not have frame 25
     assert 4.0 + xyz[:, 2].min() - 0.2 < by_points < 4.0 + xyz[:, 2].max() + 0.2
     facts = shaky / "takes" / "freeze" / "take.json"
     facts.write_text(json.dumps({**json.loads(facts.read_text()), "camera_path": "/somewhere/else.json"}))

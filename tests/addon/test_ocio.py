@@ -1,4 +1,4 @@
-"""Colour configurations of other studios (OCIO): the camera and the take come in, or the scene stays as it was."""
+"""Colour configurations (OCIO) of other studios: camera and take are inserted, or the scene stays unchanged."""
 
 import json
 import os
@@ -22,7 +22,7 @@ FROM_AP0 = (
     "1.37271908766826, -0.096239173438334, 0, -0.0153780649660342, -0.152975335867399, 1.16835340083343, 0, 0, 0, 0, "
     "1]}"
 )
-"""ACES2065-1 to linear Rec.709, as the ACES configurations have it."""
+"""ACES2065-1 to linear Rec.709, with the numbers of the ACES configurations."""
 CURVE = "!<ExponentWithLinearTransform> {gamma: 2.4, offset: 0.055, direction: inverse}"
 CONFIG = """ocio_profile_version: 2
 search_path: ""
@@ -72,7 +72,7 @@ SPACES = """  - !<ColorSpace>
 
 
 def configuration(folder: Path, linear: str, srgb: str, view: str = "Un-tone-mapped") -> Path:
-    """An ACES configuration in small, whose spaces for linear Rec.709 and sRGB have these names."""
+    """Write a small ACES configuration with these names for linear Rec.709 and sRGB."""
     text = CONFIG.format(paint=srgb, view=view, display="sRGB")
     text += SPACES.format(linear=linear, srgb=srgb, matrix=FROM_AP0, curve=CURVE)
     (folder / "config.ocio").write_text(text)
@@ -80,7 +80,7 @@ def configuration(folder: Path, linear: str, srgb: str, view: str = "Un-tone-map
 
 
 def blender(config: Path | str, root: Path, shot: Path, out: Path, script: str = "in_ocio") -> dict:
-    """Runs a script of data/ in another Blender with a colour configuration; returns what it told."""
+    """Run a script of data/ in another Blender with a colour configuration; return the content of told.json."""
     script = str(root / "tests" / "addon" / "data" / f"{script}.py")
     command = [bpy.app.binary_path, "--background", "--factory-startup", "--python", script]
     command = command if bpy.app.binary_path else [sys.executable, script]
@@ -101,7 +101,7 @@ def blender(config: Path | str, root: Path, shot: Path, out: Path, script: str =
 
 
 def test_camera_and_take_come_in_whole_under_an_aces_configuration(root, shot, tmp_path, pictures, layers):
-    """Names of the ACES studio configuration; pixels leave as they came in, through ACEScg."""
+    """The names are those of the ACES studio configuration. Pixels pass through ACEScg unchanged."""
     config = configuration(tmp_path, "Linear Rec.709 (sRGB)", "sRGB Encoded Rec.709 (sRGB)")
     told = blender(config, root, shot, tmp_path)
     assert "my shot é camera is the scene's camera, with the plate behind it." in told["first"]["said"]
@@ -138,13 +138,13 @@ def test_where_nothing_fits_a_sentence_says_so_and_the_scene_stays_as_it_was(roo
 
 
 CG_CONFIG = "ocio://cg-config-v2.1.0_aces-v1.3_ocio-v2.3"
-"""The ACES configuration for CG, as OpenColorIO has it built in."""
+"""ACES configuration for CG that is built into OpenColorIO."""
 TO_AP1 = np.linalg.inv([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
-"""Linear Rec.709 to ACEScg, the published matrix."""
+"""Linear Rec.709 to ACEScg: inverse of the published matrix."""
 
 
 def with_detail(shot, probe):
-    """The shot with the take of data/detail, made of the EXR plates there, in which the probe means this light."""
+    """Shot with a take of data/detail and its EXR plates; `probe`: linear Rec.709 light of the contract's `PROBE`."""
     take = shot / "takes" / "detail"
     shutil.copytree(DATA / "detail", take)
     footage = {"file": str(DATA / "detail" / "plate" / "000005.exr"), "beside": "", "size": [56, 42], "first": 5}
@@ -156,17 +156,18 @@ def with_detail(shot, probe):
 
 
 def light(path):
-    """[H, W, 3] as it stands in a file of the scene's light."""
+    """[H, W, 3]: values stored in a file, in the scene's linear space."""
     return read(path)[..., :3]
 
 
 def off(found, expected):
-    """Largest error of a pixel, relative to its brightest channel, 0.01 at least."""
+    """Largest pixel error relative to the pixel's brightest channel (at least 0.01)."""
     return float((np.abs(found - expected).max(-1) / np.maximum(np.abs(expected).max(-1), 0.01)).max())
 
 
 def test_light_passes_an_aces_scene_within_a_thousandth(root, shot, tmp_path):
-    """-0.2 to 50 in Rec.709 through ACEScg: the plate, the take's frames, and the plate frozen by its warp."""
+    """Rec.709 values from -0.2 to 50 through ACEScg, for the plate, the take's frames, and the plate frozen by its
+    warp."""
     told = blender(CG_CONFIG, root, with_detail(shot, [0.78125, 0.390625, 0.1953125]), tmp_path, "in_aces")
     assert any("000005.exr itself" in line for line in told["said"])
     half = made.frozen(6).astype(np.float32).astype(np.float16)
@@ -175,7 +176,7 @@ def test_light_passes_an_aces_scene_within_a_thousandth(root, shot, tmp_path):
 
 
 def test_working_frames_with_a_shoulder_give_their_light_to_an_aces_scene(root, shot, tmp_path):
-    """Their curve is of Rec.709's light, channel by channel: there and back from the scene's. Up to 60 times white."""
+    """The shoulder applies to Rec.709 channels, so light of up to 60 is converted from the scene's space and back."""
     told_of = with_detail(shot, [0.78125, 0.390625, 0.1953125]) / "takes" / "detail" / "take.json"
     facts = json.loads(told_of.read_text())
     facts["footage"]["unlike"] = "its pixels are not square"
@@ -187,7 +188,7 @@ def test_working_frames_with_a_shoulder_give_their_light_to_an_aces_scene(root, 
     listing.write_text(json.dumps({**json.loads(listing.read_text()), "display": "shoulder"}))
     told = blender(CG_CONFIG, root, shot, tmp_path, "in_aces")
     assert any("shows working frames as the plate" in line for line in told["said"])
-    # A step of 16 bits is 8e-4 of light at the end of the shoulder, and Blender 4.2 is some steps off.
+    # One 16-bit step at the end of the shoulder is 8e-4 of light; Blender 4.2 has errors of some steps.
     assert off(light(tmp_path / "plate.exr"), expected @ TO_AP1.T) < 5e-3
 
 

@@ -1,4 +1,4 @@
-"""A bake into a scene without a compositor of its own: the plate is the footage itself, not a copy of it."""
+"""A bake into a scene without a compositor tree: the plate is the footage itself, not a copy."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ LINEAR = (0.78125, 0.390625, 0.1953125)
 
 @pytest.fixture
 def footage(scene, shot, tmp_path):
-    """footage(...): the shot, its take `detail` of an EXR sequence beside it, and what take.json says of that."""
+    """footage(...): sets up the take `detail` of an EXR sequence next to the shot, with these facts in take.json."""
     folder = tmp_path / "the plate"
     shutil.copytree(DATA / "detail" / "plate", folder)
     take = shot / "takes" / "detail"
@@ -50,7 +50,7 @@ def render(*asked):
 
 
 def st_map(path: Path, places: np.ndarray) -> None:
-    """Writes a map that looks at these places [H, W, 2], pixels from the top left, of a picture of that size."""
+    """Write an ST map for a picture of the same size; `places` [H, W, 2] are pixels from the top left."""
     height, width = places.shape[:2]
     pixels = np.ones((height, width, 4), np.float32)
     pixels[..., 0] = (places[..., 0] + 0.5) / width
@@ -75,7 +75,7 @@ def test_mix_0_is_the_footage_bit_for_bit_and_no_copy_is_shown(addon, scene, foo
 
 @pytest.mark.parametrize("shift", [4, -90])
 def test_footage_that_the_shot_numbers_otherwise_is_shown_at_the_shots_frames(addon, scene, footage, tmp_path, shift):
-    """Behind the camera's own nodes: an Image node whose file number is not the scene's frame."""
+    """An Image node shows the file; its number differs from the scene frame."""
     shot = footage(shift=shift)
     folder = tmp_path / "the plate"
     for frame in (5, 6):
@@ -92,7 +92,7 @@ def test_footage_that_the_shot_numbers_otherwise_is_shown_at_the_shots_frames(ad
 
 
 def test_acescg_footage_is_brought_to_the_scenes_light(addon, scene, footage, tmp_path):
-    """Under Blender's own configuration, where light is Rec.709's."""
+    """Under Blender's default configuration, scene light is linear Rec.709."""
     matrix = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
     said = addon("bake.insertion").insert_freeze(scene, footage(probe=(matrix @ LINEAR).tolist()), "detail")
     assert "The plate is 000005.exr itself, 56 x 42." in said
@@ -102,7 +102,7 @@ def test_acescg_footage_is_brought_to_the_scenes_light(addon, scene, footage, tm
 
 
 def test_the_freeze_as_a_warp_works_on_the_footage_itself(addon, scene, footage, tmp_path):
-    """Values from -0.2 to 50, which no PNG holds."""
+    """Values from -0.2 to 50, which a PNG cannot store."""
     addon("bake.insertion").insert_freeze(scene, footage(), "detail", warp=True)
     found, delivered = render(scene, tmp_path, 6), made.frozen(6)
     assert delivered.max() > 40
@@ -148,7 +148,7 @@ def test_what_is_read_ahead_is_the_footage(addon, scene, footage):
 
 
 def test_the_map_of_the_lens_is_read_ahead_and_again_if_it_has_changed(addon, scene, footage, tmp_path):
-    """Reading one holds Blender's window, so each has a turn of its own; the first bake here never came in."""
+    """Reading a map blocks Blender's window, so each map has its own turn. The first bake here is never inserted."""
     bake, shot = addon("bake.insertion"), footage(map="stmap/undistort.exr")
     for frame in (5, 6):
         st_map(shot / "takes" / "detail" / "stmap" / "undistort.exr", made.places(frame))
@@ -163,7 +163,7 @@ def test_the_map_of_the_lens_is_read_ahead_and_again_if_it_has_changed(addon, sc
 
 
 def test_a_video_shows_frame_n_at_frame_n(addon, scene, footage, tmp_path):
-    """Its n-th picture, as bright as its luma says."""
+    """Frame n shows the n-th picture, with the brightness of its luma."""
     size = levels.WIDTH, levels.HEIGHT
     told = {"file": str(DATA / "levels.mp4"), "size": list(size), "first": 1, "last": levels.FRAMES}
     shot = footage(**told, probe=list(SRGB), space="video, Rec.709")
@@ -250,14 +250,14 @@ def test_colour_spaces_are_known_by_any_light_they_give(addon, contract):
     compat = addon("compat")
     assert compat.colour_space(contract.PROBE) == compat.colour_space("linear")
     assert compat.colour_space(SRGB) == compat.colour_space("srgb")
-    ap1 = (1.07292, 0.34180, 0.15606)  # by the published matrix of ACEScg
+    ap1 = (1.07292, 0.34180, 0.15606)  # light in ACEScg, by the published matrix
     assert "ACEScg" in compat.colour_space(ap1)
     assert not compat.knows_colour((3.0, 0.1, 7.0))
 
 
 @pytest.mark.parametrize("warp", [False, True])
 def test_frames_and_warps_of_acescg_footage_are_read_in_their_light(addon, scene, footage, tmp_path, warp):
-    """Also where the same place held Rec.709's before."""
+    """This also holds after the same files held Rec.709 frames."""
     shot, bake = footage(), addon("bake.insertion")
     bake.insert_freeze(scene, shot, "detail", warp=warp)
     take = shot / "takes" / "detail"
@@ -272,7 +272,7 @@ def test_frames_and_warps_of_acescg_footage_are_read_in_their_light(addon, scene
 
 
 def test_working_frames_that_stand_in_have_the_highlights_of_their_shoulder(addon, contract, scene, footage, tmp_path):
-    """Light up to 60, read back through the compositor; without the record of a shoulder they are sRGB."""
+    """Light up to 60 is recovered by the compositor. If the record has no shoulder, the frames are read as sRGB."""
     shot = footage(unlike="its pixels are not square")
     light = shoulder.light(*SIZE)
     assert (contract.SHOULDER_FROM, contract.SHOULDER_ROLL) == (shoulder.START, shoulder.ROLL)

@@ -1,4 +1,4 @@
-"""Overscan in the compositor, pixel by pixel, and the way through the lens and back by Blender's own Map UV node."""
+"""Overscan in the compositor, pixel by pixel; undistortion and redistortion by Blender's own Map UV node."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ def inside(values: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def take(addon, shot):
-    """A take of one frame, 6: 12 x 10 pixels in a picture of 16 x 12."""
+    """Take of one frame, 6: 12 x 10 pixels in a picture of 16 x 12."""
     folder = shot / "takes" / "over"
     folder.mkdir()
     shutil.copy(DATA / "overscan" / "000006.exr", folder)
@@ -44,7 +44,7 @@ def test_frame_and_margin_come_from_the_exr_header(addon, take, shot, tmp_path):
     file = tmp_path / "aside.exr"
     header = bytearray((DATA / "overscan" / "000006.exr").read_bytes())
     at = header.find(b"displayWindow\0box2i\0") + len(b"displayWindow\0box2i\0") + 4
-    header[at + 8 : at + 12] = (12).to_bytes(4, "little")  # the frame ends one pixel farther right
+    header[at + 8 : at + 12] = (12).to_bytes(4, "little")  # extends the display window by one pixel to the right
     file.write_bytes(header)
     with pytest.raises(ValueError, match="equally far"):
         addon("bake.take_files").exr_windows(file)
@@ -127,7 +127,7 @@ WIDTH, HEIGHT = 160, 120
 
 @pytest.fixture
 def lens_shot(shot):
-    """The shot, filmed through a barrel lens (k1 = -0.2) in 160 x 120: undistorted as wide as its borders allow."""
+    """Shot through a barrel lens (k1 = -0.2) at 160 x 120, undistorted to the widest view without black borders."""
     path = json.loads((shot / "solve" / "cameras.json").read_text())
     path |= {"width": WIDTH, "height": HEIGHT}
     for frame in path["frames"]:
@@ -147,7 +147,7 @@ def image_of(name: str, rgb: np.ndarray):
 
 
 def mapped(tree, picture, path: Path):
-    """Socket of a picture sent through an ST map, as the manual says."""
+    """Output socket of a picture that is mapped by an ST map, as described in the manual."""
     source = tree.nodes.new("CompositorNodeImage")
     source.image = bpy.data.images.load(str(path))
     source.image.colorspace_settings.name = "Non-Color"
@@ -172,19 +172,19 @@ def test_blenders_map_uv_undistorts_and_gives_the_original_back(addon, scene, le
     back = mapped(tree, plate, lens_shot / "solve" / "stmap_redistort.exr")
     tree.links.new(plate, compat.output_socket(tree))
     undistorted = pictures.read(render(addon, scene, tmp_path / "plate", (WIDTH, HEIGHT)))
-    # By the model: where a pixel of the plate lies in the original.
+    # Position in the original of each pixel of the plate, by the lens model.
     ideal = np.stack([x + 0.5 - 80.0, y + 0.5 - 60.0], axis=2) / 135.0
     at = 141.0 * ideal * (1 - 0.2 * (ideal**2).sum(2, keepdims=True)) + [80.0, 60.0] - 0.5
     expected = np.stack(
         [0.5 + 0.4 * np.sin(at[..., 0] / 11.0), 0.5 + 0.4 * np.cos(at[..., 1] / 9.0), at.sum(2) / 300.0], axis=2
     )
     middle = np.s_[3:-3, 3:-3]
-    # Before 5.0 the node's only smooth filter is off by up to 0.2 pixels.
+    # Before 5.0 the only smooth filter of the node has errors up to 0.2 pixels.
     least = 45.0 if compat.HAS_COMPOSITING_GROUP else 38.0
     assert psnr(undistorted[middle], pictures.srgb(expected)[middle]) > least
     tree.links.new(back, compat.output_socket(tree))
     found = pictures.read(render(addon, scene, tmp_path / "back", (WIDTH, HEIGHT)))
-    seen = (np.abs(x - 79.5) < 70) & (np.abs(y - 59.5) < 50)  # the plate alone lacks the corners
+    seen = (np.abs(x - 79.5) < 70) & (np.abs(y - 59.5) < 50)  # leaves out the corners, which the plate lacks
     assert psnr(found[seen], pictures.srgb(original)[seen]) > least - 3.0
     assert found[0, 0].max() < 0.01, "beyond the plate there is nothing"
 
@@ -211,7 +211,7 @@ def test_in_a_window_the_timer_takes_the_answer_in_and_ends(addon, scene, lens_s
     operators.follow_stmaps(lens_shot, asked)
     assert not bpy.ops.splannequin.write_stmaps.poll(), "one at a time"
     asked.process.wait(60)
-    for _ in range(100):  # a turn has a budget, and what the process wrote is read by a thread
+    for _ in range(100):  # a turn has a time budget, and a thread reads the process's output
         supervisor.tick()
         if not operators.writing:
             break

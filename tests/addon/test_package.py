@@ -1,4 +1,4 @@
-"""The extension's manifest and zip, with Blender's own packager."""
+"""Manifest and zip of the extension, checked with Blender's own packager."""
 
 import re
 import subprocess
@@ -13,7 +13,7 @@ import pytest
 
 @pytest.fixture
 def packager(tmp_path):
-    """packager(*arguments) runs Blender's `extension` command line under this Python; returns what it printed."""
+    """packager(*arguments): runs Blender's `extension` command line with this Python and returns its output."""
     scripts = Path(bpy.utils.system_resource("SCRIPTS"))
     tool = scripts / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
     assert tool.is_file()
@@ -43,7 +43,7 @@ def test_source_and_zip_are_valid_and_hold_what_is_needed(packager, root, tmp_pa
     assert not [n for n in names if n.startswith(for_developers)]
     assert {"torch_backend/contract/__init__.py", "torch_backend/contract/options.py"} <= set(names)
     assert {"splannequin_addon/translations/__init__.py", "splannequin_addon/translations/de_DE.py"} <= set(names)
-    # Kernels are no Python, and the rasteriser reads them at its first picture.
+    # Kernels are not Python modules; the rasteriser reads them when it draws its first picture.
     kernels = [p for p in (root / "torch_backend").rglob("kernels/**/*") if p.is_file()]
     assert kernels and {p.relative_to(root).as_posix() for p in kernels} <= set(names)
     assert not [n for n in names if "__pycache__" in n or n.endswith((".pyc", ".whl", ".so", ".pyd"))]

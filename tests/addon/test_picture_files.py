@@ -1,4 +1,4 @@
-"""Whole and cut-off files of every format that Blender writes."""
+"""Complete and truncated files of every format that Blender writes."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def test_a_cut_off_picture_is_told_from_a_whole_one(addon, scene, tmp_path, kind
     settings.file_format = kind
     path = tmp_path / f"picture{scene.render.file_extension}"
     scene.render.resolution_x, scene.render.resolution_y = 96, 64
-    if kind.endswith("LAYER"):  # an image that is none of a render's has no layers to write
+    if kind.endswith("LAYER"):  # only an image from a render has layers to write
         tree = addon("compat").new_compositor_tree(scene, "tree")
         shown = tree.nodes.new("CompositorNodeImage")
         shown.image = noise
@@ -36,7 +36,7 @@ def test_a_cut_off_picture_is_told_from_a_whole_one(addon, scene, tmp_path, kind
         bpy.ops.render.render(write_still=True)
     else:
         noise.save_render(str(path), scene=scene)
-    check(addon, path, -600 if kind.startswith("TARGA") else -3)  # its last bytes are a footer, behind all pixels
+    check(addon, path, -600 if kind.startswith("TARGA") else -3)  # a Targa file ends with a footer after all pixels
 
 
 @pytest.mark.parametrize("container", MOVIES)

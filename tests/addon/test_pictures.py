@@ -1,4 +1,4 @@
-"""The curve of the error and where its points come from."""
+"""The curve of the error and the source of its points."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A project folder that is moved goes on working; a shot folder that is gone is said and located, never made empty."""
+"""A moved project folder keeps working; a missing shot folder is reported and can be located, never created empty."""
 
 import dataclasses
 import json
@@ -23,7 +23,7 @@ def opened(folder: Path):
 
 @pytest.fixture
 def project(tmp_path, shot, clip, scene) -> Path:
-    """A folder with a clip, its shot beside it, and a file that names both by whole paths; the camera is loaded."""
+    """Folder with a clip, its shot, and a file with absolute paths of both; the camera is loaded."""
     folder = tmp_path / "project"
     folder.mkdir()
     shutil.copy(clip, folder / "people.mp4")
@@ -79,7 +79,7 @@ def test_a_copy_of_a_project_works_on_its_own_files(addon, project):
 
 @pytest.mark.skipif(os.sep != "/", reason="there a backslash is what it is")
 def test_a_file_that_was_saved_on_windows_finds_its_shot_elsewhere(addon, project):
-    """Windows, and Blender there, write backslashes into relative paths."""
+    """On Windows, Blender writes backslashes into relative paths."""
     (project / "scenes").mkdir()
     odd = project / "scenes" / "a\\b.exr"
     odd.touch()
@@ -125,12 +125,12 @@ def test_saving_elsewhere_and_saving_a_copy_keep_the_shot(addon, project, tmp_pa
 
 
 def output() -> Path:
-    """Where the scene's pictures go."""
+    """Resolved output path of the scene."""
     return Path(bpy.path.abspath(bpy.context.scene.render.filepath)).resolve()
 
 
 def painted_on(shot: Path):
-    """An image that the matte of frame 6 is painted on."""
+    """Image for painting the matte of frame 6."""
     image = bpy.data.images.new("Motion", 4, 4)
     image["splannequin_matte"], image["splannequin_matte_shot"] = 6, str(shot)
     image.use_fake_user = True
@@ -277,7 +277,7 @@ def test_a_failed_import_followed_by_the_timer_leaves_none_and_is_told(addon, sc
 
 
 def test_a_failed_import_is_taken_away_once_its_process_has_ended(addon, contract, tmp_path):
-    """It tells its end before it lets go of the shot's lock and, on Windows, of its own log."""
+    """The process reports its end before it releases the shot's lock and, on Windows, its log."""
     supervisor, jobs, shot = addon("process.job_timer"), addon("process.jobs"), tmp_path / "text.splannequin"
     addon("shot.inventory").create(shot)
     job = jobs.new_job(shot, "import", contract.ImportParams("text.mp4"))

@@ -1,4 +1,4 @@
-"""The plate's own stream in a tree that a bake made: the artist's from then on, whatever is baked next."""
+"""The plate's stream in a tree created by a bake belongs to the artist: later bakes keep their changes."""
 
 import json
 import shutil
@@ -15,7 +15,7 @@ DATA = Path(__file__).resolve().parent / "data"
 
 @pytest.fixture
 def bake(addon, scene, shot):
-    """bake(): the shot's take into the scene's compositor; returns the tree and the group's node."""
+    """bake(): inserts the shot's take into the scene's compositor; returns the tree and the group's node."""
 
     def bake(take: str = "freeze"):
         bake.said = addon("bake.insertion").insert_freeze(scene, shot, take)
@@ -27,7 +27,7 @@ def bake(addon, scene, shot):
 
 @pytest.fixture
 def footage(scene, shot, tmp_path):
-    """footage(...): gives the shot a take `detail` of an EXR sequence, with or without a map of its lens."""
+    """footage(...): writes a take `detail` of an EXR sequence, with or without a lens map."""
     folder, take = tmp_path / "the plate", shot / "takes" / "detail"
     shutil.copytree(DATA / "detail" / "plate", folder)
     shutil.copytree(DATA / "detail", take, ignore=shutil.ignore_patterns("plate"))
@@ -68,7 +68,7 @@ def file_of(node) -> Path:
 
 
 def path_into(socket) -> list[str]:
-    """Labels, or names, of what leads into a socket, from it."""
+    """Labels (or names) of the nodes upstream of a socket, nearest first."""
     found = []
     while socket.links:
         node = socket.links[0].from_node

@@ -1,4 +1,4 @@
-"""Properties that classes assign are Blender's once they are registered."""
+"""Properties declared in a class become Blender properties when the class is registered."""
 
 import inspect
 
@@ -14,7 +14,7 @@ def test_what_a_class_and_its_base_assign_becomes_what_blender_reads(addon):
     class Group(Base, bpy.types.PropertyGroup):
         word = properties.StringProperty(name="Word", default="a")
 
-    for _ in range(2):  # as switching the add-on off and on again does
+    for _ in range(2):  # twice, like disabling and enabling the add-on
         properties.annotate(Group)
         bpy.utils.register_class(Group)
         properties.release(Group)
@@ -27,7 +27,7 @@ def test_what_a_class_and_its_base_assign_becomes_what_blender_reads(addon):
 
 
 def test_every_property_that_a_class_assigns_is_blenders_and_nothing_of_it_is_left(package, addon):
-    """What is left in the class would be no setting; what is left in its annotations crashes 4.2 at Python's end."""
+    """A property left in a class is no setting. One left in its annotations crashes Blender 4.2 when Python exits."""
     properties = addon("properties")
     kinds = (bpy.types.Operator, bpy.types.PropertyGroup, bpy.types.AddonPreferences)
     classes = [c for kind in kinds for c in kind.__subclasses__() if c.__module__.startswith(f"{package.__name__}.")]

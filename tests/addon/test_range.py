@@ -1,4 +1,4 @@
-"""Which frames a bake asks of the backend, and which it renders: the scene's range and step, missing or stale ones."""
+"""Frames that a bake requests from the backend and renders: the scene's range and step, missing or stale frames."""
 
 import json
 import os
@@ -82,7 +82,7 @@ def test_a_run_that_was_trained_on_makes_a_take_suspect(addon, shot):
 
 
 def test_a_take_tells_by_content_whether_its_run_was_trained_on(addon, contract, shot):
-    """Times say nothing: `cp -r` copies in any order."""
+    """Modification times are unreliable: `cp -r` copies files in any order."""
     addon("process.steps")
     stale = addon("freeze.takes").may_be_stale
     checkpoint, take = shot / "runs" / "main" / "checkpoint.safetensors", shot / "takes" / "freeze" / "take.json"
@@ -122,7 +122,7 @@ def test_headless_bakes_a_part_of_a_take_and_leaves_it_in_the_file(addon, shot, 
 
 
 def larger_plate(shot, times: int) -> None:
-    """The shot as if its plate were that many times as large as its take."""
+    """Enlarge the shot's recorded plate size and camera intrinsics `times` times."""
     for name in ("shot.json", "solve/cameras.json"):
         told = json.loads((shot / name).read_text())
         told |= {"width": 16 * times, "height": 12 * times}

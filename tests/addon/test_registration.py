@@ -1,4 +1,4 @@
-"""Everything the add-on registers is there once, and gone after it is unregistered."""
+"""Registration adds every class and handler once; unregistration removes all of them."""
 
 import os
 import subprocess
@@ -38,7 +38,7 @@ def test_unregister_leaves_nothing_and_register_twice_registers_once(package):
 
 
 def everything() -> tuple:
-    """What Blender knows of the add-on: classes, handlers, menu entries, the property of scenes, timer."""
+    """The add-on's registered parts: classes, handlers, number of menu entries, and the property of scenes."""
     menus = (bpy.types.TOPBAR_MT_render, bpy.types.CLIP_MT_clip)
     drawn = [getattr(getattr(menu.draw, "__func__", menu.draw), "_draw_funcs", []) for menu in menus]
     entries = sum(_ours(draw) for functions in drawn for draw in functions)
@@ -46,7 +46,7 @@ def everything() -> tuple:
 
 
 class BrokenOperator(bpy.types.Operator):
-    """Blender refuses it: its identifier has no dot."""
+    """Operator that Blender refuses, because its identifier has no dot."""
 
     bl_idname = "broken"
     bl_label = "Broken"

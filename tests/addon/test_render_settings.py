@@ -1,4 +1,4 @@
-"""Every row of the table of render settings: set against the bake, baked for real, and put back."""
+"""Every row of the table of render settings: set to disturb the bake, rendered, and restored."""
 
 import contextlib
 import json
@@ -10,7 +10,7 @@ import pytest
 
 
 def strip(scene, start: int) -> None:
-    """A grey strip in the sequencer."""
+    """Add a grey strip to the sequencer."""
     editor = scene.sequence_editor_create()
     strips = editor.strips if hasattr(editor, "strips") else editor.sequences
     how = {"length": 20} if hasattr(editor, "strips") and bpy.app.version >= (5, 0, 0) else {"frame_end": start + 20}
@@ -45,7 +45,7 @@ AGAINST = {
     "keyed exposure": lambda s: keyed(s),
     "override": override,
 }
-"""What an artist may have set, by name."""
+"""Settings by which an artist's scene may disturb a bake, by name."""
 
 
 def region(scene, crop: bool) -> None:
@@ -75,7 +75,7 @@ def white_balance(scene) -> None:
 
 @pytest.fixture
 def baked(addon, scene, shot):
-    """The freeze in a scene of 16 x 12 whose artist wants JPEG."""
+    """The freeze in a scene of 16 x 12, frames 5 and 6."""
     scene.splannequin.shot_path = str(shot)
     addon("bake.insertion").insert_freeze(scene, shot, "freeze")
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 16, 12, 100
@@ -84,7 +84,7 @@ def baked(addon, scene, shot):
 
 
 def state(scene) -> dict:
-    """All plain settings of a scene that are about its picture."""
+    """All scalar settings of a scene that affect its picture."""
     owners = {
         "render": scene.render, "out": scene.render.image_settings, "view": scene.view_settings,
         "display": scene.display_settings, "out view": scene.render.image_settings.view_settings,
@@ -95,9 +95,10 @@ def state(scene) -> dict:
         for prop in owner.bl_rna.properties:
             if prop.type in ("BOOLEAN", "INT", "FLOAT", "ENUM", "STRING") and not getattr(prop, "is_array", False):
                 found[name, prop.identifier] = getattr(owner, prop.identifier)
-    if scene.render.image_settings.color_management == "FOLLOW_SCENE":  # else these mean nothing, until they are copied
+    # otherwise these have no effect until they are copied
+    if scene.render.image_settings.color_management == "FOLLOW_SCENE":
         found = {key: value for key, value in found.items() if key[0] not in ("out view", "out display")}
-    # RNA tells them while the scene is at work, or by when it was last evaluated.
+    # These properties change while the scene is evaluated or rendered.
     return {k: v for k, v in found.items() if k[1] not in ("is_evaluated", "tag", "frame_float", "file_extension")}
 
 
@@ -127,7 +128,7 @@ def test_a_setting_of_the_artists_neither_changes_the_bake_nor_is_changed(
     for frame in (5, 6):
         found = pictures.read(out / f"{frame:06d}.png")
         assert found.shape == (12, 16, 3)
-        # Half-covered pixels (the first column) keep their alpha from 5.2 on, and a PNG then holds straight colours.
+        # From 5.2 on, half-covered pixels (the first column) keep their alpha, and a PNG stores straight colours.
         expected = pictures.srgb(layers(frame)["rgba"][..., :3])
         assert np.abs(found - expected)[1:, 1:].max() * 255 < 0.6
     assert sorted(path.name for path in out.iterdir()) == ["000005.png", "000006.png"]
@@ -136,7 +137,7 @@ def test_a_setting_of_the_artists_neither_changes_the_bake_nor_is_changed(
 
 
 def test_every_row_of_the_table_is_tried(addon, baked):
-    """A row that nothing above sets otherwise would not be known to work."""
+    """A row that no setting above changes would be untested."""
     settings = addon("bake.render_settings")
     tried = set()
     for make in AGAINST.values():
@@ -153,7 +154,7 @@ def test_every_row_of_the_table_is_tried(addon, baked):
     lacking = (
         {row.name for row in rows if (row.owner, row.name) not in tried} - {"use_nodes", "frame_map_old"} - colours
     )
-    assert not lacking - {"use_file_extension"}, lacking  # the button's test on a full disk has it off
+    assert not lacking - {"use_file_extension"}, lacking  # the button's test on a full disk switches it off
 
 
 @pytest.mark.parametrize("name", ["a{{b}}", "{fps}", "a{", "x}y", "#####", "50%_%d", "a # b", "{blend_name}"])
@@ -177,7 +178,7 @@ def test_a_folder_that_blender_cannot_name_is_refused(addon, contract, baked, tm
     before = state(baked)
     with pytest.raises(contract.JobError, match="Blender cannot write pictures to") as failure:
         addon("bake.rendering").render(baked, tmp_path / name, png=False)
-    failure.value.message.encode()  # it can be printed
+    failure.value.message.encode()  # can be printed
     assert state(baked) == before
 
 
@@ -216,7 +217,8 @@ def test_a_setting_that_moves_is_refused_before_anything_is_rendered(addon, cont
 
 
 def test_a_file_that_is_saved_while_it_is_baked_holds_the_artists_settings(addon, contract, baked, tmp_path):
-    """By a handler, as the artist's Ctrl-S between two frames; and one that was saved with the bake's is put right."""
+    """A save during the bake runs a handler that restores the settings. A file saved without handlers is repaired on
+    load."""
     scene, file, crashed = baked, tmp_path / "saved.blend", tmp_path / "crashed.blend"
     region(scene, True)
     scene.render.filepath = "//mine/f_##"
@@ -226,11 +228,12 @@ def test_a_file_that_is_saved_while_it_is_baked_holds_the_artists_settings(addon
 
     def save(done: int, _: int) -> None:
         if done == 1:
-            bpy.data.libraries.write(str(crashed), {scene})  # as an autosave: no handler hears of it
+            bpy.data.libraries.write(str(crashed), {scene})  # an autosave: no handler runs
             bpy.ops.wm.save_as_mainfile(filepath=str(file), copy=True)
             assert not scene.render.use_border and "splannequin_bake_settings" in scene, "the bake goes on"
 
-    with pytest.raises(contract.JobError, match="saved while frame 6"):  # in a window that one was at work
+    # in a window, another process could be using the file
+    with pytest.raises(contract.JobError, match="saved while frame 6"):
         addon("bake.rendering").render(scene, tmp_path / "out", on_frame=save)
     assert scene.render.use_border
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["000005.png", "000007.png"], "it goes on"

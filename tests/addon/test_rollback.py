@@ -1,4 +1,4 @@
-"""A change of the scene that fails leaves it as it was."""
+"""A failing change leaves the scene unchanged."""
 
 import bpy
 import pytest

@@ -1,4 +1,4 @@
-"""Pause, resume, train on; runs and takes side by side: on files of the real formats, and once on a real backend."""
+"""Pause, resume, extended training, and several runs and takes: on files of the real formats, and on a real backend."""
 
 import json
 import os
@@ -16,7 +16,7 @@ CONFIG = {
 
 
 def checkpoint(path: Path, **facts) -> None:
-    """The header of a checkpoint as safetensors writes it, with one tensor."""
+    """Write a checkpoint file in safetensors format: the header and one tensor."""
     told = {"version": 1, "key": "k", "config": CONFIG, "trained_seconds": 10.0, **facts}
     tensor = {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}
     header = json.dumps({"__metadata__": {"splannequin": json.dumps(told)}, "means": tensor}).encode()
@@ -26,7 +26,7 @@ def checkpoint(path: Path, **facts) -> None:
 
 @pytest.fixture
 def with_runs(scene, shot):
-    """The test shot with a finished run main, a paused run better, and a second take."""
+    """Test shot with a finished run `main`, a paused run `better`, and a second take."""
     scene.splannequin.shot_path = str(shot)
     summary = shot / "runs" / "main" / "summary.json"
     told = {**json.loads(summary.read_text()), "preset": "preview", "key": "k", "train_seconds": 125.0}
@@ -63,7 +63,7 @@ def test_the_button_says_what_it_will_do(addon, with_runs, shot):
 
 
 def test_a_training_that_will_replace_a_run_is_gone_on_with(addon, with_runs, shot):
-    """The backend trains other settings in the run's folder `next`: the run is still listed as it is."""
+    """The backend trains with other settings in the subfolder `next` of the run; the finished run stays listed."""
     props, shots = with_runs.splannequin, addon("shot.inventory")
     config, before = {**CONFIG, "preset": "final", "seed": 9}, shots.stamp(shot)
     work = shot / "runs" / "main" / "next" / "0123456789abcdef"

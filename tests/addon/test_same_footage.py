@@ -1,4 +1,4 @@
-"""A data-block shows the plate, or does not, however its path is spelled."""
+"""Detection of data-blocks that show the plate, for all spellings of a path."""
 
 import os
 import shutil
@@ -11,7 +11,7 @@ import pytest
 
 @pytest.fixture
 def plate(tmp_path, pictures):
-    """Three frames of a plate, v002 of its shot, beside a v001 with the same numbers and other pictures."""
+    """Three frames of a plate, version v002, and a v001 with the same numbers and other pictures."""
     folder = tmp_path / "plates"
     folder.mkdir()
     for n in (5, 6, 7):
@@ -23,7 +23,7 @@ def plate(tmp_path, pictures):
 
 @pytest.fixture
 def video(tmp_path):
-    """A file that Blender need not read: its name and its bytes are what counts."""
+    """File that Blender does not have to read; only name and bytes matter."""
     path = tmp_path / "plates" / "clip.mov"
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(zlib.compress(os.urandom(3_000_000), 0))
@@ -31,14 +31,14 @@ def video(tmp_path):
 
 
 def image(path, source):
-    """A data-block as a .blend holds it: not read, with a path as it stands there."""
+    """Data-block as stored in a .blend file: unread, with the stored path."""
     data = bpy.data.images.new("plate", 4, 4)
     data.source, data.filepath = source, str(path)
     return data
 
 
 def spelled(kind, file, tmp_path, monkeypatch):
-    """`file` under another name for the same footage."""
+    """Path of the same footage as `file`, in another spelling."""
     if kind == "relative":
         bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "comp" / "shot.blend"), check_existing=False)
         return "//../plates/" + file.name
@@ -70,7 +70,7 @@ SPELLINGS = ["relative", "dotted", "linked folder", "hard links", "linked files"
 @pytest.mark.parametrize("kind", SPELLINGS)
 @pytest.mark.parametrize("named", ["0007", "####", "0099"])
 def test_a_sequence_is_known_by_any_of_its_pictures(addon, plate, tmp_path, monkeypatch, kind, named):
-    """Also by one that is not there: the number in a path says nothing."""
+    """This includes a missing picture: the number in a path does not matter."""
     (tmp_path / "comp").mkdir()
     path = str(spelled(kind, plate, tmp_path, monkeypatch)).replace("0005", named)
     shows = addon("scene.same_footage").shows
@@ -110,7 +110,7 @@ def test_footage_that_was_chosen_by_its_folder(addon, plate):
 
 
 def test_the_freeze_goes_behind_a_plate_of_a_project_that_was_moved(addon, scene, shot, plate, tmp_path, contract):
-    """shot.json names a place that is gone; the .blend and the plates lie together elsewhere."""
+    """shot.json names a missing folder; the .blend file and the plates were moved together."""
     info = contract.read_json(shot / "shot.json")
     contract.write_json(shot / "shot.json", {**info, "source": f"/old/project/plates/{plate.name}"})
     listing = contract.read_json(shot / "frames" / "frames.json")

@@ -1,4 +1,4 @@
-"""The scale of a solve is guessed from the camera's height over the floor, until somebody sets it."""
+"""The scale of a solve is estimated from the camera's height above the floor until the artist sets it."""
 
 import json
 
@@ -8,7 +8,7 @@ import pytest
 
 
 def with_floor(shot, height, sway=0.0):
-    """Gives a shot's solve a floor, its cameras `height` solve units above it, each `sway` of that higher or lower."""
+    """Give the solve a floor with cameras `height` solve units above it; heights alternate by the fraction `sway`."""
     record, cameras = (json.loads((shot / "solve" / name).read_text()) for name in ("solve.json", "cameras.json"))
     for n, frame in enumerate(cameras["frames"]):
         viewmat = np.eye(4)
@@ -76,7 +76,7 @@ def test_another_solve_is_guessed_anew_and_what_stood_without_a_guess_stays(addo
         with_floor(shot, height)
         load(scene, shot)
         assert scale(scene, shot) == pytest.approx(expected, rel=1e-4)
-    # It stands at 1 now, and scenes of earlier versions do, with all that was built into them.
+    # Scenes of earlier versions have this scale of 1 too, together with objects built to it.
     with_floor(shot, 0.13)
     load(scene, shot)
     assert scale(scene, shot) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""A camera of the artist's scene as the clip's: against Blender's own projection, and where the solve then stands."""
+"""A camera of the artist's scene used for the clip: compared with Blender's projection; placement of the solve."""
 
 import json
 
@@ -13,7 +13,7 @@ POINTS = np.random.default_rng(3).uniform([-4, -3, -9], [4, 3, -4], (20, 3))
 
 
 def moving_camera(scene, frames=(FIRST, LAST), name="match é"):
-    """A camera on a scaled parent that moves and zooms, with shift and vertical sensor fit."""
+    """Camera that moves and zooms on a scaled parent, with shift and vertical sensor fit."""
     parent = bpy.data.objects.new("dolly", None)
     parent.location, parent.rotation_euler, parent.scale = (1.0, -2.0, 0.5), (0.1, -0.2, 0.3), (1.5, 1.5, 1.5)
     data = bpy.data.cameras.new(name)
@@ -33,7 +33,7 @@ def moving_camera(scene, frames=(FIRST, LAST), name="match é"):
 
 @pytest.fixture
 def chosen(scene, shot):
-    """The scene with a shot, of its shape, and a camera that is chosen for it."""
+    """Scene of the shot's aspect ratio, with a moving camera chosen as its source."""
     scene.render.resolution_x, scene.render.resolution_y = 1600, 1200
     props = scene.splannequin
     props.shot_path, props.cameras_from, props.scene_camera = str(shot), "SCENE", moving_camera(scene)
@@ -41,7 +41,8 @@ def chosen(scene, shot):
 
 
 def seen_by_blender(scene, camera, size):
-    """[F, P, 2] pixels of POINTS, moved to where the camera looks, and these [F, P, 3]: by Blender's own projection."""
+    """Blender's projection [F, P, 2] of POINTS placed in front of the camera, and these points in world space [F, P,
+    3]."""
     pixels, world = [], []
     for frame in range(FIRST, LAST + 1):
         scene.frame_set(frame)
@@ -54,7 +55,7 @@ def seen_by_blender(scene, camera, size):
 
 
 def projected(told, world):
-    """The same by a transforms.json, float64."""
+    """[F, P, 2] pixels of the points `world` [F, P, 3], projected by a transforms.json."""
     pixels = []
     for frame, points in zip(told["frames"], world, strict=True):
         lens = {**told, **frame}
@@ -67,7 +68,7 @@ def projected(told, world):
 @pytest.mark.parametrize("aspect", [(1.0, 1.0), (1.0, 1.6), (2.0, 1.0)])
 @pytest.mark.parametrize("fit", ["VERTICAL", "HORIZONTAL", "AUTO"])
 def test_what_is_written_projects_as_blender_does(addon, chosen, shot, aspect, fit):
-    """Lens, sensor, fit, shift, pixel aspect and zoom: for the clip's size, which is not the render's."""
+    """Covers lens, sensor, fit, shift, pixel aspect and zoom, at the clip's size instead of the render size."""
     chosen.render.pixel_aspect_x, chosen.render.pixel_aspect_y = aspect
     camera = chosen.splannequin.scene_camera
     camera.data.sensor_fit = fit
@@ -141,7 +142,7 @@ def test_cameras_that_cannot_be_the_clips_are_refused(addon, contract, chosen, s
 
 
 def test_frames_that_nobody_tracked_are_left_out(addon, scene):
-    """Beyond the keys Blender holds a camera; a camera that pauses between its keys was tracked there."""
+    """Frames outside the camera's keys are not tracked. A pause between two keys counts as tracked."""
     module, evaluated = addon("solve.camera_samples"), addon("shot.seen_camera").evaluated
 
     def left(camera, frames, span):
@@ -154,13 +155,13 @@ def test_frames_that_nobody_tracked_are_left_out(addon, scene):
     assert left(camera, range(1, 12), None) == [5, 6, 7], "what moves it has no keys that are known"
     for block in (camera, camera.data):
         for path in ("location", "rotation_euler") if block is camera else ("lens",):
-            block.keyframe_insert(path, frame=10)  # as at 7
+            block.keyframe_insert(path, frame=10)  # same values as at frame 7
     assert left(camera, range(1, 12), module.keyed(camera))[-1] == 10
 
 
 @pytest.fixture
 def in_scene_world(shot):
-    """The shot's solve as one with a camera of the scene."""
+    """Shot whose solve comes from a camera of the scene."""
     record = json.loads((shot / "solve" / "solve.json").read_text())
     (shot / "solve" / "solve.json").write_text(json.dumps({**record, "world": "scene"}))
     return shot

@@ -1,4 +1,4 @@
-"""What is ours in a scene, and what the artist's: copies, renamed objects, things hung on the root, other files."""
+"""Ownership of objects in a scene: copies, renamed objects, children of the root, and other files."""
 
 import shutil
 import sys
@@ -9,7 +9,7 @@ import pytest
 
 
 def duplicate(*items):
-    """Shift-D on objects; returns the copies by the original's name."""
+    """Duplicate objects (Shift-D); return the copies by the original's name."""
     for item in items:
         item.hide_select = False
     bpy.ops.object.select_all(action="DESELECT")
@@ -30,7 +30,7 @@ def built(addon, scene, shot):
 def test_copies_of_ours_are_the_artists(addon, built, shot):
     cameras = addon("solve.cameras")
     ours = {kind: cameras.find(built, shot, kind) for kind in ("EMPTY", "CAMERA", "MESH")}
-    ours["CAMERA"].name, ours["EMPTY"].name = "zz renamed", "aa renamed"  # in either order of the names
+    ours["CAMERA"].name, ours["EMPTY"].name = "zz renamed", "aa renamed"  # one name sorts before, one after the copies
     copies = duplicate(*ours.values())
     assert len(copies) == 3
     assert {kind: cameras.find(built, shot, kind) for kind in ours} == ours
@@ -82,7 +82,7 @@ def test_what_the_artist_deleted_is_let_go(addon, built, shot):
 
 
 def test_a_turn_of_the_timer_lists_no_scenes_objects(addon, built, shot):
-    """There may be tens of thousands, and the artist waits meanwhile."""
+    """A scene may have tens of thousands of objects, and the timer blocks Blender."""
     made, called = addon("shot.scene_objects"), []
     assert built.splannequin.camera_before is not None and built.splannequin.made[0].camera is not None
     sys.setprofile(lambda frame, event, _: called.append(frame.f_code.co_name) if event == "call" else None)

@@ -1,4 +1,4 @@
-"""A scene or mask is found by its number in the session: renamed, after undo, and never another one in its place."""
+"""Scenes and masks are found by session number after renaming and undo, and never confused with another one."""
 
 import bpy
 

@@ -1,4 +1,4 @@
-"""Several shots in one scene: settings, keys, cameras, jobs and removal of one leave the others alone."""
+"""Several shots in one scene: settings, keys, cameras, jobs and removal of one shot do not affect the others."""
 
 import json
 import shutil
@@ -10,7 +10,7 @@ import pytest
 
 @pytest.fixture
 def other(shot, tmp_path):
-    """A second solved shot, over frames 5 to 7 as well."""
+    """Second solved shot, also with frames 5 to 7."""
     folder = tmp_path / "second.splannequin"
     shutil.copytree(shot, folder)
     return folder
@@ -18,7 +18,7 @@ def other(shot, tmp_path):
 
 @pytest.fixture
 def two(addon, scene, shot, other):
-    """Both in the scene with their cameras; the second is chosen."""
+    """Scene with both shots and their cameras; the second is chosen."""
     props = scene.splannequin
     props.shot_path, props.run_name = str(shot), "first run"
     addon("solve.arrival").load_camera(scene, shot)
@@ -69,7 +69,7 @@ def test_settings_are_put_away_and_come_back(addon, scene, shot, other, clip):
 
 
 def keyed(addon, scene):
-    """Data path -> values of the keys."""
+    """Map from data path to values of the keys."""
     return {c.data_path: [k.co[1] for k in c.keyframe_points] for c in addon("compat_animation").fcurves(scene)}
 
 
@@ -127,7 +127,7 @@ def seen(scene) -> tuple:
 
 
 def test_each_shot_has_its_own_size_rate_and_range(addon, scene, shot, other):
-    """Put back at switching, as the artist left them; the scene's own come back with the last shot."""
+    """Switching restores the values that the artist left; removing the last shot restores the scene's own values."""
     first, second = ((16, 12, 100), 12.5, (5, 7)), ((32, 24, 100), 25.0, (5, 7))
     original = seen(scene)
     props = scene.splannequin
@@ -245,7 +245,7 @@ def test_undo_brings_a_shot_back(addon, two, shot, other):
 
 
 def ended(addon, contract, folder, step, kind, params, result):
-    """A job of a shot that the supervisor follows and that has just ended well."""
+    """A job that the supervisor follows and that has just ended successfully."""
     jobs = addon("process.jobs")
     job = jobs.new_job(folder, kind, params)
     (job.folder / "step").write_text(step)
@@ -281,7 +281,7 @@ def test_a_job_of_a_shot_that_is_not_chosen_waits_for_it(addon, contract, scene,
         contract.FreezeParams(),
         {"t_star_frame": 6, "take": "freeze", "first": 5, "last": 7},
     )
-    for _ in range(100):  # a turn has a budget, and the machine may be busy
+    for _ in range(100):  # a turn has a time budget, and the machine may be busy
         supervisor.tick()
         if all(job.ended for job in (frozen, solved, baked)):
             break
@@ -333,7 +333,7 @@ def test_a_dropped_video_begins_a_shot_beside_one_that_was_imported(addon, scene
 
 @pytest.fixture
 def linked(addon, scene, shot, tmp_path):
-    """A scene of another file that has the shot, too, linked into a new one beside it."""
+    """Scene with the same shot, linked from another file into a new file in the same folder."""
     scene.name, scene.splannequin.shot_path = "Layout", str(shot)
     addon("solve.arrival").load_camera(scene, shot)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "layout.blend"))
@@ -360,7 +360,7 @@ def test_a_linked_scene_with_the_same_shot_is_left_alone(addon, linked, shot):
 
 
 def test_paths_of_a_linked_scene_stay_over_saving(linked, shot, tmp_path):
-    """They are relative to its own file, which this one is not beside."""
+    """The paths are relative to the scene's own file, not to the saved file."""
     before = linked.splannequin.shot_path, linked.splannequin.made[0].folder
     (tmp_path / "deeper").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "deeper" / "comp.blend"))
@@ -368,7 +368,7 @@ def test_paths_of_a_linked_scene_stay_over_saving(linked, shot, tmp_path):
 
 
 def test_a_video_dropped_again_is_the_shot_that_it_was(addon, scene, shot, tmp_path):
-    """However its path is written: after saving, the .blend holds it relative to itself."""
+    """The path's spelling does not matter: after saving, the .blend stores it as relative."""
     props, clip = scene.splannequin, tmp_path / f"{addon('shot.scene_objects').name_of(shot)}.mp4"
     clip.touch()
     props.shot_path = str(shot)

@@ -1,4 +1,4 @@
-"""Cameras from Blender's own tracker, out to other programs, through Alembic: against the cameras they came from."""
+"""Cameras from Blender's tracker, exported to other programs, and through Alembic, compared with their source."""
 
 import json
 import math
@@ -30,7 +30,7 @@ TRUTH = [
 
 @pytest.fixture
 def clip(tmp_path, pictures):
-    """A numbered sequence from 101 on, known to Blender."""
+    """Numbered sequence from 101 on, loaded as movie clip."""
     for n in range(FRAMES):
         pictures.write(tmp_path / f"take é.{101 + n:04d}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     return bpy.data.movieclips.load(str(tmp_path / "take é.0101.png"))
@@ -38,7 +38,7 @@ def clip(tmp_path, pictures):
 
 @pytest.fixture
 def tracked(clip):
-    """The clip with tracks of points seen through `TRUTH` and a bent lens, solved by Blender itself."""
+    """Clip with tracks of points projected by `TRUTH` and a distorted lens, solved by Blender."""
     camera = clip.tracking.camera
     camera.units, camera.distortion_model = "PIXELS", "POLYNOMIAL"
     camera.focal_length_pixels, camera.k1 = FOCAL, K1
@@ -64,12 +64,12 @@ def tracked(clip):
 
 
 def opencv(matrices) -> np.ndarray:
-    """[F, 4, 4] world-to-camera, OpenCV axes, of camera-to-world with OpenGL's."""
+    """[F, 4, 4] world-to-camera with OpenCV axes, from camera-to-world with OpenGL axes."""
     return np.linalg.inv(np.array(matrices) @ np.diag([1.0, -1.0, -1.0, 1.0]))
 
 
 def relative(viewmats) -> np.ndarray:
-    """[F, 4, 4] poses as the first camera sees them, in units of the path's length."""
+    """[F, 4, 4] poses relative to the first camera, scaled by the distance between first and last camera."""
     seen = np.array(viewmats) @ np.linalg.inv(viewmats[0])
     seen[:, :3, 3] /= np.linalg.norm(seen[-1, :3, 3])
     return seen
@@ -93,7 +93,7 @@ def test_the_solve_is_asked_for_with_what_was_tracked(addon, tracked, scene, sho
     params = addon("process.steps").STEPS["solve"].params(scene)
     assert params.cameras == str(shot / "tracking" / "transforms.json")
     assert json.loads(Path(params.cameras).read_text(encoding="utf-8")) == addon("solve.exchange").transforms(tracked)
-    # The backend understands it, and finds that it is of another clip: the test shot has frames 5 to 7 of 16 x 12.
+    # The backend reads the file and finds another clip's frames: the test shot has frames 5 to 7 of 16 x 12.
     with pytest.raises(RuntimeError, match=r"Only 0 of the 3 frames needed, from 5 to 7, have a camera.* 101 to 114"):
         bpy.ops.splannequin.solve_camera()
     assert (shot / "solve" / "cameras.json").is_file(), "the solve that was there stays"
@@ -218,7 +218,7 @@ def test_export_and_given_cameras_from_the_command_line(addon, shot, tmp_path, c
 
 
 def test_alembic_carries_the_camera(addon, scene, shot, tmp_path):
-    """The solved camera is an ordinary one: what Blender's own Alembic takes out, it brings back."""
+    """The solved camera survives a round trip through Blender's own Alembic export and import."""
     if not bpy.app.alembic.supported:
         pytest.skip("this Blender was built without Alembic")
     scene.splannequin.shot_path = str(shot)

@@ -1,4 +1,4 @@
-"""The splats of a take in Blender, and what leaves it: they lie on the solved camera, whatever moved the shot."""
+"""Splats of a take in Blender and in exported files: aligned with the solved camera for every placement of the shot."""
 
 import json
 import os
@@ -25,7 +25,7 @@ def write_ply(path: Path, rows: np.ndarray) -> None:
 
 
 def splats(matrix: np.ndarray) -> np.ndarray:
-    """Rows of a PLY whose means are points of the solve in front of the cameras, placed by a similarity."""
+    """PLY rows with means at `points`, transformed by a similarity."""
     chance = np.random.default_rng(4)
     rows = chance.normal(0.0, 0.5, (COUNT, len(NAMES)))
     rows[:, :3] = points() @ matrix[:3, :3].T + matrix[:3, 3]
@@ -33,13 +33,13 @@ def splats(matrix: np.ndarray) -> np.ndarray:
 
 
 def points() -> np.ndarray:
-    """In solve units; the cameras of the shot look at the origin's surroundings from 3 units away."""
+    """Points [P, 3] in solve units around the origin; the shot's cameras look at it from a distance of 3."""
     return np.random.default_rng(3).uniform(-0.5, 0.5, (COUNT, 3))
 
 
 @pytest.fixture
 def stood(scene, shot, addon):
-    """The shot in the scene, on a floor that was turned, with a scale that was set; and its root's matrix."""
+    """Root of the shot in the scene, with a rotated floor, a scale and an offset."""
     scene.splannequin.shot_path = str(shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
     root = addon("shot.scene_objects").part(scene, shot, "root")
@@ -50,7 +50,7 @@ def stood(scene, shot, addon):
 
 
 def placed_take(shot: Path, addon, scene, matrix=None) -> dict:
-    """The take `freeze` with splats that left in the present placement, or in the one of a matrix."""
+    """Take `freeze` with splats in the current placement, or in the placement `matrix`."""
     told = addon("shot.placement").placement_in(scene, shot).to_json()
     if matrix is not None:
         told["scene_from_solve"] = np.asarray(matrix, float).ravel().tolist()
@@ -62,7 +62,7 @@ def placed_take(shot: Path, addon, scene, matrix=None) -> dict:
 
 
 def pixels_in_solve(shot: Path, frame: int, contract) -> np.ndarray:
-    """Where the solve's own camera sees `points`, [P, 2], float64."""
+    """Projection of `points` by the solve's camera, [P, 2], float64."""
     path = contract.CameraPath.load(shot / "solve/cameras.json")
     one = next(f for f in path.frames if f.frame == frame)
     viewmat, (fx, fy, cx, cy) = np.reshape(one.viewmat, (4, 4)), one.K
@@ -71,7 +71,7 @@ def pixels_in_solve(shot: Path, frame: int, contract) -> np.ndarray:
 
 
 def pixels_in_blender(scene, camera, places, size) -> np.ndarray:
-    """Where a camera of the scene sees places, by Blender's own projection, [P, 2], y down."""
+    """Blender's projection of `places` by a scene camera, [P, 2], y down."""
     scene.render.resolution_x, scene.render.resolution_y = size
     seen = np.array([world_to_camera_view(scene, camera, Vector(p))[:2] for p in places])
     return seen * [size[0], -size[1]] + [0, size[1]]
@@ -110,7 +110,7 @@ def test_splats_lie_on_the_camera(scene, shot, stood, addon, contract):
 
 
 def test_splats_follow_a_shot_that_is_moved_later(scene, shot, stood, addon, contract):
-    """Set Scale, a turned floor: the take is not frozen again, and lies on the camera all the same."""
+    """Set Scale and a rotated floor: the take is not frozen again, and its splats stay aligned with the camera."""
     placed_take(shot, addon, scene)
     bpy.ops.splannequin.add_splats()
     addon("solve.scale").move(scene, shot, np.array(Matrix.Rotation(-0.4, 4, "X") @ Matrix.Scale(7.0, 4)))
@@ -122,7 +122,7 @@ def test_splats_follow_a_shot_that_is_moved_later(scene, shot, stood, addon, con
 
 
 def test_what_a_splat_carries(scene, shot, stood, addon):
-    """Against the file in float64: linear colour, opacity, standard deviations, unit quaternions."""
+    """Compared with the file in float64: linear colour, opacity, standard deviations, unit quaternions."""
     told = placed_take(shot, addon, scene)
     bpy.ops.splannequin.add_splats()
     item = addon("freeze.splats").find(scene, shot, "freeze")
@@ -214,7 +214,7 @@ def test_what_cannot_be_added_is_said(scene, shot, stood, addon, contract):
 
 
 def test_the_buttons_hand_on_where_the_shot_stands(scene, shot, stood, addon, tmp_path):
-    """A camera for Nuke from the button: the places of Blender's camera, y up."""
+    """Camera for Nuke, exported by the button: positions of Blender's camera, converted to y up."""
     out = tmp_path / "out"
     assert bpy.ops.splannequin.export_cameras(directory=str(out), format="chan") == {"FINISHED"}
     rows = np.loadtxt(out / "camera.chan")
@@ -226,7 +226,7 @@ def test_the_buttons_hand_on_where_the_shot_stands(scene, shot, stood, addon, tm
 
 
 def test_blenders_own_importer_reads_a_ply_that_lies_on_the_camera(scene, shot, stood, addon, contract):
-    """frozen.ply is in the scene's axes and units: nothing has to be turned."""
+    """frozen.ply is in the scene's axes and units, so no rotation is needed."""
     placed_take(shot, addon, scene)
     known = set(bpy.data.objects)
     bpy.ops.wm.ply_import(filepath=str(shot / "takes/freeze/frozen.ply"))
@@ -265,7 +265,7 @@ stage.Save()
 
 
 def in_backend(addon, root: Path, code: str, *words: str) -> None:
-    """Runs code in the backend's Python; skips the test where that has no usd-core."""
+    """Run code in the backend's Python; skip the test if the backend has no usd-core."""
     paths = [str(root), *filter(None, [os.environ.get("USD_CORE")])]
     ran = subprocess.run(
         [addon("process.backend").python(), "-P", "-c", code, *words], capture_output=True, text=True,
@@ -278,7 +278,8 @@ def in_backend(addon, root: Path, code: str, *words: str) -> None:
 
 @pytest.mark.parametrize("reads", [True, False])
 def test_where_blenders_importer_reads_splats_it_is_used(scene, shot, stood, addon, contract, root, monkeypatch, reads):
-    """Points stand in for splats, which no Blender reads yet; where the importer brings nothing, ours are added."""
+    """Points stand in for splats, which no Blender imports yet. If the importer returns nothing, the add-on's are
+    used."""
     if "import_points" not in addon("compat").usd_import_options():
         pytest.skip("this Blender reads no points from USD")
     told = placed_take(shot, addon, scene)
@@ -303,7 +304,7 @@ def test_where_blenders_importer_reads_splats_it_is_used(scene, shot, stood, add
 def test_blenders_own_importer_brings_the_camera_back_to_where_it_is(
     scene, shot, stood, addon, contract, root, tmp_path, metres
 ):
-    """The USD stage of the backend, read by Blender: the same pose, lens and offsets on every frame."""
+    """Blender reads the backend's USD stage with the same pose, lens and offsets on every frame."""
     if not addon("compat").usd_import_options():
         pytest.skip("this Blender reads no USD")
     scene.unit_settings.scale_length = metres

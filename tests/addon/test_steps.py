@@ -1,4 +1,4 @@
-"""The five steps and their buttons, run headless on real jobs, and what they change in the scene."""
+"""The five steps and their buttons, run headless on real jobs, and their changes to the scene."""
 
 import io
 import json
@@ -233,9 +233,10 @@ def test_a_newer_shot_is_refused_in_words(addon, contract, tmp_path: Path):
 
 
 def test_no_button_meets_a_newer_or_damaged_shot_with_a_traceback(scene, shot, tmp_path, monkeypatch, capfd):
-    """Nor does what asks at every draw whether one is on."""
+    """The poll functions, which run at every draw, do not fail either."""
     scene.splannequin.shot_path = str(shot)
-    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))  # then Bake looks into the shot itself
+    # without a backend, Bake reads the shot itself
+    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(tmp_path / "gone"))
     for text in ('{"version": 99, "name": "x"}', "{"):
         (shot / "shot.json").write_text(text)
         assert not bpy.ops.splannequin.export_for_farm.poll()
@@ -274,7 +275,7 @@ def test_a_second_clip_gets_a_shot_folder_of_its_own(addon, scene, clip, tmp_pat
 
 
 def imported(addon, scene, clip, name: Path) -> Path:
-    """The shot folder of a clip that was imported in the scene, a copy called `name`."""
+    """Import a copy of the clip, called `name`, in the scene; return its shot folder."""
     name.parent.mkdir(exist_ok=True)
     shutil.copy(clip, name)
     scene.splannequin.clip = str(name)
@@ -284,7 +285,7 @@ def imported(addon, scene, clip, name: Path) -> Path:
 
 @pytest.fixture
 def a_few(scene):
-    """Eight frames are imported."""
+    """Scene set to import eight frames."""
     scene.splannequin.use_range, scene.splannequin.first, scene.splannequin.last = True, 1, 8
     return scene
 
@@ -334,7 +335,7 @@ def test_the_shot_of_another_clip_in_a_folder_that_was_chosen_is_not_replaced_wi
 
 
 def test_work_on_a_shot_is_replaced_with_consent_alone(addon, a_few, clip, tmp_path):
-    """Another clip of the same name, which the panel cannot know: it asks, and the backend refuses a script."""
+    """The clip is another one of the same name, which the panel cannot detect. The panel asks; the backend refuses."""
     folder = imported(addon, a_few, clip, tmp_path / "a.mp4")
     (folder / "solve").mkdir()
     (folder / "solve" / "cameras.json").write_text("{}")
@@ -394,7 +395,7 @@ def test_one_broken_shot_does_not_end_the_timer(addon, with_shot, shot, tmp_path
     broken, sound = supervisor.watch_of(tmp_path), supervisor.watch_of(shot)
     broken.jobs["train"] = types.SimpleNamespace(ended=False)
     sound.redraw = True
-    for _ in range(50):  # a turn that a busy machine made too long leaves jobs to the next
+    for _ in range(50):  # if a turn takes too long, as on a busy machine, jobs wait for the next
         assert supervisor.tick() == supervisor.TICK_SECONDS and not sound.redraw
         if broken.failures:
             break

@@ -1,4 +1,4 @@
-"""Where an artist stood before a grey button, or before nothing: what is in reach, and what is shown, at every time."""
+"""Panels in states where artists found a disabled button or an empty panel: which buttons and text they show."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ def with_shot(scene, shot):
 
 @pytest.fixture
 def with_raw(shot) -> Path:
-    """The shot with the pictures of its import, as they are before the solve."""
+    """Shot with the import's pictures, as before the solve."""
     raw = shot / "frames" / "raw"
     raw.mkdir()
     for n in (5, 6, 7):
@@ -26,7 +26,7 @@ def with_raw(shot) -> Path:
 
 @pytest.fixture
 def session(addon, shot, monkeypatch):
-    """A session of a real backend, as the view holds one."""
+    """Session of a real backend, held by the view."""
     viewport = addon("freeze.viewport")
     one = addon("freeze.live").open_session(
         shot, "nothing", addon("process.backend").python(), addon("process.backend").package_root()
@@ -185,7 +185,7 @@ def test_a_missing_backend_says_why(addon, monkeypatch, tmp_path):
 
 
 def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp_path):
-    """The set-up was cancelled, or Blender closed while it ran: the interpreter stands there, the packages do not."""
+    """Set-up was cancelled, or Blender was closed during it: the interpreter exists, the packages do not."""
     backend = addon("process.backend")
     monkeypatch.delenv("SPLANNEQUIN_BACKEND_PYTHON", raising=False)
     monkeypatch.setenv("SPLANNEQUIN_HOME", str(tmp_path))
@@ -196,7 +196,8 @@ def test_a_half_made_environment_is_no_backend(addon, contract, monkeypatch, tmp
     notes = tmp_path / ".venv" / ".splannequin"
     notes.mkdir()
     refused = "The backend's set-up has not finished"
-    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(python))  # named: no other one is taken instead
+    # named explicitly, so that no other environment is used instead
+    monkeypatch.setenv("SPLANNEQUIN_BACKEND_PYTHON", str(python))
 
     def said() -> str:
         trouble = backend.trouble()

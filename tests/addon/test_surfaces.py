@@ -1,4 +1,4 @@
-"""The surface of a take in Blender: where it stands, what it catches and hides in a render, undone, of two shots."""
+"""Surface of a take in Blender: placement, shadow catching and holdout in a render, undo, and two shots."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ PERSON = np.array([(-2, -1.5, 0), (-0.2, -1.5, 0), (-0.2, -1.5, 3), (-2, -1.5, 3
 
 
 def write_surface(shot: Path, contract, matrix=None) -> None:
-    """A floor, and a person as a board that stands on it, of the take as it is."""
+    """Write a surface of the take's current state: a floor, and a person as an upright rectangle."""
     take = contract.TakeFolder(shot / "takes" / "freeze")
     vertices = np.zeros(8, list(contract.VERTEX_FIELDS))
     for n, axis in enumerate("xyz"):
@@ -32,7 +32,7 @@ def write_surface(shot: Path, contract, matrix=None) -> None:
 
 @pytest.fixture
 def stood(scene, shot, addon, contract):
-    """The shot in the scene, and a surface of its take that left for where the shot's root stands."""
+    """Root of the shot in the scene, with a surface of its take written for this placement."""
     scene.splannequin.shot_path = str(shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
     root = addon("shot.scene_objects").part(scene, shot, "root")
@@ -147,7 +147,7 @@ def test_a_render_has_the_shadow_and_what_is_behind_people_is_hidden(scene, shot
 def test_what_cannot_be_added_is_a_sentence(scene, shot, stood, addon, contract):
     surface = shot / "takes/freeze/surface.ply"
     whole = bytearray(surface.read_bytes())
-    whole[-5] = 9  # a corner that is no vertex
+    whole[-5] = 9  # index of a vertex that does not exist
     surface.write_bytes(whole)
     with pytest.raises(ValueError, match="damaged"):
         addon("freeze.surfaces").add(scene, shot, "freeze")

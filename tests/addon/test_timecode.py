@@ -1,4 +1,4 @@
-"""The footage's timecode in Blender: at the current frame in the panel, in the metadata of what is rendered."""
+"""Timecode of the footage in Blender: in the panel at the current frame, and in the metadata of rendered files."""
 
 import json
 
@@ -10,7 +10,7 @@ NOTE = "Timecode 01:00:00:10 at frame 5, 24 fps."
 
 @pytest.fixture
 def dated(scene, shot):
-    """dated(code): the scene, and a shot whose first frame has this timecode."""
+    """dated(code): the scene with a shot whose first frame has this timecode."""
 
     def tell(code):
         for path, more in ((shot / "frames" / "frames.json", {"timecode": code}), (shot / "shot.json", {"fps": 24.0})):

@@ -1,4 +1,4 @@
-"""Whatever the add-on shows has a translation in every language that is shipped, and nothing else has."""
+"""Every text that the add-on shows is translated in every shipped language, and no other text is."""
 
 import ast
 import re
@@ -9,27 +9,27 @@ import bpy
 import pytest
 
 NOT_ON_SCREEN = {"console.py", "headless.py", "cli.py", "run_in_bpy.py"}
-"""Modules that speak to a console, in English."""
+"""Modules that print to a console, in English."""
 NOT_SHOWN = {
     "Splannequin",  # a name
-    "Splannequin Freeze",  # name of the node group: the same in every file
+    "Splannequin Freeze",  # name of the node group, equal in every file
     "t*",
     "",
 }
 SHOWN_ARGUMENTS = {"text", "heading", "title", "message", "confirm_text"}
-"""Keyword arguments that are drawn, whatever takes them."""
+"""Keyword arguments that are drawn, in any call."""
 SHOWN_POSITIONS = {
     "tr": (0,), "wrap": (2,), "sub_panel": (2,), "report": (1,), "poll_message_set": (0,), "JobError": (0, 1),
     "Step": (1, 3, 4, 5), "View": (2, 3),
 }  # fmt: skip
-"""Calls whose arguments are drawn."""
+"""Positions of drawn arguments, by name of the call."""
 TRANSLATED_BY_BLENDER = {"label", "operator", "prop", "row", "column", "split", "progress", "report"}
-"""Calls that look a literal up by themselves, but no composed text."""
+"""Calls that translate a literal by themselves, but no composed text."""
 A_SENTENCE = re.compile(r"[A-Z{][^\n]* [^\n]*([.]|: \{\})")
 
 
 def strings(node: ast.AST) -> Iterator[str]:
-    """The texts that an expression may be; {} for each value that is put into one."""
+    """Texts that an expression may evaluate to; each inserted value is written as {}."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         yield node.value
     elif isinstance(node, ast.JoinedStr):
@@ -50,14 +50,14 @@ def called(node: ast.Call) -> str:
 
 
 def bare(tree: ast.AST) -> set[int]:
-    """Docstrings and the insides of f-strings: no texts by themselves."""
+    """Ids of the nodes of docstrings and of the parts of f-strings, which are not texts by themselves."""
     inside = [part for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in ast.walk(node)]
     docs = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
     return {id(part) for part in [*inside, *docs] if not isinstance(part, ast.JoinedStr)}
 
 
 def shown_by(path: Path) -> Iterator[tuple[str, int]]:
-    """(text, line) that a module of the add-on shows, from its source: arguments of what draws, and all sentences."""
+    """(text, line) of each text that a module shows: arguments of drawing calls, and all sentences in its source."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     skip = bare(tree)
     for node in ast.walk(tree):
@@ -74,7 +74,7 @@ def shown_by(path: Path) -> Iterator[tuple[str, int]]:
 
 
 def worth_translating(text: str) -> bool:
-    """False for what has no word in it, and for names."""
+    """False for texts without a word, and for names."""
     return text not in NOT_SHOWN and re.search(r"[A-Za-z]{2}", text.replace("{}", "")) is not None
 
 
@@ -88,7 +88,7 @@ def classes() -> list[type]:
 
 
 def registered() -> Iterator[tuple[str, str]]:
-    """(text, where) of labels, tooltips, properties and choices that Blender was given."""
+    """(text, where) of registered labels, tooltips, properties and choices."""
     for cls in classes():
         for text in (getattr(cls, "bl_label", ""), getattr(cls, "bl_description", "")):
             yield text, cls.__name__
@@ -105,13 +105,13 @@ def registered() -> Iterator[tuple[str, str]]:
 
 
 def sources(root: Path) -> list[Path]:
-    """Of the add-on, without the translations themselves."""
+    """Source files of the add-on without its translations."""
     return [p for p in sorted((root / "splannequin_addon").rglob("*.py")) if p.parent.name != "translations"]
 
 
 @pytest.fixture
 def shown(package, root) -> dict[str, str]:
-    """Text -> where it is shown."""
+    """Map from each shown text to its place."""
     found: dict[str, str] = {}
     for path in sources(root):
         if path.name not in NOT_ON_SCREEN:
@@ -123,7 +123,7 @@ def shown(package, root) -> dict[str, str]:
 
 
 def written(root: Path) -> set[str]:
-    """All texts in the sources, and the backend's stages as the panel writes them."""
+    """All texts in the sources, and the backend's stages as the panel shows them."""
     found: set[str] = set()
     for path in [*(root / "torch_backend").rglob("*.py"), *sources(root)]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -157,7 +157,7 @@ def test_translations_are_filled_in_and_have_the_fields_of_the_original(addon):
 
 
 def test_what_is_composed_is_not_left_to_blender_to_look_up(root):
-    """A label finds "Import Clip" by itself, but not "74 frames": f-strings go through tr()."""
+    """A label translates "Import Clip" by itself, but not "74 frames": f-strings must use tr()."""
     wrong = []
     for path in sources(root):
         if path.name in NOT_ON_SCREEN:

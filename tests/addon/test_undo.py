@@ -1,4 +1,4 @@
-"""Every operator that Blender may undo: undone, the file is as before; done again, as after. To the last property."""
+"""Every operator that supports undo restores all properties of the file on undo, and its result on redo."""
 
 import importlib.util
 import shutil
@@ -14,14 +14,14 @@ whole_file = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(whole_file)
 full = whole_file.full
 pytestmark = [
-    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # the state of a file has all properties
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # reading the file's state touches deprecated properties
     pytest.mark.skipif(
         bpy.app.version < (4, 5, 0), reason="Blender 4.2 ends by SIGSEGV when UV sculpting's properties are read"
     ),
 ]
 
 PLACES = [0.0, 0.0, 0.0, 1.0, 0.2, 0.1, 0.3, 1.0, 0.4]
-"""Three points in space, not on a line."""
+"""Three non-collinear points."""
 CALLS = {
     "align_floor": {"places": PLACES},
     "align_origin": {"places": PLACES[3:6]},
@@ -38,9 +38,9 @@ BEFORE = {
     "shot_remove": ("insert_freeze", "shot_add"),
     "save_motion": ("paint_motion",),
 }
-"""Operators that are needed before."""
+"""Operators that must run before another."""
 ELSEWHERE = {
-    "freeze_as_warp": "test_layers.py",  # its take is made of plates
+    "freeze_as_warp": "test_layers.py",  # needs a take of plate-based frames
     "suggested_instant": "needs a live session; it sets what t_star_here sets",
     "use_movie_clip": "needs an editor of clips; it calls use_clip",
 }
@@ -65,7 +65,7 @@ def test_no_operator_is_left_out(addon):
 
 @pytest.fixture
 def ready(full, scene, addon, contract, new_take):
-    """A shot with all that an operator may ask for: mattes, another take and run, a lasso."""
+    """Shot with data for all operators: mattes, a second take and run, and a lasso."""
     for folder in (full / "solve" / "motion", full / "takes" / "freeze" / "preview"):
         folder.mkdir()
         for frame in (5, 6, 7):

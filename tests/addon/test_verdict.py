@@ -1,4 +1,5 @@
-"""The panel shows what a run's and a take's verdict say; how frozen frames are made travels with the settings."""
+"""The panel shows the verdicts of runs and takes. Freeze uses the panel's rendering settings, Bake those of the
+take."""
 
 import json
 
@@ -94,7 +95,7 @@ def test_developing_is_asked_for_as_the_panel_says_and_a_bake_keeps_the_takes(ad
     props.develop = True
     assert steps.STEPS["bake"].params(with_shot).develop == "off", "its frames are of before instants were developed"
     props.develop = False
-    for frames in ([6], []):  # of a ramp with many instants none is
+    for frames in ([6], []):  # a ramp with many instants has no developed one
         add(take, developed=frames)
         assert steps.STEPS["bake"].params(with_shot).develop == "on"
 

@@ -1,4 +1,4 @@
-"""A file with all that a freeze brings into a scene: undone step by step, moved, and opened without the add-on."""
+"""A file with everything that a freeze adds to a scene: undone step by step, moved, and opened without the add-on."""
 
 import importlib.util
 import json
@@ -15,7 +15,7 @@ from tests.addon.data.pixels import read
 
 
 def beside(name: str) -> types.ModuleType:
-    """A test file of this folder, for what it writes into a take; no import finds it in Blender."""
+    """Import a test file of this folder by path for its helpers; a plain import does not work inside Blender."""
     spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -27,7 +27,7 @@ test_lights, test_splats, test_surfaces = (beside(f"test_{name}") for name in ("
 
 @pytest.fixture
 def full(scene, shot, addon, contract):
-    """Writes splats, a surface and a light of the take for where the shot stands; the shot is in the scene."""
+    """Shot in the scene, with splats, a surface and a light of its take written for its placement."""
     scene.splannequin.shot_path = str(shot)
     assert bpy.ops.splannequin.load_camera() == {"FINISHED"}
     fill(scene, shot, addon, contract)
@@ -50,7 +50,7 @@ def bring_in(scene, shot, addon):
 
 
 def rendered(path):
-    """[H, W, 3] what the scene renders at frame 6, through its compositor."""
+    """[H, W, 3]: frame 6 of the scene, rendered through its compositor."""
     scene = bpy.context.scene
     scene.frame_set(6)
     scene.render.filepath = str(path)
@@ -121,7 +121,7 @@ def test_two_shots_of_a_file_have_their_own_splats(full, scene, addon, contract,
 
 
 def add_matte(shot, contract, name):
-    """Writes what a take with one matte holds: its lasso, and pictures in place of its Cryptomattes."""
+    """Write a take's files for one matte: its lasso, and frames in place of its Cryptomattes; return their folder."""
     take = contract.TakeFolder(shot / "takes" / "freeze")
     take.cryptomattes.mkdir(parents=True)
     for frame in (5, 6, 7):
@@ -132,7 +132,7 @@ def add_matte(shot, contract, name):
 
 
 def matte_nodes(addon):
-    """(name, folder, first frame) of what each Cryptomatte node of the scene picks."""
+    """(name, folder, first frame) of each Cryptomatte node in the scene."""
     nodes = addon("compat").compositor_tree(bpy.context.scene).nodes
     return {
         (node.matte_id, str(Path(bpy.path.abspath(node.image.filepath)).resolve().parent), node.frame_start)
@@ -157,7 +157,7 @@ def test_the_node_of_a_matte_is_undone_and_done_again(full, scene, addon, contra
 
 
 def test_two_shots_of_a_file_have_their_own_mattes(full, scene, addon, contract, tmp_path):
-    """Of the same name, in takes of the same name; asked for again, each is there already."""
+    """The mattes and the takes have equal names. A second insertion reuses the existing node."""
     other = tmp_path / "other.splannequin"
     shutil.copytree(full, other)
     folders = {shot: add_matte(shot, contract, "him") for shot in (full, other)}

@@ -1,6 +1,6 @@
-"""Modules of the add-on that know no bpy, in any Python: the backend's here, Blender's in the add-on's leg.
+"""Fixtures for add-on modules that do not need bpy; they run in any Python: the backend's here, Blender's in CI.
 
-The package is loaded under the name that Blender gives an installed extension, and not registered.
+The package is loaded under the name that Blender gives an installed extension, and is not registered.
 """
 
 import importlib
@@ -29,7 +29,7 @@ def package() -> types.ModuleType:
 
 @pytest.fixture(scope="session")
 def addon(package: types.ModuleType) -> Callable[[str], types.ModuleType]:
-    """addon("process.jobs") is the add-on's module of that name."""
+    """addon(name): the add-on's module of that name, such as addon("process.jobs")."""
     return lambda name: importlib.import_module(f"{package.__name__}.splannequin_addon.{name}")
 
 

@@ -1,11 +1,11 @@
-"""Floor, origin and scale: the maths against float64 truth."""
+"""Maths of floor, origin and scale, compared with float64 ground truth."""
 
 import numpy as np
 import pytest
 
 
 def turned(seed: int) -> np.ndarray:
-    """A random rotation [3, 3]."""
+    """Random rotation [3, 3]."""
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.linalg.det(q)
@@ -67,7 +67,7 @@ def test_what_cannot_be_aligned_is_said(maths, contract):
 
 
 def test_the_nearest_point_under_the_mouse(maths):
-    places = np.array([[0, 0, -5], [1, 0, -5], [0, 0, 5.0]])  # the last is behind
+    places = np.array([[0, 0, -5], [1, 0, -5], [0, 0, 5.0]])  # the last point is behind the camera
     matrix = np.array([[1.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, -1, -0.2], [0, 0, -1, 0]])
     at, before = maths.seen(places, matrix, (200, 100))
     np.testing.assert_allclose(at[:2], [[100, 50], [120, 50]])

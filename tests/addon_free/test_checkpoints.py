@@ -1,4 +1,4 @@
-"""A paused run is asked for again with everything that it was begun with."""
+"""A paused run is resumed with all parameters that it was started with."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ ASKED_ELSEWHERE = {
     "extend": "of finished runs",
     "depth": "what the checkpoint says of its maps",
 }
-"""Fields that no stored configuration holds -> where they come from."""
+"""Map from the fields that no stored configuration holds to their source."""
 
 
 def test_every_number_of_a_training_is_asked_for_again(addon, contract):

@@ -1,4 +1,4 @@
-"""Blender says from where the launcher will fetch PyTorch, and leaves the choice to it."""
+"""Blender reports the source from which the launcher will fetch PyTorch; the launcher makes the choice."""
 
 import os
 from pathlib import Path
@@ -30,7 +30,7 @@ def test_launcher_and_add_on_know_one_rule(addon, nvidia_smi, tmp_path, monkeypa
         monkeypatch.setenv(TORCH_INDEX, variable)
     taken = environments.this_machines_index(system)
     said = environment.sources(system)
-    # Blender cannot wait for NVIDIA's tool: where that is there it takes the card for one that fits.
+    # Blender cannot wait for NVIDIA's tool; if the tool exists, Blender assumes a suitable GPU.
     doubt = system == "win32" and variable is None and card in (OLD_CARD, OLD_DRIVER)
     assert said == (BOTH if taken or doubt else OWN)
     if doubt:
@@ -39,7 +39,7 @@ def test_launcher_and_add_on_know_one_rule(addon, nvidia_smi, tmp_path, monkeypa
 
 @pytest.mark.parametrize("variable", [None, "", "https://somewhere.else/simple"])
 def test_the_launcher_is_left_to_choose(addon, tmp_path, monkeypatch, variable):
-    """What the add-on starts is told of an index only where somebody set the variable."""
+    """The child process gets a package index only if the user set the variable."""
     environment = addon("process.environment")
     monkeypatch.delenv(TORCH_INDEX, raising=False)
     if variable is not None:

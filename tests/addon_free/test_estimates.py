@@ -1,4 +1,4 @@
-"""What the presets say of themselves before they are run."""
+"""Estimates shown with the presets before they run."""
 
 import pytest
 
@@ -9,7 +9,7 @@ def run(**figures):
 
 @pytest.fixture
 def costs(addon, tmp_path):
-    """costs(runs, width) is {preset: cost} for a shot of that width, and the run that tells it."""
+    """costs(runs, width): ({preset: cost} for a shot of that width, the run that the estimate is based on)."""
 
     def call(runs, width=1280):
         state = addon("shot.shot_state").ShotState(tmp_path, {"width": width, "height": 720}, runs=runs)

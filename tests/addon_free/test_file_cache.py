@@ -1,4 +1,4 @@
-"""A shot that is looked at every second: files that did not change are not opened again, and what did is seen."""
+"""Reading a shot every second: unchanged files are not opened again, and changes are noticed."""
 
 import json
 import os
@@ -12,14 +12,17 @@ _listening = [False]
 
 
 def _note(event: str, arguments: tuple) -> None:
-    # `open` with an opener is told twice: by itself, and by `os.open`, which has no mode.
+    # `open` with an opener is audited twice: by itself, and by `os.open`, whose event has no mode.
     if _listening[0] and event == "open" and arguments[1] is not None and isinstance(arguments[0], str | os.PathLike):
         _opened.append(os.fsdecode(arguments[0]))
 
 
 @pytest.fixture
 def opened():
-    """opened(call) is (what it gives, the files it opened); an audit hook cannot be taken away, so there is one."""
+    """opened(call): (result of the call, names of the files that it opened).
+
+    An audit hook cannot be removed, so it is installed only once.
+    """
     if "hooked" not in sys.modules[__name__].__dict__:
         sys.addaudithook(_note)
         sys.modules[__name__].__dict__["hooked"] = True
@@ -37,7 +40,7 @@ def opened():
 
 @pytest.fixture
 def long_shot(shot) -> Path:
-    """The shot with all that is read of one: a run with a history, solved again since."""
+    """Shot with every file that is read: a run with a history, and a solve that is newer than the run."""
     run = shot / "runs" / "main"
     (run / "metrics.jsonl").write_text('{"seconds": 1.0, "heldout_psnr_db": 20.0}\n')
     (run / "config.json").write_text('{"solve": "another"}')
@@ -56,7 +59,7 @@ def test_what_did_not_change_is_not_opened_again(addon, long_shot, opened):
 
 
 def test_what_changed_is_seen_where_folders_have_no_date(addon, long_shot):
-    """As those of a FAT or exFAT disk under Windows, which keep the date that they were made on."""
+    """FAT and exFAT folders under Windows keep their creation date as modification date."""
     inventory = addon("shot.inventory")
     for name in ("runs/main/summary.json", "takes/freeze/take.json"):
         file = long_shot / name

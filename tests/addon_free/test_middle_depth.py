@@ -1,4 +1,4 @@
-"""The depth in the middle of a take's frame, from files that the backend's own writer made."""
+"""Depth at the centre of a take's frame, from files of the backend's own writer."""
 
 import shutil
 from pathlib import Path
@@ -15,13 +15,13 @@ def of_frame(addon):
 
 @pytest.mark.parametrize("frame", [5, 6, 7])
 def test_it_is_the_median_around_the_middle(of_frame, frame):
-    # Depth is frame + x / 16 + y, but beyond reach at the first pixel: see make_frames.py.
+    # Depth is frame + x / 16 + y, except for the first pixel, which has no depth: see make_frames.py.
     values = sorted(frame + x / 16 + y for y in range(12) for x in range(16) if (x, y) != (0, 0))
     assert of_frame(DATA / f"{frame:06d}.exr") == values[len(values) // 2]
 
 
 def test_overscan_is_counted(of_frame):
-    """Its picture is the same as that of frame 6, two pixels of which lie beyond the frame on each side."""
+    """The overscan file equals frame 6, but declares two pixels on the left and right as overscan."""
     assert of_frame(DATA / "overscan" / "000006.exr") == of_frame(DATA / "000006.exr")
 
 

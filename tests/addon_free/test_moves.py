@@ -1,4 +1,4 @@
-"""Camera moves: smoothing, timing and orbits against float64 truth."""
+"""Camera moves: smoothing, timing and orbits, compared with float64 ground truth."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ def moves(addon):
 
 
 def turned(axis, angle):
-    """[3, 3], Rodrigues."""
+    """Rotation matrix [3, 3] by Rodrigues' formula."""
     x, y, z = np.array(axis) / np.linalg.norm(axis)
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
 def path(count=80, shake=0.0, turn=1.2, seed=0):
-    """A walk past something, [F, 4, 4]: a hand's sway and shake on top."""
+    """Camera path [F, 4, 4] of a walk, with sway and tremble of a hand-held camera."""
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (count, 1, 1))
     for i, s in enumerate(np.linspace(0.0, 1.0, count)):
@@ -29,7 +29,7 @@ def path(count=80, shake=0.0, turn=1.2, seed=0):
 
 
 def dense(values, period):
-    """The smoother by its definition, with a general solver: values between the ends, float64."""
+    """Reference smoother, solved densely by its definition in float64; the ends stay fixed."""
     count = len(values)
     second = np.zeros((count - 2, count))
     for i in range(count - 2):
@@ -98,7 +98,7 @@ def test_a_stop_is_reached_held_and_left_without_a_kink(moves):
     assert timing.frames[0] == 10 and timing.frames[-1] == 90 and len(timing.frames) == 81 + 10 + 30 + 6
     pace = np.diff(timing.frames)
     assert (pace >= 0).all() and (pace <= 1 + 1e-12).all()
-    assert np.abs(np.diff(pace)).max() < 1.6 / 12  # smoothstep's steepest is 1.5 per its length
+    assert np.abs(np.diff(pace)).max() < 1.6 / 12  # smoothstep's steepest slope is 1.5 over its length
     still = np.flatnonzero(timing.frames == 50)
     assert len(still) == 31 and timing.held[still[0]] == 0.0 and timing.held[still[-1]] == 1.0
     assert np.allclose(pace[:29], 1.0) and np.allclose(pace[-29:], 1.0)
@@ -134,7 +134,7 @@ def test_an_orbit_keeps_its_distance_and_comes_back(moves):
     expected = turned(up, np.radians(40))
     np.testing.assert_allclose(round_it[30, :3, :3], expected @ poses[0, :3, :3], atol=1e-12)
     np.testing.assert_allclose(round_it[30, :3, 3], pivot + expected @ (poses[0, :3, 3] - pivot), atol=1e-12)
-    # The point stays where it is in the picture, also when the camera rises.
+    # The pivot stays at its place in the picture, also when the camera rises.
     risen = moves.orbit(poses, held, pivot, up, (np.radians(40), np.radians(-20)))
     seen = np.einsum("nij,nj->ni", risen[:, :3, :3].swapaxes(1, 2), pivot - risen[:, :3, 3])
     np.testing.assert_allclose(seen, seen[:1].repeat(61, 0), atol=1e-12)

@@ -1,4 +1,4 @@
-"""Frames of a folder by their numbers."""
+"""Frame files of a folder, found by number."""
 
 
 def test_numbers_ascend_and_other_files_are_passed_over(addon, tmp_path):

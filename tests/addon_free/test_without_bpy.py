@@ -1,4 +1,4 @@
-"""Which modules of the add-on need no Blender: they can be tested in a second, and a bpy may not creep into them."""
+"""Add-on modules that do not need Blender can be tested in a second; bpy must not be imported by them."""
 
 import subprocess
 import sys
@@ -32,7 +32,7 @@ for name in sys.argv[2:]:
 
 
 def imported(*names: str) -> subprocess.CompletedProcess[str]:
-    """A Python without Blender that imports modules of the add-on."""
+    """Import modules of the add-on in a Python without Blender."""
     command = [sys.executable, "-P", "-c", IMPORTS, str(ROOT / "splannequin_addon" / "run_in_bpy.py"), *names]
     return subprocess.run(command, capture_output=True, text=True)
 

@@ -1,4 +1,4 @@
-"""A shot with known truth: a textured wall of Gaussians, a patch on it that moves, a camera that travels."""
+"""A shot with known ground truth: a textured wall of Gaussians, a moving patch on it, and a moving camera."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FIRST = 101
 
 
 class Quiet:
-    """A reporter that remembers."""
+    """Reporter that records all events."""
 
     def __init__(self, cancel_at: tuple[str, float] | None = None):
         self.events: list[tuple] = []
@@ -57,7 +57,7 @@ class Quiet:
 
 @dataclass
 class World:
-    """The truth behind the tiny shot."""
+    """Ground truth of the tiny shot."""
 
     shot: Shot
     viewmats: torch.Tensor
@@ -68,14 +68,14 @@ class World:
     def at(self, time: float) -> dict[str, torch.Tensor]:
         """The Gaussians at a time in [0, 1]: the patch sways by 0.2 units.
 
-        A steady drift would not do: with a steady camera it looks like a patch at another depth.
+        A steady drift would be ambiguous: with a steadily moving camera it looks like a patch at another depth.
         """
         means = self.state["means"].clone()
         means[self.moving, 0] += 0.2 * math.sin(2 * math.pi * time)
         return {**self.state, "means": means}
 
     def image(self, frame: int, time: float) -> torch.Tensor:
-        """[H, W, 3] from the pose of a frame, at a time."""
+        """[H, W, 3]: view from the pose of a frame, at a time."""
         out = rasterize(
             **self.at(time),
             viewmats=self.viewmats[frame : frame + 1],
@@ -119,7 +119,7 @@ def build_world(root: Path) -> World:
 
 
 def paint_motion(world: World) -> None:
-    """Says where the patch is, as an artist paints it: at this size it travels too little for optical flow."""
+    """Paint motion mattes of the patch as an artist would: the patch moves too little for optical flow at this size."""
     for n in range(FRAMES):
         state = world.at(n / (FRAMES - 1))
         patch = rasterize(
@@ -178,14 +178,16 @@ def _write(world: World) -> None:
 
 @pytest.fixture(scope="session")
 def world(tmp_path_factory) -> World:
-    """The solved tiny shot and its truth; tests must not change it."""
+    """The solved tiny shot and its ground truth; tests must not change it."""
     return build_world(tmp_path_factory.mktemp("world"))
 
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """The tiny shot with one finished run `main` (auto, support) and a painted motion matte; tests may add takes, not
-    change the run."""
+    """The tiny shot with one finished run `main` (auto, support) and painted motion mattes.
+
+    Tests may add takes, but must not change the run.
+    """
     from torch_backend.contract import TrainParams
     from torch_backend.train import train_shot
 
@@ -197,8 +199,10 @@ def trained(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained_copy(trained, tmp_path_factory) -> World:
-    """The trained world with a copy of its shot, which the tests of one file may change: its takes and instants are
-    not those that other files count on."""
+    """The trained world with a copy of its shot, which the tests of one file may change.
+
+    Takes and instants of this copy do not affect other test files.
+    """
     world, _ = trained
     root = tmp_path_factory.mktemp("copy") / world.shot.root.name
     shutil.copytree(world.shot.root, root)
@@ -207,5 +211,5 @@ def trained_copy(trained, tmp_path_factory) -> World:
 
 @pytest.fixture(scope="session")
 def quiet():
-    """The class of a reporter that remembers."""
+    """Class of a reporter that records all events."""
     return Quiet

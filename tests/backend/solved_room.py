@@ -22,7 +22,7 @@ STEP = 2
 
 
 class Recorder(Reporter):
-    """Keeps events; cancels at the first progress of `cancel_at`."""
+    """Records events; cancels at the first progress of the stage `cancel_at`."""
 
     def __init__(self, cancel_at=None):
         self.warnings, self.steps, self.cancel_at, self.cancelled = [], [], cancel_at, False
@@ -40,7 +40,7 @@ class Recorder(Reporter):
 
 
 class Room:
-    """The inside of a box of 4 x 3 x 6 units, seen from within, with a textured block in it. y points down."""
+    """The inside of a textured box of 4 x 3 x 6 units with a textured block in it. y points down."""
 
     def __init__(self, seed=0):
         rng = np.random.default_rng(seed)
@@ -52,16 +52,17 @@ class Room:
             self.textures.append(np.clip(0.5 + 0.22 * octaves, 0.0, 1.0))
 
     def render(self, viewmat, K, radial=0.0, size=(WIDTH, HEIGHT)):
-        """[H, W, 3] uint8 from a [4, 4] world-to-camera pose through fx, fy, cx, cy and one radial coefficient."""
+        """[H, W, 3] uint8: view from a [4, 4] world-to-camera pose through fx, fy, cx, cy and one radial
+        coefficient."""
         x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
         distorted = np.stack([(x - K[2]) / K[0], (y - K[3]) / K[1]], axis=-1)
         ideal = distorted.copy()
-        for _ in range(30):  # fixed point of distorted = ideal (1 + k |ideal|^2)
+        for _ in range(30):  # fixed-point iteration of distorted = ideal (1 + k |ideal|^2)
             ideal = distorted / (1.0 + radial * (ideal**2).sum(-1, keepdims=True))
         return self.cast(viewmat, np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1))
 
     def cast(self, viewmat, rays):
-        """[H, W, 3] uint8: what is seen along rays [H, W, 3] of a camera's own axes."""
+        """[H, W, 3] uint8: picture along rays [H, W, 3] in camera axes."""
         size, rays = rays.shape[1::-1], rays.reshape(-1, 3) @ viewmat[:3, :3]
         origin = -viewmat[:3, :3].T @ viewmat[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -95,12 +96,12 @@ def _noise(rng, size, sigma):
 
 @functools.lru_cache(maxsize=1)
 def the_room():
-    """One room for all: its textures take a while."""
+    """Room shared by all tests, because making its textures takes time."""
     return Room()
 
 
 def look(position, yaw=0.0, pitch=0.0):
-    """[4, 4] world-to-camera of a camera at `position`, turned by yaw about y and pitch about x, radians."""
+    """[4, 4] world-to-camera pose at `position`, rotated by yaw about y and pitch about x, in radians."""
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     rotation = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]]) @ np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
     viewmat = np.eye(4)
@@ -110,7 +111,7 @@ def look(position, yaw=0.0, pitch=0.0):
 
 
 def handheld(count=COUNT):
-    """A step to the side with some sway: [count] world-to-camera poses."""
+    """[count] world-to-camera poses of a sideways step with some sway."""
     poses = []
     for t in np.linspace(0.0, 1.0, count):
         position = [-0.9 + 1.5 * t, 0.1 * np.sin(5 * t), 0.4 * np.sin(3 * t)]
@@ -119,7 +120,7 @@ def handheld(count=COUNT):
 
 
 def write_clip(folder, poses, noise=1.0, blurred=(), contrast=1.0):
-    """Renders PNG frames 101, 102, ... into `folder`, with sensor noise; `blurred` frames show next to nothing."""
+    """Render PNG frames 101, 102, ... into `folder`, with sensor noise; `blurred` frames have almost no detail."""
     room, rng = the_room(), np.random.default_rng(1)
     K = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     for i, viewmat in enumerate(poses):
@@ -132,7 +133,7 @@ def write_clip(folder, poses, noise=1.0, blurred=(), contrast=1.0):
 
 
 def solve_all(shot, config, report, cameras=""):
-    """As the job does, with optical flow alone: the result of the solve and of the search for what moves."""
+    """Result of the solve and of the motion search, run as by a job, with optical flow only."""
     solved = solve_shot(shot, config, report, cameras)
     return {**solved, **(motion_after_solve(shot, report, static_model=None) or {})}
 
@@ -147,7 +148,7 @@ class Solved:
 
 @pytest.fixture(scope="session")
 def solved(tmp_path_factory):
-    """A clip of 21 frames, every second one solved."""
+    """Clip of 21 frames, every second one solved."""
     folder = tmp_path_factory.mktemp("room")
     poses = handheld()
     clip = write_clip(folder, poses)
@@ -158,9 +159,9 @@ def solved(tmp_path_factory):
 
 @pytest.fixture
 def again(solved, tmp_path):
-    """A copy of the solved shot, and a model to solve it from again: quicker than from its pictures.
+    """Copy of the solved shot, and its COLMAP model. A solve from this model is faster than one from the pictures.
 
-    Its frames are as another lens would have left them.
+    Its frames are still distorted, as if another lens had been used.
     """
     shutil.copytree(solved.shot.solve / "colmap", tmp_path / "model")
     shot = Shot(shutil.copytree(solved.shot.root, tmp_path / "a.splannequin"))
@@ -171,10 +172,10 @@ def again(solved, tmp_path):
 
 @pytest.fixture(scope="session")
 def tools():
-    """What the tests of this folder build with."""
+    """Helpers for the tests of this folder."""
 
     def asked(folder, pictures, **changes):
-        """A worker's request and frames.json for `pictures`, written into a folder; no frames besides them."""
+        """A worker's request and frames.json for `pictures`, written into a folder without other frames."""
         (folder / "pictures").mkdir()
         names = [f"{n:06d}.png" for n in range(1, len(pictures) + 1)]
         for name, pixels in zip(names, pictures, strict=True):
@@ -185,7 +186,7 @@ def tools():
         return request, {"step": 1, "frames": rows}
 
     def fisheye_rays(focal, k1, size=(WIDTH, HEIGHT)):
-        """[H, W, 3] directions in which a fisheye of `size` looks."""
+        """[H, W, 3] ray directions of a fisheye of `size`."""
         x, y = np.meshgrid(np.arange(size[0]) + 0.5 - size[0] / 2, np.arange(size[1]) + 0.5 - size[1] / 2)
         away = np.hypot(x, y)
         angle = away / focal

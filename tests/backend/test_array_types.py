@@ -1,4 +1,4 @@
-"""The doors to NumPy and SciPy against what they stand for."""
+"""Typed access to NumPy and SciPy returns the same as the functions behind it."""
 
 import numpy as np
 

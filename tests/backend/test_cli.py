@@ -1,4 +1,4 @@
-"""The whole backend on a very small real clip, by its command line: files, figures, pixels; refusals in words."""
+"""The whole backend on a very small real clip, through its command line: files, figures, pixels, refusals."""
 
 import json
 import os
@@ -55,7 +55,7 @@ def test_summary_has_the_figures(frozen):
 
 
 def test_frozen_frames_look_like_their_plates(frozen):
-    """Nearly everything stands still in this clip: a frozen frame must show what its plate shows."""
+    """Almost everything in this clip is static, so a frozen frame must show what its plate shows."""
     output, summary, _ = frozen
     scores = []
     for frame in (2, 7, 13, 19):
@@ -170,7 +170,7 @@ def test_a_failed_import_leaves_no_empty_shot(tmp_path):
 
 
 def test_a_shot_of_another_clip_is_not_used_again(tmp_path, capsys):
-    """Nor is a copy of its own taken for another."""
+    """A copy of the shot's own clip is accepted."""
     shot, clips = tmp_path / "out" / "shot.splannequin", []
     for place in "ab":
         (tmp_path / place).mkdir()

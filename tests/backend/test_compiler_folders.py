@@ -1,4 +1,4 @@
-"""Folders that a compiler can open whatever the profile is called, and that Warp really compiles from them."""
+"""Folders that a compiler can open under any profile name, and that Warp really compiles in."""
 
 import os
 import shutil
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def warp_of(tmp_path: Path):
-    """warp_of(name): a package of that name with a header."""
+    """warp_of(name): creates a package of that name with a header."""
 
     def make(name: str) -> Path:
         package = tmp_path / name / "warp"
@@ -66,7 +66,7 @@ def test_a_copy_that_was_interrupted_is_made_anew(warp_of, tmp_path: Path):
 @pytest.mark.skipif(os.name == "nt", reason="owner and modes as POSIX has them")
 @pytest.mark.parametrize("whose", ["another user's", "open to all", "a link", "a file"])
 def test_a_folder_that_another_user_may_have_filled_is_not_taken(warp_of, tmp_path: Path, whose: str):
-    """What is compiled is loaded: who can write there runs code as this user."""
+    """Compiled code is loaded, so whoever can write there can run code as this user."""
     odd = warp_of("Jörg")
     places = {**environ(tmp_path), "PUBLIC": str(tmp_path / "public")}
     first = compiler_folders(odd, "1.0", places, odd, windows=True).kernels

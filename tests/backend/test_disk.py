@@ -1,4 +1,4 @@
-"""A disk that is full: a sentence and exit code 8, and what was finished is kept. On a small disk of the test's own."""
+"""A full disk gives a message and exit code 8, and finished work is kept. Tests mount a small disk."""
 
 import json
 import os
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def disk(tmp_path):
-    """disk(megabytes) mounts an empty disk of that size."""
+    """disk(megabytes): mounts an empty disk of that size."""
     mounted = []
 
     def mount(megabytes):
@@ -74,7 +74,7 @@ def test_a_checkpoint_that_does_not_fit_ends_the_job_in_words(world, disk):
     assert (shot.run("main") / "checkpoint.safetensors").read_bytes() == kept
     assert not list(shot.root.rglob("*.tmp*")), "nothing half written is left"
 
-    (folder / "ballast").write_bytes(bytes(1 << 20))  # room for words, not for a checkpoint
+    (folder / "ballast").write_bytes(bytes(1 << 20))  # room for logs, not for a checkpoint
     fill_to = shutil.disk_usage(folder).free - (4 << 20)
     with open(folder / "more", "wb") as more:
         more.write(bytes(max(0, fill_to)))
@@ -98,9 +98,9 @@ def test_pictures_and_videos_are_whole_or_not_there(disk):
 
 @pytest.mark.parametrize("left", [0, 8192])
 def test_a_full_kernel_cache_is_named_and_not_the_take(disk, tmp_path, left):
-    """A real child, whose cache of kernels is a disk without room: compiling ends in words that say which folder.
+    """In a real child process, the kernel cache is on a full disk: the error message names its folder.
 
-    With room for its text, and none for what is made of that, LLVM would end the process.
+    If the disk had room for the source but not for the compiled code, LLVM would abort the process.
     """
     folder = disk(4)
     (folder / "room").write_bytes(bytes(left))

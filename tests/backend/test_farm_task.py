@@ -1,4 +1,4 @@
-"""Tasks of a farm's job: on another folder layout, by the engine's path mapping; and what they say when they fail."""
+"""Tasks of a farm job on another folder layout with path mapping, and their failure messages."""
 
 import json
 import os
@@ -20,7 +20,7 @@ PLAIN = ("--develop", "off", "--detail", "off", "--no-grain")
 
 @pytest.fixture(scope="module")
 def submitted(trained, tmp_path_factory):
-    """The trained shot on the computer that submits, and the job's folder."""
+    """Folder with the trained shot on the submitting computer, and the exported job."""
     world, _ = trained
     home = tmp_path_factory.mktemp("artist")
     shutil.copytree(world.shot.root, home / "shots" / "tiny.splannequin")
@@ -67,7 +67,7 @@ def test_a_template_of_one_layout_runs_on_another(submitted, tmp_path):
 
 
 def test_a_task_that_only_hands_on_to_blender_loads_no_torch():
-    """It takes longer to load than a part takes to bake."""
+    """Loading torch takes longer than baking a part."""
     seen = "import sys, torch_backend.farm_task; sys.exit(int('torch' in sys.modules))"
     assert (
         subprocess.run([sys.executable, "-P", "-c", seen], env={**os.environ, "PYTHONPATH": str(ROOT)}).returncode == 0
@@ -75,7 +75,7 @@ def test_a_task_that_only_hands_on_to_blender_loads_no_torch():
 
 
 def test_what_a_task_says_and_its_exit_status_reach_the_engine(tmp_path):
-    """It ends at once, past what Python does at its end."""
+    """The process exits immediately, without Python's shutdown."""
     words = ["farm-task", "solve", "--shot", str(tmp_path / "s"), "--request", str(tmp_path / "none.json")]
     command = [sys.executable, "-P", "-m", "torch_backend", *words]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
@@ -97,7 +97,7 @@ def imported_shots(tmp_path):
 
 @pytest.fixture
 def task(submitted, tmp_path, capsys):
-    """task(step, *words) runs a task of the job in this process: (exit code, lines for the engine)."""
+    """task(step, *words): runs a task of the job in this process; returns (exit code, lines for the engine)."""
     template = json.loads((submitted / "job" / "template.json").read_text())
 
     def run(step, *words):
@@ -127,7 +127,7 @@ def test_a_request_that_is_none_is_said(submitted, tmp_path, capsys):
 
 
 def test_a_file_that_cannot_grow_is_said_without_a_traceback(submitted, tmp_path):
-    """Linux alone: a limit on the size of each file, as of a full disk."""
+    """Linux only: a limit on file sizes acts like a full disk."""
     resource = pytest.importorskip("resource")
     request = {"version": 1, "name": "tiny", "amounts": {}, "takes": {"104": "a"}, "first": 101, "last": 102}
     (tmp_path / "request.json").write_text(json.dumps({**request, "freeze": {"develop": "off", "detail": "off"}}))

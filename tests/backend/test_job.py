@@ -1,4 +1,4 @@
-"""Jobs: events in order, statuses that are true, cancellation, errors in words. Real files, real processes."""
+"""Jobs: ordered events, correct status, cancellation, error messages. Real files, real processes."""
 
 import json
 import os
@@ -28,7 +28,7 @@ def status_of(folder):
 
 
 def run_with(shot, monkeypatch, station):
-    """Runs an import job whose station is `station`: the job machinery is what is under test."""
+    """Run an import job with `station` as its station, to test the job machinery."""
     monkeypatch.setitem(job.RUNNERS, "import", station)
     folder = job.new_job(shot, "import", contract.ImportParams(source="x"))
     return folder, job.run_job(folder)
@@ -102,7 +102,7 @@ def test_errors_become_a_sentence(shot, monkeypatch, error, code, word):
 
 
 def test_what_a_user_can_put_right_is_a_value_error_to_whoever_tries(shot):
-    """Readers of settings try values; a job, and a command, say them to the user."""
+    """Readers of settings catch ValueError; jobs and commands show the message to the user."""
     with pytest.raises(ValueError, match="no field"):
         contract.from_dict(contract.ImportParams, {"sauce": "x"})
     with pytest.raises(FileNotFoundError, match=r"no shot\.json") as missing:
@@ -139,7 +139,7 @@ def test_who_listens_no_more_ends_no_job_without_its_end(shot, monkeypatch, erro
 
 
 def test_a_package_that_the_environment_lacks_is_no_bug(shot, monkeypatch):
-    """Half of a set-up, or a package that somebody removed."""
+    """The set-up is incomplete, or someone removed the package."""
 
     def station(shot, params, report):
         import a_package_that_is_not_there  # noqa: F401  # pyright: ignore
@@ -152,7 +152,7 @@ def test_a_package_that_the_environment_lacks_is_no_bug(shot, monkeypatch):
 
 
 def test_a_package_that_is_there_and_cannot_be_loaded_is_no_bug_either(shot, monkeypatch, tmp_path):
-    """A library of the system lacks, or a package needs another version of one beside it."""
+    """A system library is missing, or another package has the wrong version."""
     (tmp_path / "a_broken_package.py").write_text("raise ImportError('libx.so.1: cannot open shared object file')")
     monkeypatch.syspath_prepend(tmp_path)
 
@@ -191,7 +191,7 @@ def test_wrong_parameter_is_named(shot):
 
 
 def test_child_process_reports_an_unreadable_clip(shot, tmp_path):
-    """The command that Blender starts, on a file that is no video: exit code, one sentence, no traceback."""
+    """The command that Blender starts, with a file that is not a video: exit code, one sentence, no traceback."""
     clip = tmp_path / "notes.mp4"
     clip.write_text("not a video")
     folder = job.new_job(shot, "import", contract.ImportParams(source=str(clip)))

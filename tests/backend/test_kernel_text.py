@@ -1,4 +1,4 @@
-"""Kernel files: what of them is compiled."""
+"""The parts of kernel files that are compiled."""
 
 import re
 from pathlib import Path

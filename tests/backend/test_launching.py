@@ -1,5 +1,7 @@
-"""What a recorded launch takes anew each time: threads, numbers, structures; that threads do not share it; and what the
-workers of a processor's stage do together."""
+"""Recorded launches: threads, numbers and structures that are refreshed each time; threads do not share them.
+
+Also tests the workers that run a CPU stage together.
+"""
 
 import ctypes
 import os
@@ -26,7 +28,7 @@ from torch_backend.native import (
 
 
 def adding():
-    """out[i] += value, by a kernel of its own."""
+    """Kernel that computes out[i] += value."""
     initialised_warp()
 
     def add(out: wp.uint64, value: wp.float32, tid: wp.int32): ...
@@ -177,13 +179,13 @@ def test_an_interrupt_is_raised_when_no_worker_is_at_the_block_any_more():
 
 
 def test_a_caller_does_itself_what_no_worker_has_begun():
-    """Workers that are late, or were not woken, hold nobody up."""
+    """Late or sleeping workers must not delay the caller."""
     crew, done, hold = native._Crew(), [], threading.Event()
 
     def busy(_address, _stage, _worker):
         hold.wait()
 
-    crew.ask(native._Ask(busy, 0, 0, 1), 1)  # its one thread is at another's
+    crew.ask(native._Ask(busy, 0, 0, 1), 1)  # its only thread is busy with another request
     ask = native._Ask(lambda _address, _stage, worker: done.append(worker), 0, 0, 5)
     ask.carry_out(crew, 1)
     assert sorted(done) == [0, 1, 2, 3, 4] and not ask.errors
@@ -191,8 +193,10 @@ def test_a_caller_does_itself_what_no_worker_has_begun():
 
 
 def interrupted_at(step, work):
-    """Does some work with a Ctrl-C before the nth instruction of `native` in this thread, at which the others get time
-    to come as far as they can. False if the work has fewer."""
+    """Run `work` with a Ctrl-C before the `step`-th instruction of `native` in this thread; False if there are fewer.
+
+    Other threads get time to proceed before the interrupt.
+    """
     passed = 0
 
     def look(frame, event, _arg):
@@ -218,7 +222,7 @@ def interrupted_at(step, work):
 
 
 def test_no_interrupt_leaves_a_worker_at_the_block():
-    """Wherever it comes: the memory that the block tells of is given back as soon as the caller is left."""
+    """For every moment of the interrupt: the block's memory is freed as soon as the caller returns."""
     main, at_block = threading.get_ident(), []
 
     def run(_address, _stage, worker):
@@ -227,7 +231,7 @@ def test_no_interrupt_leaves_a_worker_at_the_block():
             time.sleep(0.02)
             at_block.remove(worker)
 
-    run_workers(lambda *_: time.sleep(0.01), Block(), 0, 3)  # its threads are there
+    run_workers(lambda *_: time.sleep(0.01), Block(), 0, 3)  # starts its threads
     step = 1
     while interrupted_at(step, lambda: run_workers(run, Block(), 0, 3)):
         assert not at_block, f"after {step} instructions"
@@ -236,7 +240,7 @@ def test_no_interrupt_leaves_a_worker_at_the_block():
 
 
 def test_a_caller_that_gets_no_threads_does_it_all_itself(monkeypatch):
-    """Threads are limited by the system, and none begins any more while Python ends."""
+    """The system limits the number of threads, and no thread can start while Python shuts down."""
 
     def start(_self):
         raise RuntimeError("can't start new thread")
@@ -251,7 +255,7 @@ def test_a_caller_that_gets_no_threads_does_it_all_itself(monkeypatch):
 
 
 def test_workers_may_have_workers():
-    """A piece that is made of pieces waits for nobody who waits for it."""
+    """A task that runs workers itself must not deadlock."""
     done = []
 
     def inner(_address, stage, worker):

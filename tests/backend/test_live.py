@@ -1,4 +1,4 @@
-"""A live session as Blender holds one: a child process, views in, frames out."""
+"""A live session as used by Blender: a child process that receives views and sends frames."""
 
 import dataclasses
 import io
@@ -37,7 +37,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def session(trained):
-    """The child after its `ready`, and that message. Nobody may leave an answer unread."""
+    """The child process after its `ready` message, and that message. Tests must read every answer."""
     world, _ = trained
     child = start(world.shot.root)
     header, body = read_message(child.stdout)
@@ -122,7 +122,7 @@ def test_a_view_is_the_frame_that_a_take_renders(session, trained, quiet):
     seen = want.rgba[..., 3] > 0.99
     assert seen.mean() > 0.9
     assert np.abs(rgba[..., :3] - linear_to_srgb(want.rgba[..., :3]))[seen].max() < 4e-3
-    # A view has the splats' own depth; a take's is measured (`surface_depth.py`).
+    # A view has the depth of the splats; a take's depth is measured (`surface_depth.py`).
     assert np.median(np.abs(depth[seen] / want.depth[seen] - 1)) < 0.02
     assert bool((depth[rgba[..., 3] == 0] == np.float32(NO_DEPTH)).all())
     tinted, _ = picture(ask(session[0], view_of(world, 105, 112, show="guesses", exposed_like=105.0, develop=False)))
@@ -139,12 +139,12 @@ def test_a_view_at_rest_is_the_frame_that_a_take_makes_of_plates(session, traine
     freeze_shot(world.shot, FreezeParams(take="plates", t_star=112, first=105, last=105), quiet())
     want = read_frozen_exr(world.shot.take("plates") / "000105.exr")
     asked = view_of(world, 105, 112.2, exposed_like=105.0)
-    asked["viewmat"] = [v + 1e-6 for v in asked["viewmat"]]  # as from Blender
+    asked["viewmat"] = [v + 1e-6 for v in asked["viewmat"]]  # rounding as from Blender
     splats, made = (picture(ask(session[0], {**asked, "detail": detail})) for detail in (False, True))
     shown = linear_to_srgb(want.rgba[..., :3]).clip(0, 1)
     difference = np.abs(made[0][..., :3] - shown).max(-1)
     assert np.quantile(difference, 0.9) < 4e-3
-    assert difference.max() < 0.05  # where it is filled: fewer plates are looked at
+    assert difference.max() < 0.05  # filled areas differ, because fewer plates are used
     assert np.abs(made[0][..., 3] - want.rgba[..., 3]).max() < 1 / 255
     seen = want.rgba[..., 3] > 0.99
     np.testing.assert_array_equal(made[1], splats[1])
@@ -166,7 +166,7 @@ def test_a_view_of_any_size_is_made_of_plates(trained, size):
     splats, made = (picture(session.draw(LiveView(**asked, detail=detail)))[0] for detail in (False, True))
     assert made.shape == (height, width, 4)
     covered = splats[..., 3] > 0.99
-    # The same view: the splats know the place, and are soft in it.
+    # The same view: the splats are at the right place, but soft.
     assert np.abs(made - splats)[covered].mean() < 0.03
     assert np.abs(made - splats)[covered].max() > 1e-3
 
@@ -189,7 +189,7 @@ def test_a_view_of_plates_gives_way_to_a_newer_one_and_is_made_after_it(session,
         assert header["kind"] == "frame"
         came.append(header["seq"])
     write_message(child.stdin, {**view_of(world, 105, 108), "view": 9, "seq": 9})
-    while came[-1] != 9:  # what was given up is not made after all
+    while came[-1] != 9:  # an abandoned view is not drawn later
         came.append(read_message(child.stdout)[0]["seq"])
     assert len(set(came)) == len(came)
     assert came.index(5) < max(came.index(1), came.index(4))

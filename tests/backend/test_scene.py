@@ -51,7 +51,7 @@ def test_holdout_never_takes_the_ends():
 
 
 def test_intrinsics_follow_the_image_size():
-    """A pixel centre at +0.5 stays where it is in the picture."""
+    """A pixel centre at +0.5 stays at the same place in the picture."""
     K = torch.tensor([[[60.0, 0, 31.0], [0, 50.0, 25.0], [0, 0, 1]]])
     small = resize_intrinsics(K, 64, 48, 32, 12)
     torch.testing.assert_close(small[0], torch.tensor([[30.0, 0, 15.5], [0, 12.5, 6.25], [0, 0, 1]]))

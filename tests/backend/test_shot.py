@@ -1,4 +1,4 @@
-"""The shot folder: atomic writes, versions, names, disk."""
+"""The shot folder: atomic writes, versions, names, disk space."""
 
 import errno
 import json
@@ -47,7 +47,7 @@ def test_failed_write_leaves_the_old_file_and_no_debris(tmp_path):
 
 
 def test_a_file_that_is_being_written_has_hardly_a_longer_path(tmp_path):
-    """Windows takes no path of more than 260 letters, and an artist's projects lie deep."""
+    """Windows limits paths to 260 characters, and artists' projects have long paths."""
     names = set()
     for _ in range(100):
         with atomic_path(tmp_path / "checkpoint.safetensors") as beside:
@@ -57,7 +57,7 @@ def test_a_file_that_is_being_written_has_hardly_a_longer_path(tmp_path):
 
 
 def test_what_went_wrong_in_a_write_is_told_though_its_rest_cannot_be_removed(tmp_path):
-    """As on Windows, where the writer of a picture has its file open still."""
+    """On Windows, the writer of a picture may still have its file open."""
     with pytest.raises(Cancelled), atomic_path(tmp_path / "a.mp4") as beside:
         beside.mkdir()
         raise Cancelled
@@ -65,7 +65,7 @@ def test_what_went_wrong_in_a_write_is_told_though_its_rest_cannot_be_removed(tm
 
 @pytest.mark.parametrize("refusals, windows, done", [(3, True, True), (4, True, False), (1, False, False)])
 def test_what_windows_refuses_for_a_moment_is_tried_anew(refusals, windows, done):
-    """Elsewhere a refusal is one for good."""
+    """On other systems, a refusal is final."""
     left = [PermissionError(errno.EACCES, "held")] * refusals
 
     def act() -> str:
@@ -127,7 +127,7 @@ def test_a_folder_behind_a_link_is_not_the_shots_own(tmp_path):
 
 
 def test_two_hosts_with_one_process_number_do_not_meet(tmp_path):
-    """Containers of a farm often have small numbers; parts of a job may run twice, also at once."""
+    """Containers of a farm often have small process ids, and parts of a job may run twice at once."""
     path = tmp_path / "000001.exr"
     with atomic_path(path) as first, atomic_path(path) as second:
         first.write_bytes(b"1")
@@ -137,7 +137,7 @@ def test_two_hosts_with_one_process_number_do_not_meet(tmp_path):
 
 @pytest.mark.parametrize("hours", [-3, 3])
 def test_files_are_swept_by_the_clock_of_their_disk(tmp_path, monkeypatch, hours):
-    """This computer's clock may be hours off that of the server whose disk it writes to."""
+    """This computer's clock may differ by hours from that of the file server."""
     names = {age: f".{age}.{'a' * 12}.tmp.exr" for age in (0, 30, 90)}
     for minutes, name in names.items():
         (tmp_path / name).write_bytes(b"half")
@@ -165,7 +165,8 @@ def test_nothing_is_written_through_links_of_a_shot_from_anywhere(tmp_path):
 
 
 def test_what_killed_writers_leave_is_swept_and_nothing_else(tmp_path):
-    """Of this version and of earlier ones, which named it by the process; a writer at work is younger than an hour."""
+    """Covers this version and earlier ones, which named temporary files by process id. Files younger than an hour
+    stay."""
     names = [".checkpoint.4711.tmp.safetensors", f".000001.{'a' * 32}.tmp.exr"]
     kept = [".mine.tmp.png", "checkpoint.tmp.safetensors", ".notes.tmp", f".young.{'b' * 32}.tmp.exr"]
     for name in names + kept:

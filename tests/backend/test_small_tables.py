@@ -1,4 +1,4 @@
-"""Small tables: sent once, and what they should be."""
+"""Small tables: sent to the device once, with correct contents."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""What cannot be done is said in one sentence, before the work, with exit code 2: a table, by the real command line."""
+"""Impossible requests are refused with one sentence before any work, with exit code 2, on the real command line."""
 
 import dataclasses
 import json
@@ -24,7 +24,7 @@ LONG = "x" * 300
 
 @pytest.fixture(scope="module")
 def place(trained, tmp_path_factory):
-    """A folder with a trained shot `s`, a plain file `file`, and broken camera paths."""
+    """Folder with a trained shot `s`, a plain file `file`, and broken camera paths."""
     world, _ = trained
     folder = tmp_path_factory.mktemp("words")
     ignored = shutil.ignore_patterns("jobs", "takes")
@@ -37,10 +37,10 @@ def place(trained, tmp_path_factory):
 
 
 def said(capsys, place, *arguments):
-    """(exit code, what was printed) of a command; {} stands for the folder `place`."""
+    """(exit code, printed text) of a command; {} stands for the folder `place`."""
     try:
         code = main([a.replace("{}", str(place)) for a in arguments])
-    except SystemExit as stop:  # the parser's own
+    except SystemExit as stop:  # raised by the parser
         code = stop.code
     printed = capsys.readouterr()
     return code, printed.out + printed.err

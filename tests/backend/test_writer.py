@@ -1,4 +1,4 @@
-"""One writer per shot: real jobs in real processes, stopped, killed, and all at once."""
+"""One writer per shot: real jobs in real processes, stopped, killed, and run at the same time."""
 
 import dataclasses
 import json
@@ -65,7 +65,7 @@ def put_lock(shot, writer: Writer) -> None:
 
 
 def test_a_job_begun_as_soon_as_the_one_before_told_its_end_waits_for_its_lock(shot):
-    """A status is written before the lock is given back: whoever reads it may begin the next step in between."""
+    """The status is written before the lock is released, so a reader may start the next step in between."""
     folder = job.new_job(shot, "import", contract.ImportParams())
     now, pid = time.time(), os.getpid()
     status = contract.Status("import", "running", pid, now, 0.0, now, host=contract.computer_name())
@@ -84,7 +84,7 @@ def test_the_second_job_is_refused_in_words_and_the_first_goes_on(shot):
     first, one = begin_import(shot, 24)
     try:
         writer = wait_for_lock(shot, first)
-        os.kill(first.pid, signal.SIGSTOP)  # it works on for as long as we look
+        os.kill(first.pid, signal.SIGSTOP)  # keeps it working during the checks
         assert (writer.pid, writer.kind, writer.job) == (first.pid, "import", one.name)
         second, other = begin_import(shot)
         assert second.wait() == ExitCode.USAGE and second.communicate()
@@ -180,7 +180,7 @@ def test_a_lock_that_is_a_link_to_nowhere_is_named(shot, tmp_path, monkeypatch):
 
 
 def test_a_job_whose_shot_was_taken_over_ends_and_leaves_it_to_the_other(shot, monkeypatch):
-    """It was suspended, or cut off from its disk, for longer than others wait for a sign of life."""
+    """The job was suspended, or lost its disk, for longer than the heartbeat timeout."""
     monkeypatch.setattr(contract, "HEARTBEAT_SECONDS", 0.02)
     other = dataclasses.replace(dead_writer(), host=ELSEWHERE)
 
@@ -291,7 +291,7 @@ def test_folders_of_a_shot_that_is_worked_on_are_made_only_inside_it(tmp_path):
 
 
 def foreign_job(shot) -> tuple[Writer, Path]:
-    """A lock of another computer, and its job's folder."""
+    """A lock of another computer, and the folder of its job."""
     folder = job.new_job(shot, "train", contract.TrainParams())
     put_lock(shot, Writer(ELSEWHERE, 77, 1.0, "train", folder.name, time.time()))
     return contract.read_writer(shot.root), folder
@@ -303,13 +303,13 @@ def beat(folder: Path, at: float) -> None:
 
 
 def test_a_patient_writer_takes_the_shot_from_one_that_fell_silent_elsewhere_and_from_no_other(shot):
-    """By this computer's clock alone: the other's may be an hour off."""
+    """The timeout only uses this computer's clock, because the other clock may be an hour off."""
     _, folder = foreign_job(shot)
     told: list[str] = []
 
     def waiting(why: str) -> None:
         told.append(why)
-        if len(told) < 8:  # it lives: beats are of no clock of ours
+        if len(told) < 8:  # it is alive, with heartbeats by another clock
             beat(folder, 1e6 + len(told))
 
     with patient_writer(shot.root, "freeze", "mine", waiting, silence=0.4) as mine:

@@ -1,4 +1,4 @@
-"""The depth bench: what it calls an occlusion boundary, and what its figures are of known depth."""
+"""The depth benchmark: detection of occlusion boundaries, and figures of known depth errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.depth import REGIONS, Pooled, add_frame, mean_of, occlusion_edge
 
 
 def floor_and_box() -> tuple[Tensor, Tensor]:
-    """(depth [40, 60] of a floor that runs away to 20 m, with a box 1.5 m off before it; bool mask of the box)."""
+    """(depth [40, 60] of a floor that recedes to 20 m with a box at 1.5 m in front, bool mask of the box)."""
     rows = torch.arange(40.0) + 2.0
     depth = (80.0 / rows)[:, None].repeat(1, 60)
     box = torch.zeros(40, 60, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""Figures of plate detail, on pictures of which the right answer is known."""
+"""Figures of plate detail, on pictures with known results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEIGHT, WIDTH = 120, 160
 
 @pytest.fixture(scope="module")
 def scene() -> torch.Tensor:
-    """[H, W, 3] with structure in every direction, as a photograph has it."""
+    """[H, W, 3] picture with structure in every direction, like a photograph."""
     rng = np.random.default_rng(4)
     noise = gaussian_filter(rng.normal(size=(HEIGHT, WIDTH, 3)), (2, 2, 0))
     return torch.from_numpy((0.5 + 0.15 * noise / noise.std()).clip(0.02, 0.98)).float()
@@ -36,13 +36,13 @@ def scene() -> torch.Tensor:
 
 @pytest.fixture
 def grid() -> torch.Tensor:
-    """[H, W, 2] places of a picture's own pixels."""
+    """[H, W, 2] pixel centres of a picture."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     return torch.stack([x, y], dim=2)
 
 
 def moved(image: torch.Tensor, x: float) -> torch.Tensor:
-    """A picture that was moved to the right."""
+    """Picture shifted to the right by `x` pixels."""
     return torch.from_numpy(shift(image.numpy(), (0, x, 0), order=3, mode="nearest")).float().clamp(0, 1)
 
 
@@ -79,7 +79,7 @@ def test_the_gradient_of_a_slope_is_its_slope():
 
 def test_still_is_far_from_movers_and_known():
     matte = torch.zeros(40, 60)
-    matte[:, :10] = 1.0  # moves
+    matte[:, :10] = 1.0  # moving
     matte[:, 50:] = 128 / 255  # unknown
     still = still_pixels(matte)
     assert not still[:, :18].any() and still[:, 18:50].all() and not still[:, 50:].any()
@@ -118,7 +118,7 @@ def test_what_another_surface_hides_is_not_seen_again(grid):
 
 
 def test_a_mover_in_a_frozen_shot_is_caught_and_an_exposure_is_not(scene, grid):
-    """The camera pans by 5.4 pixels; where it is honest nothing else moves, where it is not a hand goes 3 on."""
+    """The camera pans by 5.4 pixels. The honest picture has no other motion; in the other, a hand moves by 3 more."""
     panned = grid + torch.tensor([5.4, 0.0])
     both = inside(panned, WIDTH, HEIGHT, 4.0)
     honest = (moved(scene, 5.4) * 0.93).clamp(0, 1)
@@ -142,7 +142,7 @@ def test_a_mover_in_a_frozen_shot_is_caught_and_an_exposure_is_not(scene, grid):
 
 
 def test_light_that_wanders_over_a_wall_is_no_motion(scene):
-    """A poster on a plain wall, seen twice from one place, one side of the picture 7 % darker the second time."""
+    """A poster on a plain wall, seen twice from one place; the second time, one side of the picture is 7 % darker."""
     wall = torch.full((240, 320, 3), 0.6)
     wall[60:180, 80:240] = scene
     y, x = torch.meshgrid(torch.arange(240) + 0.5, torch.arange(320) + 0.5, indexing="ij")
@@ -155,7 +155,7 @@ def test_a_flat_wall_is_not_judged_by_flow(scene):
     flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
     flat += torch.randn(flat.shape, generator=torch.Generator().manual_seed(0)) * 1.5 / 255
     edge = torch.zeros(HEIGHT, WIDTH, 3)
-    edge[:, 80:] = 1.0  # structure in one direction alone: flow along it is a guess
+    edge[:, 80:] = 1.0  # structure in only one direction: flow along it is a guess
     assert textured(flat).float().mean() < 0.001 and not textured(edge)[20:-20].any()
     assert textured(scene).float().mean() > 0.8
 

@@ -1,4 +1,4 @@
-"""Kind `held`: changes that happen once, the region that shows another state, and motion blur. Seed 0 of `tiny`."""
+"""Scenes of kind `held`: changes that happen once, the region in another state, and motion blur. Seed 0 of `tiny`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def held(tmp_path_factory) -> Path:
 
 
 def maps(folder: Path, time: int, pose: int, window: int = 1) -> dict[str, np.ndarray]:
-    """Things at a frame from the camera of another, and the region `held`, at `FINER` times the size of `tiny`."""
+    """Masks of the things at a frame from another frame's camera, and the region `held`, at `FINER` times `tiny`'s
+    size."""
     geometry, views = Geometry.load(folder), views_of(SEED, TINY, HELD)
     width, height = FINER * TINY.width, FINER * TINY.height
     own, other = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
@@ -45,7 +46,7 @@ def maps(folder: Path, time: int, pose: int, window: int = 1) -> dict[str, np.nd
 
 
 def test_what_is_held_stands_still_before_and_after_its_change(held):
-    """Seed 0 of `tiny`: an arm and a hand change between frames 2 and 6, a person leaves between 0 and 8."""
+    """Seed 0 of `tiny`: an arm and a hand change between frames 2 and 6, a person leaves between frames 0 and 8."""
     plan = json.loads((held / "plan.json").read_text())
     assert [each["name"] for each in plan[HELD]] == list(CAST[SEED])
     geometry = Geometry.load(held)
@@ -63,21 +64,21 @@ def test_what_is_held_stands_still_before_and_after_its_change(held):
 
 
 def test_the_region_held_is_where_a_still_plate_shows_another_state(held):
-    """t* 8, after every change, from the poses 0 (before) and 10 (after)."""
+    """t* is 8, after every change; the poses are 0 (before) and 10 (after)."""
     before, after = (maps(held, 8, pose, window=0) for pose in (0, 10))
     assert set(CAST[SEED]) | {HELD} == {name.removeprefix(THING) for name in before if name.startswith(THING)}
     assert not after[THING + HELD].any()
     region, arm = before[THING + HELD], before[THING + "raised"]
-    assert region[arm].mean() > 0.6  # the plate shows the panel there: the arm was down
-    left = maps(held, 0, 0)[THING + "leaving"]  # where the plate shows the one who has left by t* 8
+    assert region[arm].mean() > 0.6  # the plate shows the panel there, because the arm was down
+    left = maps(held, 0, 0)[THING + "leaving"]  # area of the person who has left by t* 8, in the plate
     assert left.sum() > 300 and region[left].mean() > 0.8 and not before[THING + "leaving"][left].any()
-    # She starts to walk at once: with a frame around the plate looked at, hers are pixels in which something moves.
+    # She starts to walk at once: if neighbouring frames are considered, her pixels count as moving.
     assert maps(held, 8, 0)[THING + HELD][left].mean() < 0.1
     assert region.sum() < 2.5 * (arm | left | before[THING + "resting"]).sum()
 
 
 def test_what_a_plate_shows_in_the_middle_of_its_change_is_not_in_the_region_held(held):
-    """At frame 4 the arm and the hand move, and one person walks: flow sees that."""
+    """At frame 4 the arm and the hand move and a person walks, which flow detects."""
     region, shown = maps(held, 8, 4)[THING + HELD], maps(held, 4, 4)
     for name in CAST[SEED]:
         assert shown[THING + name].sum() > 50 and region[shown[THING + name]].mean() < 0.15
@@ -109,12 +110,12 @@ def test_every_change_is_over_before_the_next_instant(size):
 
 def test_the_cast_has_every_role_and_no_head_turns_where_no_column_hides_it():
     assert all(len(set(roles)) == 3 for roles in CAST) and set().union(*CAST) == set(ROLES)
-    assert set().union(*CAST[3:9]) == set(ROLES)  # the seeds that reports are accepted on
+    assert set().union(*CAST[3:9]) == set(ROLES)  # the seeds that reports accept
     assert all(seed % 4 in (2, 3) for seed in range(10) if "turned" in CAST[seed])
 
 
 def test_behind_the_truth_everything_is_in_its_other_state(held, tmp_path):
-    """The rendered pictures: at t* 8 one person has left; the other picture shows her where she stood."""
+    """In rendered pictures: at t* 8 a person has left; the other picture shows her at her former place."""
     folder = tmp_path / "rendered"
     shutil.copytree(held, folder)
     plan = json.loads((folder / "plan.json").read_text())
@@ -129,4 +130,4 @@ def test_behind_the_truth_everything_is_in_its_other_state(held, tmp_path):
     left[:, :] &= behind.sum(axis=2) > 0  # inside the box
     assert left.sum() > 20
     assert np.abs(truth - behind).mean(axis=2)[left].mean() > 20
-    assert np.abs(truth - frame).mean() < 1.0  # nothing changes at t*: only what sways differs
+    assert np.abs(truth - frame).mean() < 1.0  # nothing changes at t* except sway

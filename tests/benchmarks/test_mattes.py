@@ -1,4 +1,4 @@
-"""The benchmark of mattes: its lassos are as sloppy as they say, and people are found in the scene's triangles."""
+"""The benchmark of mattes: lassos have the requested errors, and people are found in the scene's triangles."""
 
 import json
 
@@ -20,7 +20,7 @@ def test_a_lassos_corners_are_no_farther_off_than_it_is_sloppy():
     (drawn,), (straight,) = lassos(mask, 4.0, 3.0, seed=1), lassos(mask, 4.0, 0.0, seed=1)
     corners, exact = np.array(drawn), np.array(straight)
     off = np.abs(np.hypot(*(corners - 32.0).T) - 20.0)
-    assert len(corners) > 20 and 1.0 < off.max() <= 3.0 + 1.2  # an outline of pixels is up to 1.2 inside of the circle
+    assert len(corners) > 20 and 1.0 < off.max() <= 3.0 + 1.2  # the outline of pixels is up to 1.2 px inside the circle
     assert np.abs(np.hypot(*(exact - 32.0).T) - 20.0).max() <= 1.2
 
 
@@ -36,12 +36,12 @@ def test_people_are_found_by_the_order_of_the_movers(tmp_path):
 
 
 SIDES = {"person0": ((0, 4), (-1, 3)), "person1": ((0, 5), (-2, 6))}
-"""Person -> (x, depth in metres) at two instants, of squares with sides of 1 m that face the cameras."""
+"""Map from person to (x, depth in metres) at two instants; the persons are squares of 1 m that face the cameras."""
 
 
 @pytest.fixture
 def squares(tmp_path):
-    """A wall 8 m away and two persons, square and flat; cameras 1 to 3 stand at x = -2, 0, 9."""
+    """A wall at 8 m and two flat, square persons; cameras 1 to 3 are at x = -2, 0, 9."""
     (tmp_path / "geometry").mkdir()
 
     def square(x, z, half):
@@ -63,12 +63,12 @@ def squares(tmp_path):
 
 def test_a_lasso_is_drawn_where_most_of_a_person_is_seen(squares):
     masks = person_masks(squares, 1, [1, 2, 3])
-    assert masks["person1"][2].sum() == 0 < masks["person1"][1].sum()  # person0 stands in front of them
+    assert masks["person1"][2].sum() == 0 < masks["person1"][1].sum()  # hidden by person0
     assert best_poses(squares, 1, masks)["person1"] == 1
 
 
 def test_a_pixel_belongs_to_the_instant_that_shows_its_surface(squares):
-    owner = owners(squares, "person0", 1, 2, 2)  # person0 as at 2, all else as at 1, from x = 0
+    owner = owners(squares, "person0", 1, 2, 2)  # person0 as at 2, all else as at 1, seen from x = 0
     assert owner[30, 40] == INSTANT, "person0 at the instant"
     assert owner[30, 60] == UNKNOWN, "person1, whom person0 hid at the base, stood elsewhere at the instant"
     assert owner[23, 60] == INSTANT, "the wall that person0 hid at the base"

@@ -1,4 +1,4 @@
-"""What the bench of motion mattes counts."""
+"""Counts of the benchmark of motion mattes."""
 
 import numpy as np
 import pytest
@@ -9,15 +9,15 @@ from torch_backend.motion.mattes import MOVING, STILL, UNKNOWN
 
 def test_recall_precision_and_the_worst_frames() -> None:
     rows, right = [], []
-    for share in (1.0, 0.5):  # of the arm, which is a fifth of what moves
+    for share in (1.0, 0.5):  # detected fraction of the arm, which is a fifth of the moving area
         moving, arm = np.zeros((40, 50), bool), np.zeros((40, 50), bool)
         moving[10:30, 10:35], arm[10:30, 10:15] = True, True
         matte = np.full((40, 50), UNKNOWN, np.uint8)
         matte[10 : 10 + round(20 * share), 10:15] = MOVING
-        matte[0:5, 40:50] = MOVING  # false
+        matte[0:5, 40:50] = MOVING  # a false detection
         rows.append(frame_row(matte, {"moving": moving, "arm": arm, "wall": arm}, 1))
         whole = np.where(moving, np.uint8(MOVING), np.uint8(STILL))
-        whole[9, 10:35] = MOVING  # a rim of one pixel is no error
+        whole[9, 10:35] = MOVING  # a border of one pixel is no error
         right.append(frame_row(whole, {"moving": moving, "arm": arm, "wall": arm}, 1))
     found = summary(rows)
     assert found["arm"] == pytest.approx(0.75) and found["worst"] == pytest.approx(0.5)

@@ -1,4 +1,4 @@
-"""Painted masks: they are sound, drawn where their corners say, and scored as counted by hand."""
+"""Painted masks: valid, drawn at their corners, and scored like a count by hand."""
 
 from __future__ import annotations
 

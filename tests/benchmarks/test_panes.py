@@ -1,4 +1,4 @@
-"""Glass and mirrors in a world of a few rectangles, where what each pixel shows is known."""
+"""Glass and mirrors in a world of a few rectangles, where each pixel's content is known."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ FRAMES = 3
 
 @pytest.fixture(scope="module")
 def world() -> Geometry:
-    """A wall at y = 3 with a mirror and a hole with a pane; a wall beyond at 6, one behind the camera at -3.
+    """A wall at y = 3 with a mirror and a pane in a hole; a wall beyond at 6, and one behind the camera at -3.
 
-    Before the latter hangs a board, 1.5 behind the camera, which moves 0.3 up from frame to frame.
+    A board hangs in front of the wall behind the camera, at y = -1.5, and moves 0.3 up per frame.
     """
     still, board = Builder([1.0]), Builder([1.0])
     for left, right in ((-4.0, 0.3), (1.3, 4.0)):
@@ -37,19 +37,19 @@ def world() -> Geometry:
 
 
 def with_board(world: Geometry, moved: list[float]) -> Geometry:
-    """The same world with the board elsewhere."""
+    """The same world with the board displaced."""
     moving = world.moving + np.array(moved, np.float32)
     return Geometry(world.static, moving, world.triangles, world.panes, world.things)
 
 
 def view(yaw: float = 0.0, eye: np.ndarray = EYE) -> View:
-    """Looks along y, turned to the right by `yaw` radians."""
+    """View along y, rotated to the right by `yaw` radians."""
     ahead = np.array([np.sin(yaw), np.cos(yaw), 0.0])
     return View(_look_at(eye, eye + ahead, np.zeros(3)), intrinsics(160, 90), 160, 90)
 
 
 def box(of: View, low: list[float], high: list[float]) -> np.ndarray:
-    """[H, W] pixels between the projections of two corners, less a border of one."""
+    """[H, W] mask between the projections of two corners, without a border of one pixel."""
     (x0, y1), (x1, y0) = (of.project(np.array(corner))[0] for corner in (low, high))
     x, y = np.meshgrid(np.arange(of.width) + 0.5, np.arange(of.height) + 0.5)
     return (x > x0 + 1) & (x < x1 - 1) & (y > y0 + 1) & (y < y1 - 1)
@@ -70,7 +70,7 @@ def test_masks_are_of_panes_in_which_nothing_moves(world):
     maps = region_maps(world, world.at(1), 1, of, of)
     mirror, glass, wall = (maps[THING + name] for name in ("mirror", "glass", "wall"))
     whole = box(of, [-1.2, 2.98, 0.9], [-0.2, 2.98, 2.1])
-    image = box(of, [-1.3, 2 * 2.98 + 1.5, 1.6], [-0.9, 2 * 2.98 + 1.5, 2.0])  # the board's, at frame 1
+    image = box(of, [-1.3, 2 * 2.98 + 1.5, 1.6], [-0.9, 2 * 2.98 + 1.5, 2.0])  # mirror image of the board at frame 1
     assert image.any() and maps["moving"][image].all() and not mirror[image].any()
     assert mirror[whole].mean() > 0.8 and (mirror | maps["moving"])[whole].all()
     assert glass[box(of, [0.3, 3.0, 0.9], [1.3, 3.0, 2.1])].all(), "no mover is reflected there"
@@ -89,8 +89,8 @@ def test_a_mirror_was_seen_where_the_other_view_saw_the_same_in_it(world):
     mirror = region_maps(world, world.at(1), 1, of, of)[THING + "mirror"]
     away = region_maps(world, world.at(1), 1, of, view(1.2))
     assert not away["seen"][mirror].any(), "the mirror is not in that frame"
-    # From half a metre to the left the left third of what it shows here lies beyond its edge: the image of the wall at
-    # -3 stands three times as far as the mirror.
+    # Seen from half a metre to the left, the left third of the mirror's content lies beyond its edge: the image of the
+    # wall at -3 is three times as far as the mirror.
     beside = region_maps(world, world.at(1), 1, of, view(0.0, EYE - [0.5, 0, 0]))
     share = beside["seen"][mirror].mean()
     assert share == pytest.approx(2 / 3, abs=0.07)
@@ -100,11 +100,11 @@ def test_a_mirror_was_seen_where_the_other_view_saw_the_same_in_it(world):
 
 
 def test_what_hides_a_point_from_the_mirror_hides_it_from_the_eye(world):
-    """From 0.7 aside it shows a place of the wall behind that the board, now at 0.8, covers for the other eye."""
+    """From 0.7 to the side, the mirror shows a part of the rear wall that the board at 0.8 hides from the other eye."""
     near = with_board(world, [0.0, 2.3, 0.0])
     of, other = view(), view(0.0, EYE - np.array([0.7, 0, 0]))
     maps = region_maps(near, near.at(1), 1, other, of)
-    shown = (other.rays() * 8.96 + other.eye).reshape(90, 160, 3)  # images of the wall at -3, 2.98 before the mirror
+    shown = (other.rays() * 8.96 + other.eye).reshape(90, 160, 3)  # images of the wall at -3, with the mirror at 2.98
     x, y = np.moveaxis(of.project(shown)[0], 2, 0)
     board = box(of, [-1.3, 2 * 2.98 - 0.8, 1.6], [-0.9, 2 * 2.98 - 0.8, 2.0])
     inside = (x > 0) & (x < 160) & (y > 0) & (y < 90)
@@ -124,7 +124,7 @@ def test_what_moves_in_glass_moves_however_still_the_garden_is(world):
 
 
 def test_a_board_before_a_mirror_hides_it(world):
-    """Frame 2's board stands where the way from the other eye to the mirror is."""
+    """In frame 2 the board is between the other eye and the mirror."""
     of = view()
     near = with_board(world, [0.3, 3.5, -0.3])
     maps = region_maps(near, near.at(1), 1, of, of)

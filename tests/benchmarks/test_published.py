@@ -1,4 +1,4 @@
-"""Frames of a published video, and what is measured of a frozen frame beside the clip's own."""
+"""Frames of a published video, and measurements of a frozen frame against the clip's own frames."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ WIDTH, HEIGHT = 96, 64
 
 
 def picture(level: int) -> np.ndarray:
-    """Left half of one grey, right half darker."""
+    """Picture with one grey in the left half and a darker one in the right half."""
     frame = np.full((HEIGHT, WIDTH, 3), level, np.uint8)
     frame[:, WIDTH // 2 :] //= 2
     return frame

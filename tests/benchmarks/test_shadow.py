@@ -1,4 +1,4 @@
-"""The shadow of a ball on planes: where it falls, what hides it, and how unlike one on a wrong plane is."""
+"""The shadow of a ball on planes: its place, occluders, and its similarity to a shadow on a wrong plane."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def floor(z=0.0, half=5.0, at=(0.0, 0.0)):
 
 @pytest.fixture
 def view():
-    """Four metres above the origin, looking down; a pixel is a centimetre of the floor."""
+    """View from four metres above the origin, looking down; a pixel is a centimetre of the floor."""
     viewmat = np.diag([1.0, -1.0, -1.0, 1.0])
     viewmat[2, 3] = 4.0
     return View(viewmat, np.array([[400.0, 0, 100], [0, 400.0, 75], [0, 0, 1]]), 200, 150)
@@ -34,7 +34,7 @@ def test_the_shadow_lies_opposite_of_the_lamp_and_a_screen_takes_it_away(view):
     middle = of.ball - TO_LAMP * of.ball[2] / TO_LAMP[2]
     assert abs(middle[2]) < 1e-9 and left[pixel(view, middle)] == 0.0
     assert left[pixel(view, [0.5, -0.3, 0.0])] == 1.0 and left[pixel(view, [-0.6, 0.4, 0.0])] == 1.0
-    # A ball's shadow is longer than wide by the lamp's height.
+    # A ball's shadow is elongated; the ratio depends on the lamp's height.
     slope = np.linalg.norm(TO_LAMP) / TO_LAMP[2]
     assert 1e-4 * (1.0 - left).sum() == pytest.approx(np.pi * RADIUS**2 * slope * 1.25, rel=0.15)
     screen = floor(1.2, 0.5, of.ball[:2] + TO_LAMP[:2] * 0.9)

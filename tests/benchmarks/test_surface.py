@@ -1,4 +1,4 @@
-"""Distances from a true surface, of places that are known."""
+"""Distances of known points from a true surface."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def square(z, half):
 
 
 def camera(x):
-    """At (x, 0, 0), looking along z."""
+    """Camera at (x, 0, 0), looking along z."""
     viewmat = np.eye(4)
     viewmat[0, 3] = -x
     return View(viewmat, np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48)

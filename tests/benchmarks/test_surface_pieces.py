@@ -1,4 +1,4 @@
-"""Separate pieces of a fused surface: what most views confirm is kept however small it is, what few see is noise."""
+"""Separate pieces of a fused surface: pieces that most views confirm are kept at any size, others are noise."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from torch_backend.freeze.surface.volume import SurfaceConfig, View, fuse
 WIDTH, HEIGHT, FOCAL, WALL = 160, 120, 150.0, 4.0
 HAND, SPECK = (0.0, 0.0, 2.0), (0.9, 0.5, 2.0)
 HALF = 0.2
-"""Half of the sides of both, in units of the wall's distance 4."""
+"""Half the side length of hand and speck, in the units of the wall's distance 4."""
 
 
 def looking(x: float, shows_speck: bool) -> View:
-    """A wall with a hand before it that moves in the clip, from (x, 0, 0); in a few views a speck, too."""
+    """View from (x, 0, 0) of a wall with a moving hand in front, and optionally a speck."""
     viewmat = np.eye(4)
     viewmat[0, 3] = -x
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
@@ -28,7 +28,7 @@ def looking(x: float, shows_speck: bool) -> View:
 
 
 def pieces(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(middles [T, 3] of triangles near z 2, which of them are people [T]); 2 of `count` views show the speck."""
+    """(centres [T, 3] of triangles near z 2, bool [T] of people); two of `count` views show the speck."""
     views = [looking(x, n < 2) for n, x in enumerate(np.linspace(-0.4, 0.4, count))]
     volume = fuse(views, SurfaceConfig())
     vertices, triangles = extract(volume)

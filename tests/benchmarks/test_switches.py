@@ -1,4 +1,4 @@
-"""Rules that `benchmarks.ablate` switches off or changes reach what they are of."""
+"""Rules that `benchmarks.ablate` switches off or changes affect the code that they belong to."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The synthetic benchmark, with the real body model and a real bpy: one tiny scene, made once."""
+"""The synthetic benchmark, with the real body model and a real bpy: one tiny scene, built once."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_scene_is_whole(scene):
     pictures = [scene.frame(f) for f in scene.frames] + [scene.truth(9, p) for p in scene.poses]
     for picture in pictures:
         assert picture.shape == (54, 96, 3) and picture.dtype == np.uint8
-        assert 50 < picture.mean() < 200 and picture.std() > 25  # neither black nor bare
+        assert 50 < picture.mean() < 200 and picture.std() > 25  # neither black nor uniform
     changed = [np.abs(a.astype(float) - b).mean() for a, b in itertools.pairwise(pictures[:12])]
     assert min(changed) > 1.0  # the camera moves in every frame
 
@@ -140,7 +140,7 @@ def test_seen_pixels_are_where_the_frozen_frame_shows_them(scene, pose):
     inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < scene.width) & (row < scene.height)
     seen = regions.seen.ravel()
     assert not seen[~inside].any()
-    # Against the frame's own depths: the nearest of the 3x3 around, for a pixel is not a point.
+    # Compared with the frame's own depths: the nearest of 3x3 pixels, because a pixel is not a point.
     padded = np.pad(own, 1, mode="edge")
     around = np.stack([padded[1 + row[inside] + i, 1 + column[inside] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
     off = np.abs(around - depth[inside]).min(axis=0) / depth[inside]
@@ -152,7 +152,7 @@ def test_seen_pixels_are_where_the_frozen_frame_shows_them(scene, pose):
 
 @pytest.mark.parametrize("pose", [1, 5])
 def test_cameras_depths_and_pictures_belong_together(scene, pose):
-    """The frame of t*, looked up through the truth's depth, is the truth; half a step aside it is not."""
+    """The frame of t*, sampled at the truth's depth, equals the truth; shifted by two pixels it does not."""
     regions, frame, truth = scene.regions(9, pose), scene.frame(9).astype(float), scene.truth(9, pose).astype(float)
     pixels, _ = project(scene, 9, unproject(scene, pose, regions.depth))
     seen = regions.seen.ravel()
@@ -246,12 +246,14 @@ BEFORE = {
     "arm": [874, 9487.02681, 22, 1321196.131, 55, 6252.990449],
     "hair": [789, 9796.225493, 27, 1637304.617, 52, 6010.474553],
 }
-"""What `fingerprint` said of seed 0 at commit 6f9dae5, before there were hard scenes; of these at 319a1f5, before there
-was `held`."""
+"""Fingerprints of seed 0 at commit 6f9dae5, before hard scenes were added; those of hard scenes at 319a1f5.
+
+Commit 319a1f5 precedes the kind `held`.
+"""
 
 
 def fingerprint(folder: Path) -> list[float]:
-    """Figures that another plan, geometry or other pictures would not have: numbers and words, weighted by place."""
+    """Figures that depend on plan, geometry and pictures: numbers and words, weighted by position."""
     found: list[float] = []
 
     def flatten(value) -> None:
@@ -322,11 +324,11 @@ def hard(bodies, tmp_path_factory):
 
 
 FINER = 4
-"""An apple of 2 % is two pixels wide at `tiny`: masks are looked at in views of so many times its size."""
+"""Enlargement of the views in which masks are tested: an apple of 2 % is only two pixels wide at `tiny`."""
 
 
 def seen_from(folder: Path, kind: str, time: int, pose: int) -> dict[str, np.ndarray]:
-    """`region_maps` of a hard scene of the size `tiny`, finer."""
+    """`region_maps` of a hard scene of size `tiny`, enlarged."""
     geometry, views = Geometry.load(folder), views_of(SEED, TINY, kind)
     width, height = FINER * TINY.width, FINER * TINY.height
     own, other = (View(views[n].matrix, intrinsics(width, height), width, height) for n in (time, pose))
@@ -351,7 +353,7 @@ def test_a_hard_scene_has_its_thing_in_view(kind, hard):
     if kind in ("swinging", "arm"):
         assert maps["moving"][things[kind]].mean() > 0.7
     if kind == "hair":
-        # Most of it is seen before the window, which is open to the sky, or before more hair.
+        # Most of the hair is seen in front of the window, which shows the sky, or in front of more hair.
         around = ndimage.binary_dilation(things["hair"], iterations=12)
         assert (maps["depth_mm"][around] == 0).mean() > 0.2
 
@@ -386,7 +388,7 @@ def test_what_is_behind_a_thing_is_rendered_around_it(kind, hard):
 
 
 def test_a_mirror_shows_the_room_and_a_thing_can_be_taken_away(hard, tmp_path):
-    """The rendered pictures themselves: with the mirror and with a black one; with and without the arm."""
+    """In rendered pictures: with the mirror and with a black one; with and without the arm."""
 
     def render(kind: str, name: str, **changes) -> list[np.ndarray]:
         folder = tmp_path / name

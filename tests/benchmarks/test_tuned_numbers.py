@@ -1,4 +1,4 @@
-"""What counts as a tuned number of the freeze."""
+"""Numbers that count as tuned numbers of the freeze."""
 
 from benchmarks.tuned_numbers import UNTUNED, numbers_of
 

@@ -16,7 +16,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="session")
 def small_shot(tmp_path_factory: pytest.TempPathFactory):
-    """The small shot that faults and fuzzing copy; tests must not change it."""
+    """The small shot that fault cases and fuzzing copy; tests must not change it."""
     from .prepare import make_shot
 
     return make_shot(tmp_path_factory.mktemp("small"))

@@ -1,8 +1,8 @@
-"""Runs jobs of a small shot in real child processes, disturbs them, and checks what is left on disk.
+"""Runs jobs of a small shot in real child processes, disturbs them, and checks the files on disk.
 
 A case is drawn from a seed: a fault, a kind of job and a moment. Each case works on a copy of one prepared folder. A
-job counts as whole if its files equal those of the same job undisturbed. Kinds of `PROGRAMS` take longer, or start
-processes of their own: solves, tasks of a farm, the launcher, Blender.
+job counts as whole if its files equal those of the undisturbed job. Kinds of `PROGRAMS` take longer or start child
+processes: solves, tasks of a farm, the launcher, Blender.
 """
 
 from __future__ import annotations
@@ -47,34 +47,36 @@ ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_SECONDS = 300.0
 """A job that runs longer hangs; the slowest takes 20 s on one core."""
 ORPHAN_SECONDS = 20.0
-"""How long processes of an ended job may take to notice that it ended."""
+"""Time limit for processes of an ended job to notice that it ended."""
 VOLATILE = {
     "seconds", "created", "ms_per_step", "train_seconds", "trained_seconds", "beside", "wall_seconds",
     "wall_seconds_by_stage", "ended", "cpu_seconds", "memory_mib",
 }  # fmt: skip
 """Keys of JSON files that differ between two undisturbed runs: times, memory, the path from the shot to its footage."""
 SEEK_TABLE = b"\xb1\xea\x92\x8f"
-"""Last bytes of a compressed .blend that was written to its end."""
+"""Last bytes of a completely written compressed .blend."""
 MARK = "SPLANNEQUIN_FAULT_CASE"
-"""Environment variable by which the processes of a child are found, whatever sessions they are in."""
+"""Environment variable that identifies the processes of a child in all sessions."""
 
 
-# ------------------------------------------------------------------------------------------------- what runs
+# ------------------------------------------------------------------------------------------------- jobs
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of job that is disturbed."""
+    """A kind of job."""
 
     params: Callable[[Path], Any] = lambda _: None
-    """Its parameters, from the folder with footage and lassos."""
+    """Parameters of the job, from the folder with footage and lassos."""
     base: str = "shot"
-    """Name of the folder that it begins with, a key of `prepare.BASES`."""
+    """Name of the start folder, a key of `prepare.BASES`."""
     words: tuple[str, ...] = ()
-    """Words of the command line instead of a job. SHOT is the shot, OUT the output folder, FILES the folder with
-    footage and requests, ARTIST an artist's .blend."""
+    """Command line instead of a job.
+
+        SHOT is the shot, OUT the output folder, FILES the folder with footage and requests, ARTIST an artist's .blend.
+    """
     program: str = "backend"
-    """What runs the words: `backend`, `launcher`, or `blender`."""
+    """Program that runs the command line: `backend`, `launcher`, or `blender`."""
 
 
 TAKE: dict[str, Any] = {"t_star": 108, "first": 104, "last": 107, "develop": "off", "device": "cpu"}
@@ -117,7 +119,7 @@ NEEDS_MOUNT = {"disk full", "read-only"}
 
 @dataclass(frozen=True)
 class Case:
-    """One disturbed job, repeatable from (seed, number)."""
+    """One disturbed job, reproducible from (seed, number)."""
 
     number: int
     fault: str
@@ -125,7 +127,7 @@ class Case:
     early: bool
     """True if the fault strikes while the process starts, not while the job works."""
     moment: float
-    """When it strikes, as a share of the undisturbed time."""
+    """Time of the fault as a fraction of the undisturbed time."""
     seed: str
 
     def __str__(self) -> str:
@@ -134,7 +136,7 @@ class Case:
 
 
 def draw(seed: int, number: int, kinds: Collection[str]) -> Case:
-    """The case of a number: faults take turns, kinds and moments are drawn."""
+    """Draw the case of a number: faults take turns, kinds and moments are random."""
     drawn = random.Random(f"{seed}-{number}")
     turn = random.Random(f"{seed}-turn-{number // len(FAULTS)}").sample(FAULTS, len(FAULTS))
     kind = drawn.choice(list(kinds))
@@ -143,20 +145,20 @@ def draw(seed: int, number: int, kinds: Collection[str]) -> Case:
 
 @dataclass
 class Prepared:
-    """Files that all cases copy, and what undisturbed jobs make of them."""
+    """Files that all cases copy, and results of undisturbed jobs."""
 
     shot: Path
     """Shot with frames, cameras, mattes, the run `main`, and the take `base` with the matte `drawn`."""
     files: Path
     """Folder with footage, lassos and requests for the jobs."""
     bases: dict[str, Path] = field(default_factory=dict[str, Path])
-    """Name -> folder that kinds begin with."""
+    """Map from name to start folder."""
     finished: dict[str, Path] = field(default_factory=dict[str, Path])
-    """Kind -> a folder as it is after the undisturbed job."""
+    """Map from kind to a folder after the undisturbed job."""
     expected: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
-    """Kind -> `snapshot` of that folder."""
+    """Map from kind to the `snapshot` of that folder."""
     spans: dict[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
-    """Kind -> seconds until the undisturbed job began to work, and while it did."""
+    """Map from kind to (seconds before the undisturbed job began to work, seconds of work)."""
 
 
 # ------------------------------------------------------------------------------------------------- one process
@@ -164,17 +166,17 @@ class Prepared:
 
 @dataclass
 class Child:
-    """A job or a command that runs in a new process and session."""
+    """A job or a command in a new process and session."""
 
     process: subprocess.Popen[bytes]
     output: Path
-    """What it printed; the name is the child's `MARK`, too."""
+    """File with its printed output; the name is also the child's `MARK`."""
     job: Path | None
-    """Folder of the job, None for a command."""
+    """Folder of the job; None for a command."""
     began: float
 
     def wait(self) -> int:
-        """Its exit code. AssertionError if it hangs."""
+        """Wait for the exit code. Raises AssertionError if the child hangs."""
         try:
             return self.process.wait(PATIENCE_SECONDS)
         except subprocess.TimeoutExpired:
@@ -186,7 +188,7 @@ class Child:
         return self.output.read_text(encoding="utf-8", errors="replace")
 
     def orphans(self) -> list[int]:
-        """Processes of it, in whatever sessions, that still live after `ORPHAN_SECONDS`; they are ended."""
+        """Kill its processes, in all sessions, that are alive after `ORPHAN_SECONDS`; return their ids."""
         until = time.monotonic() + ORPHAN_SECONDS
         while (left := _marked(self.output.name)) and time.monotonic() < until:
             time.sleep(0.05)
@@ -195,10 +197,10 @@ class Child:
 
 
 def _marked(mark: str) -> list[int]:
-    """Living processes whose environment has a mark. One that ended and is not waited for yet has no environment."""
+    """Living processes with a mark in their environment. Zombies have no environment."""
     found: list[int] = []
     for environment in Path("/proc").glob("[0-9]*/environ"):
-        with contextlib.suppress(OSError):  # it ended meanwhile, or is another user's
+        with contextlib.suppress(OSError):  # the process has ended, or belongs to another user
             if f"{MARK}={mark}".encode() in environment.read_bytes().split(b"\0"):
                 found.append(int(environment.parent.name))
     return found
@@ -212,7 +214,7 @@ def _kill(processes: list[int]) -> None:
 
 @functools.cache
 def blender_python() -> str:
-    """Python of a bpy wheel, 5.2 first; empty if the environments that the launcher wants are not set up."""
+    """Python of a bpy wheel, 5.2 first; empty if the launcher's environments are not set up."""
     wheels = [bpy_environment(series) for series in sorted(BPY_WHEELS, reverse=True)]
     wanted = [backend_environment(), *(bpy_environment(series) for series, _ in choose_wheels()[:1])]
     is_set_up = len(wanted) == 2 and all(environment.ready() for environment in wanted)
@@ -220,13 +222,13 @@ def blender_python() -> str:
 
 
 def can_run(kind: str) -> bool:
-    """False for a kind with Blender where that is not set up: no test sets it up."""
+    """False for a kind with Blender if that is not set up; tests do not set it up."""
     needs_blender = kind in ("farm bake", "launcher freeze") or KINDS[kind].program == "blender"
     return not needs_blender or blender_python() != ""
 
 
 def start(folder: Path, kind: str, prepared: Prepared, limits: Mapping[int, int] | None = None) -> Child:
-    """Starts a job as the add-on does. `folder` holds the shot as `shot.splannequin`."""
+    """Start a job as the add-on does. `folder` holds the shot as `shot.splannequin`."""
     limits = limits or {}
     shot, job, what = folder / "shot.splannequin", None, KINDS[kind]
     places = {"SHOT": shot, "OUT": folder / "out", "FILES": prepared.files, "ARTIST": folder / "artist.blend"}
@@ -238,7 +240,7 @@ def start(folder: Path, kind: str, prepared: Prepared, limits: Mapping[int, int]
 
 
 def start_words(words: list[str], job: Path | None, limits: Mapping[int, int], program: str = "backend") -> Child:
-    """Starts a program of `Kind.program` with words."""
+    """Start a program of `Kind.program` with a command line."""
     command = contract.python_child(sys.executable, "torch_backend", *words)
     if program == "launcher":
         command["args"] = [sys.executable, str(ROOT / "splannequin.py"), *words]
@@ -278,7 +280,7 @@ def _scratch() -> Path:
 
 
 def begun(child: Child) -> float:
-    """Waits until the job wrote its first event, or ended; a command writes none. Seconds since it was started."""
+    """Wait until the job writes its first event or ends; a command writes none. Returns the seconds since the start."""
     while child.process.poll() is None and child.job is not None:
         events = child.job / contract.EVENTS_FILE
         if (events.is_file() and events.stat().st_size) or time.monotonic() - child.began > PATIENCE_SECONDS:
@@ -288,7 +290,7 @@ def begun(child: Child) -> float:
 
 
 def await_moment(child: Child, case: Case, prepared: Prepared) -> None:
-    """Waits for the moment of a case, or the end of the child."""
+    """Wait for the moment of a case, or the end of the child."""
     before, during = prepared.spans[case.kind]
     if case.early:
         until = child.began + case.moment * before
@@ -299,11 +301,11 @@ def await_moment(child: Child, case: Case, prepared: Prepared) -> None:
         time.sleep(0.005)
 
 
-# ------------------------------------------------------------------------------------------------- what is on disk
+# ------------------------------------------------------------------------------------------------- files on disk
 
 
 def snapshot(folder: Path) -> dict[str, str]:
-    """Path -> digest of each file, without jobs, locks and files that are not renamed yet. JSON by its values."""
+    """Map from path to digest of each file, without jobs, locks and temporary files. JSON is compared by its values."""
     found: dict[str, str] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -312,7 +314,7 @@ def snapshot(folder: Path) -> dict[str, str]:
         if path.name in (contract.WRITER_FILE, contract.METRICS_FILE, "blender.log", "colmap.log"):
             continue  # metrics and logs hold seconds in each line
         if ".kept." in path.name:
-            continue  # pictures that a damaged frames.json no longer lists: an import keeps them, see strangers.py
+            continue  # an import keeps pictures that a damaged frames.json no longer lists, see strangers.py
         if path.suffix == ".blend1":
             continue  # Blender's backup of an earlier bake
         found[name] = _digest(path, str(folder))
@@ -321,7 +323,7 @@ def snapshot(folder: Path) -> dict[str, str]:
 
 def _digest(path: Path, folder: str) -> str:
     data = path.read_bytes()
-    with contextlib.suppress(ValueError, KeyError, struct.error):  # damaged: compared as it is
+    with contextlib.suppress(ValueError, KeyError, struct.error):  # damaged files are compared by their bytes
         if path.suffix == ".json":
             data = _steady_text(json.loads(data.decode().replace(folder, "")))
         if path.name == contract.CHECKPOINT_FILE:
@@ -332,7 +334,7 @@ def _digest(path: Path, folder: str) -> str:
             data = SEEK_TABLE
         if path.parent.name == "composited" and contract.is_whole_picture(path):  # Blender adds the date
             data = oiio.ImageBuf(str(path)).get_pixels(oiio.UINT8).tobytes()
-        # The same frames come out as one of two videos, by how their memory is aligned: compared by what is decoded.
+        # The encoder's bytes depend on memory alignment, so decoded frames are compared.
         if path.suffix == ".mp4" and contract.is_whole_picture(path):
             with av.open(str(path)) as video:
                 data = str([(frame.width, frame.height) for frame in video.decode(video=0)]).encode()
@@ -350,18 +352,18 @@ def _steady(value: Any) -> Any:
 
 
 def differences(found: Mapping[str, str], expected: Mapping[str, str]) -> list[str]:
-    """Files that lack, are more, or differ."""
+    """Names of missing, additional and different files."""
     return sorted(name for name in {*found, *expected} if found.get(name) != expected.get(name))
 
 
 def copy_of(prepared: Prepared, kind: str, folder: Path, finished: bool = False) -> Path:
-    """A folder for a case: as its kind begins, or that of a finished job."""
+    """Copy of the start folder of a kind, or of the folder of its finished job."""
     source = prepared.finished[kind] if finished else prepared.bases[KINDS[kind].base]
     return Path(shutil.copytree(source, folder, dirs_exist_ok=True))
 
 
 def complaints_about(child: Child, code: int, folder: Path, may_break: bool = False) -> list[str]:
-    """What is wrong with how a child ended with a code other than 0. `may_break`: an internal error is accepted."""
+    """Faults in how a child ended with a code other than 0. `may_break` accepts an internal error."""
     wrong: list[str] = []
     text = child.printed()
     if "Traceback" in text:

@@ -1,4 +1,4 @@
-"""Seeded mutations of valid files: bit flips, cuts, splices, and values that parsers do not expect."""
+"""Seeded mutations of valid files: bit flips, cuts, splices, and unexpected values."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ VALUES: tuple[Any, ...] = (
     None, True, -1, 0, 1, 1 << 31, 1 << 63, 10**40, -0.5, 1e-320, 1e308, "", "x", "1", "\u0000", "../../x", "a" * 5000,
     [], {}, [[]], [None], {"x": 1}, float("nan"), float("inf"), 2.5,
 )  # fmt: skip
-"""What a value of a JSON file is replaced by. NaN and Infinity are none of JSON, but Python writes them."""
+"""Replacements for values of a JSON file. JSON does not allow NaN and Infinity, but Python writes them."""
 WORDS = (
     struct.pack("<I", 0), struct.pack("<I", 0xFFFFFFFF), struct.pack("<I", 0x7FFFFFFF), struct.pack("<Q", 1 << 40),
     struct.pack("<Q", (1 << 64) - 1), struct.pack("<f", float("nan")), struct.pack("<f", float("inf")),
     struct.pack(">I", 0x7FFFFFFF), b"\0", b"\xff" * 8, b"nan ", b"-1 ", b"1e999 ", b"99999999999 ", b"\n", b"%s",
     b"[" * 3000,
 )  # fmt: skip
-"""What bytes of a file are overwritten with."""
+"""Replacements for bytes of a file."""
 
 
 def mutated(data: bytes, drawn: random.Random) -> bytes:
-    """`data` with one to three mutations; a JSON object's values are mutated every other time."""
+    """`data` with one to three mutations; in 60 % of the cases, values of a JSON object are mutated."""
     if data[:1] == b"{" and drawn.random() < 0.6:
         try:
             return _mutated_json(data, drawn)
@@ -35,7 +35,7 @@ def mutated(data: bytes, drawn: random.Random) -> bytes:
 
 
 def _at(data: bytes, drawn: random.Random) -> int:
-    """A place in the file; every other time in its first bytes, where headers are."""
+    """Random position in the file; half of them are among the first bytes, where headers are."""
     return drawn.randrange(max(1, min(len(data), 400) if drawn.random() < 0.5 else len(data)))
 
 
@@ -90,7 +90,7 @@ def _mutated_json(data: bytes, drawn: random.Random) -> bytes:
 
 
 def _places(value: Any) -> list[tuple[Any, Any]]:
-    """(holder, key) of each value inside."""
+    """(holder, key) of each nested value."""
     found: list[tuple[Any, Any]] = []
     waiting = [value]
     while waiting:

@@ -26,7 +26,7 @@ from .harness import KINDS, TAKE, Prepared, begun, blender_python, complaints_ab
 
 
 def make_shot(root: Path) -> Prepared:
-    """The shot, and footage and lassos for jobs."""
+    """Write the shot, and footage and lassos for jobs."""
     world = build_world(root)
     paint_motion(world)
     shot, files = world.shot, root / "files"
@@ -67,7 +67,7 @@ def _opened(prepared: Prepared, folder: Path) -> None:
 
 
 def _artist(prepared: Prepared, folder: Path) -> None:
-    """As Blender needs it: with a lens, and an artist's file beside it."""
+    """Write a shot for Blender: with a lens, and an artist's file next to it."""
     shutil.copytree(prepared.shot, folder / SHOT)
     lens = {"camera_model": "SIMPLE_RADIAL", "distortion": [0.0], "focal_px": 60.0}
     write_json(folder / SHOT / "solve" / "solve.json", {"version": 1, "quality": "Known by construction.", **lens})
@@ -92,12 +92,15 @@ BASES: dict[str, Callable[[Prepared, Path], object]] = {
     "opened": _opened,
     "artist": _artist,
 }
-"""Name -> makes a folder that kinds begin with: the prepared shot; an empty one; none; a shot with frames to solve; the
-prepared one with a take that a farm opened; the prepared one with a lens, and an artist's .blend beside it."""
+"""Map from name to a function that writes the start folder of kinds.
+
+The folders are: the prepared shot; an empty shot; nothing; a shot with frames to solve; the prepared shot with a take
+that a farm opened; the prepared shot with a lens and an artist's .blend.
+"""
 
 
 def run_undisturbed(prepared: Prepared, root: Path, kinds: set[str]) -> None:
-    """Runs the kinds of jobs, and keeps what they make as what is expected."""
+    """Run the kinds of jobs, and keep their files as the expected results."""
     for name in sorted({KINDS[kind].base for kind in kinds}):
         prepared.bases[name] = root / "bases" / name
         prepared.bases[name].mkdir(parents=True)

@@ -1,7 +1,7 @@
-"""Disturbs jobs and checks: nothing finished is lost, no process is left, and no half file is believed.
+"""Disturbs jobs and checks that finished work is kept, no process is left, and no partial file is accepted.
 
-pytest tests/faults/test_faults.py --faults 200 --program-faults 40              # nightly
-pytest tests/faults/test_faults.py --faults 1 --program-faults 0 --faults-from N # one case again
+pytest tests/faults/test_faults.py --faults 200 --program-faults 40              # nightly pytest
+tests/faults/test_faults.py --faults 1 --program-faults 0 --faults-from N # one case again
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def test_jobs_survive_faults(
 
 
 def table(cases: list[Case], failed: dict[Case, list[str]]) -> str:
-    """Fault or kind, cases and failures, a line each."""
+    """Table with one line per fault or kind: cases and failures."""
     ran, bad = (
         collections.Counter(word for case in some for word in (case.fault, case.kind)) for some in (cases, failed)
     )
@@ -91,7 +91,7 @@ def table(cases: list[Case], failed: dict[Case, list[str]]) -> str:
 
 
 def run(case: Case, prepared: Prepared, root: Path) -> list[str]:
-    """What is wrong after one case; empty if all holds."""
+    """Faults found in one case; empty if all checks pass."""
     folder = root / f"case {case.number}"
     folder.mkdir()
     is_mounted = case.fault in NEEDS_MOUNT
@@ -99,7 +99,7 @@ def run(case: Case, prepared: Prepared, root: Path) -> list[str]:
         if is_mounted:
             mount(folder)
         return FAULT[case.fault](case, prepared, folder, random.Random(f"{case.seed}-fault"))
-    except Exception as error:  # of the harness, or of a file that is not as a job should leave it
+    except Exception as error:  # an error of the harness, or of a file that a job left in a wrong state
         return [f"{type(error).__name__}: {error}"]
     finally:
         if is_mounted:
@@ -108,12 +108,12 @@ def run(case: Case, prepared: Prepared, root: Path) -> list[str]:
 
 
 def mount(folder: Path) -> None:
-    """Mounts an empty disk on a folder. CalledProcessError without the permission."""
+    """Mount an empty disk on a folder. Raises CalledProcessError without permission."""
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512M", "tmpfs", str(folder)], check=True, capture_output=True)
 
 
 def can_mount(folder: Path) -> bool:
-    """True if `mount` is permitted: for root on Linux."""
+    """True if `mount` is permitted, as for root on Linux."""
     probe = folder / "probe"
     probe.mkdir()
     try:
@@ -124,11 +124,11 @@ def can_mount(folder: Path) -> bool:
     return True
 
 
-# ------------------------------------------------------------------------------------------------- what must hold
+# ------------------------------------------------------------------------------------------------- checks
 
 
 def check_end(child: Child, case: Case, prepared: Prepared, folder: Path, may_break: bool = False) -> list[str]:
-    """After a disturbed child: its exit code is true, it left no process, and what it found is as it was."""
+    """Check a disturbed child: correct exit code, no remaining process, and all earlier files kept."""
     code = child.wait()
     wrong = [f"process {pid} was left" for pid in child.orphans()]
     if code != -signal.SIGKILL:
@@ -141,21 +141,21 @@ def check_end(child: Child, case: Case, prepared: Prepared, folder: Path, may_br
 
 
 def check_kept(case: Case, prepared: Prepared, folder: Path) -> list[str]:
-    """Files of before the fault, as they were or as the whole job leaves them."""
+    """Check that each earlier file is unchanged, or as the complete job leaves it."""
     before, after = snapshot_of_start(case, prepared), prepared.expected[case.kind]
     found = snapshot(folder)
-    # A job of mattes writes all lassos before it begins, with `finished` false: a file of a third kind.
+    # A job of mattes writes all lassos at its start, with `finished` false, which is neither of the two states.
     wanted = [name for name in before if not (name.endswith("mattes/mattes.json") and name in found)]
     return [f"{name} was lost or changed" for name in wanted if found.get(name) not in (before[name], after.get(name))]
 
 
 def snapshot_of_start(case: Case, prepared: Prepared) -> dict[str, str]:
-    """Of what a case begins with."""
+    """Snapshot of a case's start folder."""
     return {} if KINDS[case.kind].base == "empty" else snapshot(prepared.bases[KINDS[case.kind].base])
 
 
 def check_again(case: Case, prepared: Prepared, folder: Path) -> list[str]:
-    """The same job once more, undisturbed: whole, and as if nothing had happened."""
+    """Run the same job again, undisturbed: its result must be complete, as if there had been no fault."""
     child = start(folder, case.kind, prepared)
     code = child.wait()
     wrong = [f"process {pid} was left by the second job" for pid in child.orphans()]
@@ -163,12 +163,12 @@ def check_again(case: Case, prepared: Prepared, folder: Path) -> list[str]:
         return [*wrong, f"the second job ended with {code}: {complaints_about(child, code, folder)}"]
     found = snapshot(folder)
     different = {n: how_far(case, prepared, folder, n) for n in differences(found, prepared.expected[case.kind])}
-    # Sums depend on how memory is aligned: one picture of 200 cases differed, and no run of 54 since.
+    # Sums depend on memory alignment: one picture in 200 cases differed, and none in 54 runs since.
     return wrong + [f"after the second job {n} differs by {far:.3g}" for n, far in different.items() if far > 1e-3]
 
 
 def how_far(case: Case, prepared: Prepared, folder: Path, name: str) -> float:
-    """By how much a picture differs from the expected one at most, over 1 or its values; infinite for other files."""
+    """Largest relative difference of a picture (for values above 1) from the expected one; infinite for other files."""
     files = [root / name for root in (folder, prepared.finished[case.kind])]
     if not all(file.suffix == ".exr" and file.is_file() for file in files):
         return float("inf")
@@ -184,7 +184,7 @@ def how_far(case: Case, prepared: Prepared, folder: Path, name: str) -> float:
 
 
 def signalled(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
-    """SIGKILL, SIGTERM, or SIGSTOP with SIGCONT a second later."""
+    """Send SIGKILL, SIGTERM, or SIGSTOP with SIGCONT a second later."""
     copy_of(prepared, case.kind, folder)
     child = start(folder, case.kind, prepared)
     await_moment(child, case, prepared)
@@ -202,7 +202,7 @@ def signalled(case: Case, prepared: Prepared, folder: Path, drawn: random.Random
 
 
 def clock(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
-    """Killed, then all files are dated years back or ahead, as a wrong clock does."""
+    """Kill the job, then set all modification times years back or ahead, as a wrong clock does."""
     copy_of(prepared, case.kind, folder)
     child = start(folder, case.kind, prepared)
     await_moment(child, case, prepared)
@@ -240,7 +240,7 @@ def size_of(folder: Path) -> int:
 
 
 def limited(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
-    """A limit on the size of each file (as a quota or FAT has), or on the process's memory."""
+    """A limit on the size of each file (like a quota or FAT), or on the process's memory."""
     copy_of(prepared, case.kind, folder)
     if case.fault == "memory limit":
         limits = {resource.RLIMIT_AS: int(drawn.uniform(0.2, 8.0) * 1e9)}
@@ -272,9 +272,9 @@ def read_only(case: Case, prepared: Prepared, folder: Path, drawn: random.Random
 
 
 def remount(folder: Path, how: str) -> None:
-    """Makes the disk at a folder read-only (`ro`) or writable (`rw`).
+    """Remount the disk at a folder read-only (`ro`) or writable (`rw`).
 
-    It is busy for as long as a process that another case forks holds what was open for writing here.
+    The disk stays busy while a process forked by another case holds files that were open for writing here.
     """
     for _ in range(50):
         done = subprocess.run(["mount", "-o", f"remount,{how}", str(folder)], check=False, capture_output=True)
@@ -285,9 +285,10 @@ def remount(folder: Path, how: str) -> None:
 
 
 def damaged(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
-    """One file of a finished job is cut short or has some bits changed; the job is started again.
+    """Truncate one file of a finished job, or flip some of its bits; then start the job again.
 
-    A cut file is noticed or rebuilt. Changed bits may stay unnoticed where a format has no checksum, but never break.
+    A truncated file must be noticed or rebuilt. Flipped bits may stay unnoticed in formats without a checksum, but must
+    not cause a crash.
     """
     copy_of(prepared, case.kind, folder, finished=True)
     files = [p for p in sorted(folder.rglob("*")) if p.is_file() and "jobs" not in p.parts and p.stat().st_size]
@@ -326,7 +327,7 @@ def start_or_refuse(case: Case, prepared: Prepared, folder: Path) -> Child | Non
 
 
 def two_at_once(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
-    """Two jobs of one shot: the second is refused in a sentence, or runs after the first."""
+    """Two jobs of one shot: the second is refused with a message, or runs after the first."""
     copy_of(prepared, case.kind, folder)
     first = start(folder, case.kind, prepared)
     if not case.early:
@@ -341,7 +342,7 @@ def two_at_once(case: Case, prepared: Prepared, folder: Path, drawn: random.Rand
 
 
 def renamed(case: Case, prepared: Prepared, folder: Path, drawn: random.Random) -> list[str]:
-    """The shot's folder is renamed while the job works, and later named as before."""
+    """Rename the shot's folder while the job works, and rename it back later."""
     copy_of(prepared, case.kind, folder)
     child = start(folder, case.kind, prepared)
     await_moment(child, case, prepared)

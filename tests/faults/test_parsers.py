@@ -63,23 +63,23 @@ from .mutations import mutated
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
 
 SECONDS = 30
-"""After so long a parser counts as endless; the slowest valid file takes a tenth of a second."""
+"""Time limit of a parser in seconds; the slowest valid file takes a tenth of a second."""
 MEMORY = 6 << 30
-"""Bytes of address space that a parser may take beyond what the process has."""
+"""Bytes of address space that a parser may use in addition to the process's."""
 
 
 @dataclass
 class Parser:
-    """A file that is mutated, and what reads it."""
+    """A file to mutate, and its parser."""
 
     file: Callable[[Path], Path]
-    """The valid file, from the folder with shot and files."""
+    """Path of the valid file in the folder with shot and files."""
     read: Callable[[Path, Path], Any]
-    """Reads it; from the folder and the file."""
+    """Parser; called with the folder and the file."""
     errors: tuple[type[Exception], ...] = (JobError,)
-    """What it may raise: `JobError` where a person reads, `ValueError` where the parser documents that."""
+    """Accepted errors: `JobError` if a user reads the message, `ValueError` if the parser documents it."""
     share: float = 1.0
-    """Share of the `--fuzz` files: parsers of large files are slow."""
+    """Fraction of the `--fuzz` files; lower for parsers of large files, which are slow."""
 
 
 def shot_of(root: Path) -> Shot:
@@ -102,7 +102,7 @@ def request_of(path: Path) -> object:
 
 
 def messages_of(path: Path) -> list[object]:
-    """All messages of a stream, each header as a view."""
+    """All messages of a stream, with each header parsed as a view."""
     found: list[object] = []
     with open(path, "rb") as stream:
         while (message := contract.read_message(stream)) is not None:
@@ -210,7 +210,7 @@ PARSERS: dict[str, Parser] = {
     "summary of a command": Parser(named("summary.json"), lambda _, path: read_summary(path.parent)),
     "status of a command": Parser(in_shot("jobs/*/status.json"), lambda root, _: failed_job(root)),
 }
-"""Name -> parser of a file that a user, another program or a disturbed process may leave."""
+"""Map from name to the parser of a file that a user, another program or a disturbed process may leave."""
 
 
 def environment(root: Path) -> Environment:
@@ -219,7 +219,7 @@ def environment(root: Path) -> Environment:
 
 @pytest.fixture(scope="module")
 def valid(small_shot: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a valid file for each parser."""
+    """Folder with a valid file for each parser."""
     root = tmp_path_factory.mktemp("fuzz")
     shutil.copytree(small_shot.shot, root / "shot.splannequin")
     shutil.copytree(small_shot.files, root / "files")
@@ -279,7 +279,7 @@ def _write_pictures(root: Path) -> None:
 
 @contextlib.contextmanager
 def bounded() -> Generator[None]:
-    """Ends what takes too long or too much memory with an exception."""
+    """Limit time and memory; exceeding them raises an exception."""
 
     def late(number: int, frame: object) -> None:
         raise TimeoutError(f"a parser took longer than {SECONDS} s")
@@ -296,7 +296,7 @@ def bounded() -> Generator[None]:
 
 
 def fault_of(parser: Parser, root: Path, path: Path) -> str:
-    """What is wrong with how a parser took a file; empty if nothing is."""
+    """Description of a wrong reaction of a parser to a file; empty if the reaction is right."""
     signal.alarm(SECONDS)
     try:
         parser.read(root, path)

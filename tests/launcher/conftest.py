@@ -1,4 +1,4 @@
-"""Real virtual environments, made offline from a wheel that the test writes."""
+"""Real virtual environments, created offline from a wheel that the test writes."""
 
 import base64
 import dataclasses
@@ -15,7 +15,7 @@ from launcher import environments
 
 @pytest.fixture
 def write_wheel(tmp_path: Path):
-    """Writes a wheel of one module, which may ask for another package, and returns its path."""
+    """write_wheel(name, version, source, needs): writes a wheel of one module and returns its path."""
 
     def write(name: str, version: str, source: str, needs: str = "") -> Path:
         info = f"{name}-{version}.dist-info"
@@ -41,7 +41,7 @@ def write_wheel(tmp_path: Path):
 
 @pytest.fixture
 def requirements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A requirements folder of the test's own, and a pip that looks nowhere else."""
+    """Requirements folder of the test, and a pip that only uses local wheels."""
     folder = tmp_path / "requirements"
     folder.mkdir()
     monkeypatch.setattr(environments, "REQUIREMENTS", folder)
@@ -52,7 +52,7 @@ def requirements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def write_lock(requirements: Path):
-    """write_lock(name, wheels...) writes a lock of wheels that lie in the test's folder, with their hashes."""
+    """write_lock(name, wheels...): writes a lock of wheels in the test's folder, with their hashes."""
 
     def write(name: str, *wheels: Path) -> None:
         with open(requirements / f"{name}.lock", "w") as lock:
@@ -66,14 +66,14 @@ def write_lock(requirements: Path):
 
 @pytest.fixture
 def environment(tmp_path: Path, write_lock, write_wheel) -> environments.Environment:
-    """An environment of one small package, not made yet."""
+    """An environment of one small package, not set up yet."""
     write_lock("small", write_wheel("smallthing", "1.0", "value = 1"))
     return environments.Environment("the test", tmp_path / "home" / ".venv", ("small",), "import smallthing", 0.01)
 
 
 @pytest.fixture
 def with_torch(environment: environments.Environment, write_lock, write_wheel) -> environments.Environment:
-    """An environment of that package and of a torch, not made yet."""
+    """An environment of that package and of a torch, not set up yet."""
     write_lock("torch", write_wheel("torch", "2.13.0", ""))
     write_lock("torch-cpu")
     write_lock("torch-cu130")
@@ -83,8 +83,10 @@ def with_torch(environment: environments.Environment, write_lock, write_wheel) -
 
 @pytest.fixture
 def made():
-    """made(folder) makes the virtual environment that a set-up would begin with, in a tenth of the time: pip is the
-    Python's own. Where that has none, the set-up makes it anew."""
+    """made(folder): creates the virtual environment that a set-up starts with, in a tenth of the time.
+
+    It uses the pip of the current Python. If there is none, the set-up creates the environment again.
+    """
 
     def make(folder: Path) -> None:
         command = [sys.executable, "-P", "-m", "venv", "--without-pip", "--system-site-packages", str(folder)]

@@ -1,4 +1,4 @@
-"""What the launcher makes of NVIDIA's tool, for which a script stands in that prints what the real one prints."""
+"""The launcher's use of NVIDIA's tool; a script stands in that prints the real tool's output."""
 
 import os
 import shutil

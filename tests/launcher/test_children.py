@@ -1,4 +1,4 @@
-"""Children of the launcher: exit codes passed on, Ctrl-C handed on once, nothing left running."""
+"""Child processes of the launcher: exit codes passed on, Ctrl-C forwarded once, no process left running."""
 
 import json
 import os
@@ -75,7 +75,7 @@ except KeyboardInterrupt:
 def test_ctrl_c_lets_the_child_finish_its_checkpoint(tmp_path: Path, sent: signal.Signals):
     parent = subprocess.Popen([sys.executable, "-c", PARENT, CHILD, str(tmp_path)], cwd=ROOT, stdout=subprocess.DEVNULL)
     wait_for(tmp_path / "started")
-    time.sleep(0.2)  # into the child's sleep
+    time.sleep(0.2)  # while the child sleeps
     parent.send_signal(sent)
     assert parent.wait(60) == 130
     assert (tmp_path / "checkpoint").read_text() == "whole"
@@ -134,7 +134,7 @@ children.run_blender([sys.executable, "-c", sys.argv[1], str(folder)], folder / 
 
 @pytest.mark.skipif(os.name == "nt", reason="sends POSIX signals")
 def test_a_bake_that_has_much_to_say_on_ctrl_c_comes_to_its_end(tmp_path: Path, parent):
-    """Nobody takes down what it says then, but a pipe that is full, with 4 KB on Windows, would hold it up."""
+    """Nobody reads the output then, but a full pipe (4 KB on Windows) must not block the bake."""
     launcher = parent(BAKER, BAKING, tmp_path)
     wait_for(tmp_path / "started")
     launcher.send_signal(signal.SIGINT)
@@ -162,7 +162,7 @@ def test_a_tied_child_learns_that_the_launcher_was_killed(tmp_path: Path):
 
 @pytest.fixture
 def parent(tmp_path: Path):
-    """parent(source, *words) starts a Python that can import the launcher; it is killed at the end at the latest."""
+    """parent(source, *words): starts a Python that can import the launcher; it is killed at the end of the test."""
     started = []
 
     def start(source: str, *words: str | Path, **environ: str) -> subprocess.Popen[bytes]:
@@ -208,7 +208,7 @@ LAUNCHER = "import sys; from launcher.main import main; sys.exit(main())"
 
 
 def gone(pid: int) -> bool:
-    """True once a process is no more (or a zombie that nobody waits for)."""
+    """Wait until a process has ended or is a zombie; False after 30 seconds."""
     for _ in range(600):
         try:
             os.kill(pid, 0)
@@ -236,7 +236,7 @@ def test_what_does_not_end_with_a_killed_launcher_is_ended_with_its_children(tmp
 
 
 def test_a_killed_launcher_leaves_no_backend_at_work(tmp_path: Path, parent):
-    """A whole freeze, killed while it imports the clip: cancelled as by Ctrl-C, which leaves no empty shot."""
+    """A whole freeze, killed during the import: it is cancelled as by Ctrl-C, which leaves no empty shot."""
     wheels = [environments.bpy_environment(series) for series, _ in blender.choose_wheels()[:1]]
     if not all(environment.ready() for environment in (environments.backend_environment(), *wheels)):
         pytest.skip("the environments are not set up by the launcher")
@@ -263,7 +263,7 @@ environments.set_up(environments.Environment("x", pathlib.Path(sys.argv[2]), ("s
 
 
 def test_a_killed_launcher_leaves_no_pip_at_work(tmp_path: Path, requirements: Path, parent, made):
-    """pip waits for an index that does not answer; that sees how long it is waited for."""
+    """pip waits for an index that does not answer; the index measures when pip hangs up."""
     (requirements / "small.lock").write_text(f"there-is-no-such-package==1.0 --hash=sha256:{'0' * 64}\n")
     made(tmp_path / "home" / ".venv")
     with socket.create_server(("127.0.0.1", 0)) as index:

@@ -1,4 +1,4 @@
-"""The launcher's commands as a newcomer runs them: `python splannequin.py ...` in a process of its own."""
+"""The launcher's commands as a newcomer runs them: `python splannequin.py ...` in a separate process."""
 
 import ast
 import json
@@ -39,7 +39,7 @@ def test_doctor_before_set_up_says_so(tmp_path: Path):
 
 
 def test_a_name_that_the_console_has_no_letters_for_ends_nothing(tmp_path: Path):
-    """As where the output goes into a file on Windows, whose code page has only some letters."""
+    """Output redirected to a file on Windows uses a code page that lacks many characters."""
     home = tmp_path / "\N{CJK UNIFIED IDEOGRAPH-65E5}"
     ran = launch("doctor", "--output", tmp_path, SPLANNEQUIN_HOME=str(home), PYTHONIOENCODING="cp1252")
     assert "makes it in" in ran.stdout and "\\u65e5" in ran.stdout and "Traceback" not in ran.stderr
@@ -86,7 +86,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_any_work(tmp_path: P
 
 
 def on_a_disk(options: str, fill: str, folder: Path, *command: str | Path) -> subprocess.CompletedProcess[str]:
-    """Runs a command whose `folder` is a small disk of its own, after the shell command `fill` there."""
+    """Run a command with a small disk mounted at `folder`, after the shell command `fill` in this folder."""
     script = f'mount -t tmpfs -o size=64k none "$0" && cd "$0" && {{ {fill}; }} && mount -o remount,{options} "$0"'
     words = ["unshare", "--map-root-user", "--mount", "sh", "-c", f'{script} && cd / && exec "$@"', folder, *command]
     ran = subprocess.run(list(map(str, words)), capture_output=True, text=True)
@@ -105,7 +105,7 @@ def on_a_disk(options: str, fill: str, folder: Path, *command: str | Path) -> su
 )
 def test_a_disk_that_takes_nothing_is_one_sentence(tmp_path: Path, options: str, fill: str, code: int, words: str):
     (tmp_path / "disk").mkdir()
-    output = tmp_path / "disk" / ("out" if code == 2 else "")  # a full disk takes no folder either
+    output = tmp_path / "disk" / ("out" if code == 2 else "")  # on a full disk no folder can be created either
     command = ("env", f"SPLANNEQUIN_HOME={tmp_path}", sys.executable, "-P", LAUNCHER, "doctor", "--output", output)
     ran = on_a_disk(options, fill, tmp_path / "disk", *command)
     assert ran.returncode == code, ran.stderr

@@ -1,4 +1,4 @@
-"""Set-up of an environment: once, resumed after an interruption, refused in a sentence."""
+"""Set-up of an environment: done once, resumed after an interruption, refused with a message."""
 
 import dataclasses
 import os
@@ -27,7 +27,8 @@ def site_packages(environment: Environment) -> Path:
 def test_set_up_once_then_nothing_is_started(
     environment: Environment, monkeypatch: pytest.MonkeyPatch, hostile, tmp_path: Path
 ):
-    trap = hostile(tmp_path / "clips", tmp_path / "home", tmp_path)  # modules where a child could stand
+    # modules in folders where a child process could run
+    trap = hostile(tmp_path / "clips", tmp_path / "home", tmp_path)
     assert not environment.ready()
     assert set_up(environment, sys.executable) > 0
     assert environment.ready()
@@ -70,7 +71,7 @@ def test_nothing_is_installed_that_the_lock_does_not_name(environment: Environme
 
 
 def test_a_file_with_another_hash_is_not_installed(environment: Environment, write_wheel, tmp_path: Path, made):
-    """The package index, or a folder of wheels, has something else under the same name and version."""
+    """The package index, or a folder of wheels, has another file under the same name and version."""
     made(environment.folder)
     write_wheel("smallthing", "1.0", "value = 'of somebody else'")
     for wheels in (None, tmp_path):
@@ -94,7 +95,7 @@ def test_from_a_folder_of_wheels_no_index_is_asked(
     made(environment.folder)
     monkeypatch.delenv("PIP_NO_INDEX")
     monkeypatch.delenv("PIP_FIND_LINKS")
-    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")  # nobody listens
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")  # nobody listens there
     (tmp_path / "whéels 1").mkdir()
     for wheel in tmp_path.glob("*.whl"):
         wheel.rename(tmp_path / "whéels 1" / wheel.name)
@@ -111,7 +112,7 @@ def test_from_a_folder_of_wheels_no_index_is_asked(
 def test_torch_alone_is_asked_of_its_index(
     with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made, write_lock, write_wheel
 ):
-    """Nothing else of that index comes in, however high its version."""
+    """No other package is installed from that index, whatever its version."""
     made(with_torch.folder)
     index = tmp_path / "whl" / "cpu"
     theirs = write_wheel("torch", "2.13.0+cpu", "build = 'cpu'")
@@ -136,7 +137,7 @@ def test_torch_alone_is_asked_of_its_index(
 def test_the_build_of_an_index_out_of_reach_is_taken_where_pip_finds_it(
     with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, made, write_lock, write_wheel
 ):
-    """Here and in CI: a folder that pip is set to has it. A file of that name with another hash is refused."""
+    """pip is configured with a folder that has the build, as here and in CI. A file with another hash is refused."""
     made(with_torch.folder)
     monkeypatch.delenv("SPLANNEQUIN_TORCH_INDEX", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))  # no NVIDIA driver
@@ -206,7 +207,7 @@ def test_an_interrupted_set_up_is_not_believed_and_is_completed(environment: Env
     made(environment.folder)
     set_up(environment, sys.executable)
     packages = site_packages(environment)
-    # What a kill in the middle of pip leaves: the marker, a package whose files are not all there, no RECORD.
+    # State after a kill during pip: the marker, a package with missing files, no RECORD.
     environment.begun.touch()
     (packages / "smallthing-1.0.dist-info" / "RECORD").unlink()
     (packages / "smallthing.py").unlink()
@@ -297,7 +298,7 @@ def test_without_an_index_it_is_that_of_what_pypi_has(system: str, needed: float
 def test_an_index_out_of_reach_is_not_reckoned_with(
     with_torch: Environment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
 ):
-    """Then torch comes from the usual index, which on Linux has the one with CUDA."""
+    """torch is then installed from the usual index, which on Linux has the build with CUDA."""
     backend = with_torch
     monkeypatch.setenv("SPLANNEQUIN_TORCH_INDEX", "http://127.0.0.1:9/whl/cpu")
     disk = shutil.disk_usage(tmp_path)
@@ -326,7 +327,7 @@ def test_every_requirement_is_pinned_exactly():
 
 
 def pins(path: Path) -> dict[str, str]:
-    """Version by name of a list of requirements."""
+    """Map from name to version of a list of requirements."""
     found = re.findall(r"^([\w.-]+)==(\S+)", path.read_text(), re.M)
     return {environments.package_name(name): version for name, version in found}
 
@@ -342,7 +343,7 @@ def test_every_package_of_a_lock_has_hashes():
 
 
 def test_locks_have_the_versions_that_were_asked_for():
-    """Whoever edits a list and does not run tools/lock_requirements.py is told here."""
+    """Fails after an edit of a list without a run of tools/lock_requirements.py."""
     folder = environments.REQUIREMENTS
     constraints = pins(folder / "constraints.txt")
     for path in folder.glob("*.txt"):
@@ -353,7 +354,7 @@ def test_locks_have_the_versions_that_were_asked_for():
             assert asked.items() <= got.items(), f"{path.name}: run tools/lock_requirements.py"
             agreed = {name: version for name, version in constraints.items() if name in got and name not in asked}
             assert agreed.items() <= got.items(), f"{path.name}: run tools/lock_requirements.py"
-    # These lie in one environment.
+    # These are installed in one environment.
     together = [pins(folder / f"{lock}.lock") for lock in ("backend", "torch", "cuda", "test", "bench")]
     for name in set().union(*together):
         assert len({lock[name] for lock in together if name in lock}) == 1, name
@@ -381,7 +382,7 @@ def test_an_index_that_does_not_answer_is_not_asked_for_every_package(tmp_path: 
 
 @pytest.fixture
 def offline(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pip that knows one index, at which nobody listens."""
+    """A pip with one index, at which nobody listens."""
     for name, value in {"NO_INDEX": "0", "CONFIG_FILE": os.devnull, "FIND_LINKS": "", "EXTRA_INDEX_URL": ""}.items():
         monkeypatch.setenv(f"PIP_{name}", value)
     for name in ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"):

@@ -1,4 +1,4 @@
-"""What ships with the repository may ship."""
+"""Everything that ships with the repository may be distributed."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ def test_the_bundled_clip_carries_its_licence_and_credit():
 
 
 def test_no_other_footage_is_bundled():
-    """But a small .blend that is made from the clip and holds no pictures, and the script that makes it."""
+    """Allowed are the script and the small .blend that it makes from the clip, which holds no pictures."""
     folder = Path(places.DEMO_CLIP).parent
     footage = {p.name for p in folder.iterdir() if p.suffix not in (".md", ".py") and p.is_file()}
     assert footage == {places.DEMO_CLIP.name, "sitting_frozen.blend"}

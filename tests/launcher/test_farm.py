@@ -1,4 +1,4 @@
-"""A host of a render farm: what entering a job's environment tells the engine, and how a task is started."""
+"""A host of a render farm: messages to the engine when it enters a job's environment, and the start of a task."""
 
 import json
 import os
@@ -21,7 +21,8 @@ def told(capsys) -> dict[str, str]:
 
 
 def test_a_host_that_is_given_its_python_and_blender_sets_nothing_up(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("SPLANNEQUIN_HOME", "")  # the host sets it in this process; later tests get back what it was
+    # the host sets it in this process; monkeypatch restores it for later tests
+    monkeypatch.setenv("SPLANNEQUIN_HOME", "")
     blender = tmp_path / "my blender"
     blender.touch()
     home = tmp_path / "home"
@@ -54,7 +55,7 @@ def test_a_task_without_a_backend_tells_the_engine(tmp_path, monkeypatch, capsys
 
 @pytest.mark.skipif(os.name == "nt", reason="a process of its own there, tied to ours")
 def test_the_engines_signals_reach_the_task_itself(tmp_path):
-    """What the engine kills is the task: no process of ours is between, that would leave it behind."""
+    """The engine kills the task directly: no launcher process is in between that could leave it behind."""
     python = tmp_path / "python"
     python.write_text('#!/bin/sh\necho "$$ $@"\nexec sleep 30\n')
     python.chmod(0o755)

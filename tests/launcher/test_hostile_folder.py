@@ -1,4 +1,4 @@
-"""The launcher, started in a folder that holds Python modules: none of them is run."""
+"""The launcher, started in a folder that holds Python modules, imports none of them."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ def trap(hostile, tmp_path: Path) -> Path:
 
 
 def test_the_backend_runs_without_it(trap: Path, tmp_path: Path, capfd):
-    """In the folder that the user stands in, whose relative paths it is given."""
+    """It runs in the user's current folder, which relative paths refer to."""
     command = [sys.executable, "-P", "-m", "torch_backend", "freeze", "absent.mp4", "--output", "out"]
     assert children.run_child(command, cwd=places.HERE) == 3
     assert f"{tmp_path / 'clips' / 'absent.mp4'} does not exist" in "".join(capfd.readouterr())
@@ -30,7 +30,7 @@ def test_what_a_child_starts_in_turn_is_safe_too(trap: Path):
 
 @pytest.mark.parametrize("flags", [[], ["-P"]])
 def test_the_launcher_itself_runs_without_it(trap: Path, tmp_path: Path, flags: list[str], monkeypatch):
-    """Also under -P, which leaves a script's own folder out."""
+    """Also under -P, which leaves the script's own folder off the path."""
     monkeypatch.setenv("SPLANNEQUIN_HOME", str(tmp_path / "nothing yet"))
     command = [sys.executable, *flags, places.ROOT / "splannequin.py", "doctor", "--output", str(tmp_path / "told")]
     ran = subprocess.run(command, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""What pip prints: a line per package while it works, one sentence if it fails."""
+"""Output of pip: one line per package while it works, one sentence if it fails."""
 
 import pytest
 
@@ -37,7 +37,7 @@ def test_pip_in_one_line_per_package(line: str, shown: str | None):
             "port=443): Max retries exceeded with url: /packages/x.whl",
             "files.pythonhosted.org cannot be reached",
         ),
-        (  # the connection broke once, but the index did answer
+        (  # the connection broke once, but the index answered
             RETRYING + "'ReadTimeoutError(...)': /simple/torch/\n"
             "ERROR: Could not find a version that satisfies torch==9 (from versions: 2.12.0, 2.13.0)\n"
             "ERROR: No matching distribution found for torch==9",

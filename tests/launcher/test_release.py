@@ -1,4 +1,4 @@
-"""`package`: a whole release or none, the same from the same commit, and one sentence for what goes wrong."""
+"""`package`: a complete release or none, reproducible from the same commit, and one sentence per error."""
 
 import hashlib
 import importlib.metadata
@@ -24,7 +24,7 @@ from torch_backend.contract import package_name
 ROOT = Path(__file__).resolve().parents[2]
 NAME = f"splannequin-{__version__}"
 UNPACKED = ("docs", "examples", "benchmarks", "tests")
-"""Folders that the zip leaves out, and the command does without."""
+"""Folders that the zip leaves out, and that the command does not need."""
 
 
 def git(folder: Path, *words: str) -> bytes:
@@ -49,7 +49,7 @@ def _checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def checkout(_checkout: Path, tmp_path: Path) -> Path:
-    """A new repository with the files of this one."""
+    """New Git repository with a copy of this repository's files."""
     return Path(shutil.copytree(_checkout, tmp_path / "checkout"))
 
 
@@ -60,9 +60,9 @@ def commit(folder: Path) -> None:
 
 @pytest.fixture
 def blender_program(tmp_path: Path):
-    """blender_program(commands) writes a program that runs shell commands, then the tool of a bpy wheel that is set up.
+    """blender_program(commands): writes a program that runs shell commands, then the tool of an installed bpy wheel.
 
-    Its words are those of `blender --background --factory-startup --command extension ...`.
+    It accepts the arguments of `blender --background --factory-startup --command extension ...`.
     """
     ready = [series for series, _ in choose_wheels() if bpy_environment(series).ready()]
     if not ready or os.name == "nt":
@@ -88,13 +88,13 @@ def package(checkout: Path, output: Path, *arguments: str | Path, umask: int = -
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file below a folder."""
+    """Map from every file below a folder to its SHA-256."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def results(output: Path) -> set[str]:
-    """What a folder holds besides the notes of the command."""
+    """Contents of a folder without the command's own notes."""
     return {path.name for path in output.iterdir()} - {"summary.json", "blender.log", ".package.lock"}
 
 
@@ -161,7 +161,7 @@ def test_a_package_that_comes_to_nothing_leaves_the_one_before(
 
 @pytest.mark.parametrize("megabytes", [1, 5, 7, 9])
 def test_a_full_disk_is_one_sentence_and_no_package(checkout: Path, blender_program, tmp_path: Path, megabytes: int):
-    """The disk fills while files are copied, while Blender packs, while the zip is written, or just not."""
+    """The disk fills during copying, during Blender's packing, during writing of the zip, or is just large enough."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "none", str(disk)]
@@ -252,7 +252,7 @@ def test_the_bill_lists_every_package_and_hash_of_the_locks():
 
 
 def test_licences_are_those_that_the_installed_packages_declare():
-    """Of the backend's environment: what says its licence as SPDX does."""
+    """Compared with the packages of the backend's environment that declare an SPDX licence expression."""
     table = tomllib.loads((ROOT / "requirements" / LICENCES).read_text())
     assert table.keys() == {one["name"] for one in bill()["components"]}
     declared = {

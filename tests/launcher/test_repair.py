@@ -1,4 +1,4 @@
-"""What a repair takes for whole: every file's contents, whatever its size and time say."""
+"""Integrity check of a repair: compares every file's contents, whatever its size and time."""
 
 import zipfile
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The legs of `test`: their counts, their output when they run beside each other, and Ctrl-C."""
+"""The legs of `test`: their counts, their output when they run in parallel, and Ctrl-C."""
 
 import os
 import signal
@@ -111,7 +111,7 @@ def test_ctrl_c_reaches_every_leg_and_starts_no_other(tmp_path: Path):
         if all((tmp_path / name / "started").exists() for name in names):
             break
         time.sleep(0.05)
-    time.sleep(0.2)  # into their sleep
+    time.sleep(0.2)  # while they sleep
     parent.send_signal(signal.SIGINT)
     out, err = parent.communicate(timeout=60)
     assert parent.returncode == 130, err.decode()

@@ -1,4 +1,4 @@
-"""All data of the open file as a flat list, to be compared before and after an operator, undo and redo."""
+"""All data of the open file as a flat dictionary, for comparison before and after an operator, undo and redo."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from typing import Any
 import bpy
 
 _SPARED = {"all_ids", "window_managers", "workspaces", "screens", "libraries", "brushes", "palettes"}
-"""Collections that are no part of an undo step, or that Blender fills itself when an editor is opened."""
+"""Collections that undo does not restore, or that Blender fills itself when an editor is opened."""
 _UNREAD = {
     "bl_rna", "rna_type", "id_data", "session_uid", "original", "users", "tag", "pixels", "bindcode", "size",
     "channels", "depth", "resolution", "frame_duration", "animation_data", "fcurves", "file_format", "particle_edit",
 }  # fmt: skip
-"""Properties that are no data of the file, or that Blender computes once something is drawn."""
+"""Properties that are not part of the file's data, or that Blender computes when something is drawn."""
 _DEPTH = 5
 _MOST = 40
-"""Items of a collection that are read one by one; of more only their number is compared: vertices, keys, points."""
+"""Longest collection whose items are read one by one; of a longer one (vertices, keys, points) only the length is
+kept."""
 
 
 def file_state() -> dict[str, Any]:
-    """Path of every property of every data-block -> its value."""
+    """Map from the path of every property of every data-block to its value."""
     found: dict[str, Any] = {}
     for name in sorted(dir(bpy.data)):
         blocks = getattr(bpy.data, name)
@@ -34,18 +35,18 @@ def file_state() -> dict[str, Any]:
 
 
 def difference(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
-    """What two states do not share, in words."""
+    """List of the differences between two states, one "path: value -> value" each."""
     return [f"{k}: {one.get(k)} -> {other.get(k)}" for k in sorted({*one, *other}) if one.get(k) != other.get(k)]
 
 
 def _read(thing: Any, path: str, found: dict[str, Any], depth: int) -> None:
-    """Reads a struct and what it holds, down to other data-blocks, whose names stand for them."""
+    """Read a struct and its nested structs into `found`; other data-blocks are stored by name only."""
     found[path] = type(thing).__name__
     for rna in thing.bl_rna.properties if depth else ():
         name = rna.identifier
         if name in _UNREAD or name.startswith(("is_", "has_")):
             continue
-        if name == "frame_current" and isinstance(thing, bpy.types.ImageUser):  # what was drawn last
+        if name == "frame_current" and isinstance(thing, bpy.types.ImageUser):  # frame that was drawn last
             continue
         here, value = f"{path}.{name}", getattr(thing, name, None)
         if rna.type == "COLLECTION":
@@ -69,7 +70,8 @@ def _follow(value: Any, path: str, found: dict[str, Any], depth: int) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """A custom property without its address. Before 5.0 the properties of add-ons are among them."""
+    """Custom property as plain Python data, without its address. Before 5.0, custom properties include the add-ons'
+    own."""
     return value.to_dict() if hasattr(value, "to_dict") else value.to_list() if hasattr(value, "to_list") else value
 
 
@@ -80,7 +82,7 @@ def _flat(value: Any) -> list[Any]:
 def _keys(action: Any) -> list[tuple[str, int, list[float]]]:
     """(data path, index, frames and values) of every F-curve."""
     curves = getattr(action, "fcurves", None)
-    if curves is None:  # Blender 5 has them in layers
+    if curves is None:  # Blender 5 stores F-curves in layers
         strips = [strip for layer in action.layers for strip in layer.strips]
         curves = [curve for strip in strips for bag in strip.channelbags for curve in bag.fcurves]
     found = []

@@ -1,9 +1,9 @@
-"""Runs in a Blender of its own that was started with another colour configuration; tests/addon/test_ocio.py starts it.
+"""Runs in a separate Blender with another colour configuration; tests/addon/test_ocio.py starts it.
 
     OCIO=config.ocio PYTHON tests/addon/data/in_aces.py -- SHOT FOLDER      (or BLENDER --python ...)
 
-Puts the take `detail` into an empty scene and renders frame 6 as FOLDER/plate.exr (Mix 0), frozen.exr and warp.exr: in
-32-bit float, in the scene's own light. What was said goes into FOLDER/told.json.
+Inserts the take `detail` into an empty scene and renders frame 6 as FOLDER/plate.exr (Mix 0), frozen.exr and warp.exr.
+The files are 32-bit float, in the scene's linear space. Messages of the insertion are written to FOLDER/told.json.
 """
 
 import importlib

@@ -1,8 +1,8 @@
-"""Runs in a Blender of its own that was started with another colour configuration; tests/addon/test_ocio.py starts it.
+"""Runs in a separate Blender with another colour configuration; tests/addon/test_ocio.py starts it.
 
     OCIO=config.ocio PYTHON tests/addon/data/in_ocio.py -- SHOT FOLDER      (or BLENDER --python ...)
 
-Builds the camera, puts the take in, renders frame 6 twice (plate, frozen) into FOLDER, and writes FOLDER/told.json.
+Builds the camera, inserts the take, renders frame 6 twice (plate, frozen) into FOLDER, and writes FOLDER/told.json.
 """
 
 import importlib
@@ -21,7 +21,7 @@ def add_on(name: str):
 
 
 def there(scene) -> dict:
-    """All that a step could leave in the file."""
+    """Everything that a step could change in the file."""
     kinds = ("objects", "cameras", "meshes", "collections", "node_groups", "actions", "images", "textures")
     render, view = scene.render, scene.view_settings
     return {
@@ -36,7 +36,7 @@ def there(scene) -> dict:
 
 
 def tried(scene, change) -> dict:
-    """What a change said, or how it failed, and what of the file is different since."""
+    """Run a change; return its message or error, and the part of the file that it changed."""
     before = there(scene)
     try:
         said = {"said": change()}
@@ -57,7 +57,8 @@ def main() -> None:
     scene.splannequin.shot_path = str(shot)
     told = {"blender": bpy.app.version_string}
     told["first"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
-    if "error" in told["first"]:  # without a plate nothing has to be shown: a camera that a second try must spare
+    # without a plate no colour space is needed, so the camera is built; the next try must not remove it
+    if "error" in told["first"]:
         (shot / "frames").rename(shot / "away")
         told["without a plate"] = tried(scene, lambda: add_on("solve.arrival").load_camera(scene, shot))
         (shot / "away").rename(shot / "frames")

@@ -1,12 +1,14 @@
-"""Frames made of plates for the add-on's tests: in detail/ two frozen frames of 56 x 42 pixels, their warps in
-detail/warp/, and the linear plates that they are made of, with values from -0.2 to 50, in detail/plate/.
+"""Generates the add-on tests' frames composited from plates: two frozen frames of 56 x 42 pixels in detail/.
 
     python tests/addon/data/make_detail.py      (with the backend's Python: it uses the backend's own EXR writers)
 
-Frame numbers 5 and 6. The left third is the plate as it is, the middle one the plate moved by parts of a pixel, the
-right one the plate at a share over something else. In float32, centres of 56 or 42 pixels are not where they should be.
+Their warps go to detail/warp/. The linear plates that they are composited from, with values from -0.2 to 50, go to
+detail/plate/. Frame numbers are 5 and 6.
 
-detail_ap1/ has frame 6 and its warp once more, as they leave for ACEScg footage.
+The left third shows the unchanged plate. In the middle third the plate is moved by fractions of a pixel. In the right
+third it is blended with another picture. At the sizes 56 and 42, pixel centres are inexact in float32.
+
+detail_ap1/ holds frame 6 and its warp again, as written for ACEScg footage.
 """
 
 from pathlib import Path
@@ -28,7 +30,7 @@ def plate(frame: int) -> np.ndarray:
 
 
 def places(frame: int) -> np.ndarray:
-    """[H, W, 2] float64: where each pixel looks in the plate, in pixels of it from the top left, in steps of 1/256."""
+    """[H, W, 2] float64: plate position that each pixel shows, in pixels from the top left, in steps of 1/256."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
     moves = x >= WIDTH // 3
     x += moves * 1.4 * np.sin(y / 5.0 + frame)
@@ -43,7 +45,7 @@ def matte(frame: int) -> np.ndarray:
 
 
 def moved(pixels: np.ndarray, frame: int) -> np.ndarray:
-    """[H, W, C] float64: a picture seen through `places`, bilinear."""
+    """[H, W, C] float64: a picture sampled bilinearly at `places`."""
     at = places(frame)
     first = np.minimum(at.astype(int), [WIDTH - 2, HEIGHT - 2])
     (x, y), (fx, fy) = np.moveaxis(first, 2, 0), np.moveaxis((at - first)[..., None, :], 3, 0)
@@ -53,13 +55,13 @@ def moved(pixels: np.ndarray, frame: int) -> np.ndarray:
 
 
 def other(frame: int) -> np.ndarray:
-    """[H, W, 3] float32: what splats show there; multiples of 1/64."""
+    """[H, W, 3] float32: picture of the splats, in multiples of 1/64."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     return (np.stack([x * 2 + frame, y * 2 + frame, x + y], axis=2) % 65 / 64.0).astype(np.float32)
 
 
 def alpha() -> np.ndarray:
-    """[H, W]: a hole at the right bottom, half covered around it."""
+    """[H, W]: 0 in the bottom right corner, 0.5 around it, else 1."""
     whole = np.ones((HEIGHT, WIDTH), np.float32)
     whole[-4:, -4:], whole[-2:, -2:] = 0.5, 0.0
     return whole
@@ -72,12 +74,12 @@ def frozen(frame: int) -> np.ndarray:
 
 
 def source(frame: int) -> np.ndarray:
-    """[H, W] float32: numbers that a half float has not."""
+    """[H, W] float32: frame numbers that a half float cannot represent."""
     return np.where(matte(frame) > 0, 100_001.0 + frame, 0.0).astype(np.float32)
 
 
 def main() -> None:
-    """Writes the files into detail/ beside this one."""
+    """Write the files into detail/."""
     import OpenImageIO as oiio
     import torch
 

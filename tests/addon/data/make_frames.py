@@ -1,9 +1,9 @@
-"""The frozen frames of the add-on's tests: three files of 16 x 12 pixels whose every value can be computed again, and
-in overscan/ one whose frame is the 12 x 10 pixels in the middle, and in passes/ one with motion, normals and positions.
+"""Generates the frozen frames of the add-on's tests: three files of 16 x 12 pixels with reproducible values.
 
     python tests/addon/data/make_frames.py      (with the backend's Python: it uses the backend's own EXR writer)
 
-All values are exact in half floats. Frame numbers 5, 6, 7.
+overscan/ gets a picture whose frame is the 12 x 10 pixels in the middle. passes/ gets a picture with motion, normals
+and positions. All values are exact in half floats. Frame numbers are 5, 6 and 7.
 """
 
 from pathlib import Path
@@ -14,11 +14,11 @@ WIDTH, HEIGHT = 16, 12
 FRAMES = (5, 6, 7)
 NO_DEPTH = 1e10
 MARGIN = (2, 1)
-"""Pixels beyond the frame of overscan/000006.exr, left and right, and above and below."""
+"""Overscan of overscan/000006.exr in pixels: (left and right, above and below)."""
 
 
 def layers(frame: int) -> dict[str, np.ndarray]:
-    """rgba [H, W, 4] scene-linear premultiplied, depth, support and motion [H, W], top row first."""
+    """Layers of a frame, top row first: rgba [H, W, 4] scene-linear premultiplied; depth, support and motion [H, W]."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     alpha = np.where(x == 0, 0.5, 1.0)
     alpha[0, 0] = 0.0
@@ -33,7 +33,7 @@ def layers(frame: int) -> dict[str, np.ndarray]:
 
 
 def passes(frame: int) -> dict[str, np.ndarray]:
-    """Passes by layer, [H, W, C] float32, top row first; positions are none of a half float."""
+    """Passes by layer name, [H, W, C] float32, top row first. Half floats cannot represent the positions."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     vector = np.stack([x - 8.0, y - 4.0, frame - x / 2.0, y / 4.0 - 2.0], axis=2)
     normal = np.stack([(x % 5) / 4.0 - 0.5, (y % 5) / 4.0 - 0.5, (x + y) % 3 - 1.0], axis=2)
@@ -44,7 +44,7 @@ def passes(frame: int) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Writes the files beside this one."""
+    """Write the files into the folder of this file."""
     from torch_backend.freeze.exr import FrameMetadata, write_frozen_exr
 
     k = np.array([[20.0, 0.0, 8.0], [0.0, 20.0, 6.0], [0.0, 0.0, 1.0]], np.float32)

@@ -1,6 +1,6 @@
-"""Two frozen frames with grain for the add-on's tests: flat grey, half of it half covered, 96 x 64 pixels.
+"""Generates two frozen frames with grain for the add-on's tests: flat grey, 96 x 64 pixels, alpha 0.5 in one half.
 
-python tests/addon/data/make_grain.py      (with the backend's Python: the backend draws and writes them)
+python tests/addon/data/make_grain.py      (with the backend's Python: it renders and writes the frames)
 """
 
 from pathlib import Path
@@ -10,14 +10,14 @@ import numpy as np
 WIDTH, HEIGHT = 96, 64
 FRAMES = (5, 6)
 VALUE = 0.5
-"""Display-referred grey of the picture."""
+"""Grey of the picture, display-referred."""
 DEVIATION = (2.0 / 255.0, 4.0 / 255.0, 6.0 / 255.0)
-"""Of the plate's grain, display-referred, per channel."""
+"""Standard deviation of the plate's grain per channel, display-referred."""
 FOLDER = Path(__file__).with_name("grain")
 
 
 def main() -> None:
-    """Writes grain/NNNNNN.exr beside this file."""
+    """Write grain/NNNNNN.exr into the folder of this file."""
     from torch_backend.footage.display import PLAIN
     from torch_backend.freeze.composite.grain import BINS, Grain, draw
     from torch_backend.freeze.exr import FrameMetadata, write_frozen_exr

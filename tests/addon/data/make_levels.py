@@ -1,4 +1,4 @@
-"""Makes levels.mp4: 12 frames of 64 x 48, each of one colour, tagged as BT.709 video, for the tests of the add-on.
+"""Generates levels.mp4 for the add-on's tests: 12 frames of 64 x 48, each of one colour, tagged as BT.709 video.
 
 PYTHON tests/addon/data/make_levels.py        (the backend's Python)
 """
@@ -12,12 +12,12 @@ WIDTH, HEIGHT, FRAMES = 64, 48, 12
 
 
 def level(frame: int) -> int:
-    """Luma of a frame, 16 to 235: grey, so no matrix matters."""
+    """Luma of a frame, 16 to 235. Frames are grey, so the colour matrix has no effect."""
     return 20 + 16 * frame
 
 
 def main() -> None:
-    """Writes the file beside this one."""
+    """Write the file into the folder of this file."""
     import av
 
     with av.open(str(Path(__file__).with_name("levels.mp4")), "w") as container:

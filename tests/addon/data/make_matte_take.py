@@ -1,4 +1,4 @@
-"""Run by the backend's Python: the tiny world of its tests, trained for a moment and frozen at frame 105, in a folder.
+"""Train the tiny test world for a few steps and freeze it at frame 105; run by the backend's Python.
 
 python make_matte_take.py ROOT_OF_THE_REPOSITORY FOLDER
 """

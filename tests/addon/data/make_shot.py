@@ -1,4 +1,4 @@
-"""A shot as the backend leaves it, for the tests of the add-on: files of the real formats, made without either."""
+"""Write a shot in the backend's file formats for the add-on's tests, without Blender or the backend."""
 
 import importlib.util
 import json
@@ -17,7 +17,7 @@ _spec.loader.exec_module(make_frames)
 
 
 def write_png(path: Path, rgb: np.ndarray) -> None:
-    """8-bit RGB [H, W, 3] uint8 as a PNG, without help from Blender or the backend."""
+    """Write 8-bit RGB [H, W, 3] uint8 as a PNG, without Blender or the backend."""
     height, width, _ = rgb.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), rgb.reshape(height, width * 3)], axis=1)
 
@@ -30,14 +30,14 @@ def write_png(path: Path, rgb: np.ndarray) -> None:
 
 
 def rotation(axis: tuple[float, float, float], angle: float) -> np.ndarray:
-    """[3, 3], Rodrigues."""
+    """Rotation matrix [3, 3] by Rodrigues' formula."""
     x, y, z = np.array(axis) / np.linalg.norm(axis)
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
 def make_shot(parent: Path) -> Path:
-    """A shot as the backend leaves it: frames 5 to 7 of 16 x 12, solved, with one take. Files of the real formats."""
+    """Write a solved shot with frames 5 to 7 of 16 x 12 and one take, in the backend's file formats."""
     folder = parent / "my shot é.splannequin"
     (folder / "frames").mkdir(parents=True)
     (folder / "solve").mkdir()
@@ -72,7 +72,7 @@ def make_shot(parent: Path) -> Path:
 
 
 def add_take(folder: Path, name: str) -> Path:
-    """A take of the test frames."""
+    """Add a take of the test frames; return its folder."""
     take = folder / "takes" / name
     take.mkdir(parents=True)
     for n in make_frames.FRAMES:

@@ -1,4 +1,4 @@
-"""Pictures as they are stored, and frames as they leave the compositor."""
+"""Reads pictures as stored, and renders frames through the compositor."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import numpy as np
 
 
 def read(path: str | Path) -> np.ndarray:
-    """[H, W, channels] float32 of a picture, as stored, top row first."""
+    """[H, W, channels] float32: stored values of a picture, top row first."""
     image = bpy.data.images.load(str(path))
     try:
         image.colorspace_settings.is_data = True
@@ -19,7 +19,8 @@ def read(path: str | Path) -> np.ndarray:
 
 
 def render(scene: bpy.types.Scene, folder: Path, frame: int = 6, size: tuple[int, int] = (56, 42)) -> np.ndarray:
-    """[H, W, 4] float32: a frame as it leaves the compositor, top row first; the size is that of `make_detail`."""
+    """[H, W, 4] float32: a frame rendered through the compositor, top row first. The default size is
+    `make_detail`'s."""
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = *size, 100
     settings = scene.render.image_settings
     if hasattr(settings, "media_type"):

@@ -1,8 +1,8 @@
-"""Where a camera is while the shutter is open, as the backend has it, for a test of the add-on's.
+"""Writes the camera poses during one exposure, as the backend computes them, for a test of the add-on.
 
     python tests/addon/data/sub_poses.py REPOSITORY PATH.json FRAME DEPTH OUT.json      (with the backend's Python)
 
-OUT gets a list of world-to-camera matrices, 16 numbers each, for a shutter of 180 degrees and a wall in DEPTH.
+OUT gets a list of world-to-camera matrices, 16 numbers each, for a shutter of 180 degrees and a wall at DEPTH.
 """
 
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def main(root: str, path: str, frame: str, depth: str, out: str) -> None:
-    """Writes OUT."""
+    """Write OUT."""
     sys.path.insert(0, root)
     import torch
 

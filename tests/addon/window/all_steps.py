@@ -1,8 +1,9 @@
-"""Import Clip, then Solve, Train and Freeze, pressed in a real Blender window; a picture of each state.
+"""Presses Import Clip, then Solve, Train and Freeze, in a real Blender window; takes a picture of each state.
 
     python tests/addon/window/all_steps.py --blender BLENDER [--last 24] [--output docs/images]
 
-Needs what press_steps.py needs. Fails unless the two presses lead to a frozen take whose bar never fell.
+Needs what press_steps.py needs. Fails unless the two presses lead to a frozen take and the progress bar never went
+back.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import press_steps as press
 
 
 def main() -> int:
-    """The host's side."""
+    """Run the host's side."""
     args = press._arguments()
     plan = {"clip": str(Path(args.clip).absolute()), "last": args.last, "t_star": args.t_star}
     results = press._host(__file__, plan, args)
@@ -28,7 +29,7 @@ def main() -> int:
 
 
 def play(plan: dict, told: dict) -> Iterator[float]:
-    """The artist: yields seconds to wait between what it does."""
+    """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
     press._time_ticks(told)

@@ -1,13 +1,14 @@
-"""Suzanne, a second one and a chrome ball among the frozen people, with shadows on desk and lap: a picture of it.
+"""Renders Suzanne, a second one and a chrome ball among the frozen people, with shadows on desk and lap.
 
     SPLANNEQUIN_BACKEND_PYTHON=.venv/bin/python .venv-bpy-5.0/bin/python tests/addon/window/among.py SHOT.splannequin
     python tests/addon/window/among.py SHOT.splannequin --blender BLENDER [--pictures DIR]
 
-SHOT is a solved and trained shot of the bundled clip. Its take "among" is frozen at frame 50 and its surface is made if
-they are missing. The first command needs no window and writes docs/images/cg-among-frozen.jpg, or `--output FILE`; a
-Blender without the extension runs it as `blender -b --factory-startup --python among.py -- SHOT`. The second presses
-the panel's buttons in a real window, on a copy of the shot whose take has to be there; see press_steps.py for what it
-needs. Where things stand is taken from the take's depth and surface.
+SHOT is a solved and trained shot of the bundled clip. If they are missing, its take "among" is frozen at frame 50 and
+its surface is made. Objects are placed by the take's depth and surface.
+
+The first command needs no window and writes docs/images/cg-among-frozen.jpg, or `--output FILE`. A Blender without the
+extension runs it as `blender -b --factory-startup --python among.py -- SHOT`. The second command presses the panel's
+buttons in a real window, on a copy of the shot, whose take must exist; press_steps.py lists what it needs.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import press_steps as press
 
-with contextlib.suppress(ImportError):  # the host of a window has no bpy
+with contextlib.suppress(ImportError):  # the process that controls a window has no bpy
     import bpy
     import cube
     from mathutils import Matrix, Vector
@@ -38,21 +39,21 @@ with contextlib.suppress(ImportError):  # the host of a window has no bpy
     cube.TAKE, cube.FRAME = "among", 50
 
 DESK = (0.31, 0.77, 0.70, 0.75)
-"""Left, right, top and bottom of the part of frame 50 that shows the desk, 0 to 1 from the upper left."""
+"""Part of frame 50 that shows the desk: left, right, top, bottom, from 0 to 1, counted from the upper left."""
 SUZANNE, BEHIND, BALL = (0.46, 0.708), (0.275, 0.735), (0.60, 0.735)
-"""Where on the desk the three stand: between the men, behind the left man's hand, left of the right man's keyboard."""
+"""Frame positions on the desk: between the men, behind the left man's hand, and left of the right man's keyboard."""
 TALL, SMALL, ROUND = 0.15, 0.12, 0.09
-"""Their widths in shares of the frame's width."""
+"""Widths of the three objects as fractions of the frame's width."""
 LAP = (0.36, 0.86)
-"""Where on the left man's lap the shadow of Suzanne's forehead falls: the lamp shines along that line."""
+"""Frame position on the left man's lap where the shadow of Suzanne's forehead falls; it gives the lamp's direction."""
 SHADOWS = {"desk": (0.43, 0.46, 0.735, 0.745), "lap": (0.34, 0.40, 0.86, 0.88)}
-"""Left, right, top and bottom of places in Suzanne's shadow."""
+"""Areas in Suzanne's shadow: left, right, top, bottom."""
 HAND, ABOVE_HAND = (0.25, 0.285, 0.73, 0.755), (0.25, 0.285, 0.66, 0.70)
-"""A place of the left man's hand in front of the second one, and of the second one above it."""
+"""Area of the left man's hand in front of the second Suzanne, and area of that Suzanne above the hand."""
 
 
 class Eye:
-    """Places in the scene of places in the frame."""
+    """Maps positions in the frame to the scene."""
 
     def __init__(self, depth: np.ndarray) -> None:
         self.depth = depth
@@ -63,24 +64,25 @@ class Eye:
         self.axis = camera.matrix_world.to_3x3() @ Vector((0.0, 0.0, -1.0))
 
     def at(self, place: tuple[float, float]) -> Vector:
-        """The frozen surface that is seen at a place of the frame."""
+        """Point of the frozen surface at a frame position."""
         ray = self.ray(place)
         return self.place + ray * (cube.at(self.depth, place) / ray.dot(self.axis))
 
     def ray(self, place: tuple[float, float]) -> Vector:
-        """From the camera through a place of the frame."""
+        """Ray from the camera through a frame position (not normalised)."""
         return self.corner + place[0] * self.right + place[1] * self.down - self.place
 
     def size(self, where: Vector, share: float) -> float:
-        """Length in the scene of a share of the frame's width, at a point's distance."""
+        """Length in the scene, at the distance of `where`, that spans `share` of the frame's width."""
         away = (where - self.place).dot(self.axis)
         return share * self.right.length * away / (self.corner - self.place).dot(self.axis)
 
 
 def plane_of(points: np.ndarray, towards: Vector) -> tuple[Vector, Vector]:
-    """(a point of the plane through most of the points [N, 3], its normal on the side of `towards`).
+    """(point, normal) of the plane through most of the points [N, 3]; the normal points towards `towards`.
 
-    What stands on the desk is no part of the plane: each round leaves out points farther from it than twice the median.
+    Objects on the desk must not tilt the plane. Each round keeps points no farther from it than twice the median
+    distance.
     """
     kept = points
     for _ in range(20):
@@ -93,7 +95,7 @@ def plane_of(points: np.ndarray, towards: Vector) -> tuple[Vector, Vector]:
 
 
 def material_of(name: str, colour: tuple[float, ...], metal: float, rough: float) -> bpy.types.Material:
-    """A material of the Principled shader."""
+    """New material with a Principled shader."""
     material = bpy.data.materials.new(name)
     if material.node_tree is None:
         material.use_nodes = True
@@ -104,7 +106,7 @@ def material_of(name: str, colour: tuple[float, ...], metal: float, rough: float
 
 
 def put(eye: Eye) -> None:
-    """Suzannes and ball on the desk, in the light of the shot and of a lamp."""
+    """Add two Suzannes and a ball on the desk, and a lamp; the shot's light stays on."""
     scene = bpy.context.scene
     left, right, top, bottom = DESK
     columns, rows = np.linspace(left, right, 60).tolist(), np.linspace(top, bottom, 20).tolist()
@@ -112,7 +114,7 @@ def put(eye: Eye) -> None:
     graph = bpy.context.evaluated_depsgraph_get()
 
     def on_desk(place: tuple[float, float]) -> Vector:
-        """Where the ray of a place meets the desk's plane, dropped onto the surface as snapping to faces does."""
+        """Intersection of a position's ray with the desk's plane, moved onto the surface along the normal."""
         ray = eye.ray(place)
         where = eye.place + ray * ((middle - eye.place).dot(up) / ray.dot(up))
         is_hit, found, *_ = scene.ray_cast(graph, where + up, -up, distance=2.0)
@@ -120,7 +122,7 @@ def put(eye: Eye) -> None:
 
     front = (eye.place - middle).normalized()
     front = (front - up * front.dot(up)).normalized()
-    turn = Matrix((up.cross(front), -front, up)).transposed()  # Suzanne looks along her -Y
+    turn = Matrix((up.cross(front), -front, up)).transposed()  # Suzanne faces -Y
     for name, place, share, colour in (
         ("Suzanne", SUZANNE, TALL, (0.8, 0.25, 0.05)), ("Behind", BEHIND, SMALL, (0.05, 0.35, 0.7)),
     ):  # fmt: skip
@@ -153,8 +155,11 @@ def put(eye: Eye) -> None:
 
 
 def check(picture: np.ndarray, frozen: np.ndarray, cg: np.ndarray) -> dict[str, float]:
-    """Figures of a picture: how much of CG and its shadows is as Cycles made it over the frozen frame, where no man is
-    near, and how dark shadows are. AssertionError if CG, a shadow or the hand in front is missing."""
+    """Compare CG and shadows of a picture with CG composited over the frozen frame, away from the men; return the
+    figures.
+
+    Figures include the darkness of the shadows. Raises AssertionError if CG, a shadow or the hand in front is missing.
+    """
     covered = cg[..., 3] > 0.01
     covered[:, : int(0.36 * covered.shape[1])] = covered[:, int(0.72 * covered.shape[1]) :] = False
     over = cg[..., :3] + (1.0 - cg[..., 3:]) * frozen[..., :3]
@@ -179,20 +184,20 @@ def check(picture: np.ndarray, frozen: np.ndarray, cg: np.ndarray) -> dict[str, 
 
 
 def cut(picture: np.ndarray, place: tuple[float, float, float, float]) -> np.ndarray:
-    """A part of a picture: left, right, top, bottom in 0 to 1."""
+    """Part of a picture; `place` is left, right, top, bottom in 0 to 1."""
     height, width = picture.shape[:2]
     left, right, top, bottom = place
     return picture[int(top * height) : int(bottom * height), int(left * width) : int(right * width)]
 
 
 def display(linear: np.ndarray) -> np.ndarray:
-    """8-bit sRGB of scene-linear values, not rounded."""
+    """Scene-linear values as 8-bit sRGB, not rounded."""
     linear = np.clip(linear, 0.0, 1.0)
     return 255.0 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def save(picture: np.ndarray, path: Path) -> None:
-    """A scene-linear picture as a JPEG in sRGB."""
+    """Save a scene-linear picture as an sRGB JPEG."""
     height, width = picture.shape[:2]
     image = bpy.data.images.new("among", width, height)
     shown = np.concatenate([display(picture[..., :3]) / 255.0, np.ones_like(picture[..., :1])], -1)
@@ -204,7 +209,7 @@ def save(picture: np.ndarray, path: Path) -> None:
 
 
 class Sockets:
-    """Pictures of the compositor's sockets."""
+    """Renders sockets of the compositor."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -213,16 +218,16 @@ class Sockets:
         self.layers = next(n for n in tree.nodes if n.bl_idname == "CompositorNodeRLayers")
 
     def of_group(self, output: str) -> np.ndarray:
-        """[H, W, 4] an output of the freeze's group."""
+        """[H, W, 4]: an output of the freeze's group."""
         return cube.see(self.group.outputs[output], self.folder, output)
 
     def cg(self) -> np.ndarray:
-        """[H, W, 4] the scene's own render."""
+        """[H, W, 4]: the scene's own render."""
         return cube.see(self.layers.outputs["Image"], self.folder, "CG")
 
 
 def headless(shot: Path, output: Path, samples: int) -> None:
-    """Bakes, adds the surface, puts things, renders, prints what is seen."""
+    """Bake, add the surface, place the objects, render, and print the figures."""
     cube.start()
     scene, shot = bpy.context.scene, shot.absolute()
     scene.splannequin.shot_path = str(shot)
@@ -252,7 +257,7 @@ def headless(shot: Path, output: Path, samples: int) -> None:
 
 
 def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
-    """The artist in a window: a surface, light, CG and a bake by the panel's buttons."""
+    """Play the artist in a window: surface, light, CG and bake by the panel's buttons."""
     work = Path(plan["work"])
     shot = work / "sitting.splannequin"
     shutil.copytree(plan["shot"], shot, ignore=shutil.ignore_patterns("jobs", "lock.json"))
@@ -296,29 +301,31 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 def _scene() -> Any:
-    """The window's scene: undo makes another one of it."""
+    """The window's scene. Undo replaces the scene object, so it is looked up each time."""
     return bpy.context.window_manager.windows[0].scene
 
 
 def _entry() -> Any:
-    """What the shot has in the scene."""
+    """The shot's entry in the scene's record of created objects."""
     return _scene().splannequin.made[0]
 
 
 def _group() -> Any:
-    """The freeze's node, if the scene has it."""
+    """Node of the freeze's group, or None."""
     tree = cube.add_on("compat").compositor_tree(_scene())
     return None if tree is None else cube.add_on("bake.freeze_group").group_node(tree)
 
 
 def _press(shot: Path, operator: str, told: dict[str, Any], has: Callable[[], Any] | None = None) -> Iterator[float]:
-    """Clicks a button of the panel and waits until what it began has ended. With `has`, which finds what is added,
-    it is undone and redone, too."""
+    """Click a button of the panel and wait until its job has ended.
+
+    With `has`, which finds the added object, also undo and redo the step.
+    """
     watch = press._supervisor().watch_of(shot)
     window = bpy.context.window_manager.windows[0]
     with bpy.context.temp_override(window=window):
         bpy.ops.ed.undo_push(message="Before")
-    for _ in range(8):  # the end of the sidebar has all of these buttons
+    for _ in range(8):  # all of these buttons are at the end of the sidebar
         yield from press._scroll_down()
     began = time.monotonic()
     yield from press._click(f"splannequin.{operator}")
@@ -341,7 +348,7 @@ def _press(shot: Path, operator: str, told: dict[str, Any], has: Callable[[], An
 
 
 def _show_render(work: Path) -> Iterator[float]:
-    """A picture of the window with what was baked."""
+    """Take a picture of the window with the baked frame."""
     window = bpy.context.window_manager.windows[0]
     window.workspace = bpy.data.workspaces["Rendering"]
     yield 2.0
@@ -349,7 +356,7 @@ def _show_render(work: Path) -> Iterator[float]:
 
 
 def main() -> int:
-    """The command line, of all three ways to run it."""
+    """Run the command line, in any of the three ways."""
     words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     parser = argparse.ArgumentParser(description="CG among the frozen people.")
     parser.add_argument("shot", type=Path, help="solved and trained shot folder; a take is added to it")

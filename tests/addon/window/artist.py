@@ -1,11 +1,11 @@
-"""The whole way as an artist goes it, in real windows: install, set up, five steps, SIGKILL in between, scrub, result.
+"""Walks an artist's whole workflow in real windows: install, set up, five steps, a SIGKILL, scrub, and result.
 
     python tests/addon/window/artist.py --blender BLENDER --zip EXTENSION.zip [--last 24] [--output docs/images]
 
-Three Blenders, one after the other, in a home folder of their own: the first installs the extension and sets its
-backend up from the preferences (packages are downloaded: about 1.5 GB), the second imports, solves and is killed with
-SIGKILL while it trains, the third opens the saved file, finds the job, scrubs, freezes, bakes and renders. Every button
-is pressed by simulated events. Fails unless the job went on without Blender and every step ended well. Needs what
+Three Blenders run one after the other in a separate home folder. The first installs the extension and sets its backend
+up from the preferences (it downloads about 1.5 GB of packages). The second imports, solves, and is killed with SIGKILL
+during training. The third opens the saved file, finds the job, scrubs, freezes, bakes and renders. Every button is
+pressed by simulated events. Fails unless the job continued without Blender and every step ended well. Needs what
 press_steps.py needs.
 """
 
@@ -31,7 +31,7 @@ PLAN = "SPLANNEQUIN_ARTIST_PLAN"
 
 
 def main() -> int:
-    """The host's side: three Blenders on one display."""
+    """Run the host's side: three Blenders on one display."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--blender", required=True)
     parser.add_argument("--zip", default="", help="the built extension; without it, it is taken to be installed")
@@ -76,7 +76,7 @@ def main() -> int:
 
 
 def _told(work: Path) -> dict[str, Any]:
-    """What the last Blender told."""
+    """Results written by the last Blender."""
     told = work / "told.json"
     if not told.is_file():
         return {"error": "a Blender ended without telling how it went"}
@@ -86,7 +86,7 @@ def _told(work: Path) -> dict[str, Any]:
 
 
 def _serve_until(file: Path, blender: Any, work: Path, output: Path, environ: dict[str, str], limit: float) -> None:
-    """Takes pictures until `file` is there; RuntimeError if Blender ends before."""
+    """Take requested pictures until `file` exists; raise RuntimeError if Blender ends before."""
     until = time.monotonic() + limit
     while not file.exists():
         if blender.poll() is not None or time.monotonic() > until:
@@ -96,7 +96,7 @@ def _serve_until(file: Path, blender: Any, work: Path, output: Path, environ: di
 
 
 def _state(work: Path) -> str:
-    """State of the training job by its status file."""
+    """State of the training job in its status file."""
     status = max((work / "sitting.splannequin" / "jobs").glob("*-train-*/status.json"))
     return str(json.loads(status.read_text())["state"])
 
@@ -105,7 +105,7 @@ def _state(work: Path) -> str:
 
 
 def inside() -> None:
-    """Starts this turn's script as a timer."""
+    """Start this turn's script as a timer."""
     import bpy
 
     plan = json.loads(os.environ[PLAN])
@@ -117,7 +117,7 @@ def inside() -> None:
 
 
 def _set_up(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
-    """Installs the zip, sets the backend up from the preferences, keeps both for the next Blender."""
+    """Install the zip, set the backend up from the preferences, and save both for the next Blender."""
     import bpy
 
     work = Path(plan["work"])
@@ -168,7 +168,7 @@ def _set_up(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 def _first(plan: dict[str, Any], _: dict[str, Any]) -> Iterator[float]:
-    """Import, solve, save, train; asks to be killed once the training is under way."""
+    """Import, solve, save and train; request to be killed once the training runs."""
     import bpy
 
     work = Path(plan["work"])
@@ -196,7 +196,7 @@ def _first(plan: dict[str, Any], _: dict[str, Any]) -> Iterator[float]:
 
 
 def _second(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
-    """The file is open again: the job is found, watched to its end, and the shot is finished."""
+    """Reopen the file: find the job, watch it until it ends, and finish the shot."""
     import bpy
 
     work = Path(plan["work"])
@@ -224,7 +224,7 @@ def _second(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 def _scrub(plan: dict[str, Any], work: Path) -> Iterator[float]:
-    """Scrubs in the view, and sets t* from the frame that is shown."""
+    """Scrub in the view, and set t* from the shown frame."""
     import bpy
 
     yield from press._click("splannequin.live")

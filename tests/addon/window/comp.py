@@ -1,11 +1,14 @@
-"""What a bake leaves in an artist's comp, in a real Blender window: sizes, CG, a grade, the way back. With pictures.
+"""Checks what a bake leaves in an artist's comp, in a real Blender window: sizes, CG, a grade, removal.
 
     python tests/addon/window/comp.py --blender BLENDER --shot SHOT.splannequin [--output docs/images]
 
-BLENDER has the extension installed, as for press_steps.py; the shot is of the bundled clip and has a take "freeze" with
-frame 48 (`freeze examples/sitting.mp4`, any preset). Exit status 0 if the take, put in at 50 %, fills the frame at
-100 %; a cube stands where Only Moving shows the plate, its edge is soft, and nobody's hand is there twice; a grade
-behind the plate stays; the scene kept its size, and has its camera back in the end.
+BLENDER has the extension installed, as for press_steps.py. The shot is of the bundled clip and has a take "freeze" with
+frame 48 (`freeze examples/sitting.mp4`, any preset). Takes pictures. Exit status is 0 if
+
+- the take, inserted at 50 %, fills the frame at 100 %;
+- the cube is kept where Only Moving shows the plate, its edge is soft, and no hand is shown twice;
+- a grade behind the plate is kept;
+- the scene keeps its size, and has its camera back at the end.
 """
 
 from __future__ import annotations
@@ -56,7 +59,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
-    """Put in at 50 %, rendered at 100 %: alone, with a cube, and where only what moves is frozen."""
+    """Insert at 50 % and render at 100 %: alone, with a cube, and with Only Moving."""
     import bpy
     import cube
     import numpy as np
@@ -89,14 +92,14 @@ def _cg(work: Path, told: dict[str, Any]) -> Iterator[float]:
     moving = _render(work, "only-moving")
     told["cube_kept"] = bool(np.abs(moving - among)[solid & seen].max(axis=1).mean() < 0.05)
     told["only_moving_differs"] = round(float((np.abs(moving - among).max(axis=2) > 0.2).mean()), 4)
-    told["moved_once"] = told["only_moving_differs"] < 0.003  # a hand that has gone elsewhere in the plate: 0.01
+    told["moved_once"] = told["only_moving_differs"] < 0.003  # 0.01 if the plate shows a hand a second time
     yield from _show(work, "11-only-moving", "Rendering")
     bpy.data.objects.remove(next(o for o in scene.objects if o.type == "MESH" and not o.hide_render))
     _press("remove_shot")
 
 
 def _beside(mask: Any) -> Any:
-    """Pixels within two of a mask's."""
+    """Mask dilated by two pixels."""
     import numpy as np
 
     found = mask.copy()
@@ -107,7 +110,7 @@ def _beside(mask: Any) -> Any:
 
 
 def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
-    """A comp of the artist's: the plate, without its colours. The freeze goes in between, and out again."""
+    """Artist's comp that removes the plate's colours: insert the freeze between the nodes, and remove it."""
     import bpy
     import numpy as np
 
@@ -148,7 +151,7 @@ def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
     region = next(r for r in area.regions if r.type == "WINDOW")
     if compat.HAS_COMPOSITING_GROUP:
         area.spaces.active.node_tree = tree
-        area.spaces.active.show_region_asset_shelf = False  # it would lie over the nodes
+        area.spaces.active.show_region_asset_shelf = False  # it would cover the nodes
         yield 1.0
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.node.view_all()
@@ -158,7 +161,7 @@ def _grade(work: Path, shot: Path, told: dict[str, Any]) -> Iterator[float]:
 
 
 def _press(operator: str) -> set[str]:
-    """Runs an operator of ours, as its button does."""
+    """Run an operator of the extension as its button does."""
     import bpy
 
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
@@ -166,7 +169,7 @@ def _press(operator: str) -> set[str]:
 
 
 def _render(work: Path, name: str) -> Any:
-    """The frame as it leaves the compositor, [H, W, 3] in 0..1 as shown, top row first."""
+    """[H, W, 3] in 0..1: the frame rendered through the compositor, display-referred, top row first."""
     import bpy
     import numpy as np
 
@@ -184,7 +187,7 @@ def _render(work: Path, name: str) -> Any:
 
 
 def _crop(work: Path, picture: Any, alpha: Any) -> Iterator[float]:
-    """A picture of a part of the frame about the cube's left edge, each pixel four times as large."""
+    """Take a picture of the frame around the cube's left edge, magnified four times."""
     import bpy
     import numpy as np
 
@@ -198,7 +201,7 @@ def _crop(work: Path, picture: Any, alpha: Any) -> Iterator[float]:
 
 
 def _show(work: Path, name: str, workspace: str, image: Any = None) -> Iterator[float]:
-    """A picture of the window with a workspace in it; an image editor shows an image, or the render."""
+    """Take a picture of the window in a workspace; an image editor shows `image`, or the render."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]

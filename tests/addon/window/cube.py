@@ -1,10 +1,10 @@
-"""A cube put by hand among the frozen people: rendered through the compositor, checked, kept as a picture.
+"""Places a cube among the frozen people, renders it through the compositor, checks it and saves a picture.
 
     SPLANNEQUIN_BACKEND_PYTHON=.venv/bin/python .venv-bpy-5.0/bin/python tests/addon/window/cube.py SHOT.splannequin
 
-SHOT is a solved and trained shot of the bundled clip; its take "cube" is frozen at the plate's size if it is not there.
+SHOT is a solved and trained shot of the bundled clip. Its take "cube" is frozen at the plate's size if it is missing.
 No window is needed. Writes docs/images/cube-among-frozen.jpg (`--output FILE` for another place). The cube stands on
-the desk behind the man on the right, nearer than the screen that it covers; where, is taken from the take's own depth.
+the desk behind the man on the right and in front of a screen. Its place comes from the take's depth.
 """
 
 import argparse
@@ -21,20 +21,20 @@ from mathutils import Euler, Vector
 ROOT = Path(__file__).resolve().parents[3]
 TAKE, FRAME = "cube", 48
 MAN, SCREEN = (0.835, 0.47), (0.70, 0.50)
-"""Where the head of the man on the right and the screen behind him are in the frame, 0 to 1 from the upper left."""
+"""Frame positions of the right man's head and of the screen behind him, 0 to 1 from the upper left."""
 MIDDLE, SIDE = (0.752, 0.5), 0.13
-"""Where the cube is to be seen, and how wide in shares of the frame's width."""
+"""Frame position of the cube's centre, and its width as a fraction of the frame's width."""
 NEAR = 0.03
-"""Nearer to each other than this share of their distance, frozen surface and cube are not told apart here."""
+"""Relative depth difference below which the check does not decide whether surface or cube is in front."""
 
 
 def add_on(name: str):
-    """A module of the add-on."""
+    """Module of the add-on."""
     return importlib.import_module(f"bl_ext.user_default.splannequin.splannequin_addon.{name}")
 
 
 def start() -> None:
-    """Registers the package as an installed extension is."""
+    """Register the package as an installed extension."""
     spec = importlib.util.spec_from_file_location("run_in_bpy", ROOT / "splannequin_addon" / "run_in_bpy.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -42,7 +42,7 @@ def start() -> None:
 
 
 def bake(shot: Path) -> None:
-    """The frozen frame in the compositor of a new scene, behind the solved camera."""
+    """Insert the frozen frame into the compositor of a new scene with the solved camera."""
     bpy.ops.wm.read_homefile(use_empty=True)
     scene = bpy.context.scene
     scene.splannequin.shot_path, scene.splannequin.set_up_scene = str(shot), True
@@ -80,7 +80,7 @@ def see(socket, folder: Path, name: str) -> np.ndarray:
 
 
 def pixels_of(path: Path) -> np.ndarray:
-    """[H, W, 4] float32 values of a picture file as they are, top row first."""
+    """[H, W, 4] float32: stored values of a picture file, top row first."""
     image = bpy.data.images.load(str(path))
     image.colorspace_settings.name = "Non-Color"
     width, height = image.size
@@ -91,19 +91,20 @@ def pixels_of(path: Path) -> np.ndarray:
 
 
 def at(layer: np.ndarray, place: tuple[float, float]) -> float:
-    """Median of a layer [H, W] about a place of the frame."""
+    """Median of a layer [H, W] around a frame position."""
     row, column = int(place[1] * layer.shape[0]), int(place[0] * layer.shape[1])
     return float(np.median(layer[row - 4 : row + 5, column - 4 : column + 5]))
 
 
 def put_cube(depth: np.ndarray) -> float:
-    """A chequered cube between man and screen, lit like the hall; returns its distance along the camera's axis."""
+    """Add a chequered cube between man and screen, lit like the hall; return its distance along the camera's axis."""
     scene = bpy.context.scene
     man, screen = at(depth, MAN), at(depth, SCREEN)
     assert man < 0.9 * screen, f"the man at {man:.2f} should be well in front of the screen at {screen:.2f}"
     along = 0.5 * (man + screen)
     camera = scene.camera
-    corners = [camera.matrix_world @ c for c in camera.data.view_frame(scene=scene)]  # right up, right down, left down
+    # top right, bottom right, bottom left
+    corners = [camera.matrix_world @ c for c in camera.data.view_frame(scene=scene)]
     right, down = corners[0] - corners[3], corners[1] - corners[0]
     eye = camera.matrix_world.translation
     ray = corners[3] + MIDDLE[0] * right + MIDDLE[1] * down - eye
@@ -113,7 +114,7 @@ def put_cube(depth: np.ndarray) -> float:
     bpy.ops.mesh.primitive_cube_add(size=0.8 * wide, location=place)
     cube = bpy.context.object
     cube.rotation_mode = "QUATERNION"
-    # Upright as the camera is, turned to show two sides and the top.
+    # Aligned with the camera, then turned to show two sides and the top.
     turn = camera.matrix_world.to_quaternion()
     cube.rotation_quaternion = turn @ Euler((0.35, 0.6, 0.0)).to_quaternion()
     material = bpy.data.materials.new("Chequers")
@@ -141,7 +142,7 @@ def put_cube(depth: np.ndarray) -> float:
 
 
 def check(picture: np.ndarray, frozen: np.ndarray, depth: np.ndarray, cube: np.ndarray, far: np.ndarray) -> str:
-    """Every pixel that the cube could cover, but its edge and where the two are equally far; a line of figures."""
+    """Check every pixel that the cube may cover, except its edge and nearly equal depths; return a line of figures."""
     inside = cube[..., 3] > 0.999
     outside = cube[..., 3] == 0.0
     nearer = inside & (far < depth * (1.0 - NEAR))
@@ -149,7 +150,7 @@ def check(picture: np.ndarray, frozen: np.ndarray, depth: np.ndarray, cube: np.n
     assert nearer.sum() > 1000, f"the cube should be seen, {nearer.sum()} pixels of it are"
     assert hidden.sum() > 300, f"the man should hide a part of the cube, he hides {hidden.sum()} pixels"
     np.testing.assert_allclose(picture[nearer][:, :3], cube[nearer][:, :3], atol=1e-4)
-    # Splats cover all but a percent of what is behind them.
+    # Splats let up to a percent of the background through.
     np.testing.assert_allclose(picture[hidden][:, :3], frozen[hidden][:, :3], atol=0.01)
     np.testing.assert_allclose(picture[outside][:, :3], frozen[outside][:, :3], atol=1e-4)
     undecided = inside & ~nearer & ~hidden
@@ -157,7 +158,7 @@ def check(picture: np.ndarray, frozen: np.ndarray, depth: np.ndarray, cube: np.n
 
 
 def keep(picture: Path, folder: Path) -> None:
-    """The picture as it leaves, as a JPEG of at most 150 kB."""
+    """Save the rendered picture as a JPEG of at most 150 kB."""
     scene = bpy.context.scene
     settings = scene.render.image_settings
     for quality in (92, 85, 75, 60):
@@ -172,7 +173,7 @@ def keep(picture: Path, folder: Path) -> None:
 
 
 def main() -> None:
-    """Bakes, puts the cube, checks, writes."""
+    """Bake, place the cube, check, and write the picture."""
     parser = argparse.ArgumentParser(description="A cube among the frozen people.")
     parser.add_argument("shot", type=Path, help="solved and trained shot folder; a take is added to it")
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "images" / "cube-among-frozen.jpg")

@@ -1,13 +1,13 @@
-"""The first ten minutes of an artist with an empty profile: every sentence of the panel, every wait, a picture each.
+"""Records the first ten minutes of an artist with an empty profile: the panel's sentences, waiting times, and pictures.
 
     SPLANNEQUIN_WINDOW=1920x1080 python tests/addon/window/first_minutes.py --blender BLENDER --zip EXTENSION.zip
         [--clip CLIP] [--last N] [--output DIR]
 
-The backend's environment is there (SPLANNEQUIN_BACKEND_PYTHON): its set-up is `artist.py`'s. One Blender with an empty
-profile installs the zip; the clip is dropped on the 3D view, and the buttons are pressed down to the render. Writes
-first_minutes.json beside the pictures: for each stage its seconds and the sentences that the panel showed meanwhile.
-Fails unless all five steps end, and every button is in sight when it is needed, in the window's height. Needs what
-press_steps.py needs.
+The backend's environment must exist (SPLANNEQUIN_BACKEND_PYTHON); `artist.py` tests its set-up. One Blender with an
+empty profile installs the zip. The clip is dropped on the 3D view, and the buttons are pressed down to the render.
+Writes first_minutes.json to the folder of the pictures: for each stage its seconds and the sentences shown by the
+panel. Fails unless all five steps end and every button is in sight when it is needed, at the window's height. Needs
+what press_steps.py needs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def main() -> int:
-    """The host's side: a fresh profile, a display, Blender on it."""
+    """Run the host's side: a fresh profile, a display, and Blender."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--blender", required=True)
     parser.add_argument("--zip", required=True, help="the built extension")
@@ -55,7 +55,7 @@ def main() -> int:
 
 
 class Record:
-    """Seconds of each stage, and the sentences that the panel shows in it."""
+    """Records the seconds of each stage and the sentences that the panel shows in it."""
 
     def __init__(self, told: dict[str, Any], work: Path) -> None:
         self.told, self.work = told, work
@@ -63,15 +63,15 @@ class Record:
         self.stage, self.began, self.seen = "", time.monotonic(), set[str]()
 
     def enter(self, stage: str) -> None:
-        """Ends the stage before, and begins one."""
+        """End the current stage and begin another."""
         now = time.monotonic()
         if self.stage:
             self.told["seconds"][self.stage] = round(now - self.began, 1)
         self.stage, self.began, self.seen = stage, now, set()
-        (self.work / "told.json").write_text(json.dumps(self.told))  # what there is by now, should Blender be ended
+        (self.work / "told.json").write_text(json.dumps(self.told))  # partial results, in case Blender is ended
 
     def hear(self, text: str) -> None:
-        """Notes a sentence once in each stage; sentences that differ in their figures are one."""
+        """Record a sentence once per stage; sentences that differ only in numbers count as equal."""
         alike = re.sub(r"\d+(\.\d+)?", "0", text)
         if text and alike not in self.seen:
             self.seen.add(alike)
@@ -79,7 +79,7 @@ class Record:
 
 
 def listen(record: Record) -> None:
-    """Has all that the panel wraps into lines, and the text of its bars, noted."""
+    """Record all texts that the panel wraps into lines, and the texts of its progress bars."""
     sentences = press.addon_module("ui.sentences")
     wrap, panel = sentences.wrap, press.addon_module("ui.step_panel")
     tr = panel.tr
@@ -99,7 +99,7 @@ def listen(record: Record) -> None:
 
 
 def count_searches(told: dict[str, Any]) -> None:
-    """Counts how often a button was not in sight: a step had to be opened for it, or the panel scrolled."""
+    """Count the cases in which a button was out of sight, so that a step was opened or the panel scrolled."""
 
     def counted(act: Callable[..., Iterator[float]]) -> Callable[..., Iterator[float]]:
         def do(*args: Any) -> Iterator[float]:
@@ -112,7 +112,7 @@ def count_searches(told: dict[str, Any]) -> None:
 
 
 def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
-    """The artist: yields seconds to wait between what it does."""
+    """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
     work = Path(plan["work"])
@@ -153,7 +153,7 @@ def play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 def scrub(work: Path, told: dict[str, Any]) -> Iterator[float]:
-    """Scrubs from end to end, and takes the frame that is shown for t*."""
+    """Scrub from end to end, and set t* to the shown frame."""
     import bpy
 
     yield from press._click("splannequin.live")
@@ -178,7 +178,7 @@ def scrub(work: Path, told: dict[str, Any]) -> Iterator[float]:
 
 
 def inside() -> None:
-    """Starts the script as a timer."""
+    """Start the script as a timer."""
     import bpy
 
     plan = json.loads(os.environ[press.PLAN])

@@ -2,8 +2,8 @@
 
     python tests/addon/window/pick.py --blender BLENDER --shot SHOT.splannequin [--output docs/images]
 
-BLENDER has the extension installed, as for press_steps.py. Prints what was checked as JSON; pictures: a point under the
-mouse, two of three points picked, the question for the distance.
+BLENDER has the extension installed, as for press_steps.py. Prints the checks as JSON. Takes pictures of a point under
+the mouse, of two of three picked points, and of the dialog for the distance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import press_steps as press
 
 
 class _Artist:
-    """A hand on the mouse, over the first 3D view."""
+    """Simulates the mouse over the first 3D view."""
 
     def __init__(self, scene: Any) -> None:
         import bpy
@@ -34,14 +34,14 @@ class _Artist:
         return self.scene.splannequin.made[0].root
 
     def at(self, place: Any) -> tuple[int, int]:
-        """Pixel of a place of the world."""
+        """Pixel of a point in world space."""
         from bpy_extras.view3d_utils import location_3d_to_region_2d
 
         seen = location_3d_to_region_2d(self.region, self.region.data, place)
         return self.region.x + round(seen.x), self.region.y + round(seen.y)
 
     def invoke(self, operator: str) -> None:
-        """As a button of the sidebar does."""
+        """Invoke an operator as a button of the sidebar does."""
         import bpy
 
         side = press._sidebar(self.area)
@@ -49,7 +49,7 @@ class _Artist:
             getattr(bpy.ops.splannequin, operator)("INVOKE_DEFAULT")
 
     def press(self, kind: str, x: int, y: int) -> Iterator[float]:
-        """A key or button, down and up."""
+        """Press and release a key or button."""
         press._move(self.window, x - 1, y)
         yield 0.1
         press._move(self.window, x, y)
@@ -59,7 +59,7 @@ class _Artist:
         yield 0.4
 
     def points(self) -> list[Any]:
-        """Places of four points of the solve that stand alone in the view."""
+        """Four points of the solve that are isolated in the view, as world positions."""
         cloud = self.scene.splannequin.made[0].points
         side, chosen = press._sidebar(self.area), []
         seen = [(v.co.copy(), cloud.matrix_world @ v.co) for v in cloud.data.vertices]

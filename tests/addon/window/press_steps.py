@@ -3,8 +3,8 @@
     python tests/addon/window/press_steps.py --blender BLENDER [--clip CLIP] [--last 24] [--output docs/images]
 
 BLENDER is a Blender that has the extension installed (`--command extension install-file -r user_default -e ZIP`). Needs
-Xvfb, xwd (x11-apps) and convert (imagemagick). The same file is the script that runs inside Blender: it moves the mouse
-over the sidebar with simulated events until the button it looks for is under it, and clicks.
+Xvfb, xwd (x11-apps) and convert (imagemagick). This file is also the script that runs inside Blender. The script moves
+the mouse over the sidebar with simulated events until it points at the wanted button, and clicks.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-# With Mesa's cache of shaders Blender 5.2 was ended by SIGBUS, in a thread that compiles them.
+# With Mesa's shader cache, Blender 5.2 crashed with SIGBUS in a thread that compiles shaders.
 os.environ.setdefault("MESA_SHADER_CACHE_DISABLE", "true")
 
 STEPS = (
@@ -32,15 +32,15 @@ STEPS = (
     ("5-bake", "splannequin.bake"),
 )
 WINDOW = tuple(int(n) for n in os.environ.get("SPLANNEQUIN_WINDOW", "1600x1000").split("x"))
-"""Pixels; another size is measured with SPLANNEQUIN_WINDOW=960x600, say."""
+"""Window size in pixels; change it with, for example, SPLANNEQUIN_WINDOW=960x600."""
 PICTURE = os.environ.get("SPLANNEQUIN_PICTURE", "1280x")
-"""Size of the pictures of the window, as ImageMagick takes it."""
+"""Size of the window pictures, in ImageMagick's syntax."""
 PLAN = "SPLANNEQUIN_PRESS_PLAN"
-"""Environment variable: JSON of what the script inside Blender shall do."""
+"""Environment variable with the plan of the script inside Blender, as JSON."""
 
 
 def main() -> int:
-    """The host's side: a display, Blender on it, photographs when asked for. Exit status 0 if all five steps ended."""
+    """Run the host's side: a display, Blender, and requested pictures. Exit status is 0 if all five steps ended."""
     args = _arguments()
     plan = {"clip": str(Path(args.clip).absolute()), "last": args.last, "t_star": args.t_star}
     results = _host(__file__, plan | {"stop_train": args.cancel_once}, args)
@@ -48,7 +48,7 @@ def main() -> int:
 
 
 def _host(script: str, plan: dict, args: argparse.Namespace) -> dict:
-    """Runs a script in Blender on a display, takes the pictures it asks for; returns and prints what it told."""
+    """Run a script in Blender on a display and take the pictures that it requests; print and return its results."""
     output = Path(args.output).absolute()
     output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="splannequin-window-") as work:
@@ -71,15 +71,15 @@ def on_a_shot(
     display: str,
     good: Callable[[dict], bool] = lambda results: True,
 ) -> int:
-    """Both sides of a script that plays on one shot: the host's, or, within Blender, the start of `play(plan, told)`.
+    """Run either side of a script on one shot: the host, or, inside Blender, `play(plan, told)`.
 
     Args:
-        script: file of the script, which Blender runs.
-        text: what it does, for --help.
-        play: the artist; `plan` has the shot's folder and a work folder, what `told` holds is printed.
-        needs: what the shot needs, for --help.
+        script: file of the script that Blender runs.
+        text: description of the script, for --help.
+        play: script of the artist; `plan` holds the shot's folder and a work folder, and `told` is printed at the end.
+        needs: requirements on the shot, for --help.
         display: X display to open.
-        good: whether what was told is a success, if nothing failed.
+        good: whether the results are a success, provided that nothing failed.
 
     Returns:
         Exit status.
@@ -104,7 +104,7 @@ def on_a_shot(
 
 @contextlib.contextmanager
 def screen(display: str) -> Iterator[None]:
-    """An X display of the window's size, in memory."""
+    """Open a virtual X display of the window's size."""
     child = subprocess.Popen(["Xvfb", display, "-screen", "0", f"{WINDOW[0]}x{WINDOW[1]}x24"])
     try:
         time.sleep(2.0)
@@ -115,7 +115,7 @@ def screen(display: str) -> Iterator[None]:
 
 
 def command(blender: str, script: str, *files: str) -> list[str]:
-    """A Blender in a window that fills the display, which takes simulated events and runs a script."""
+    """Command line of a Blender whose window fills the display; it accepts simulated events and runs a script."""
     size = [str(n) for n in WINDOW]
     window = ["--gpu-backend", "opengl", "--enable-event-simulate", "--window-geometry", "0", "0", *size]
     return [blender, *files, *window, "--python", script]
@@ -136,7 +136,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def _serve(blender: subprocess.Popen[bytes], work: Path, output: Path, environ: dict[str, str], limit: float) -> None:
-    """Takes the pictures that the script inside asks for, until Blender ends."""
+    """Take the pictures that the script inside Blender requests, until Blender ends."""
     until = time.monotonic() + limit
     while blender.poll() is None and time.monotonic() < until:
         _photograph(work, output, environ)
@@ -146,7 +146,7 @@ def _serve(blender: subprocess.Popen[bytes], work: Path, output: Path, environ: 
 
 
 def _photograph(work: Path, output: Path, environ: dict[str, str]) -> None:
-    """Takes the pictures that have been asked for."""
+    """Take the requested pictures."""
     for request in sorted(work.glob("*.shoot")):
         picture = output / f"window-{request.stem}.jpg"
         dump = subprocess.run(["xwd", "-root", "-silent"], env=environ, capture_output=True, check=True).stdout
@@ -159,13 +159,13 @@ def _photograph(work: Path, output: Path, environ: dict[str, str]) -> None:
 
 
 def inside() -> None:
-    """Starts the script as a timer that walks through `_play`."""
+    """Start the script as a timer that advances `_play`."""
     plan = json.loads(os.environ[PLAN])
     act(_play(plan), Path(plan["work"]), None)
 
 
 def act(play: Iterator[float], work: Path, told: dict | None) -> None:
-    """Walks through a script, which yields seconds to wait; leaves `told` in the work folder and quits Blender."""
+    """Advance a script, which yields the seconds to wait; write `told` to the work folder and quit Blender."""
     import bpy
 
     def turn() -> float | None:
@@ -173,7 +173,7 @@ def act(play: Iterator[float], work: Path, told: dict | None) -> None:
             return next(play)
         except StopIteration:
             pass
-        except Exception as error:  # whatever it was: told, and Blender must not stand open until the limit
+        except Exception as error:  # any error is reported, and Blender must not stay open until the time limit
             traceback.print_exc()
             if told is not None:
                 told["error"] = f"{type(error).__name__}: {error}"
@@ -186,7 +186,7 @@ def act(play: Iterator[float], work: Path, told: dict | None) -> None:
 
 
 def _play(plan: dict) -> Iterator[float]:
-    """The artist: yields seconds to wait between what it does."""
+    """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
     work = Path(plan["work"])
@@ -215,7 +215,7 @@ def _play(plan: dict) -> Iterator[float]:
 
 
 def _time_ticks(told: dict) -> None:
-    """Has the add-on's timer timed: how long it holds Blender's main thread at most."""
+    """Record the longest time for which the add-on's timer blocks Blender's main thread."""
     import bpy
 
     tick = _supervisor().tick
@@ -231,7 +231,7 @@ def _time_ticks(told: dict) -> None:
 
 
 def _show_results(work: Path) -> Iterator[float]:
-    """What an artist looks at afterwards: the compositor's nodes, and the picture."""
+    """Show the compositor's nodes and the picture, as an artist would look at them."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]
@@ -252,14 +252,14 @@ def _show_results(work: Path) -> Iterator[float]:
 
 
 def _arrange() -> Iterator[float]:
-    """A 3D view with the sidebar open on our tab; the splash gone."""
+    """Show a 3D view with the sidebar open on the extension's tab, and close the splash screen."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]
     preferences = bpy.context.preferences
     preferences.use_preferences_save = False
     preferences.view.show_splash = False
-    preferences.view.render_display_type = "NONE"  # its window would cover the panel
+    preferences.view.render_display_type = "NONE"  # a render window would cover the panel
     bpy.data.objects.remove(bpy.data.objects["Cube"])
     _move(window, 300, 500)
     window.event_simulate(type="ESC", value="PRESS", x=300, y=500)
@@ -287,9 +287,9 @@ def _move(window, x: int, y: int) -> None:
 
 
 def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
-    """Finds the operator's button under the mouse, scrolling if need be, and clicks it.
+    """Find the operator's button with the mouse, scrolling if necessary, and click it.
 
-    Looked for in the sidebar of the 3D view, or in the window region of another kind of area.
+    The button is searched in the sidebar of the 3D view, or in the window region of another kind of area.
     """
     import bpy
 
@@ -297,7 +297,7 @@ def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
     wanted = f"bpy.ops.{operator}("
     for look in range(12):
         area, region = _place(window, kind)
-        shares = (0.8,) if operator.endswith(".cancel") else (0.33, 0.745, 0.85)  # small ones stand at the right
+        shares = (0.8,) if operator.endswith(".cancel") else (0.33, 0.745, 0.85)  # small buttons are at the right
         rows = range(region.y + region.height - 8, region.y + 4, -9)
         for x, y in ((region.x + int(region.width * share), y) for share in shares for y in rows):
             _move(window, x + (y % 2), y)
@@ -307,7 +307,7 @@ def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
             window.event_simulate(type="LEFTMOUSE", value="PRESS", x=x, y=y)
             window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=x, y=y)
             yield 0.5
-            if kind == "VIEW_3D":  # else what the button opened would close
+            if kind == "VIEW_3D":  # in other areas, the opened dialog would close
                 _move(window, region.x - 200, y)
                 yield 0.3
             return
@@ -319,7 +319,7 @@ def _click(operator: str, kind: str = "VIEW_3D") -> Iterator[float]:
 
 
 def _place(window, kind: str):
-    """(area, region) whose buttons are looked for."""
+    """(area, region) in which a button is searched."""
     if kind == "VIEW_3D":
         return _view(window), _sidebar(_view(window))
     area = next(a for a in window.screen.areas if a.type == kind)
@@ -327,7 +327,7 @@ def _place(window, kind: str):
 
 
 def _unfold() -> Iterator[float]:
-    """Opens every step of the panel: only the one at hand is open by itself."""
+    """Open every step of the panel; by default only the current step is open."""
     import bpy
 
     for name, _ in STEPS:
@@ -336,7 +336,7 @@ def _unfold() -> Iterator[float]:
 
 
 def _scroll_down(kind: str = "VIEW_3D") -> Iterator[float]:
-    """Turns the wheel over the buttons."""
+    """Turn the mouse wheel over the buttons."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]
@@ -350,7 +350,7 @@ def _scroll_down(kind: str = "VIEW_3D") -> Iterator[float]:
 
 
 def _under_mouse(window, area, region) -> str:
-    """Python of the operator button under the mouse, as Ctrl-C over it copies; empty over anything else."""
+    """Python call of the operator button under the mouse, as Ctrl-C copies it; empty over anything else."""
     import bpy
 
     manager = bpy.context.window_manager
@@ -362,13 +362,13 @@ def _under_mouse(window, area, region) -> str:
 
 
 def _watch(work: Path, name: str, told: dict, cancel: bool) -> Iterator[float]:
-    """Waits for the step to end; a picture while it runs and one after. Notes in `told` how it ended."""
+    """Wait until the step ends; take a picture during it and one after. Record the outcome in `told`."""
     import bpy
 
     watch = _supervisor().watch_of(work / "sitting.splannequin")
     began, taken = time.monotonic(), False
     stage = "training" if name == "3-train" else ""
-    share = {"2-solve": 0.3, "3-train": 0.3 if cancel else 0.6}.get(name, 0.05)  # the others are over soon
+    share = {"2-solve": 0.3, "3-train": 0.3 if cancel else 0.6}.get(name, 0.05)  # the other steps end soon
     yield 1.0
     while watch.running() is not None:
         job = next((j for j in watch.jobs.values() if not j.ended), None)
@@ -400,7 +400,7 @@ def _supervisor():
 
 
 def addon_module(name: str):
-    """A module of the installed extension. RuntimeError if it is not enabled."""
+    """Module of the installed extension. Raises RuntimeError if the extension is not enabled."""
     found = [m for n, m in sys.modules.items() if n.endswith(f".splannequin.splannequin_addon.{name}")]
     if not found:
         raise RuntimeError("the extension is not enabled in this Blender")
@@ -408,11 +408,11 @@ def addon_module(name: str):
 
 
 def _shoot(work: Path, name: str, settle: int = 12) -> Iterator[float]:
-    """Asks the host for a picture and waits until it is taken."""
+    """Request a picture from the host and wait until it is taken."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]
-    for step in range(settle):  # panels grow and shrink over several redraws, which the mouse brings about
+    for step in range(settle):  # panels change size over several redraws, which mouse moves trigger
         _move(window, 400 + 5 * step, 300)
         for area in window.screen.areas:
             area.tag_redraw()

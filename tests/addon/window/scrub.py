@@ -1,10 +1,10 @@
-"""Scrubs t* in a real Blender window over a trained shot: frozen views a second, and how long the main thread waits.
+"""Scrubs t* in a real Blender window over a trained shot: frozen views per second, and stalls of the main thread.
 
     python tests/addon/window/scrub.py --blender BLENDER --shot SHOT.splannequin [--output docs/images]
 
-BLENDER has the extension installed, as for press_steps.py, and SPLANNEQUIN_BACKEND_PYTHON (or a checkout's .venv) names
-the backend. SPLANNEQUIN_WINDOW=960x600 asks for a smaller window. Prints the figures as JSON; pictures: the camera's
-view, made of plates, a free view with a cube among the people, the guesses.
+BLENDER has the extension installed, as for press_steps.py. SPLANNEQUIN_BACKEND_PYTHON (or a checkout's .venv) names the
+backend. SPLANNEQUIN_WINDOW=960x600 selects a smaller window. Prints the figures as JSON. Takes pictures of the camera's
+view composited from plates, of a free view with a cube among the people, and of the guesses.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     trained = session.facts["trained"]
     scene.splannequin.t_star = trained[len(trained) // 2]
     told["detail_seconds"] = [(yield from _detailed(session))]
-    yield from press._scroll_down()  # to what the step shows while it scrubs
+    yield from press._scroll_down()  # to the part of the step that is shown while scrubbing
     yield from press._shoot(work, "8-scrub-camera")
     told["sharp_width"] = max(frame.rgba.shape[1] for frame in session.frames.values())
     told["covered"] = round(min(float(frame.rgba[..., 3].mean()) for frame in session.frames.values()), 3)
@@ -80,7 +80,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 def _sweeps(scene: Any, trained: list[int]) -> list[tuple[str, Callable[[int], None]]]:
-    """Changes of t* over the whole clip; then a pose of the camera per turn, with t* held."""
+    """Sweeps to time: t* over the whole clip, then the camera's pose per turn at a fixed t*."""
 
     def instants(n: int) -> None:
         scene.splannequin.t_star = trained[(3 * n) % len(trained)]
@@ -92,7 +92,7 @@ def _sweeps(scene: Any, trained: list[int]) -> list[tuple[str, Callable[[int], N
 
 
 def _detailed(session: Any) -> Generator[float, None, float]:
-    """Waits until what the view shows is made of plates; returns for how many seconds."""
+    """Wait until the view shows a picture composited from plates; return the seconds."""
     since, before = time.monotonic(), {frame.asked.seq for frame in session.frames.values()}
     while not any(f.asked.detail and f.asked.seq not in before for f in session.frames.values()):
         if time.monotonic() - since > 120:
@@ -104,7 +104,7 @@ def _detailed(session: Any) -> Generator[float, None, float]:
 
 
 def _tinted(session: Any, width: int) -> Iterator[float]:
-    """Waits until the guesses are shown as sharp as the picture before them."""
+    """Wait until the guesses are shown as sharp as the previous picture."""
     since = time.monotonic()
     while not any(f.asked.show == "guesses" and f.rgba.shape[1] >= width for f in session.frames.values()):
         if time.monotonic() - since > 120:
@@ -114,7 +114,7 @@ def _tinted(session: Any, width: int) -> Iterator[float]:
 
 
 def _free_view(scene: Any, work: Path, session: Any, told: dict[str, Any]) -> Iterator[float]:
-    """A view of its own, with a cube that stands in the middle of what is seen."""
+    """Show a free view with a cube in its centre."""
     import bpy
     from mathutils import Vector
 
@@ -137,7 +137,7 @@ def _free_view(scene: Any, work: Path, session: Any, told: dict[str, Any]) -> It
 
 
 def _time(viewport: Any, told: dict[str, Any]) -> dict[str, list[float]]:
-    """Has everything of ours that runs on Blender's main thread timed: seconds by name, filled as it goes."""
+    """Time all functions of the extension on Blender's main thread: seconds by name, filled while it runs."""
     import bpy
 
     stalls: dict[str, list[float]] = {}

@@ -1,9 +1,9 @@
-"""Looks for a button with Blender's search (F3), then shows the panel in German, in a real Blender window.
+"""Finds a button with Blender's search (F3), then shows the panel in German, in a real Blender window.
 
     python tests/addon/window/search_and_language.py --blender BLENDER --shot SHOT.splannequin [--output docs/images]
 
-BLENDER has the extension installed, as for press_steps.py; the shot has a take. Exit status 0 if the search started
-what it found and one undo took it back. Pictures: the search in English, the panel and the search in German.
+BLENDER has the extension installed, as for press_steps.py; the shot has a take. Exit status is 0 if the search started
+the operator and one undo reverted it. Takes pictures of the search in English, and of panel and search in German.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 def _search(text: str) -> Iterator[float]:
-    """F3 over the 3D view, and what is typed into it."""
+    """Press F3 over the 3D view and type the text."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]
@@ -70,7 +70,7 @@ def _search(text: str) -> Iterator[float]:
 
 
 def _press(key: str, times: int) -> Iterator[float]:
-    """A key, again and again."""
+    """Press a key several times."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]

@@ -1,10 +1,10 @@
-"""Times what holds Blender's main thread because of us: loading the camera, and a bake with its render.
+"""Times the calls that block Blender's main thread: loading the camera, and a bake with its render.
 
     python tests/addon/window/stalls.py --blender BLENDER --shot SHOT.splannequin
 
-BLENDER has the extension installed, as for press_steps.py; the shot has a trained run and a take, and is copied.
-Prints, in milliseconds, the turns of our timer over 10 ms with the longest calls in them, and Blender's own start of a
-render in the same scene before anything of ours is in it.
+BLENDER has the extension installed, as for press_steps.py. The shot has a trained run and a take, and is copied. Prints
+the timer turns over 10 ms in milliseconds, with their longest calls. For comparison, also prints the start of a render
+in the same scene without the extension's objects.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
     scene.render.filepath, scene.render.resolution_percentage = "/tmp/", 100  # noqa: S108  (what a new file has)
     scene.splannequin.shot_path = str(shot)
     scene.splannequin.take_name = sorted(p.name for p in (shot / "takes").iterdir())[0]
-    (shot / "takes" / scene.splannequin.take_name / "000003.exr").unlink()  # so that there is something to freeze
+    (shot / "takes" / scene.splannequin.take_name / "000003.exr").unlink()  # a missing frame, so that Freeze has work
     yield 1.0
     calls: list[tuple[str, float]] = []
     told["turns"] = []
@@ -57,7 +57,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
         told["load_camera"].append({"ms": spent, "from_disk": _from_disk() - before, "in": _longest(calls)})
         yield 1.0
     scene.frame_start, scene.frame_end = 1, FRAMES
-    for _ in range(6):  # the last panel: looking for its button from the first one on takes minutes
+    for _ in range(6):  # scrolls to the last panel; searching its button from the top takes minutes
         yield from press._scroll_down()
     yield from press._click("splannequin.bake")
     watch = press._supervisor().watch_of(shot)
@@ -79,19 +79,19 @@ def _rendered() -> Iterator[float]:
 
 
 def _from_disk() -> int:
-    """Pages that this process had to wait for: programs and libraries come from disk when first used."""
+    """Number of page faults that waited for the disk: programs and libraries are read from it when first used."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_majflt
 
 
 def _timed(call: Callable[[], Any]) -> float:
-    """Milliseconds."""
+    """Duration of a call in milliseconds."""
     began = time.perf_counter()
     call()
     return round(1000 * (time.perf_counter() - began), 1)
 
 
 def _watch_calls(calls: list[tuple[str, float]]) -> None:
-    """Has the functions behind the steps timed: (name, milliseconds), as they end."""
+    """Time the functions behind the steps; append (name, milliseconds) when each ends."""
 
     def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **named: Any) -> Any:
@@ -127,7 +127,7 @@ def _longest(calls: list[tuple[str, float]]) -> list[str]:
 
 
 def _watch_turns(calls: list[tuple[str, float]], turns: list[dict[str, Any]]) -> None:
-    """Has the timer's turns timed, with the calls in them."""
+    """Time the turns of the timer, with the calls in them."""
     import bpy
 
     tick = press._supervisor().tick

@@ -1,12 +1,12 @@
-"""Where artists stood before grey buttons and cut words, in a real Blender window; pictures of each.
+"""Checks disabled buttons and truncated texts that stopped artists, in a real Blender window, with pictures.
 
     python tests/addon/window/stuck.py --blender BLENDER --backend PYTHON [--output docs/images]
 
-BLENDER is any Blender: the extension is built from this checkout and installed into a home folder of its own. PYTHON is
-the backend's. In this order: no backend, and the button that sets it up; the preferences at the width Blender gives
-them; the clip seen after its import; presets with pixels and minutes, the scale that is asked for; t* suggested;
-scrubbing stopped while a training runs; a project folder moved as a whole; a shot folder renamed, missed and located.
-Exit status 0 if all of it held. Needs what press_steps.py needs.
+BLENDER is any Blender: the extension is built from this checkout and installed into a separate home folder. PYTHON is
+the backend's. The states, in this order: no backend, and the button that sets it up; the preferences at Blender's
+default width; the clip after its import; presets with pixels and minutes, and the request for the scale; a suggested
+t*; scrubbing stopped during a training; a moved project folder; a renamed shot folder, reported and located. Exit
+status is 0 if all checks passed. Needs what press_steps.py needs.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ HELD = {
     "set_up_offered", "plate_seen", "scene_camera_kept", "scale_asked_for", "scale_known", "suggested",
     "stopped_at_work", "moved", "missed", "located",
 }  # fmt: skip
-"""What has to be told as true."""
+"""Results that must be true."""
 
 
 def main() -> int:
-    """The host's side: a trained tiny world, an installed extension, Blender on a display."""
+    """Run the host's side: a trained tiny world, an installed extension, and Blender on a display."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--blender", required=True)
     parser.add_argument("--backend", required=True, help="Python of the backend's environment")
@@ -68,7 +68,7 @@ def main() -> int:
 
 
 def _prepare(work: Path, backend: str) -> None:
-    """A project with a clip to import, and one with a shot that is solved and trained."""
+    """Write a project with a clip to import, and one with a solved and trained shot."""
     (work / "home").mkdir()
     (work / "clip").mkdir()
     shutil.copy(ROOT / "examples" / "sitting.mp4", work / "clip" / "people.mp4")
@@ -82,7 +82,7 @@ def _prepare(work: Path, backend: str) -> None:
 
 
 def _install(blender: str, work: Path, environ: dict[str, str]) -> None:
-    """Builds the extension and installs it as an artist does."""
+    """Build the extension and install it as an artist does."""
     run = [blender, "--background", "--command", "extension"]
     subprocess.run([*run, "build", "--output-dir", str(work)], cwd=ROOT, env=environ, check=True)
     zips = [str(path) for path in work.glob("*.zip")]
@@ -93,7 +93,7 @@ def _install(blender: str, work: Path, environ: dict[str, str]) -> None:
 
 
 def inside() -> None:
-    """Starts the script as a timer."""
+    """Start the script as a timer."""
     import bpy
 
     plan = json.loads(os.environ[PLAN])
@@ -102,7 +102,7 @@ def inside() -> None:
 
 
 def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
-    """The artist: yields seconds to wait between what it does."""
+    """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
     work = Path(plan["work"])
@@ -121,7 +121,7 @@ def _play(plan: dict[str, Any], told: dict[str, Any]) -> Iterator[float]:
 
 
 def _no_backend(work: Path, told: dict[str, Any]) -> Iterator[float]:
-    """The red box has the button that helps; it asks before it downloads."""
+    """The red box contains the button that helps; the button asks before it downloads."""
     import bpy
 
     yield from press._shoot(work, "11-no-backend")
@@ -134,7 +134,7 @@ def _no_backend(work: Path, told: dict[str, Any]) -> Iterator[float]:
 
 
 def _imported(work: Path, told: dict[str, Any]) -> Iterator[float]:
-    """The clip is seen once it is in; the cube and the scene's camera are where they were."""
+    """The clip is visible after its import; the cube and the scene's camera are unchanged."""
     import bpy
 
     bpy.ops.mesh.primitive_cube_add()
@@ -153,7 +153,7 @@ def _imported(work: Path, told: dict[str, Any]) -> Iterator[float]:
 
 
 def _solved(work: Path, told: dict[str, Any]) -> Iterator[float]:
-    """A solved and trained shot: what the presets cost, the scale that is asked for."""
+    """Open a solved and trained shot: the costs of the presets, and the request for the scale."""
     import bpy
 
     shot, scene = work / "project" / "tiny.splannequin", bpy.context.scene
@@ -176,7 +176,7 @@ def _solved(work: Path, told: dict[str, Any]) -> Iterator[float]:
 
 
 def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
-    """t* that nobody chose is the suggested one, and says so; scrubbing stops while a training runs."""
+    """An unset t* uses the suggested instant and says so; scrubbing stops during a training."""
     import bpy
 
     shot, scene = work / "project" / "tiny.splannequin", bpy.context.scene
@@ -188,7 +188,7 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     told["t_star"] = props.t_star
     yield from press._scroll_down()
     yield from press._shoot(work, "11-suggested")
-    props.extend_steps = 30000  # it is paused, however long the button takes to be found
+    props.extend_steps = 30000  # long enough that the training still runs when the pause button is found
     yield from _scroll_up()
     yield from press._click("splannequin.train")
     watch = press._supervisor().watch_of(shot)
@@ -200,13 +200,13 @@ def _scrubbed(work: Path, told: dict[str, Any]) -> Iterator[float]:
     told["stopped_at_work"] = viewport.session() is None and watch.running() == "train"
     yield from _scroll_up()
     yield from press._click("splannequin.cancel")
-    press._move(bpy.context.window_manager.windows[0], 400, 300)  # the sidebar lays itself out with nobody over it
+    press._move(bpy.context.window_manager.windows[0], 400, 300)  # the sidebar is laid out without the mouse over it
     yield from _ended(shot, failed=True)
     yield from press._shoot(work, "11-laid-out", settle=0)
 
 
 def _moved(work: Path, told: dict[str, Any]) -> Iterator[float]:
-    """The project folder moves with everything in it."""
+    """Move the whole project folder."""
     import bpy
 
     bpy.ops.wm.save_as_mainfile(filepath=str(work / "project" / "work.blend"))
@@ -221,7 +221,7 @@ def _moved(work: Path, told: dict[str, Any]) -> Iterator[float]:
 
 
 def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
-    """The shot folder alone is renamed: the panel misses it, Locate takes its new place."""
+    """Rename only the shot folder: the panel reports it missing, and Locate finds it."""
     import bpy
 
     before, there = work / "moved" / "tiny.splannequin", work / "moved" / "renamed.splannequin"
@@ -252,7 +252,7 @@ def _renamed(work: Path, told: dict[str, Any]) -> Iterator[float]:
 
 
 def _preferences(work: Path) -> Iterator[float]:
-    """The add-on's page in the window that Blender opens for its preferences, as large as that is."""
+    """Show the add-on's page in the preferences window at the size that Blender gives the window."""
     import bpy
 
     module = press._supervisor().__name__.rpartition(".splannequin_addon")[0]
@@ -269,7 +269,7 @@ def _preferences(work: Path) -> Iterator[float]:
 
 
 def _opened(file: Path) -> Iterator[float]:
-    """Another file, with the sidebar on our tab."""
+    """Open another file, with the sidebar on the extension's tab."""
     import bpy
 
     bpy.ops.wm.open_mainfile(filepath=str(file))
@@ -282,7 +282,7 @@ def _opened(file: Path) -> Iterator[float]:
 
 
 def _ended(shot: Path, failed: bool = False) -> Iterator[float]:
-    """Waits for the shot's step. RuntimeError with its sentence if it failed."""
+    """Wait until the shot's step ends. Raises RuntimeError with its message if it failed."""
     watch = press._supervisor().watch_of(shot)
     yield 1.0
     while watch.running() is not None:
@@ -294,7 +294,7 @@ def _ended(shot: Path, failed: bool = False) -> Iterator[float]:
 
 
 def _scroll_up() -> Iterator[float]:
-    """Turns the wheel over the sidebar until its first button is seen."""
+    """Turn the mouse wheel over the sidebar until its first button is visible."""
     import bpy
 
     window = bpy.context.window_manager.windows[0]

@@ -2,8 +2,8 @@
 
     python tests/addon/window/train_on.py --blender BLENDER --backend PYTHON [--output DIR]
 
-BLENDER is any Blender: the add-on is loaded from this checkout. PYTHON is the backend's. Fails unless the preview in
-the panel changed while it trained, the paused run was whole, and the resumed one has all its steps.
+BLENDER is any Blender: the add-on is loaded from this checkout. PYTHON is the backend's. Fails unless the panel's
+preview changed during training, the paused run was complete, and the resumed run has all its steps.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ PLAN = "SPLANNEQUIN_TRAIN_ON_PLAN"
 ROOT = Path(__file__).resolve().parents[3]
 WORLD = "from pathlib import Path; from tests.backend.conftest import build_world; build_world(Path({!r}))"
 MORE = 2500
-"""Steps that are added: enough for the button that pauses them to be found before they are done."""
+"""Additional steps; enough that the training still runs when the pause button is found."""
 
 
 def main() -> int:
-    """The host's side: makes the world, trains two runs, opens Blender on a display."""
+    """Run the host's side: build the world, train two runs, open Blender on a display."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--blender", required=True)
     parser.add_argument("--backend", required=True, help="Python of the backend's environment")
@@ -63,7 +63,7 @@ def main() -> int:
 
 
 def inside() -> None:
-    """Loads the add-on from the checkout and starts the script as a timer."""
+    """Load the add-on from the checkout and start the script as a timer."""
     sys.path.insert(0, str(ROOT / "splannequin_addon"))
     package = importlib.import_module("run_in_bpy").load_package()
     package.register()
@@ -72,7 +72,7 @@ def inside() -> None:
 
 
 def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
-    """The artist: yields seconds to wait between what it does."""
+    """Play the artist; yield the seconds to wait between actions."""
     import bpy
 
     def module(name: str) -> Any:
@@ -92,7 +92,7 @@ def _play(package: str, told: dict[str, Any]) -> Iterator[float]:
     shown: dict[str, int] = {}
     while len(shown) < 4 and watch.running() == "train":
         path = watch.jobs["train"].images.get("preview")
-        if path in (pictures._collection or {}):  # drawn, not only told of
+        if path in (pictures._collection or {}):  # the preview is drawn, not only listed
             shown[path] = pictures.icon_of(Path(path))
         yield 0.1
     told["previews_seen"] = len(set(shown.values()))

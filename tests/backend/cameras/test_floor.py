@@ -1,4 +1,4 @@
-"""The floor under a solve, against rooms whose floor is known."""
+"""Floor detection in a solve, on rooms with a known floor."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from torch_backend.cameras.floor import find_floor
 
 
 def turned(seed: int) -> np.ndarray:
-    """A random rotation [3, 3]."""
+    """Random rotation [3, 3]."""
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.linalg.det(q)
 
 
 def room(seed: int, floor_share: float = 0.15, count: int = 3000, pitch: float = 25.0):
-    """Points, centres and ups of a room: floor z = 0, a table with more points than it, walls, people, outliers."""
+    """Points, camera centres and up vectors of a room: floor z = 0, a table with more points, walls, people,
+    outliers."""
     rng = np.random.default_rng(seed)
     on_floor = int(floor_share * count)
     ground = np.concatenate([rng.uniform(-3, 3, (on_floor, 2)), rng.normal(0, 0.01, (on_floor, 1))], axis=1)
@@ -25,7 +26,7 @@ def room(seed: int, floor_share: float = 0.15, count: int = 3000, pitch: float =
     outliers = rng.uniform(-4, 4, (count // 33, 3))
     people = rng.normal((0, 0, 1.0), (0.6, 0.6, 0.25), (count - on_floor - count // 4 - count // 3 - count // 33, 3))
     centres = np.array([0, -3, 1.6]) + np.stack([np.linspace(-0.5, 0.5, 20), *rng.normal(0, 0.03, (2, 20))], 1)
-    tilt = np.radians(pitch)  # looking down on the table: the camera's up leans forward
+    tilt = np.radians(pitch)  # the camera looks down at the table: its up vector leans forward
     ups = np.array([0, np.sin(tilt), np.cos(tilt)]) + rng.normal(0, 0.03, (20, 3))
     return np.concatenate([ground, table, wall, outliers, people]), centres, ups
 

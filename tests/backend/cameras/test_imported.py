@@ -1,4 +1,4 @@
-"""Cameras from elsewhere, in and out: files against float64, whole solves of the rendered room from given cameras."""
+"""Import of cameras from other programs: files compared with float64, and matching of cameras to frames."""
 
 import json
 import math
@@ -25,7 +25,7 @@ def turned(angle, axis=1):
 
 
 def transforms(path, poses, names=None, **lens):
-    """A transforms.json of [4, 4] world-to-camera poses, OpenCV axes."""
+    """Write a transforms.json of [4, 4] world-to-camera poses, OpenCV axes."""
     names = names or [f"images/frame_{n:05d}.png" for n in range(101, 101 + len(poses))]
     frames = []
     for name, pose in zip(names, poses, strict=True):
@@ -54,7 +54,8 @@ def fake_solve(count, first=101, lens=None):
 
 
 def test_transforms_come_out_with_opencv_axes(tmp_path):
-    """nerfstudio looks along -z with y up: a point before its camera is before ours, and up in it is up in ours."""
+    """nerfstudio cameras look along -z with y up. A point in front of and above such a camera stays there after
+    import."""
     poses = some_poses()
     solve = imported.read(transforms(tmp_path / "transforms.json", poses))
     assert solve.kind == "transforms.json" and len(solve.cameras) == 10
@@ -104,7 +105,7 @@ def test_colmap_lenses(model, params, expected):
 
 
 def test_an_ordinary_lens_bends_as_colmap_says(solved, tmp_path):
-    """SIMPLE_RADIAL and what it becomes give the same pixels, asked from COLMAP in a process of its own."""
+    """SIMPLE_RADIAL and the converted model project to the same pixels in COLMAP, which runs in a separate process."""
     import subprocess
     import sys
 
@@ -120,7 +121,7 @@ def test_an_ordinary_lens_bends_as_colmap_says(solved, tmp_path):
 
 
 def test_a_colmap_model_reads_as_pycolmap_wrote_it(solved):
-    """solve/colmap is written by COLMAP itself; cameras.json is what came out of it by another way."""
+    """COLMAP wrote solve/colmap itself; cameras.json holds the same cameras by another code path."""
     solve = imported.read(solved.shot.solve / "colmap")
     path = {f.frame: f for f in CameraPath.load(solved.shot.solve / "cameras.json").frames}
     numbers = [int(c.name.rpartition(".")[0]) for c in solve.cameras]
@@ -239,7 +240,7 @@ def test_matching_is_by_number_and_says_what_is_missing():
 
 @pytest.mark.parametrize("lost", [[], [19], [3, 4, 11], [0]])
 def test_pictures_counted_from_zero_are_no_frame_late_however_many_have_a_camera(lost):
-    """The last case cannot be told from a count from 1: the first picture has no camera."""
+    """In the last case the first picture has no camera, so it looks like a count from 1."""
     solve = fake_solve(20, first=0)
     solve.cameras = [c for n, c in enumerate(solve.cameras) if n not in lost]
     matched = imported.match(solve, Counted(list(range(1, 21)), clip=(1, 20)), (640, 480))
@@ -263,7 +264,7 @@ def test_too_few_or_another_shape_are_refused():
 def test_frames_that_are_trained_on_are_what_is_counted():
     frames = list(range(101, 141))
     solve = fake_solve(40)
-    solve.cameras = solve.cameras[1::2]  # every other frame, and the step keeps the others
+    solve.cameras = solve.cameras[1::2]  # every second frame; the frame step selects the other ones
     with pytest.raises(JobError, match="Only 0 of the 20 frames"):
         imported.match(solve, Counted(frames), (640, 480), solved=frames[::2])
 
@@ -293,7 +294,7 @@ def test_points_without_tracks_count_the_pictures_they_lie_in():
 
 
 def test_what_blender_says_of_a_camera_of_its_scene_is_believed(tmp_path):
-    """Its numbers are the shot's though another count fits as well; its remarks are the artist's."""
+    """Such a file states that its numbers are the shot's, even if another count fits too. Its notes are passed on."""
     facts = {"world": "scene", "is_numbered_as_shot": True, "notes": [["One of two.", "Choose."], ["half"], 3]}
     names = [f"{n}.png" for n in range(1, 11)]
     counted = Counted(list(range(1, 13)), (1, 12), shift=-1)

@@ -1,4 +1,4 @@
-"""Whole solves from given cameras: of the rendered room, and out and in again."""
+"""Whole solves with imported cameras of the rendered room, and round trips through export and import."""
 
 import json
 import math
@@ -23,7 +23,7 @@ from torch_backend.shot import Shot
 
 
 def again(solved, tools, folder, step=1):
-    """A fresh shot of the room's raw frames."""
+    """New shot of the room's raw frames."""
     shot = Shot.create(folder / "again.splannequin")
     import_footage(shot, solved.shot.info().source, FootageConfig(step=step), tools.recorder())
     return shot
@@ -36,7 +36,7 @@ def the_lens(scale=1):
 
 
 def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
-    """The room's own cameras, for pictures of twice the size, without points: poses exact, points on the walls."""
+    """The room's true cameras at twice the picture size, without points: poses are exact, points lie on the walls."""
     shot = again(solved, tools, tmp_path)
     report = tools.recorder()
     poses = solved.poses[:18]
@@ -52,7 +52,7 @@ def test_true_cameras_give_a_solve_in_their_own_world(solved, tools, tmp_path):
     walls = np.minimum(np.abs(xyz - [-2.0, -1.5, -1.0]), np.abs(xyz - [2.0, 1.5, 5.0])).min(1)
     block = np.minimum(np.abs(xyz - [-0.9, 0.1, 1.8]), np.abs(xyz - [0.1, 1.5, 2.8])).min(1)
     assert len(xyz) > 300 and np.median(np.minimum(walls, block)) < 0.02
-    # The undistorted frame is what the pinhole sees.
+    # The undistorted frame equals the pinhole camera's picture.
     ideal = tools.room().render(poses[7], path.frames[7].K).astype(float)
     off = tools.room().render(poses[7], np.add(path.frames[7].K, (0, 0, 0.5, 0))).astype(float)
     got = read_png(shot.frames / "000108.png").astype(float)
@@ -80,7 +80,7 @@ def test_a_colmap_folder_brings_its_own_points(solved, tools, tmp_path):
     assert [f.source for f in now[1::2]] == ["interpolated"] * 10
     one, other = load_points(solved.shot), load_points(shot)
     np.testing.assert_allclose(other["xyz"], one["xyz"])
-    # COLMAP may count an image twice that sees a point twice.
+    # COLMAP may count an image twice if the image observes a point twice.
     assert (other["track"] <= one["track"]).all() and (other["track"] == one["track"]).mean() > 0.9
     assert result["registered"] == 11 and result["quality"].startswith("Good: cameras given for 11 of 11 frames")
     difference = read_png(shot.frames / "000105.png").astype(int) - read_png(solved.shot.frames / "000105.png")
@@ -88,7 +88,7 @@ def test_a_colmap_folder_brings_its_own_points(solved, tools, tmp_path):
 
 
 def test_two_lenses_in_one_clip(solved, tools, tmp_path):
-    """A zoom that a file tells of frame by frame: every frame is undistorted with its own, and keeps it."""
+    """Lens values per frame: every frame is undistorted with its own lens, and keeps it."""
     shot = again(solved, tools, tmp_path)
     file = transforms(tmp_path / "transforms.json", solved.poses, **the_lens())
     data = json.loads(file.read_text())
@@ -119,7 +119,7 @@ def test_cameras_of_another_clip_are_refused(solved, tools, tmp_path):
 
 @pytest.mark.parametrize(("kind", "text"), [("colmap", False), ("colmap", True), ("nerfstudio", False)])
 def test_what_goes_out_comes_back_in(solved, tools, tmp_path, kind, text):
-    """Exported, then taken in by a fresh shot of the same undistorted frames: the same poses and the same lens."""
+    """Exported cameras are imported by a new shot of the same undistorted frames, with equal poses and lens."""
     plates = tmp_path / "plates"
     plates.mkdir()
     for file in solved.shot.frames.glob("*.png"):
@@ -147,7 +147,7 @@ def test_what_goes_out_comes_back_in(solved, tools, tmp_path, kind, text):
 
 
 def test_colmap_itself_reads_what_is_exported(solved, tmp_path):
-    """pycolmap, in a process of its own: names, poses, pinhole, points that project where the cameras say."""
+    """pycolmap reads the export in a separate process: names, poses, pinhole, and points that project as expected."""
     import subprocess
     import sys
 
@@ -180,7 +180,7 @@ def test_an_export_never_hides_behind_another_model(solved, tmp_path):
 
 
 def test_cameras_that_stand_still_are_refused(solved, tools, tmp_path):
-    """No point can be triangulated at all."""
+    """No point can be triangulated."""
     shot = again(solved, tools, tmp_path)
     file = transforms(tmp_path / "transforms.json", [np.eye(4)] * 21, **the_lens())
     with pytest.raises(JobError, match="do not fit these frames: only 0 points"):
@@ -189,7 +189,7 @@ def test_cameras_that_stand_still_are_refused(solved, tools, tmp_path):
 
 
 def test_how_much_agrees_decides():
-    """The error in pixels cannot: with cameras held, what does not fit is left out of it."""
+    """The reprojection error cannot decide: cameras are fixed, and observations that do not fit are dropped from it."""
     answer = {"triangulation_angle_deg": 5.0, "agreement": 0.6}
     refuse_misfit(answer, 500)
     assert doubts(answer) == [] and doubts({"triangulation_angle_deg": 5.0}) == []

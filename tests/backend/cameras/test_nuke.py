@@ -1,4 +1,4 @@
-"""Cameras for Nuke, read back by Nuke's documented rules in float64, against the solve's own projection."""
+"""Camera export for Nuke, read back by Nuke's documented rules in float64 and compared with the solve's projection."""
 
 import re
 
@@ -23,12 +23,12 @@ def about(axis: str, degrees: float) -> np.ndarray:
 
 
 def zxy(degrees) -> np.ndarray:
-    """Rotation order ZXY: z first, then x, then y."""
+    """Rotation matrix for rotation order ZXY: first about z, then x, then y."""
     return about("y", degrees[1]) @ about("x", degrees[0]) @ about("z", degrees[2])
 
 
 def in_camera(place, degrees, points):
-    """Points of Nuke's world in a camera's space: x right, y up, looking along -z."""
+    """Points of Nuke's world in camera space: x right, y up, looking along -z."""
     return (points - np.asarray(place)) @ zxy(degrees)
 
 
@@ -39,7 +39,8 @@ def truth(path, n):
 
 
 def turning(shifted: bool) -> CameraPath:
-    """A camera that turns a whole circle, rolls and zooms; off the centre, with tall pixels, or neither."""
+    """Camera path that turns a full circle and rolls; `shifted` adds zoom, an off-centre principal point and tall
+    pixels."""
     frames = []
     for n in range(24):
         turn = about("y", 15.0 * n + 3) @ about("x", 20 * np.sin(n)) @ about("z", 5 * n)
@@ -58,7 +59,7 @@ def test_a_chan_file_sees_what_the_solve_saw():
     for n, (_, *place, rx, ry, rz, view) in enumerate(rows):
         seen = in_camera(place, (rx, ry, rz), placed)
         pixels, depth = truth(path, n)
-        focal = 360.0 / np.tan(np.radians(view) / 2.0)  # vertical field of view, degrees
+        focal = 360.0 / np.tan(np.radians(view) / 2.0)  # vertical field of view in degrees
         x, y = focal * seen[:, 0] / -seen[:, 2] + 640.0, 360.0 - focal * seen[:, 1] / -seen[:, 2]
         np.testing.assert_allclose(-seen[:, 2], 2.5 * depth, rtol=1e-6, atol=1e-6)
         before = np.abs(depth) > 1.0
@@ -76,7 +77,7 @@ def curves(text: str, knob: str) -> np.ndarray:
 
 @pytest.mark.parametrize("shifted", [False, True])
 def test_a_nuke_script_sees_what_the_solve_saw(shifted):
-    """By nukescripts.snap3d's projection: window offset in halves of the width, subtracted after the lens."""
+    """Projection as in nukescripts.snap3d: the window offset is in half widths and subtracted after the lens."""
     path = turning(shifted)
     text = nk_text(path, SCENE, "3 shot é")
     assert " rot_order ZXY\n" in text and "{curve L x101 " in text and " name _3_shot___camera\n" in text
@@ -100,7 +101,7 @@ def test_a_nuke_script_sees_what_the_solve_saw(shifted):
 
 
 def test_the_axis_of_a_script_stands_splats_into_nukes_world():
-    """Splats leave with z up, as Blender has them; under this axis they are where the camera looks."""
+    """Exported splats have z up, as in Blender. The Axis node rotates them into the world of the Nuke camera."""
     text = nk_text(turning(False), SCENE, "a").partition("Axis2")[2]
     degrees = [float(v) for v in re.search(r"rotate \{(.*)\}", text)[1].split()]
     np.testing.assert_allclose(zxy(degrees), Y_UP.rotation, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Points, cameras and lenses placed in a scene against float64 projections; which placement a shot has."""
+"""Points, cameras and lenses placed in a scene, compared with float64 projections; choice of a shot's placement."""
 
 import json
 
@@ -17,7 +17,7 @@ from torch_backend.contract import CameraFrame, CameraPath, Placement, file_dige
 from torch_backend.shot import Shot
 
 SCENE = [0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0]
-"""A turn, a scale of 2.5 and a move."""
+"""Rotation, scale of 2.5 and translation."""
 
 
 def project(viewmats, K, points):
@@ -54,7 +54,7 @@ def test_placed_cameras_see_placed_points_in_the_same_pixels(path):
 
 
 def test_upright_is_blenders_world():
-    """The solve's down (y) is the scene's -z, its ahead (z) the scene's y."""
+    """Down in the solve (y) is -z in the scene; forward (z) is the scene's y."""
     where = Similarity.of(Placement())
     np.testing.assert_array_equal(where.points(np.array([[1.0, 2.0, 3.0]])), [[1.0, 3.0, -2.0]])
     to_world = camera_to_world(where.viewmats(np.eye(4)[None]))[0]
@@ -63,10 +63,10 @@ def test_upright_is_blenders_world():
 
 
 def test_a_lens_is_the_intrinsics():
-    """A film back of 36 mm with these numbers projects as K does, pixels that are not square included."""
+    """A film back of 36 mm with these lens values projects like K, also with non-square pixels."""
     K, width, height = [900.0, 880.0, 610.0, 350.0], 1280, 720
     lens = lens_of(K, width, height)
-    x, y, z = 0.3, -0.2, 2.0  # OpenCV: y down
+    x, y, z = 0.3, -0.2, 2.0  # OpenCV: y points down
     across = lens.focal_mm * x / z / SENSOR_MM + 0.5 - lens.shift_x
     up = lens.focal_mm * -y / z / lens.sensor_height_mm + 0.5 - lens.shift_y * SENSOR_MM / lens.sensor_height_mm
     assert across * width == pytest.approx(K[0] * x / z + K[2])

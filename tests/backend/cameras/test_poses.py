@@ -1,4 +1,4 @@
-"""Poses between poses, against closed forms."""
+"""Interpolated poses, compared with closed forms."""
 
 import numpy as np
 import pytest
@@ -48,9 +48,9 @@ def test_half_turns_have_a_quaternion(axis):
 def test_slerp_agrees_with_scipy(a, b, share):
     one, two = Rotation.from_rotvec(a), Rotation.from_rotvec(b)
     if (one.inv() * two).magnitude() > np.pi - 1e-3:
-        return  # there is no shorter way between opposite rotations
+        return  # no unique path between opposite rotations
     expected = Slerp([0, 1], Rotation.concatenate([one, two]))(share)
-    got = slerp(wxyz(one), -wxyz(two), share)  # q and -q are one rotation
+    got = slerp(wxyz(one), -wxyz(two), share)  # q and -q are the same rotation
     assert abs(got @ wxyz(expected)) == pytest.approx(1.0, abs=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""Damaged files of a shot: each is named, with the step that makes it anew, and that step does."""
+"""Damaged files of a shot: the error names the file and the step that rebuilds it, and that step does rebuild it."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ def shot(world, tmp_path):
 
 
 def cut(path):
-    """Leaves half of a file."""
+    """Truncate a file to half its length."""
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 

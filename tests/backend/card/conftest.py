@@ -1,4 +1,4 @@
-"""A pretended card for this folder's tests: a shim that needs a C++ compiler, and processes that begin with it."""
+"""Fixtures for tests on a simulated CUDA device: a shim that needs a C++ compiler, and processes that preload it."""
 
 import json
 import os
@@ -18,7 +18,7 @@ ROOT = HERE.parents[2]
 
 @pytest.fixture(scope="session")
 def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The compiled shim. Skips, with the reason, where it cannot be made or would meet a real CUDA."""
+    """Path of the compiled shim. Skips the test if the shim cannot be compiled or PyTorch has real CUDA support."""
     compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
     if sys.platform != "linux":
         pytest.skip("the pretended card is a shared library for Linux")
@@ -49,12 +49,12 @@ WALKS = (
     "self_test",
     "station",
 )
-"""All in one process: half of what one takes is the import of torch."""
+"""Walks that run together in one process, because importing torch takes half the time of a walk."""
 
 
 @pytest.fixture(scope="session")
 def walk(card: Path) -> Callable[[str], Any]:
-    """walk(name and arguments): what `walks.py` says of one of `WALKS`."""
+    """walk(words): result of a walk of `walks.py`; the words are one of `WALKS` or its beginning."""
     environ = {**os.environ, "PRETEND_CARD": str(card), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-P", str(HERE / "walks.py"), *WALKS]
     done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True)

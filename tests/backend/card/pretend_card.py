@@ -1,9 +1,9 @@
-"""A CUDA card that is not there, for machines without one: real CPU tensors that say they lie on `cuda:0`.
+"""A simulated CUDA device for machines without one: CPU tensors that report the device `cuda:0`.
 
-They keep torch's rules on mixing devices, and are counted: what would make the host wait for the card, and the bytes
-that live on it, up to a limit. The rasteriser's kernels run on Warp's fibers, the others on Warp's cpu device. Import
-this file before torch, in a process of its own (`guard.cpp`, compiled, has to be found first; it stays for good).
-What it does not know: the bytes of a kernel's own scratch (a sort's), other streams, how long anything takes.
+The tensors follow torch's rules on mixing devices. Synchronisations of the host are counted, and so are the bytes on
+the device, up to a limit. The rasteriser's kernels run on Warp's fibers, the others on Warp's cpu device. Import this
+file before torch, in a separate process (the compiled `guard.cpp` must be found first; the patches are permanent). It
+does not simulate the scratch memory of kernels (such as a sort), other streams, or durations.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from torch.utils._pytree import tree_flatten, tree_map  # noqa: E402
 
 CUDA = torch.device("cuda:0")
 _BLOCK = 512
-"""Bytes that torch's allocator hands out at a time."""
+"""Granularity of torch's allocator in bytes."""
 _ASKED = {
     "_local_scalar_dense", "nonzero", "masked_select", "unique_dim", "_unique2", "unique_consecutive", "equal",
     "repeat_interleave",
 }  # fmt: skip
-"""Operators whose answer, or its size, the host has to wait for."""
+"""Operators whose result, or its size, the host must wait for."""
 _INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index"}
 _NOTHING = {"empty", "empty_strided", "empty_like", "new_empty", "new_empty_strided", "detach", "lift_fresh", "set_"}
-"""Operators that launch nothing, beside views."""
+"""Operators that launch no kernel, in addition to views."""
 _COPIES = {"copy_", "_to_copy", "copy", "_copy_from"}
 _LENIENT = {
     "where", "lerp", "lerp_", "fill_", "masked_fill", "masked_fill_", "index_fill", "clamp", "clamp_min", "clamp_max",
 }  # fmt: skip
-"""Take a number of the host's as a 0-dim tensor, as pointwise operators do."""
+"""Operators that accept a 0-dim tensor of the host, as pointwise operators do."""
 
 
 class Mismatch(RuntimeError):
@@ -46,30 +46,30 @@ class Mismatch(RuntimeError):
 
 
 class Card:
-    """What is counted."""
+    """Counters and state of the simulated device."""
 
     def __init__(self) -> None:
         self.waits: collections.Counter[str] = collections.Counter()
-        """Operator and place in the backend -> how often the host waited for the card."""
+        """Map from operator and place in the backend to the number of synchronisations."""
         self.launched: collections.Counter[str] = collections.Counter()
-        """Kernel of ours -> launches."""
+        """Map from each of the backend's own kernels to its number of launches."""
         self.operators = 0
-        """torch's operators that did something on the card: each is a launch at least."""
+        """Number of torch operators that worked on the device; each launches at least one kernel."""
         self.limit = 8 << 30
-        """Bytes there are."""
+        """Memory of the device in bytes."""
         self.live = self.peak = 0
-        """Bytes in use now, and at most."""
+        """Bytes in use now, and their maximum."""
         self._held: dict[int, list[int]] = {}
         self.tape: Tape | None = None
-        """What records now, if something does."""
+        """Active recording, or None."""
         self.before_launch: Callable[[str], None] = lambda name: None
-        """Called with the name of each kernel of the rasteriser; may raise."""
+        """Called with the name of each rasteriser kernel; may raise."""
 
     def waited(self, what: str) -> None:
         self.waits[f"{what} at {_place()}"] += 1
 
     def take(self, storage: torch.UntypedStorage) -> int:
-        """Counts a tensor of this storage. torch.OutOfMemoryError if it is new, and too large for what is free."""
+        """Count a tensor of this storage. Raises torch.OutOfMemoryError if it is new and exceeds the free memory."""
         key = storage.data_ptr()
         if not key:
             return 0
@@ -93,13 +93,16 @@ class Card:
 
 
 class Tape:
-    """`train.recorder.Recording` as a card does it: the work is not carried out while it is recorded, and no word of
-    the host's reaches a replay, but through tensors that were there before. What a graph refuses is refused."""
+    """Simulated `train.recorder.Recording`: work is recorded without being executed, and replayed later.
+
+    Values of the host do not reach a replay, except through tensors that existed at recording. Operations that a CUDA
+    graph refuses raise RuntimeError.
+    """
 
     def __init__(self, device: torch.device) -> None:
         self.steps: list[Callable[[], Any]] = []
         self.kept: list[Any] = []
-        """All tensors that were made: kernels know their addresses only."""
+        """All created tensors, kept alive because kernels only know their addresses."""
 
     def watched(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
@@ -124,7 +127,7 @@ class Tape:
         return replay, result
 
     def run(self, func: Any, name: str, args: Any, kwargs: Any, real: tuple[Any, Any]) -> Any:
-        """Notes an operator on tensors of the card, and carries it out only as far as its result's size needs it."""
+        """Record an operator on device tensors; execute it only as far as the size of its result requires."""
         if func._schema.is_mutable:
             if name == "copy_" and not isinstance(args[1], Pretended):
                 raise RuntimeError(f"operation not permitted when stream is capturing: {func} at {_place()}")
@@ -144,7 +147,7 @@ class Tape:
         return out
 
     def launch(self, inputs: list[Any], run: Callable[[list[Any]], None]) -> None:
-        """Notes a launch; structures are the host's, which goes on to write into them."""
+        """Record a launch. Structures are copied, because the host goes on to write into them."""
         held = [type(i).from_buffer_copy(i) if isinstance(i, ctypes.Structure) else i for i in inputs]
         self.steps.append(lambda: run(held))
 
@@ -153,7 +156,7 @@ CARD = Card()
 
 
 def _place() -> str:
-    """The two innermost lines of the backend."""
+    """The two innermost functions of the backend on the call stack."""
     frame, found = sys._getframe(2), []
     while frame and len(found) < 2:
         name = frame.f_code.co_filename.replace("\\", "/")
@@ -168,11 +171,11 @@ def _given_back(held: list[int]) -> None:
 
 
 class Pretended(torch.Tensor):
-    """A tensor that says it lies on the card."""
+    """A tensor that reports to be on the simulated device."""
 
     _real: torch.Tensor
     _held: list[int]
-    """What `CARD.take` said of the storage."""
+    """Result of `CARD.take` for the storage."""
 
     @staticmethod
     def __new__(cls, real: torch.Tensor) -> Pretended:
@@ -222,7 +225,7 @@ def _on_card(value: Any) -> Any:
 
 
 def _check(func: Any, name: str, tensors: list[Any]) -> None:
-    """Mismatch where torch would refuse tensors of two devices."""
+    """Raise Mismatch where torch refuses tensors of two devices."""
     ours = [t for t in tensors if isinstance(t, Pretended)]
     others = [t for t in tensors if not isinstance(t, Pretended)]
     if not ours or not others or name in _COPIES or name in _INDEXED:
@@ -235,7 +238,7 @@ def _check(func: Any, name: str, tensors: list[Any]) -> None:
 
 
 def _check_index(func: Any, name: str, args: Any) -> None:
-    """The same of indices, which may lie on the host; waits where they do, or where they are flags."""
+    """Check the devices of index operators. Indices may be on the host, but those and boolean indices synchronise."""
     values, indices = args[0], [i for i in args[1] if isinstance(i, torch.Tensor)]
     if not isinstance(values, Pretended) and any(isinstance(i, Pretended) for i in indices):
         raise Mismatch(f"{func}: cpu indexed by cuda at {_place()}")
@@ -264,7 +267,7 @@ def _count_waits(name: str, args: Any, kwargs: dict[str, Any], to_card: bool, to
 
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    """Carries an operator out on the real tensors."""
+    """Execute an operator on the real tensors."""
     name = func._schema.name.split("::")[-1]
     tensors = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, torch.Tensor)]
     touches = any(isinstance(t, Pretended) for t in tensors)
@@ -279,7 +282,7 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     held = {**kwargs, "device": torch.device("cpu")} if to_card else dict(kwargs)
     held.pop("pin_memory", None)
     if name == "_to_copy":
-        held.pop("device", None)  # between two tensors of the host it is always a copy
+        held.pop("device", None)  # between two host tensors the result is always a copy
     real = tree_map(_real, args), tree_map(_real, held)
     if CARD.tape is not None and (touches or to_card):
         leaves = name == "_to_copy" and (to_host or not touches)
@@ -307,7 +310,7 @@ class _Mode(TorchDispatchMode):
 
 @contextlib.contextmanager
 def pretended_card() -> Iterator[Card]:
-    """All below has one NVIDIA card, with `CARD.limit` bytes."""
+    """Simulate one NVIDIA GPU with `CARD.limit` bytes for the block."""
     import torch_backend.deformation.planes_cuda as planes_cuda
     import torch_backend.native as native
     import torch_backend.raster.cuda as cuda
@@ -362,7 +365,7 @@ def pretended_card() -> Iterator[Card]:
     for module in (recorder, self_test):
         patch(module, "CudaGraphs", Tape)
     patch(chosen, "cuda_refusal", lambda: "")
-    patch(chosen, "card_verdict", self_test.SelfTest)  # it would ask a process of its own, which has no such card
+    patch(chosen, "card_verdict", self_test.SelfTest)  # a separate process would not have the simulated device
     for module in (native, ssim_cuda, adam, planes_cuda):
         patch(module, "launch_on", launch_on)
     patch(cuda, "warp_stream", lambda device: None)

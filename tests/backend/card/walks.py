@@ -1,6 +1,6 @@
-"""Walks over the pretended card, in a process of their own: `python walks.py "WALK ARGUMENT ..." ...`, JSON out.
+"""Walks on the simulated device, run in a separate process: `python walks.py "WALK ARGUMENT ..." ...`; prints JSON.
 
-The tiny shot of `conftest.py`, at a quarter of its size: the rasteriser's kernels run on fibers here.
+They use the tiny shot of `conftest.py` at a quarter of its size, because the rasteriser's kernels run on fibers here.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ def small_world(folder: Path) -> tuple[Any, type]:
 
 
 def new_trainer(world: Any, quiet: type, method: str, supervision: str, poses: bool, iterations: int = 20) -> Any:
-    """A run of few steps whose every event happens: growth, the gate, the poses, the paper's and our anchors."""
+    """Trainer of a short run that includes every event: growth, the gate, pose refinement, and both kinds of
+    anchors."""
     from torch_backend.contract import TrainParams
     from torch_backend.scene import load_images, load_scene
     from torch_backend.train import config_from_params
@@ -46,13 +47,13 @@ def new_trainer(world: Any, quiet: type, method: str, supervision: str, poses: b
     config.gate.start, config.field.start, config.supervision.support_samples = 0.2, 0.2, 64
     config.densify.start = min(config.densify.start, 0.2)
     if method in ("mlp", "control_points"):
-        config.field.noise = 0.1  # published: times are blurred
+        config.field.noise = 0.1  # the published configuration perturbs times
     images = load_images(scene, scene.solved, 32, 24).to("cuda")
     return Trainer(scene, images, scene.solved, config, quiet(), {}, "cuda")
 
 
 def _steps(trainer: Any, count: int) -> dict[str, int]:
-    """Takes steps; what the host waited for in those that are no tenth, by operator and place."""
+    """Take steps; return the synchronisations by operator and place, except in every tenth step."""
     from torch_backend.train.events import schedule_events
 
     waits: dict[str, int] = {}
@@ -70,7 +71,7 @@ def _steps(trainer: Any, count: int) -> dict[str, int]:
 
 
 def steps(folder: Path, *runs: str) -> dict[str, Any]:
-    """`METHOD/SUPERVISION[/poses]` ...: per run its waits in steps, and how it stands at the end."""
+    """Per run (`METHOD/SUPERVISION[/poses]`): synchronisations in steps, and the state at the end."""
     world, quiet = small_world(folder)
     told: dict[str, Any] = {}
     for run in runs:
@@ -86,7 +87,7 @@ def steps(folder: Path, *runs: str) -> dict[str, Any]:
 
 
 def recorded(folder: Path, *methods: str) -> dict[str, Any]:
-    """Per method: a run whose steps are recorded beside one whose are not, with all events of a run."""
+    """Per method: compare a run with recorded steps and one with launched steps, through all events of a run."""
     world, quiet = small_world(folder)
     told: dict[str, Any] = {}
     for method in methods:
@@ -116,8 +117,10 @@ def recorded(folder: Path, *methods: str) -> dict[str, Any]:
 
 
 def launches(folder: Path, *methods: str) -> dict[str, Any]:
-    """Per method: launches of six steps with our kernels for the field's planes, and with torch's operators: kernels of
-    ours and operators, a launch each at the least."""
+    """Per method: launches in each of six steps with the backend's plane kernels, and with torch's operators.
+
+    Counted are the backend's kernels and torch's operators; each operator launches at least one kernel.
+    """
     from torch_backend.deformation import planes_cuda
 
     world, quiet = small_world(folder)
@@ -130,7 +133,7 @@ def launches(folder: Path, *methods: str) -> dict[str, Any]:
                 with pretended_card():
                     trainer = new_trainer(world, quiet, method, "support", False)
                     trainer.recorder = None
-                    _steps(trainer, 6)  # the field is there, and its tables
+                    _steps(trainer, 6)  # after these, field and tables exist
                     for _ in range(6):
                         before = CARD.operators + sum(CARD.launched.values())
                         _steps(trainer, 1)
@@ -142,7 +145,7 @@ def launches(folder: Path, *methods: str) -> dict[str, Any]:
 
 
 def resume(folder: Path, method: str) -> dict[str, Any]:
-    """A run that is resumed just before a round of growth: moments are cloned before the optimiser's next step."""
+    """Resume a run just before a round of growth, when the optimiser's moments are restored but not yet used."""
     from torch_backend.train.resume import restore_run, save_run
 
     world, quiet = small_world(folder)
@@ -162,7 +165,7 @@ def resume(folder: Path, method: str) -> dict[str, Any]:
 
 
 def station(folder: Path) -> dict[str, Any]:
-    """Train, extend, freeze, live: the whole way of a shot."""
+    """Train, extend, freeze and draw live: all stations of a shot."""
     from torch_backend.contract import FreezeParams, LiveView, TrainParams
     from torch_backend.freeze import freeze_shot
     from torch_backend.live import LiveSession
@@ -189,7 +192,7 @@ def station(folder: Path) -> dict[str, Any]:
 
 
 def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
-    """Bytes that a step takes per Gaussian, all of them moving but with `static`, beside what the model says."""
+    """Bytes of a step per Gaussian, compared with the memory model. All Gaussians move, except with `static`."""
     import torch
 
     from torch_backend.train import memory
@@ -210,14 +213,14 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
                 fresh = torch.zeros(many, dtype=torch.bool, device="cuda")
                 trainer.model.gaussians.rebuild(rows, fresh, trainer.optimizer)
                 trainer.densifier.reset(many)
-                trainer.step()  # makes the moments
+                trainer.step()  # creates the moments
                 CARD.peak = CARD.live
                 trainer.step()
                 peaks.append((many, CARD.peak))
             (few, low), (many, high) = peaks
             whole = memory.moving_bytes(trainer.config, True) if method != "static" else 0
             harmonics = 3 * (trainer.config.sh_degree + 1) ** 2
-            # Of so few steps on so small a picture: no mean of the last steps, one list of hits, no harmonics yet.
+            # Absent in so short a run: the running mean of the last steps, a second list of hits, and harmonics.
             absent = 4 * (11 + harmonics) + 16 * memory.HIT_BYTES + 8 * harmonics
             said = memory.gaussian_bytes(trainer.config, len(trainer.centres)) + whole - absent
             told[method] = {"measured": (high - low) / (many - few), "said": said}
@@ -225,7 +228,7 @@ def step_bytes(folder: Path, *methods: str) -> dict[str, Any]:
 
 
 def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
-    """A run whose card has this share of the memory that a step with anchors takes, from the ninth step on."""
+    """Run on a device with `share` of the memory that a step with anchors needs, from the ninth step on."""
     from torch_backend.train import memory
     from torch_backend.train.loop import train_to_end
 
@@ -233,10 +236,10 @@ def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
     memory.LEAST, memory.LEAST_PIECE = 40, 100
     with pretended_card():
         trainer = new_trainer(world, quiet, method, "support", False, iterations=14)
-        trainer.recorder = None  # it would hold as much again, for good
+        trainer.recorder = None  # a recording would permanently hold as much memory again
         _steps(trainer, 8)
         CARD.peak = CARD.live
-        _steps(trainer, 1)  # the first with anchors, which take most
+        _steps(trainer, 1)  # the first step with anchors, which needs most memory
         CARD.limit = CARD.live + int(float(share) * (CARD.peak - CARD.live))
         before = len(trainer.model.gaussians)
         train_to_end(trainer, folder / "c.safetensors", lambda _: None)
@@ -250,13 +253,13 @@ def memory_ends(folder: Path, method: str, share: str) -> dict[str, Any]:
 
 
 def bad_frames(folder: Path) -> dict[str, Any]:
-    """Steps on frames of no numbers: what the run says of nine, what of its parameters they changed, and of 21."""
+    """Steps on NaN frames: the changed parameters and warnings after nine steps, and the error after 21."""
     from torch_backend.contract import JobError
 
     world, quiet = small_world(folder)
     with pretended_card():
         trainer = new_trainer(world, quiet, "auto", "support", False)
-        trainer.images = trainer.images * float("nan")  # not before: colours begin as the frames'
+        trainer.images = trainer.images * float("nan")  # only now, because colours are initialised from the frames
         before = {name: p.detach().clone() for name, p in trainer.model.gaussians.params.items()}
         for _ in range(9):
             trainer.step()
@@ -274,7 +277,7 @@ def bad_frames(folder: Path) -> dict[str, Any]:
 
 
 def self_test(folder: Path) -> dict[str, Any]:
-    """The self-test of the card as it is, of one whose kernels fail to launch, and of one that is full."""
+    """Self-test of the device in three states: sound, with failing kernel launches, and with full memory."""
     import torch
 
     from torch_backend.train.self_test import run_self_test

@@ -1,4 +1,4 @@
-"""What a checkpoint says of itself, of files whole and broken."""
+"""Headers of checkpoints, from complete and damaged files."""
 
 import json
 import struct

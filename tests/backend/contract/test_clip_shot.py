@@ -1,4 +1,4 @@
-"""Which shot folder is a clip's."""
+"""The shot folder that belongs to a clip."""
 
 import pytest
 

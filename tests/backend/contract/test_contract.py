@@ -1,4 +1,4 @@
-"""What crosses the wall: versions, types, camera paths."""
+"""Data that crosses the wall between add-on and backend: versions, types, camera paths."""
 
 import dataclasses
 import gc
@@ -62,12 +62,12 @@ def child_process() -> subprocess.Popen[bytes]:
     command = [sys.executable, "-c", "import time; print(flush=True); time.sleep(60)", "a word"]
     child = subprocess.Popen(command, stdout=subprocess.PIPE)
     assert child.stdout is not None
-    child.stdout.readline()  # before, the system may still show it without its command line
+    child.stdout.readline()  # until then, the system may list the process without its command line
     return child
 
 
 def test_an_interrupt_while_a_file_is_opened_closes_it_once(tmp_path):
-    """Ctrl-C between the call of `open` and its return read as a fault of the disk: "Bad file descriptor"."""
+    """Ctrl-C between the call of `open` and its return was reported as a disk error: "Bad file descriptor"."""
     path = tmp_path / "shot.json"
     path.write_text("{}")
 
@@ -104,7 +104,7 @@ def test_a_process_is_known_by_its_start_and_command():
         assert not contract.runs_still(child.pid, found.started + 1)
     finally:
         child.kill()
-    while contract.process(child.pid) is not None:  # it has ended, and nobody has asked for its exit code yet
+    while contract.process(child.pid) is not None:  # ended, but its exit code has not been read yet
         time.sleep(0.01)
     child.communicate()
     for pid in (child.pid, 0, -1, 10**30):
@@ -137,14 +137,14 @@ print(os.read(0, 3), child.stdout.strip(), os.read(taken, 3))
 
 
 def test_an_input_that_is_ours_alone_is_seen_by_nobody_else():
-    """On Windows a child, or a library that is loaded, would wait for what a thread of ours is waiting for."""
+    """On Windows, a child process or a loading library would block while a thread of ours reads the same input."""
     ran = subprocess.run([sys.executable, "-c", READER], input="abc", capture_output=True, text=True, check=True)
     assert ran.stdout.split() == ["b''", "b''", "b'abc'"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="ps is POSIX")
 def test_ps_tells_the_same_as_proc():
-    """What macOS is asked; ps of Linux answers in the same words."""
+    """macOS uses `ps`; the `ps` of Linux prints the same format."""
     before = time.time()
     child = child_process()
     try:

@@ -1,4 +1,4 @@
-"""Files that may come from anywhere: whoever reads one is held up by no pipe, and fills no memory. Real files."""
+"""Files of unknown origin: no reader blocks on a pipe or fills the memory. Uses real special files."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows has no such fil
 
 @pytest.fixture(autouse=True)
 def no_waiting() -> Iterator[None]:
-    """A test that waits for a pipe is ended."""
+    """End a test that blocks on a pipe."""
 
     def late(number: int, frame: object) -> None:
         raise TimeoutError("it waits for a file")
@@ -46,7 +46,7 @@ def make(path: Path, kind: str) -> Path:
         path.mkdir()
     else:
         path.touch()
-        os.truncate(path, 40 << 30)  # 40 GB that take no disk
+        os.truncate(path, 40 << 30)  # a sparse file of 40 GB, which uses no disk space
     return path
 
 
@@ -97,7 +97,7 @@ def test_a_file_that_is_whole_is_opened(tmp_path: Path):
 
 
 def packed(path: Path, size: int, header: str = "") -> Path:
-    """An .npz whose array "xyz" has that many bytes, or another header than it should."""
+    """Write an .npz whose array "xyz" has `size` bytes, or the given header."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         with archive.open("xyz.npy", "w", force_zip64=True) as member:
             text = header or f"{{'descr': '|u1', 'fortran_order': False, 'shape': ({size},), }}"

@@ -1,4 +1,4 @@
-"""Frame numbers in file names: which run of digits it is, and which names belong together."""
+"""Frame numbers in file names: which digits form the number, and which names belong together."""
 
 import pytest
 

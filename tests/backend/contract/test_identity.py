@@ -1,4 +1,4 @@
-"""What a file is known by: copies are alike, and every change of content tells, also inside of a large file."""
+"""Digests of files: copies have equal digests, and every change of content changes the digest, also in large files."""
 
 import os
 import shutil
@@ -24,7 +24,7 @@ def test_a_copy_of_another_name_and_time_is_the_same_file(tmp_path, size):
 
 @pytest.mark.parametrize("place", [0, 0.3, 0.5, 1])
 def test_a_change_of_content_tells_where_size_and_time_are_the_same(tmp_path, place):
-    """A patch in an uncompressed picture of 35 MB: 40 rows of 16 KB."""
+    """The change is a patch in an uncompressed picture of 35 MB: 40 rows of 16 KB."""
     size, patch = 35 << 20, 40 << 14
     keys = []
     for name in ("as filmed", "painted"):

@@ -1,4 +1,4 @@
-"""The one table of options: every option is heard, and what it says is what both command lines and the panel say."""
+"""The table of options: every option is effective, and both command lines and the panel use its texts."""
 
 import argparse
 import ast
@@ -16,11 +16,11 @@ NEEDED = {
     "freeze": ("a.mp4",),
     "farm": ("export", "s.splannequin", "--output", "job"),
 }
-"""What a command cannot do without."""
+"""Required words of each command."""
 
 
 def cases():
-    """(command, words, fields of kinds of jobs that the words are for) of every option of every command."""
+    """(command, words, affected fields of job kinds) of every option of every command."""
     for command, kinds in contract.COMMANDS.items():
         found: dict[tuple[str, ...], list[str]] = {}
         for kind, cls in kinds.items():
@@ -32,7 +32,7 @@ def cases():
 
 
 def words_for(one, told) -> tuple[str, ...]:
-    """An option with a value that is not its default."""
+    """An option with a value that differs from its default."""
     if told.switch:
         return (told.flag,)
     if told.choices:
@@ -75,7 +75,7 @@ def test_every_option_says_what_it_does():
 
 
 def read_of(files, names: tuple[str, ...]) -> set[str]:
-    """Attributes that the code of `files` reads of variables and attributes of these names."""
+    """Attributes that `files` read from variables and attributes of these names."""
     found = set()
     for file in files:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
@@ -113,7 +113,7 @@ def test_no_word_of_a_verb_is_passed_over_by_its_side(side, files):
     read = read_of([ROOT / file for file in files], ("args", "words"))
     for name, verb in contract.VERBS.items():
         if side in verb.sides and (side, name) not in ((contract.BLENDER, "farm"), (contract.BLENDER, "export")):
-            # Those it hands on, as below.
+            # Options that are passed on are checked below.
             dests = {told.dest for _, told in contract.options_for(name, verb.words, side)}
             assert dests - read == set(), name
 
@@ -176,7 +176,7 @@ def test_freeze_of_a_shot_asks_for_the_freeze_alone_and_of_a_clip_for_everything
     ],
 )
 def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, instead, capsys):
-    """Also where the value is the default, and where the option is abbreviated."""
+    """Also if the value is the default, or the option is abbreviated."""
     assert cli.main(["freeze", "s.splannequin", *words]) == contract.ExitCode.USAGE
     said = capsys.readouterr().err
     assert named in said and "s.splannequin is a shot folder" in said and said.count("\n") == 1
@@ -194,7 +194,7 @@ def test_what_a_clip_wants_is_refused_of_a_shot_in_one_sentence(words, named, in
     ],
 )
 def test_what_is_said_in_vain_or_in_an_old_word_is_told(words, told, capsys):
-    assert cli.main(list(words)) == contract.ExitCode.USAGE  # there is no such shot
+    assert cli.main(list(words)) == contract.ExitCode.USAGE  # this shot does not exist
     first, _, rest = capsys.readouterr().err.partition("\n")
     assert first.startswith("note: ") and told in first and rest.count("\n") == 1
 

@@ -1,4 +1,4 @@
-"""How long jobs will take: their work, what a machine's earlier jobs taught, and several of them as one bar."""
+"""Expected durations of jobs: their work, paces learnt from earlier jobs, and one progress bar for several jobs."""
 
 import json
 
@@ -48,7 +48,7 @@ def test_more_work_is_expected_to_take_longer():
     longer = ShotSize(148, SIZE.working, SIZE.source)
     for kind, params in (("solve", SolveParams()), ("freeze", FreezeParams())):
         once, twice = seconds(kind, params), seconds(kind, params, longer)
-        assert once < twice < 2.0 * once  # some of it is there however few frames there are
+        assert once < twice < 2.0 * once  # a part of the time does not depend on the number of frames
     assert seconds("train", TrainParams(iterations=1000)) < seconds("train", TrainParams())
     assert seconds("train", TrainParams()) < seconds("train", TrainParams(preset="standard"))
     assert seconds("train", TrainParams()) == seconds("train", TrainParams(), longer)
@@ -94,7 +94,7 @@ def test_a_damaged_file_teaches_nothing_and_is_replaced(environment, text):
 
 
 def run(way, jobs, step=1.0):
-    """Drives a way through jobs (kind, seconds it takes, does it estimate itself); yields (clock, share, left)."""
+    """Run jobs (kind, duration in seconds, whether it estimates itself) through a way; yield (clock, share, left)."""
     clock = 0.0
     for kind, takes, estimates in jobs:
         spent = 0.0
@@ -109,7 +109,7 @@ def test_jobs_as_expected_make_an_even_bar_with_a_true_estimate():
     way = WholeWay({"solve": 50.0, "train": 60.0, "freeze": 40.0}, spent=10.0)
     jobs = [("solve", 50.0, True), ("train", 60.0, False), ("freeze", 40.0, True)]
     for clock, share, left in run(way, jobs):
-        assert left == pytest.approx(150.0 - clock, abs=8.0)  # a job without an estimate never says that it is over
+        assert left == pytest.approx(150.0 - clock, abs=8.0)  # a job without an estimate does not announce its end
         assert share == pytest.approx((10.0 + clock) / 160.0, abs=0.04)
 
 
@@ -126,7 +126,7 @@ def test_work_that_was_done_before_does_not_make_what_follows_look_short():
     way = WholeWay({"solve": 50.0, "train": 60.0, "freeze": 40.0})
     assert way.at("solve", 0.1, None)[1] == pytest.approx(49.9 + 100.0)
     assert way.at("train", 0.0, None)[1] == pytest.approx(100.0)
-    assert way.at("train", 2.0, 3.0)[1] == pytest.approx(43.0)  # it goes on near its end
+    assert way.at("train", 2.0, 3.0)[1] == pytest.approx(43.0)  # it continues near its end
     share, left = way.at("freeze", 0.0, None)
     assert left == pytest.approx(40.0) and 0.0 < share < 0.2
 

@@ -1,4 +1,4 @@
-"""Path mapping rules of a farm: what a shot remembers of another computer, found here."""
+"""Path mapping rules of a farm: paths that a shot stored on another computer are mapped to local ones."""
 
 import json
 
@@ -15,7 +15,7 @@ def rule(source, destination, kind="POSIX"):
     ("path", "there"),
     [
         ("/home/ann/clips/a.mp4", "/mnt/clips/a.mp4"),
-        ("/home/ann/clips/deep/a.####.exr", "/mnt/deep/a.####.exr"),  # the longer source counts
+        ("/home/ann/clips/deep/a.####.exr", "/mnt/deep/a.####.exr"),  # the rule with the longer source wins
         ("/home/ann/clipsy/a.mp4", "/mnt/ann/clipsy/a.mp4"),
         ("/home/bob/a.mp4", "/home/bob/a.mp4"),
         ("clips/a.mp4", "clips/a.mp4"),

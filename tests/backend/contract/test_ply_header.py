@@ -1,4 +1,4 @@
-"""The header of a PLY: its vertices, their properties, and where they begin; what is none is refused in words."""
+"""Header of a PLY: vertices, their properties, and the offset of the data; other files are refused with a message."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""Verdicts and measurements that come from files: what is none of ours is passed over."""
+"""Verdicts and measurements from files: values of the wrong form are ignored."""
 
 import pytest
 

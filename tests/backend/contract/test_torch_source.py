@@ -1,11 +1,11 @@
-"""Which PyTorch a set-up takes, and whether that brings CUDA."""
+"""Choice of the PyTorch package in a set-up, and whether it includes CUDA."""
 
 import pytest
 
 from torch_backend.contract import CPU_INDEX, CUDA_INDEX, TORCH_INDEX, brings_cuda, torch_index
 
 ROWS = [
-    # system, NVIDIA's driver is there, a card fits, index, CUDA comes with it
+    # system, has NVIDIA driver, has suitable GPU, index, includes CUDA
     ("linux", False, False, CPU_INDEX, False),
     ("linux", True, False, "", True),
     ("linux", True, True, "", True),

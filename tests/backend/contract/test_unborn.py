@@ -1,4 +1,4 @@
-"""A failed import takes away the shot that it was to begin, and nothing that took anybody's work."""
+"""A failed import removes the shot that it began, and nothing that holds work."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from torch_backend.shot import Shot
 
 @pytest.fixture
 def shot(tmp_path):
-    """As an import finds it that fails at once."""
+    """Shot folder as an import that fails at once leaves it."""
     begun = Shot.create(tmp_path / "a.splannequin")
     begun.raw.mkdir(parents=True)
     return begun

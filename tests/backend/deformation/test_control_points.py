@@ -1,4 +1,4 @@
-"""Host C: skinning against values worked out by hand, penalties, nodes that join later."""
+"""Host C (control points): skinning compared with hand-computed values, penalties, and nodes that are added later."""
 
 import math
 
@@ -23,7 +23,7 @@ def field(places, **changes):
 
 
 def let_nodes_do(module, frame=(0.0, 0, 0, 0), shift=(0.0, 0, 0)):
-    """All nodes move alike: the heads say constants."""
+    """Make all nodes move alike: the heads output constants."""
     with torch.no_grad():
         for head in module.heads.values():
             head.weight.zero_()
@@ -50,7 +50,7 @@ def test_shares_are_those_of_the_paper():
 
 
 def test_a_node_turns_what_follows_it_about_itself():
-    half = math.tan(math.pi / 8)  # (1, 0, 0, tan(a / 2)) is a turn by a about z
+    half = math.tan(math.pi / 8)  # (1, 0, 0, tan(a / 2)) is a rotation by a about z
     module = let_nodes_do(field([[1.0, 0, 0]]), frame=(0.0, 0, 0, half), shift=(0.0, 0.5, 0))
     x = torch.tensor([[2.0, 0, 0], [1.0, 0, 0]])
     deltas = module(x, torch.tensor([0.3]))
@@ -62,7 +62,7 @@ def test_a_node_turns_what_follows_it_about_itself():
 
 
 def test_hyper_coordinates_say_whom_to_follow():
-    """Two Gaussians at one place can belong to two things: SC-GS' reason for the extra dimensions."""
+    """Two Gaussians at one place can follow different nodes; SC-GS adds the hyper dimensions for this case."""
     module = field([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]], hyper=1)
     with torch.no_grad():
         module.log_radii.fill_(math.log(0.2))
@@ -76,7 +76,7 @@ def test_hyper_coordinates_say_whom_to_follow():
 
 @pytest.mark.parametrize("configuration", ["default", "reference"])
 def test_blending_is_linear_blend_skinning_of_the_nodes(configuration):
-    """Against the sum over nodes as SC-GS writes it, at float64."""
+    """Compared with the sum over nodes as in SC-GS, in float64."""
     g = torch.Generator().manual_seed(3)
     config = host_config("control_points", configuration, 1000)
     module = ControlPoints(config, torch.randn(40, 3, generator=g), BOX, 10, g)
@@ -135,7 +135,7 @@ def test_rigid_motion_costs_no_arap_and_stretching_does():
     moved = places @ turn.T + 1.0
     assert float(arap_energy(places, moved)) < 1e-8
     stretched = places * torch.tensor([1.5, 1.0, 1.0])
-    # Every edge is off by at least what the best rotation leaves: more than nothing, less than the whole stretch.
+    # The best rotation leaves a residual on every edge: above zero, below the full stretch.
     assert 1e-3 < float(arap_energy(places, stretched)) < 60 * 10 * 0.3**2
 
 
@@ -143,7 +143,7 @@ def test_arap_leaves_far_neighbours_beyond_the_third_out():
     line = torch.arange(6.0)[:, None] * torch.tensor([[1.0, 0, 0]])
     moved = line.clone()
     moved[5, 1] = 4.0
-    # Node 0 has nodes 1, 2, 3 for neighbours, nearer than any; node 5 is none of them.
+    # The three nearest neighbours of node 0 are nodes 1, 2 and 3; node 5 is not among them.
     only = arap_energy(line[:5], moved[:5])
     assert float(only) < 1e-8
     assert float(arap_energy(line, moved)) > 0.1
@@ -162,7 +162,7 @@ def test_elastic_and_acceleration_pull_the_right_way():
     paths[:, 2, 1] = 3.0
     paths.requires_grad_()
     elastic_energy(paths).backward()
-    assert paths.grad[7, 1, 0] > 0  # the edge is longest at the end: descending shortens it
+    assert paths.grad[7, 1, 0] > 0  # the edge is longest at the end: gradient descent shortens it
     assert paths.grad[0, 1, 0] < 0
     path = torch.tensor([[[0.0, 0, 0]], [[0.0, 1, 0]], [[0.0, 0, 0]]], requires_grad=True)
     acceleration_energy(path).backward()

@@ -1,4 +1,4 @@
-"""The gate closes what did not move, keeps what moves in pieces, and leaves the mean change behind."""
+"""The gate closes Gaussians that did not move, keeps moving pieces open, and bakes the mean change into closed ones."""
 
 import math
 
@@ -19,7 +19,7 @@ def model(count=400):
 
 
 def moments(count, shift=None, opacity=None, color=None):
-    """Deltas at the two ends of a swing about 0."""
+    """Deltas at both ends of an oscillation about 0."""
     for sign in (1.0, -1.0):
         yield Deltas(
             torch.zeros(count, 3) if shift is None else sign * shift,
@@ -63,7 +63,7 @@ def test_times_at_which_nobody_saw_it_say_nothing():
     change, mean = change_of(m, rows, asked, torch.full((10,), 100.0), GateConfig(), seen)
     assert float(change[0]) < 1e-3
     torch.testing.assert_close(mean.means[0], torch.full((3,), 0.1))
-    for row in (4, 7):  # seen always; seen never: nothing is known better than all
+    for row in (4, 7):  # seen at all times, or at none: both use the mean over all times
         torch.testing.assert_close(mean.means[row], torch.full((3,), 0.3))
         assert float(change[row]) > 100.0
 
@@ -80,7 +80,7 @@ def test_the_piece_that_moves_stays_open_and_little_else():
 def test_what_cameras_that_are_a_little_off_make_of_a_still_scene_does_not_stay_open():
     m, rows = model(), torch.arange(400)
     moves = m.params["means"].detach()[:, 0] > 0.85
-    # As measured on a real clip: half of all Gaussians change by more than the threshold, none of them moves.
+    # As measured on a real clip: half of all Gaussians change by more than the threshold, but none moves.
     change = torch.empty(400).log_normal_(0.25, 0.5, generator=torch.Generator().manual_seed(2)) + 6.0 * moves
     stays = stays_open(m, rows, change, GateConfig())
     assert stays[moves].float().mean() > 0.9
@@ -97,7 +97,7 @@ def test_a_lone_mover_is_noise():
 
 def test_share_is_a_limit_and_what_moves_most_stays():
     m = model()
-    # Neighbours in space are alike: each stands for itself.
+    # Neighbours in space have similar changes, so smoothing does not alter the order.
     change = 1.5 + m.params["means"].detach()[:, 0]
     stays = stays_open(m, torch.arange(400), change, GateConfig(max_share=0.05, noise=0.0))
     assert int(stays.sum()) == 20

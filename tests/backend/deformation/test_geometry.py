@@ -1,4 +1,4 @@
-"""Rotations, rigid motions and samples: against closed forms, and finite where those divide by zero."""
+"""Rotations, rigid motions and sampling, compared with closed forms, and finite at their singularities."""
 
 import math
 
@@ -64,7 +64,7 @@ def test_screw_has_gradients_at_angle_zero():
     points = torch.tensor([[1.0, 0, 0], [0, 0, 2]], dtype=torch.float64)
     assert torch.equal(screw(points, turn, shift), points)
     assert torch.autograd.gradcheck(lambda t, s: screw(points, t, s), (turn, shift), eps=1e-6, atol=1e-6)
-    # d(exp(w) x)/dw at 0 is -[x]: the sum over the outputs of e_x cross is known.
+    # d(exp(w) x)/dw at 0 is -[x], so the gradient of one output is known in closed form.
     screw(points, turn, shift)[0, 1].backward()
     assert turn.grad[0].tolist() == pytest.approx([0, 0, 1])
 
@@ -78,7 +78,7 @@ def test_farthest_points_spread_and_skip_duplicates():
 
 
 def test_nearest_far_from_the_origin():
-    """Thousands of units away, products of coordinates would cancel; the centre is taken off first."""
+    """Thousands of units away, products of coordinates lose precision, so the centre is subtracted first."""
     g = torch.Generator().manual_seed(5)
     points, queries = torch.rand(40, 3, generator=g), torch.rand(300, 3, generator=g)
     far = torch.tensor([3000.0, -2000.0, 500.0])
@@ -94,7 +94,7 @@ def test_rotations_of_edges_are_found_and_never_mirror():
     valid = torch.ones(30, 8, dtype=torch.bool)
     valid[:, 6:] = False
     after = before @ truth.transpose(1, 2)
-    after[:, 6:] += 10.0  # what is not valid does not count
+    after[:, 6:] += 10.0  # invalid edges are ignored
     found, usable = rigid_rotations(before, after, valid)
     assert bool(usable.all())
     torch.testing.assert_close(found, truth, atol=1e-10, rtol=0)
@@ -105,7 +105,7 @@ def test_rotations_of_edges_are_found_and_never_mirror():
 def test_collapsed_flat_and_bad_edges():
     edges = torch.randn(4, 5, 3, generator=torch.Generator().manual_seed(8))
     edges[0] = 0.0
-    edges[1] = edges[1, :1]  # all along one line
+    edges[1] = edges[1, :1]  # all edges are parallel
     edges[2, 0, 0] = torch.nan
     valid = torch.ones(4, 5, dtype=torch.bool)
     rotation, usable = rigid_rotations(edges, edges, valid)

@@ -1,4 +1,4 @@
-"""Host A: identity at the start, time over the whole plane, gradients against finite differences."""
+"""Host A (HexPlane): identity at the start, time over the whole plane, gradients compared with finite differences."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def points(count=9):
 
 
 def stir(module):
-    """Gives the zero heads and flat time planes something to say."""
+    """Perturb all parameters, so that the zero heads and the flat time planes have an effect."""
     g = torch.Generator().manual_seed(2)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -39,7 +39,8 @@ def test_shapes_and_sizes():
 
 
 def test_ends_of_time_hit_the_end_nodes():
-    """The published code feeds [0, 1] to a [-1, 1] sampler and never reaches half of the plane (issues #248, #251)."""
+    """The published code passes [0, 1] to a sampler for [-1, 1] and never reaches half of the plane (issues #248,
+    #251)."""
     module = field()
     with torch.no_grad():
         for plane in module.temporal:
@@ -51,7 +52,7 @@ def test_ends_of_time_hit_the_end_nodes():
 
 
 def test_stretched_axes_are_fine_where_the_gaussians_are():
-    """People 0.3 wide in a box of 40: even axes of 8 nodes give them an eighth of one, these ten times as many."""
+    """People are 0.3 wide in a box of 40. Stretched axes give them over ten times as many nodes as 8 even nodes do."""
     g = torch.Generator().manual_seed(4)
     people, background = 0.3 * torch.randn(60, 3, generator=g), 20.0 * torch.randn(30, 3, generator=g)
     means = torch.cat([people, background])
@@ -59,7 +60,7 @@ def test_stretched_axes_are_fine_where_the_gaussians_are():
     nodes = {}
     for stretch in (0.0, 2.0):
         made = host("hexplane").create(HexPlaneConfig(features=4, resolution=8, time_nodes=5, stretch=stretch), start)
-        with torch.no_grad():  # the first plane counts nodes along x, all others are 1
+        with torch.no_grad():  # the first plane counts nodes along x; all others are 1
             for n, plane in enumerate((*made.spatial, *made.temporal)):
                 plane.copy_(torch.arange(8.0).expand_as(plane) if n == 0 else torch.ones_like(plane))
         at = made.features_at(people, torch.tensor([0.5]))[:, 0]
@@ -96,12 +97,12 @@ def test_published_means_get_gradient_through_the_lookup():
     step = 1e-3 * torch.nn.functional.normalize(x.grad, dim=1)
     with torch.no_grad():
         low, high = (module(x + sign * step, torch.tensor([0.5])).means.square().sum() for sign in (-1.0, 1.0))
-    # Some of the steps cross into another cell of a plane.
+    # Some steps cross into another cell of a plane.
     assert float(high - low) == pytest.approx(2.0 * float((x.grad * step).sum()), rel=0.2)
 
 
 def test_smoothness_sees_every_axis():
-    """4DGaussians' spatial term never smooths x; ours must notice a kink along any axis."""
+    """4DGaussians' spatial term never smooths x; this one must notice a kink along any axis."""
     for plane_index in range(3):
         for axis in (2, 3):
             module = field()
@@ -162,7 +163,7 @@ def test_the_published_field_reaches_only_the_upper_half_of_time():
 
 
 def test_the_published_smoothness_never_sees_x():
-    """Planes are [second axis, first axis]: only what bends down them counts, so x is never smoothed."""
+    """Planes are stored as [second axis, first axis], and only differences along rows count, so x is never smoothed."""
     for plane_index, axis, counts in ((0, 3, False), (0, 2, True), (1, 3, False), (2, 2, True), (2, 3, False)):
         module, _ = published()
         with torch.no_grad():

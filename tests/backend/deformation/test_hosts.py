@@ -1,4 +1,5 @@
-"""What every host keeps: found by its file, identity at the start, a rigid motion fitted, finite, restored."""
+"""Requirements on every host: registered by its file, identity at the start, fits a rigid motion, finite,
+restorable."""
 
 import dataclasses
 import importlib
@@ -57,7 +58,7 @@ def test_the_hosts_of_the_issue_are_there():
 
 
 def test_only_a_host_with_an_axis_to_size_asks_how_many_nodes_time_needs():
-    """To answer, the run renders dozens of frames."""
+    """Computing the number of time nodes renders dozens of frames."""
     asked = []
 
     def nodes():
@@ -75,8 +76,8 @@ def test_only_a_host_with_an_axis_to_size_asks_how_many_nodes_time_needs():
 
 @pytest.mark.parametrize("name", ["hexplane", "control_points"])
 def test_what_a_host_calls_is_compiled_before_it_is_called(name, monkeypatch):
-    """From the main thread, before the clock of the first step: no snippet is compiled in a step."""
-    for made in (planes._sampler, planes._penalty, geometry._search):  # by another test
+    """Warm-up compiles all snippets in the main thread, before the first step is timed."""
+    for made in (planes._sampler, planes._penalty, geometry._search):  # left by another test
         made.cache_clear()
     spec = registry.host(name)
     spec.warm_up(spec.settings())
@@ -118,7 +119,7 @@ def test_a_time_for_all_is_the_same_time_for_each(name, configuration):
 
 @pytest.mark.parametrize("rules", [{}, {"quats": turn, "log_scales": add_to_scale}])
 def test_deltas_meet_all_rows_as_they_meet_some(rules):
-    """All rows in order are not indexed; the same rows in another order, and each half alone, give the same."""
+    """All rows in order are processed without an index; a permutation and each half alone give equal results."""
     model, g = cloud(20), torch.Generator().manual_seed(6)
     deltas = Deltas(*(0.1 * torch.randn(20, n, generator=g) for n in (3, 4, 3)))
     rows, mixed = torch.arange(20), torch.randperm(20, generator=g)
@@ -133,7 +134,7 @@ def test_deltas_meet_all_rows_as_they_meet_some(rules):
 
 
 def rigid(means, t):
-    """A quarter turn about z through the clip, and a shift."""
+    """Rotation about z by 0.8 rad through the clip, and a translation."""
     angle = torch.as_tensor(t) * 0.8
     c, s = angle.cos(), angle.sin()
     turned = torch.stack([c * means[:, 0] - s * means[:, 1], s * means[:, 0] + c * means[:, 1], means[:, 2]], dim=1)
@@ -253,7 +254,7 @@ HOST = HostSpec("sway", SwayConfig, lambda iterations: SwayConfig(lr=0.2), lambd
 
 @pytest.fixture
 def fourth_host(tmp_path, monkeypatch):
-    """A host in one file, in a folder that joins the package for the length of a test."""
+    """A host in a single file, in a folder that joins the package during a test."""
     package = importlib.import_module("torch_backend.deformation")
     (tmp_path / "sway.py").write_text(FOURTH)
     monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
@@ -282,7 +283,7 @@ def test_one_name_for_two_hosts_is_refused(fourth_host, tmp_path):
 
 
 def test_rehearsal_finds_a_motion_and_places_the_nodes():
-    """SC-GS' first stage with a loss that knows where every surrogate should be."""
+    """First stage of SC-GS, with a loss that knows the target position of the surrogates."""
     means = cloud(300).params["means"].detach()
     config = registry.host_config("control_points", "reference", 1000)
     config.nodes, config.width, config.depth = 40, 64, 4
@@ -295,12 +296,12 @@ def test_rehearsal_finds_a_motion_and_places_the_nodes():
         asked.append(len(state["means"]))
         assert state["log_scales"].unique().numel() == 1
         assert state["shN"].shape[1] == 0
-        # The cloud should be centred on a place that moves: points are where they start, plus the motion.
+        # The centre of the surrogates should follow the motion: the start positions plus the shift.
         gap = state["means"].mean(0) - means.mean(0) - times[frame] * shift
         return 50.0 * gap.square().sum()
 
     field.rehearse(Rehearsal(means, torch.rand(300, 3), times, 200, loss, torch.Generator().manual_seed(0)))
-    # Surrogates multiply from a twentieth of the stage on, up to 16 per node; then the nodes are drawn.
+    # Surrogates multiply from a twentieth of the stage on, up to 16 per node; then the nodes are sampled.
     assert asked[:11] == [300] * 11
     assert asked[:150] == sorted(asked[:150])
     assert asked[149] == 16 * 40

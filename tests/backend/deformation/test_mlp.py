@@ -1,4 +1,4 @@
-"""Host B: the published shape, its composition rules, and the corrected ones."""
+"""Host B (MLP): the published shape, the published composition rules, and the corrected ones."""
 
 import math
 

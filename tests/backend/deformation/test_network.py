@@ -1,4 +1,4 @@
-"""The compiled network against torch's own operators and autograd at float64."""
+"""The compiled network, compared with torch's operators and autograd in float64."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ SIZES = (3, 4, 3, 1, 3)
 
 
 def layers(inputs=32, width=64, sizes=SIZES, dtype=torch.float32):
-    """A trunk and heads, as leaves; the same numbers whatever the type."""
+    """A trunk and heads as leaf tensors, with equal values in every dtype."""
     g = torch.Generator().manual_seed(0)
 
     def drawn(*shape):
@@ -38,8 +38,8 @@ def off(got, want):
     return float((got.double() - want).norm() / want.norm())
 
 
-# One row, a tile and a row, several shares of the sums of gradients; a trunk as of one level, three, a wide one; a head
-# of one output, of sixteen.
+# Rows: one, a tile and one, and several chunks of gradient sums. Trunks: of one level, of three, and wide. Heads: with
+# one output, and with sixteen.
 @pytest.mark.parametrize(
     ("count", "inputs", "width", "sizes"),
     [(1, 32, 64, SIZES), (33, 32, 64, SIZES), (3001, 32, 64, SIZES), (301, 16, 32, (16,)), (301, 48, 128, (1, 9))],
@@ -60,7 +60,7 @@ def test_values_and_gradients_match_float64(count, inputs, width, sizes):
 
 
 def test_far_out_it_bends_as_silu_does():
-    """Where exp overflows SiLU is 0 or the line itself, with slope 0 or 1."""
+    """Where exp overflows, SiLU is 0 or the identity, with slope 0 or 1."""
     eye = Layer(torch.eye(16), torch.zeros(16))
     x = torch.tensor([-1e4, -200.0, -90.0, 90.0, 200.0, 1e4]).repeat_interleave(16).view(6, 16).requires_grad_()
     (value,) = network.network(x, eye, [(eye, eye)])

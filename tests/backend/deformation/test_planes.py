@@ -1,7 +1,7 @@
-"""The compiled planes of each body against torch's grid_sample and autograd at float64: the processor's, and the GPU's
-on Warp's cpu device everywhere and on a GPU if there is one.
+"""The compiled planes of each implementation, compared with torch's grid_sample and autograd in float64.
 
-What a GPU compiles of them, run on the CPU: tests/backend/raster/test_device_text.py.
+The CPU's planes run on the CPU. The GPU's planes run on Warp's cpu device everywhere, and on a GPU if there is one.
+tests/backend/raster/test_device_text.py runs the code that a GPU compiles of them on the CPU.
 """
 
 import math
@@ -12,14 +12,14 @@ import torch
 from torch_backend.deformation import HexPlane, HexPlaneConfig, planes, planes_cuda
 
 BODIES = {"cpu": (planes, "cpu"), "fibers": (planes_cuda, "cpu"), "gpu": (planes_cuda, "cuda")}
-"""Body: module, device."""
+"""Map from implementation to (module, device)."""
 BOUNDS = {"cpu": (1e-5, 1e-4), "fibers": (2e-6, 1e-5), "gpu": (2e-6, 1e-5)}
-"""Body: relative error of values and gradients of planes, and of gradients of points."""
+"""Map from implementation to the relative error bound of (values and plane gradients, point gradients)."""
 no_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 
 
 def on_every_body(*rows):
-    """Parameters (body, *row) of the rows that a body takes: the processor's wants a multiple of 16 features."""
+    """Test parameters (implementation, *row); the CPU's implementation needs a multiple of 16 features."""
     return [
         pytest.param(body, *row, marks=no_gpu if body == "gpu" else ())
         for body in BODIES
@@ -29,7 +29,7 @@ def on_every_body(*rows):
 
 
 def fields(features=16, levels=(1, 2), time_nodes=7, **more):
-    """The same field twice, with planes that nothing repeats in: float32 and float64. Published: points are pulled."""
+    """The same field in float32 and float64, with random planes; `published`, so that points receive gradients."""
     made = []
     for dtype in (torch.float32, torch.float64):
         config = HexPlaneConfig(
@@ -45,7 +45,7 @@ def fields(features=16, levels=(1, 2), time_nodes=7, **more):
 
 
 def points(count=301):
-    """[count, 4] in and beyond [-1, 1]; the first lie on nodes and rims."""
+    """[count, 4] inside and outside [-1, 1]; the first points lie on nodes and on the border."""
     where = 1.2 * torch.randn(count, 4, generator=torch.Generator().manual_seed(2))
     where[:4] = torch.tensor([[-1.0, -1, -1, -1], [1, 1, 1, 1], [0, 0.25, -0.5, 0], [1, -1, 1, 0]])
     return where
@@ -71,7 +71,7 @@ def test_samples_and_every_gradient_match_float64(body, features, levels, time_n
     want = exact.features_at(where[:, :3].double(), where[:, 3].double())
     assert got.shape == (len(where), features * len(levels))
     assert relative(got, want) <= bound
-    # On a node and on the rim a point's slope is one-sided, and rounding decides which side.
+    # On a node or the border, the gradient of a point is one-sided, and rounding decides the side.
     here, leaves = where[4:].to(device).requires_grad_(), on(device, ours)
     there, time = (where[4:, part].double().requires_grad_() for part in (slice(0, 3), 3))
     pull = torch.randn(len(here), got.shape[1], generator=torch.Generator().manual_seed(3))

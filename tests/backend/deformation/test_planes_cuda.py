@@ -1,4 +1,4 @@
-"""The GPU's planes: what they take, and what is compiled of them. Values and gradients: test_planes.py."""
+"""The GPU's planes: accepted inputs and compiled code. test_planes.py checks values and gradients."""
 
 import re
 
@@ -22,7 +22,7 @@ def test_what_it_does_not_take_is_refused_and_what_the_self_test_refused_is_torc
         planes_cuda.penalty(exact._by_level(), [(1.0, 1.0, 1.0)] * 12)
     monkeypatch.setattr(planes_cuda, "refused", "a kernel does not build or run on it")
     assert not planes_cuda.supports(taken)
-    assert HexPlaneConfig().row_bytes() > 1024  # torch's path keeps every sample
+    assert HexPlaneConfig().row_bytes() > 1024  # torch's implementation keeps every sample
     monkeypatch.undo()
     assert HexPlaneConfig().row_bytes() + 4 * 10 * 16 * 2 == 4 * (12 * 16 * 2 + 64 * 15)
 
@@ -42,6 +42,6 @@ def test_kernels_compile_for_gpus_that_are_not_here(tmp_path, arch):
     wp.compile_aot_module(module, arch=arch, module_dir=str(tmp_path), use_ptx=True)
     (made,) = tmp_path.rglob("*.ptx")
     text = made.read_text(errors="replace")
-    # A thread reads four channels at once, adds by atomics, and keeps nothing outside its registers.
+    # A thread reads four channels at once, adds with atomics, and keeps its data in registers.
     assert len(re.findall(r"ld\.(global\.)?v4", text)) == 24 and text.count("atom.global.add.f32") == 24
     assert "ld.local" not in text

@@ -1,4 +1,4 @@
-"""Shots that look imported, for what only reads their records."""
+"""Shots with the records of an import, for code that only reads records."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from torch_backend.contract import FreezeParams, ImportParams, ShotFolder, Solve
 
 
 def _imported(root, name, first=1, last=20, size=(640, 360), source=(1920, 1080)):
-    """A shot folder with the records of an import."""
+    """Write a shot folder with the records of an import."""
     shot = ShotFolder(root / f"{name}.splannequin")
     write_json(shot.info_path, {"version": 1, "name": name, "first": first, "last": last})
     frames = [{"frame": n, "file": f"raw/{n:06d}.png"} for n in range(first, last + 1)]
@@ -19,7 +19,7 @@ def _imported(root, name, first=1, last=20, size=(640, 360), source=(1920, 1080)
 
 @pytest.fixture
 def requests():
-    """requests(**freeze) is what a command line asks for without options, but for those of the freeze."""
+    """requests(**freeze): parameters of a command line without options, except these of the freeze."""
 
     def made(**freeze):
         params = FreezeParams(only_missing=True)
@@ -35,11 +35,11 @@ def requests():
 
 @pytest.fixture
 def shot(tmp_path):
-    """shot(name, ...) makes an imported shot in the test's folder."""
+    """shot(name, ...): writes an imported shot into the test's folder."""
     return lambda name, **words: _imported(tmp_path / "shots", name, **words)
 
 
 @pytest.fixture
 def imported():
-    """imported(folder, name, ...) makes an imported shot in a folder."""
+    """imported(folder, name, ...): writes an imported shot into a folder."""
     return _imported

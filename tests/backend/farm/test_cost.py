@@ -1,4 +1,4 @@
-"""Tasks, their amounts, rates of what was measured, and what a job costs by them."""
+"""Tasks, their amounts of work, measured rates, and the resulting cost of a job."""
 
 import dataclasses
 import math
@@ -15,11 +15,11 @@ from torch_backend.farm.work import MOST_VALUES, steps_of
 from torch_backend.freeze.instant.develop import DevelopConfig
 
 ONE = {kind: Rate(1.0, 0.0, 2.0, 1000) for kind in rates.MEASURED}
-"""Every task takes a second, on two cores."""
+"""Rates at which every task takes a second on two cores."""
 
 
 PARTS = ((1, 10), (11, 10), (21, 3))
-"""First frame and length of the parts of 23 frames by tens."""
+"""(first frame, length) of the parts of 23 frames, ten frames each."""
 
 
 def shots_of(shot, requests, count=1, instants=(4, 12), **words):
@@ -63,7 +63,7 @@ def test_what_a_job_costs(shot, requests):
     found = shots_of(shot, requests, count=3)
     steps = [step for one in found for step in steps_of(one, 5, False)]
     told = estimate(steps, ONE, True, False)
-    # a shot: solve, train, 2 opened, 2 x 4 parts, 2 finished
+    # per shot: solve, train, 2 opened, 2 x 4 parts, 2 finished
     assert (told.shots, told.tasks) == (3, 3 * 14)
     own, engine = sum(row.core_seconds for row in told.rows[:-1]), told.rows[-1]
     assert own == pytest.approx(3 * 14 * 2.0) and told.core_hours == pytest.approx((own + engine.core_seconds) / 3600)

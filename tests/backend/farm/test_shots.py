@@ -1,4 +1,4 @@
-"""What `farm export` is given: shots, clips, instants."""
+"""Arguments of `farm export`: shots, clips, instants."""
 
 import shutil
 import unicodedata
@@ -37,7 +37,7 @@ def test_shots_of_one_name_have_steps_and_outputs_of_two_in_any_order(imported, 
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
-    """A video of three frames."""
+    """Video of three frames."""
     path = tmp_path_factory.mktemp("video") / "clip.mp4"
     with av.open(str(path), "w") as out:
         stream = out.add_stream("mpeg4", rate=24)
@@ -50,7 +50,7 @@ def video(tmp_path_factory):
 
 @pytest.fixture
 def clip(tmp_path, video):
-    """clip("a/plate.mp4") is the path of a video; of one with a # in its name, the pattern of a sequence."""
+    """clip("a/plate.mp4"): path of a video; for a name with #, the pattern of a sequence."""
 
     def made(name):
         path = tmp_path / "clips" / name

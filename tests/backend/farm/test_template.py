@@ -1,4 +1,4 @@
-"""The job template: valid, without a path of ours outside of what is mapped, one chain of steps per shot."""
+"""The job template: valid, without local paths outside of the mapped ones, one chain of steps per shot."""
 
 import json
 import subprocess
@@ -17,7 +17,7 @@ from torch_backend.farm.work import steps_of
 
 @pytest.fixture
 def shots(shot):
-    """Two shots; the name of one holds what would be a reference in a template."""
+    """Two shots; the name of one contains the syntax of a template reference."""
     hall, other = shot("hall").root, shot("kitchen", last=23)
     write_json(other.info_path, {"version": 1, "name": "kit {{chen}}"})
     return [str(hall), str(other.root)]
@@ -25,7 +25,7 @@ def shots(shot):
 
 @pytest.fixture
 def job(tmp_path, shots, capsys):
-    """job(*words) is (template, parameters, folder) of `farm export` of both shots with these words."""
+    """job(*words): (template, parameters, folder) of `farm export` of both shots with these options."""
 
     def made(*words):
         folder = tmp_path / "job"
@@ -155,7 +155,7 @@ ODD = [
     "t\tab\x7f\x85",
     "h\u00e4ll \U0001f3ac",
 ]
-"""Names that a shot.json may hold, whoever wrote it."""
+"""Odd names that a shot.json may hold."""
 
 
 def test_whatever_shots_are_called_the_engine_takes_the_job(tmp_path, imported, capsys):
@@ -195,7 +195,7 @@ def test_what_a_task_is_told_is_what_was_asked_for_whatever_it_holds(shot, reque
 )
 @pytest.mark.parametrize("what", ["shot", "output", "mask"])
 def test_a_path_that_the_engine_refuses_is_one_sentence_at_export(imported, tmp_path, capsys, name, what):
-    """An output folder or a mask is a value beside the template, where braces mean nothing."""
+    """Output folders and masks are parameter values, where braces have no meaning."""
     model = pytest.importorskip("openjd.model")
     name = name if len(name) < 100 else "/".join([name] * 3)
     folder, words = tmp_path / name, []

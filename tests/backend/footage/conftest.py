@@ -1,4 +1,4 @@
-"""Tiny real clips and a reporter that keeps what it is told."""
+"""Tiny real clips and a reporter that records its events."""
 
 from fractions import Fraction
 
@@ -11,7 +11,7 @@ from torch_backend.contract import Cancelled, Reporter
 
 
 class Recorder(Reporter):
-    """Keeps events; cancels once `cancel_after` checks have passed."""
+    """Records events; cancels after `cancel_after` checks."""
 
     def __init__(self, cancel_after=None):
         self.warnings, self.steps, self.checks, self.cancel_after = [], [], 0, cancel_after
@@ -50,7 +50,7 @@ def pan():
 
 @pytest.fixture
 def write_video():
-    """write_video(path, frames, ...): a lossless H.264 file in YCbCr 4:4:4."""
+    """write_video(path, frames, ...): writes a lossless H.264 file in YCbCr 4:4:4."""
 
     def write(
         path, frames, rate=24, rotation=None, aspect=None, milliseconds=None, codec="libx264", faststart=False,
@@ -82,7 +82,7 @@ def write_video():
 
 @pytest.fixture
 def frame_of_planes():
-    """frame_of_planes(planes, format, size): a video frame with these codes, [h, w] for each plane, as they stand."""
+    """frame_of_planes(planes, format, size): video frame with exactly these codes; each plane is [h, w]."""
 
     def make(planes, kind, size=None):
         width, height = size or planes[0].shape[::-1]

@@ -1,4 +1,4 @@
-"""What is measured on frames: against known pictures, cuts, and the choice of frames."""
+"""Measurements of frames, compared with known pictures; detection of cuts; choice of frames."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def flat(value, dtype=np.uint8):
 
 
 def plain(count, **flags):
-    """Measures of equal sharpness, frames 1 to `count`; flags by frame: f5="blank"."""
+    """Measures of frames 1 to `count` with equal sharpness; flags by frame, such as f5="blank"."""
     return [FrameMeasures(i, 10.0, 0.0, [flags[f"f{i}"]] if f"f{i}" in flags else []) for i in range(1, count + 1)]
 
 
@@ -94,7 +94,7 @@ def test_flagged_frames_give_way_to_their_neighbours():
 
 def test_a_blurred_frame_gives_way_to_the_sharpest_near_it():
     frames = plain(11)
-    frames[5].sharpness, frames[7].sharpness = 1.0, 11.0  # frame 6 is blurred, frame 8 the sharpest
+    frames[5].sharpness, frames[7].sharpness = 1.0, 11.0  # frame 6 is blurred, frame 8 is the sharpest
     assert choose_solved(frames, 5) == {1, 8, 11}
 
 

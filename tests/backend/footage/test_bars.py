@@ -1,4 +1,5 @@
-"""Bars beside the picture: found where they are, masked and told; dark pictures and door frames are none."""
+"""Black or blurred bars around the picture are located, masked and reported; dark pictures and door frames are not
+bars."""
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ HEIGHT, WIDTH = 120, 200
 
 @pytest.fixture
 def world(pan):
-    """24 uint8 frames [120, 200, 3] of a camera that pans over a texture with detail."""
+    """24 uint8 frames [120, 200, 3] of a camera that pans over a detailed texture."""
     grain = np.random.default_rng(1).normal(0, 12, (HEIGHT, 400, 1))
     frames = pan(24, HEIGHT, WIDTH, speed=3)
     return [np.clip(f + grain[:, 3 * i : 3 * i + WIDTH], 0, 255).astype(np.uint8) for i, f in enumerate(frames)]
@@ -35,7 +36,7 @@ def barred(frames, top=0, bottom=0, left=0, right=0, colour=0):
 
 
 def blurred_beside(frames, size):
-    """The middle of each frame over a blurred, enlarged copy of it."""
+    """Middle of each frame over a blurred, enlarged copy of the frame's middle."""
     out = []
     for frame in frames:
         middle = np.ascontiguousarray(frame[:, size : WIDTH - size])
@@ -74,13 +75,13 @@ def test_a_subtitle_in_a_bar_and_a_picture_that_is_dark_at_the_other_do_not_hide
 
 
 def darkened(world):
-    """Underexposed until most of the picture clips to black, the upper third of it everywhere."""
+    """Underexposed frames: most of the picture clips to black, the upper third everywhere."""
     fall = np.clip((np.arange(HEIGHT) - 40) / 60, 0, 1)[:, None, None]
     return [np.clip((frame.astype(float) - 90) * fall, 0, 255).astype(np.uint8) for frame in world]
 
 
 def skyline(world):
-    """Roofs before a black sky: no straight line, and they go by."""
+    """Roofs against a black sky: their line is not straight, and it moves."""
     out = []
     for i, frame in enumerate(world):
         roofs = 30 + 8 * np.sin((np.arange(WIDTH) + 3 * i) / 9)
@@ -89,7 +90,7 @@ def skyline(world):
 
 
 def door(world):
-    """A black door frame at the side that stands nearly still in the picture."""
+    """Black door frame at the left side that is nearly still in the picture."""
     out = [frame.copy() for frame in world]
     for i, frame in enumerate(out):
         frame[:, : 24 + round(3 * np.sin(i / 3))] = 9
@@ -97,7 +98,7 @@ def door(world):
 
 
 def shallow(world):
-    """Sharp in the middle only, as a fast lens shows it."""
+    """Frames with shallow depth of field: only the middle is sharp."""
     weight = np.clip(np.abs(np.arange(WIDTH) - WIDTH / 2) / 40 - 0.5, 0, 1)[None, :, None]
     return [(f * (1 - weight) + cv2.GaussianBlur(f, (0, 0), 7) * weight).astype(np.uint8) for f in world]
 

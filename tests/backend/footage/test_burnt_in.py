@@ -1,4 +1,4 @@
-"""What is burnt into a clip is found and masked, whatever goes by behind it; a camera that stands finds nothing."""
+"""Burnt-in logos are found and masked over any moving background; a static camera finds nothing."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ def grey(frames):
 
 
 def stamped(frames, x, y, strength=0.6):
-    """A half transparent ring with a cross in it, 36 pixels wide, at x, y; and where it is, bool [H, W]."""
+    """Frames with a half-transparent ring and cross, 36 pixels wide, at x, y; and the mark's area, bool [H, W]."""
     mark, inside = np.zeros((H, W), np.uint8), np.zeros((H, W), np.uint8)
     cv2.circle(mark, (x, y), 16, 255, 3)
     cv2.line(mark, (x - 10, y), (x + 10, y), 255, 3)

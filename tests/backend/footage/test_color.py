@@ -12,7 +12,7 @@ from torch_backend.footage.color import (
 
 
 def reference_to_linear(x):
-    """IEC 61966-2-1 in float64, odd-extended."""
+    """IEC 61966-2-1 decoding in float64, extended to negative values as an odd function."""
     magnitude = np.abs(np.asarray(x, dtype=np.float64))
     return np.sign(x) * np.where(magnitude <= 0.04045, magnitude / 12.92, ((magnitude + 0.055) / 1.055) ** 2.4)
 
@@ -47,7 +47,7 @@ def test_every_encoded_value_comes_back(value):
 def test_strictly_rising_over_all_16_bit_codes():
     codes = np.arange(-65535, 65536, dtype=np.float64) / 65535.0
     assert (np.diff(srgb_to_linear(codes)) > 0).all()
-    # In linear light float32 neighbours may share a code; none may ever fall.
+    # Neighbouring float32 values may share a code in linear light, but codes must never decrease.
     assert (np.diff(linear_to_srgb(codes)) >= 0).all()
 
 

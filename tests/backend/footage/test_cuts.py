@@ -1,4 +1,4 @@
-"""Transitions between takes, made of a real handheld clip; and what is none: noise, darkness, blur, flashes."""
+"""Transitions between takes, built from a real handheld clip; and false candidates: noise, darkness, blur, flashes."""
 
 from pathlib import Path
 
@@ -16,14 +16,14 @@ RNG = np.random.default_rng(0)
 
 @pytest.fixture(scope="module")
 def clip():
-    """[74, 240, 320, 3] of a clip of 10 frames per second, whose camera sways fast."""
+    """[74, 240, 320, 3] frames of a clip at 10 frames per second with a fast-swaying camera."""
     frames = open_source(str(ROOT / "examples" / "sitting.mp4")).frames(None, None)
     return [cv2.resize(f.pixels, (320, 240), interpolation=cv2.INTER_AREA) for f in frames]
 
 
 @pytest.fixture(scope="module")
 def other():
-    """Another scene, panned over: blobs of all sizes."""
+    """Frames of a pan over another scene, with blobs of all sizes."""
     noise = sum(cv2.resize(RNG.random((n, 2 * n, 3)), (640, 240), interpolation=cv2.INTER_CUBIC) for n in (12, 30, 60))
     strip = np.clip((noise - 0.6) * 280, 0, 255).astype(np.uint8)
     return [np.ascontiguousarray(strip[:, 3 * i : 3 * i + 320]) for i in range(40)]
@@ -54,7 +54,7 @@ def test_hard_cuts_dark_mirrored_to_another_view_and_near_an_end(clip, other):
 
 def test_a_dissolve_a_wipe_and_a_fade_are_named_with_frames_of_one_take_on_both_sides(clip, other):
     before, after = clip[:24], other[:24]
-    sides = list(zip(before[-5:], after[:5], strict=True))  # frames 19 to 23 show both
+    sides = list(zip(before[-5:], after[:5], strict=True))  # frames 19 to 23 mix both takes
     dissolved = [mix(a, b, (i + 1) / 6) for i, (a, b) in enumerate(sides)]
     edge = np.arange(320)[None, :, None]
     wiped = [np.where(edge < 53 * (i + 1), b, a) for i, (a, b) in enumerate(sides)]
@@ -67,7 +67,7 @@ def test_a_dissolve_a_wipe_and_a_fade_are_named_with_frames_of_one_take_on_both_
 
 @pytest.mark.parametrize("made", ["plain", "dark", "noisy", "flicker", "blur", "flash", "black", "gap", "passer-by"])
 def test_one_take_has_no_transition(clip, other, made):
-    frames = list(clip[42:74])  # the fastest sway
+    frames = list(clip[42:74])  # part with the fastest sway
     if made == "dark":
         frames = [mix(f, f * 0, 0.95) for f in frames]
     elif made == "noisy":

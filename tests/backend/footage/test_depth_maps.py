@@ -1,4 +1,4 @@
-"""Depth maps as programs and phones write them: which values are read, and what is left out and why."""
+"""Depth maps as written by programs and phones: which values are used, and which are dropped and why."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The display of working frames: light far above white comes back from 16 bits, and nothing below it changed."""
+"""Display encoding of working frames: light far above white survives 16 bits, and values below white are unchanged."""
 
 import json
 
@@ -59,7 +59,8 @@ def test_alpha_is_taken_away_before_the_curve(display):
 
 
 def test_a_lamp_that_is_made_smaller_is_nowhere_brighter_than_it_is():
-    """A kernel that rings would, on the bent curve, make its rim three times as bright."""
+    """With the shoulder's encoding, a resampling kernel with overshoot would make the lamp's rim three times as
+    bright."""
     plate = np.full((96, 128, 3), 0.1, np.float16)
     plate[30:60, 40:70] = 20.0
     for size in ((64, 48), (92, 70)):
@@ -74,7 +75,7 @@ def test_what_is_brighter_than_the_display_holds_is_counted():
 
 
 def test_an_exr_of_lamps_is_imported_with_them(tmp_path, recorder):
-    """Light 50 comes back from the working frame; frames of the same sequence that version 0.2 cut stay as they are."""
+    """Light 50 is recovered from the working frame. Frames that version 0.2 clipped stay unchanged."""
     wall = np.random.default_rng(0).uniform(0.1, 0.9, (48, 100, 3))
     for n in range(9):
         picture = np.ascontiguousarray(wall[:, 4 * n : 4 * n + 64]).astype(np.float16)

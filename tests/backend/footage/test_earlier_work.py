@@ -1,4 +1,4 @@
-"""What an import does to a shot on which work was done: it asks, and keeps that work as a shot of its own."""
+"""An import into a shot with earlier work asks for consent, and keeps that work as a separate shot."""
 
 import json
 import os
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def clips(tmp_path, pan, write_video):
-    """Two clips of the same size and length."""
+    """Two clips of equal size and length."""
     for name, seed in (("a", 0), ("b", 1)):
         write_video(tmp_path / f"{name}.mp4", pan(20, seed=seed), rate=10)
     return str(tmp_path / "a.mp4"), str(tmp_path / "b.mp4")
@@ -31,7 +31,7 @@ def clips(tmp_path, pan, write_video):
 
 @pytest.fixture
 def worked_on(tmp_path, clips, recorder):
-    """A shot of the first clip with a file of every kind of work."""
+    """Shot of the first clip with one file of each kind of work."""
     shot = Shot.create(tmp_path / "a.splannequin")
     import_footage(shot, clips[0], FootageConfig(), recorder())
     for path in work(shot):
@@ -65,7 +65,7 @@ def test_an_import_of_other_frames_into_a_shot_with_work_is_refused_and_changes_
     assert contents(worked_on) == before
 
 
-@pytest.mark.parametrize("alone", [0, 2, 3, 4, 5, 6, 7])  # 1: figures without cameras are no solve
+@pytest.mark.parametrize("alone", [0, 2, 3, 4, 5, 6, 7])  # 1: solve.json without cameras does not count as a solve
 def test_each_kind_of_work_is_reason_enough_to_refuse(worked_on, clips, recorder, alone):
     for number, path in enumerate(work(worked_on)):
         if number != alone:
@@ -99,7 +99,7 @@ def test_paint_stays_with_frames_that_are_the_same_picture(worked_on, clips, rec
 
 
 def test_the_same_pictures_by_another_way_replace_nothing(worked_on, clips, tmp_path, recorder):
-    """A clip that was copied, a range that names all frames: whatever it is called, it is the same."""
+    """A copied clip, or a range that covers all frames, counts as the same footage."""
     (tmp_path / "moved").mkdir()
     moved = shutil.copy(clips[0], tmp_path / "moved" / "a.mp4")
     os.utime(moved, (1, 1))

@@ -1,8 +1,7 @@
-"""The decode matrix: clips of many codecs, depths, ranges, matrices, rates, rotations, sizes, aspects against float64.
+"""Decoding matrix: clips of many codecs, depths, ranges, matrices, rates, rotations, sizes and aspects.
 
-Each clip shows 48 patches of 16 x 16 pixels whose codes are known. Their centres are held against the definition of the
-YCbCr matrix in float64, from the codes that the file holds: what was written or, where the codec loses something, what
-it gives back unscaled.
+Each clip shows 48 patches of 16 x 16 pixels with known codes. Their centres are compared with the definition of the
+YCbCr matrix in float64. Reference codes are the written ones or, for lossy codecs, the decoder's unscaled output.
 """
 
 import contextlib
@@ -28,22 +27,22 @@ SHARES = {
     7: (0.212, 0.087),
     9: (0.2627, 0.0593),
 }
-"""Of red and blue in luma, by the number of the matrix in ITU-T H.273."""
+"""Weights of red and blue in luma, by matrix number of ITU-T H.273."""
 PATCH, COLUMNS, ROWS = 16, 8, 6
 ALPHA = 3
 
 
 @dataclass
 class Clip:
-    """One generated input."""
+    """One generated input clip."""
 
     codec: str
     kind: str
-    """FFmpeg's name of the pixels."""
+    """FFmpeg's name of the pixel format."""
     matrix: int = 1
-    """In the file; 2: unsaid."""
+    """Matrix number stored in the file; 2: unspecified."""
     codes: int = 1
-    """1: video range, 2: full range, 0: unsaid."""
+    """Stored range; 1: video range, 2: full range, 0: unspecified."""
     suffix: str = "mkv"
     rate: str = "24"
     size: tuple[int, int] = (PATCH * COLUMNS, PATCH * ROWS)
@@ -51,15 +50,15 @@ class Clip:
     turned: int = 0
     transfer: int = 1
     expected_matrix: int = 0
-    """If the file does not say."""
+    """Expected matrix if the file does not specify it."""
     loses: bool = False
     decoded: str = ""
-    """Kind that the decoder gives out, if it is another one."""
+    """Pixel format of the decoder's output, if it differs."""
     options: dict[str, str] = field(default_factory=dict)
 
     @property
     def name(self):
-        """Of the test."""
+        """Name of the test."""
         words = [self.codec, self.kind, f"m{self.matrix}", f"r{self.codes}", self.suffix, self.rate.replace("/", ":")]
         words += [f"{self.size[0]}x{self.size[1]}"] * (self.size != (128, 96)) + [f"a{self.aspect}"] * (
             self.aspect != "1"
@@ -150,13 +149,14 @@ CLIPS = [
 
 
 def depth(kind):
-    """Bits of FFmpeg's pixel format."""
+    """Bit depth of an FFmpeg pixel format."""
     digits = "".join(c for c in kind.removesuffix("le")[-2:] if c.isdigit())
     return int(digits) if kind.endswith("le") else 8
 
 
 def patch_codes(clip):
-    """[3, rows, columns] integer Y, Cb, Cr (or G, B, R) of colours within the gamut; first white, then black."""
+    """[3, rows, columns] integer Y, Cb, Cr (or G, B, R) of in-gamut colours; the first patch is white, the second
+    black."""
     rng = np.random.default_rng(7)
     rows, columns = (-(-n // PATCH) for n in clip.size[::-1])
     rgb = rng.uniform(0.05, 0.95, (rows, columns, 3))
@@ -176,7 +176,7 @@ def patch_codes(clip):
 
 
 def reference(codes, clip):
-    """R'G'B' [..., 3] of codes [3, ...] by definition, in float64."""
+    """R'G'B' [..., 3] of codes [3, ...] by the definition, in float64."""
     bits = depth(clip.decoded or clip.kind)
     largest, step = (1 << bits) - 1, 1 << (bits - 8)
     if clip.kind.startswith(("gbr", "rgb")):
@@ -194,12 +194,12 @@ def reference(codes, clip):
 
 
 def shares(kind):
-    """Rows and columns of chroma for each of luma's: (down, across)."""
+    """Chroma subsampling: luma rows and columns per chroma sample, as (down, across)."""
     return {"420": (2, 2), "422": (1, 2), "440": (2, 1), "411": (1, 4)}.get(kind.lstrip("yuvaj")[:3], (1, 1))
 
 
 def planes_of_patches(codes, clip):
-    """Planes as the file is to hold them, [h, w] each."""
+    """Planes that the file should contain, each [h, w]."""
     width, height = clip.size
     kind = np.uint8 if depth(clip.kind) == 8 else np.uint16
     down, across = shares(clip.kind)
@@ -218,14 +218,14 @@ def planes_of_patches(codes, clip):
 
 @contextlib.contextmanager
 def usual_scheduling():
-    """SVT-AV1 makes the thread that calls it a real-time one where it may (root), and leaves it so."""
+    """Restore the scheduling of this thread: SVT-AV1, run as root, makes its caller a real-time thread permanently."""
     yield
     if hasattr(os, "sched_setscheduler") and os.sched_getscheduler(0) != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def written(path, clip, frame_of_planes, codes):
-    """The clip of three frames; what its container or codec says is what a camera would write."""
+    """Write a clip of three frames, tagged in container and codec as a camera would."""
     with usual_scheduling(), av.open(str(path), "w") as container:
         stream = container.add_stream(clip.codec, rate=Fraction(clip.rate), options=clip.options)
         (stream.width, stream.height), stream.pix_fmt = clip.size, clip.kind
@@ -249,7 +249,7 @@ def written(path, clip, frame_of_planes, codes):
 
 
 def stored(path, clip):
-    """Codes [3, rows, columns] at the patches' centres, as the decoder gives them out."""
+    """Codes [3, rows, columns] at the centres of the patches, as decoded."""
     with av.open(str(path)) as container:
         frame = next(container.decode(video=0))
     kind = np.uint8 if depth(frame.format.name) == 8 else np.uint16
@@ -273,7 +273,7 @@ def test_decoded_clips_are_what_their_codes_say(tmp_path, frame_of_planes, clip)
     source = open_source(str(path))
     frames = list(source.frames(None, None))
     check_facts(source, frames, clip)
-    pixels = np.clip(display(frames[0].pixels), 0.0, 1.0)  # of light, too
+    pixels = np.clip(display(frames[0].pixels), 0.0, 1.0)  # also if the pixels are linear light
     pixels = np.rot90(pixels, -clip.turned // 90)
     across = max(1.0, float(Fraction(clip.aspect)))
     down = max(1.0, 1 / float(Fraction(clip.aspect)))
@@ -285,14 +285,14 @@ def test_decoded_clips_are_what_their_codes_say(tmp_path, frame_of_planes, clip)
     assert np.abs(got - expected).max() < step
     assert np.abs((got - expected)[inside].mean(0)).max() < 0.2 * step
     if (reference(held, clip)[0, 0] >= 1).all():
-        # Made square, 16 bits end at 65531: FFmpeg's Lanczos weights do not quite add up.
+        # With non-square pixels resampled, 16-bit white is 65531: FFmpeg's Lanczos weights do not sum to exactly 1.
         assert (got[0, 0] >= (1.0 if clip.aspect == "1" or step == 1 / 255 else 0.9999)).all(), "white"
     intended = reference(codes, replace(clip, decoded=""))
     assert not clip.loses or np.abs(expected - intended).max() < 12 / 255, "the clip shows its patches"
 
 
 def check_facts(source, frames, clip):
-    """Sizes, numbers, times, and what is said of them."""
+    """Check sizes, numbers, times and the metadata of the source."""
     aspect, (width, height) = Fraction(clip.aspect), clip.size
     size = (round(width * aspect), height) if aspect >= 1 else (width, round(height / aspect))
     size = size[::-1] if clip.turned % 180 else size
@@ -310,7 +310,8 @@ def check_facts(source, frames, clip):
 
 
 def test_a_person_outdoes_the_file(tmp_path, frame_of_planes):
-    """Full range and BT.709, in a file that says video range and BT.601, with pixels twice as wide as high."""
+    """The user states full range and BT.709; the file states video range and BT.601. Pixels are twice as wide as
+    high."""
     true = Clip("ffv1", "yuv422p10le", 1, 2)
     codes, says = patch_codes(true), Clip("ffv1", "yuv422p10le", 6, 1)
     written(tmp_path / "a.mkv", says, frame_of_planes, codes)

@@ -1,4 +1,4 @@
-"""Pictures: what is written is read, sizes, and full disks."""
+"""Image files: round trip, sizes, and full disks."""
 
 import errno
 

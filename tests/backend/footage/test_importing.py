@@ -1,4 +1,4 @@
-"""The import as a whole: the folder it leaves, what it refuses, and what an interruption leaves behind."""
+"""The whole import: the folder it writes, refusals, and the state after an interruption."""
 
 import dataclasses
 import json
@@ -111,7 +111,7 @@ def test_nothing_is_removed_through_a_link(shot, clip, tmp_path, recorder, linke
 
 
 def test_a_killed_import_leaves_what_was_there(shot, clip, recorder):
-    """At the worst moment: the old frames were moved aside, the new ones not yet put in their place."""
+    """The import dies when the old frames are moved away and the new ones are not yet in place."""
     import_footage(shot, clip, FootageConfig(), recorder())
     before = files(shot.frames)
     shot.frames.rename(shot.root / ".frames.old")
@@ -216,7 +216,7 @@ def test_a_step_that_leaves_too_few_is_refused(shot, clip, recorder):
 
 @pytest.fixture
 def sequence(tmp_path, pan):
-    """sequence(first): twelve numbered PNG of a pan, from that number on, alone in their folder."""
+    """sequence(first): twelve numbered PNG files of a pan, starting at this number, alone in their folder."""
 
     def make(first):
         folder = tmp_path / f"from_{first}"
@@ -356,7 +356,7 @@ def test_an_import_is_known_by_what_version_0_2_noted_of_it(shot, clip, recorder
 
 @pytest.mark.parametrize("kind", ["video", "sequence"])
 def test_a_copy_of_the_footage_is_the_same_footage(shot, clip, pan, tmp_path, recorder, kind):
-    """As `cp -r` makes it: another folder, another name, other times. The solve stays."""
+    """A copy as made by `cp -r`, with another folder, name and times, keeps the solve."""
     there = tmp_path / "copied"
     there.mkdir()
     if kind == "video":
@@ -390,7 +390,7 @@ def test_an_import_that_an_earlier_version_knew_by_times_stays_while_they_are_th
 
 
 def test_an_option_that_comes_later_leaves_finished_imports_alone():
-    """A field that imports of before do not know tells them from others only where it is not its default."""
+    """A new option changes the key of an import only if it differs from its default."""
     old = FootageConfig(first=1, step=2)
     info = SourceInfo(64, 48, 24.0, 1, 9, False, False, "srgb", ["clip"])
 

@@ -1,4 +1,4 @@
-"""The focal length that a file names: from Exif and from QuickTime keys, and where it goes."""
+"""Focal length stored in a file's Exif data or QuickTime keys, and its use."""
 
 import math
 
@@ -51,7 +51,7 @@ def test_a_file_that_does_not_say_or_says_nonsense_has_none(tmp_path, make, valu
 
 
 def test_the_equivalent_is_over_the_diagonal():
-    """50 mm on film see 46.8 degrees from corner to corner, whatever the picture's shape."""
+    """The 35 mm equivalent refers to the diagonal: 50 mm see 46.8 degrees between corners for every picture shape."""
     for width, height in ((640, 480), (1920, 1080), (1080, 1920)):
         half = math.hypot(width, height) / 2
         assert 2 * math.degrees(math.atan(half / focal_px(50.0, width, height))) == pytest.approx(46.8, abs=0.05)

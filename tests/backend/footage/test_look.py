@@ -1,4 +1,4 @@
-"""Looks of cameras: footage, plates and what leaves are seen through a .cube table."""
+"""Camera looks: footage, plates and output are converted by a .cube table."""
 
 import numpy as np
 import OpenImageIO as oiio
@@ -22,7 +22,7 @@ def write_1d(path):
 
 
 def write_3d(path, size=17):
-    """Red and blue exchanged, and brighter."""
+    """Write a 3D table that swaps red and blue and brightens the picture."""
     at = np.linspace(0, 1, size) ** 0.5
     rows = "\n".join(f"{b:.6f} {g:.6f} {r:.6f}" for b in at for g in at for r in at)
     path.write_text(f"LUT_3D_SIZE {size}\n{rows}\n")
@@ -30,7 +30,7 @@ def write_3d(path, size=17):
 
 
 def shown(picture, order):
-    """[H, W, 3] in 0..1 of uint8 codes through the 1D curve, by straight lines between its values."""
+    """[H, W, 3] in 0..1: uint8 codes through the 1D curve with linear interpolation."""
     return np.interp(picture[..., order] / 255.0, np.linspace(0, 1, 33), CURVE)
 
 

@@ -1,4 +1,5 @@
-"""Masks as artists hand them over: one picture, a sequence, a video, an alpha; and what does not fit is refused."""
+"""Masks in all forms that artists deliver: one picture, a sequence, a video, an alpha; and refusal of unsuitable
+ones."""
 
 import struct
 import zlib
@@ -21,7 +22,7 @@ COVERED[10:20, 30:50] = True
 
 @pytest.fixture
 def shot(tmp_path, pan, recorder):
-    """Ten frames of 64 x 48, numbered 101 to 110."""
+    """Shot of ten frames of 64 x 48, numbered 101 to 110."""
     (tmp_path / "clip").mkdir()
     for number, pixels in zip(FRAMES, pan(10), strict=True):
         write_png(tmp_path / "clip" / f"f.{number}.png", pixels)
@@ -35,7 +36,7 @@ def white(covered):
 
 
 def write_masks(folder, numbers, covered=COVERED):
-    """A mask that goes a pixel to the right at each frame."""
+    """Write a mask per number, each shifted by one pixel to the right."""
     folder.mkdir()
     for n, number in enumerate(numbers):
         write_png(folder / f"m.{number:04d}.png", white(np.roll(covered, n, axis=1)))
@@ -43,7 +44,7 @@ def write_masks(folder, numbers, covered=COVERED):
 
 
 def write_rgba(file, rgb, alpha):
-    """A PNG with straight alpha: [h, w, 3] and [h, w] uint8."""
+    """Write a PNG with straight alpha from rgb [h, w, 3] and alpha [h, w] uint8."""
     buffer = oiio.ImageBuf(np.ascontiguousarray(np.dstack([rgb, alpha])))
     buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)
     buffer.specmod().alpha_channel = 3
@@ -116,7 +117,7 @@ ALPHA_CODECS = {
 
 
 def write_alpha_video(path, codec, pixels, rotation=0):
-    """Frames whose alpha covers `COVERED`, a pixel more to the right in each."""
+    """Write a video whose alpha covers `COVERED`, shifted by one pixel to the right in each frame."""
     kind, options = ALPHA_CODECS[codec]
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec.partition(".")[0], rate=24, options=options)
@@ -201,7 +202,7 @@ def test_a_damaged_mask_is_named(shot, recorder, tmp_path):
 
 
 def drawn(rgb, alpha):
-    """[48, 64, 3] colour, broadcast, and alpha, uint8."""
+    """Colour and alpha, broadcast to [48, 64, 3] and [48, 64] uint8."""
     rgb, alpha = np.asarray(rgb, np.uint8), np.asarray(alpha, np.uint8)
     return np.broadcast_to(rgb, (48, 64, 3)), np.broadcast_to(alpha, (48, 64))
 
@@ -214,13 +215,14 @@ HALF_BLACK = np.where(np.arange(64)[None, :, None] < 40, 0, 255)
     ("rgb", "alpha", "expected"),
     [
         (SKIN, np.where(COVERED, 255, 0), COVERED),  # a cut-out of people
-        (SKIN // 8, np.where(COVERED, 255, 0), COVERED),  # in the dark
+        (SKIN // 8, np.where(COVERED, 255, 0), COVERED),  # a dark cut-out
         (np.where(COVERED[..., None], SKIN, 255), np.where(COVERED, 255, 0), COVERED),
         (255, np.where(COVERED, 255, 0), COVERED),
         (0, np.where(COVERED, 255, 0), COVERED),
-        (HALF_BLACK, np.where(COVERED, 255, 0), COVERED & (HALF_BLACK[..., 0] > 0)),  # a matte with an alpha
+        # a black and white matte with an alpha
+        (HALF_BLACK, np.where(COVERED, 255, 0), COVERED & (HALF_BLACK[..., 0] > 0)),
         (np.where(COVERED[..., None], 255, 0), 255, COVERED),
-        (np.where(COVERED[..., None], 255, 0), 0, COVERED),  # an alpha that nobody filled
+        (np.where(COVERED[..., None], 255, 0), 0, COVERED),  # an alpha that was never filled
         (np.where(COVERED[..., None], 255, 0), 90, COVERED),
     ],
 )
@@ -252,7 +254,7 @@ def test_cut_outs_in_exr_and_in_a_video_are_read_by_their_alpha(shot, recorder, 
 
 
 def announced(width, height):
-    """A PNG of a few bytes that says how large it is."""
+    """A PNG of a few bytes whose header announces this size."""
 
     def chunk(kind, data):
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,4 +1,4 @@
-"""`--start`: the shot counts its frames from a number of its own, and the footage is found again by it."""
+"""`--start`: the shot numbers its frames from another start, and the footage's frames are found by these numbers."""
 
 import json
 
@@ -26,7 +26,7 @@ def pictures(pan):
 
 @pytest.fixture
 def footage(request, tmp_path, pictures, write_video):
-    """A video, a sequence from 0 and one whose numbers Blender cannot count, each with its first own number."""
+    """A video, a sequence from 0, or one with numbers too large for Blender, each with its first frame number."""
     kind, first = request.param
     if kind == "video":
         write_video(tmp_path / "clip.mp4", pictures)
@@ -45,7 +45,7 @@ COUNTED = [("video", 1), ("files", 0)]
 def test_the_shot_counts_from_its_start_and_every_frame_is_read_again_as_its_own(
     tmp_path, footage, pictures, recorder, skipped
 ):
-    """A quarter of the height: plates come from the footage, not from the working frames."""
+    """Plates have full height although working frames have a quarter: plates are read from the footage."""
     source, own = footage
     shot = Shot.create(tmp_path / "a.splannequin")
     config = FootageConfig(start=1001, first=own + skipped if skipped else None, working_height=24)
@@ -87,7 +87,7 @@ def test_gaps_of_a_sequence_stay_gaps(tmp_path, pictures, recorder):
     import_footage(shot, str(folder), FootageConfig(start=100), report)
     expected = [100 + n - 2 for n in range(2, COUNT + 1) if n != 6]
     assert [row["frame"] for row in load_frames(shot)["frames"]] == expected
-    # Its first file is lost afterwards: what was imported stays where it was.
+    # The first file of the sequence is lost after the import: the other frames keep their numbers.
     (folder / "a.0002.png").unlink()
     plates = Plates(solved(shot), size=(128, 96))
     assert np.abs(plates.display(110).numpy() - pictures[11].astype(np.float32) / 255).max() < 0.02
@@ -122,7 +122,7 @@ def test_the_footages_own_alpha_is_that_of_the_same_frame(tmp_path, pictures, re
 
 @pytest.mark.parametrize("counted_from", [1, 1001])
 def test_masks_may_be_numbered_as_the_footage_or_as_the_shot(tmp_path, pictures, write_video, recorder, counted_from):
-    """More masks than frames: they were drawn for the whole clip, of which the shot is a part."""
+    """There are more masks than frames: masks exist for the whole clip, the shot is a part of it."""
     write_video(tmp_path / "clip.mp4", pictures)
     folder = tmp_path / "mask"
     folder.mkdir()
@@ -139,7 +139,7 @@ def test_masks_may_be_numbered_as_the_footage_or_as_the_shot(tmp_path, pictures,
 
 @pytest.mark.parametrize(("counted_from", "shift"), [(1, 1000), (1001, 0)])
 def test_cameras_may_be_numbered_as_the_footage_or_as_the_shot(tmp_path, counted_from, shift):
-    """Again more of them than frames."""
+    """There are more cameras than frames."""
     lens = imported.Lens("PINHOLE", 128, 96, (100.0, 100.0, 64.0, 48.0))
     names = [f"f_{n:04d}.png" for n in range(counted_from, counted_from + 30)]
     cameras = [imported.ImportedCamera(name, np.eye(4)[:3], 0) for name in names]

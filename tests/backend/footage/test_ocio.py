@@ -1,4 +1,4 @@
-"""Colour spaces by the names of OCIO configurations: against OpenImageIO's own conversions, with real files."""
+"""Colour spaces by name from OCIO configurations, compared with OpenImageIO's conversions on real files."""
 
 import subprocess
 import sys
@@ -42,18 +42,18 @@ LIGHT = np.array([-0.01, 0.001, 0.01, 0.18, 1.0, 10.0, 50.0], np.float32)
 @pytest.fixture(autouse=True)
 def no_config_of_this_machine(monkeypatch):
     monkeypatch.delenv("OCIO", raising=False)
-    # OpenImageIO reads a configuration of its own once in a process: not that of one of these tests.
+    # OpenImageIO reads its own configuration once per process; this call keeps it from reading one of the tests.
     oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(np.zeros((1, 1, 3), np.float32)), "ACEScg", "lin_rec709")
 
 
 def swatches(grey=False):
-    """[3, 7, 3] greys, or colours, of `LIGHT`."""
+    """[3, 7, 3] tints of `LIGHT`, or greys."""
     tints = np.array([[1.0, 1.0, 1.0], [1.0, 0.8, 0.6], [0.7, 0.9, 1.0]], np.float32)
     return LIGHT[None, :, None] * (np.ones((3, 1, 3), np.float32) if grey else tints[:, None])
 
 
 def converted(pixels, space, target, config=BUILT_IN):
-    """OpenImageIO's own conversion."""
+    """Pixels converted by OpenImageIO."""
     out = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(pixels), space, target, False, "", "", config)
     assert not out.has_error, out.geterror()
     return np.asarray(out.get_pixels(oiio.FLOAT))
@@ -76,7 +76,7 @@ def written(folder, pixels, name="a", kind="float", **attributes):
 
 
 def read(folder, *chosen):
-    """Scene-linear Rec.709 of the middle frame as plates hold it, and its source."""
+    """(scene-linear Rec.709 plate of the middle frame, its source)."""
     source = open_source(str(folder), colours=Colours(*chosen))
     return source.plates(None).plate(2).astype(np.float32), source
 
@@ -86,7 +86,8 @@ LOGS = ["ARRI LogC3 (EI800)", "ARRI LogC4", "S-Log3 S-Gamut3", "V-Log V-Gamut", 
 
 @pytest.mark.parametrize("space", ["ACEScg", "ACES2065-1", "Linear Rec.2020", *LOGS])
 def test_light_goes_there_and_comes_back(space):
-    """0.001 to 50 and -0.01: OpenImageIO encodes, we decode, and its own decoder agrees."""
+    """OpenImageIO encodes light of 0.001 to 50 and -0.01; our decoding agrees with the light and with OpenImageIO's
+    decoding."""
     codes = converted(swatches(), "lin_rec709_scene", space)
     found = light_of(codes, space, BUILT_IN)
     assert off(found, swatches()) < 1e-3
@@ -96,7 +97,7 @@ def test_light_goes_there_and_comes_back(space):
 
 @pytest.mark.parametrize("space", ["ADX10", "ADX16"])
 def test_a_film_scan_comes_back_from_black_on(space):
-    """Film densities have no code for light below black."""
+    """Film densities cannot encode light below black."""
     codes = converted(swatches()[:, 1:].copy(), "lin_rec709_scene", space)
     assert off(light_of(codes, space, BUILT_IN), swatches()[:, 1:]) < 1e-3
 
@@ -113,7 +114,8 @@ def test_our_hdr_curves_are_ocios_but_for_what_white_is(ours, theirs):
 
 
 def test_a_sequence_in_a_named_space_is_what_oiiotool_makes_of_it(tmp_path):
-    """Another process, from file to file; what plates hold is within 1e-3, seen in the record, and said."""
+    """oiiotool converts the file in a separate process; plates agree within 1e-3, and record and message name the
+    space."""
     folder = written(tmp_path / "plate", converted(swatches(), "lin_rec709_scene", "S-Log3 S-Gamut3"))
     tool = str(Path(sys.executable).with_name("oiiotool"))
     command = [tool, str(folder / "a.2.exr"), "--colorconfig", BUILT_IN]
@@ -166,7 +168,7 @@ def test_names_that_cannot_be_are_refused_in_a_sentence(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("interchange", ["", "aces_interchange: Flat, "])
 def test_the_configuration_of_the_environment_is_the_one_in_force(tmp_path, monkeypatch, interchange):
-    """One with ACES2065-1 by its role, and one of before OCIO 2 that only names linear Rec.709."""
+    """One configuration has ACES2065-1 as a role; the other, of OCIO 1, only names linear Rec.709."""
     config = tmp_path / "studio.ocio"
     config.write_text(CONFIG.format(interchange=interchange, alias="lin_rec709"))
     monkeypatch.setenv("OCIO", str(config))
@@ -195,7 +197,7 @@ def test_a_video_in_a_named_space(tmp_path, write_video):
 
 
 def test_plates_keep_to_the_configuration_of_the_import(tmp_path, monkeypatch, recorder, pan):
-    """Today's $OCIO is another one: plates agree with the frames that were imported, uncut."""
+    """$OCIO has changed since the import: plates still agree with the imported frames, and highlights are kept."""
     config, folder = tmp_path / "studio.ocio", tmp_path / "plate"
     config.write_text(CONFIG.format(interchange="", alias="lin_rec709"))
     folder.mkdir()

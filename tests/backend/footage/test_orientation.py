@@ -1,4 +1,4 @@
-"""Orientation by headers: videos, pictures and masks become what a person sees in a viewer that knows the standards."""
+"""Orientation in headers: videos, pictures and masks are shown as in a standard-conforming viewer."""
 
 import math
 
@@ -24,7 +24,7 @@ UPRIGHT = {
     7: lambda x: x[::-1, ::-1].swapaxes(0, 1),
     8: lambda x: x[:, ::-1].swapaxes(0, 1),
 }
-"""EXIF code -> the picture that is meant, by where the standard says that its first row and column are."""
+"""Map from EXIF code to the upright picture, by the standard's definition of first row and column."""
 MATRICES = {
     1: (1, 0, 0, 1), 2: (-1, 0, 0, 1), 3: (-1, 0, 0, -1), 4: (1, 0, 0, -1),
     5: (0, 1, 1, 0), 6: (0, 1, -1, 0), 7: (0, -1, -1, 0), 8: (0, -1, 1, 0),
@@ -33,7 +33,7 @@ COS, SIN = math.cos(math.radians(30)), math.sin(math.radians(30))
 
 
 def set_matrix(path, a, b, c, d):
-    """Writes a display matrix into the header of an MP4's first track."""
+    """Write a display matrix into the header of an MP4's first track."""
     data = bytearray(path.read_bytes())
     at = data.find(b"tkhd") + 44
     rows = [round(65536 * value) for value in (a, b, 0, c, d, 0, 0, 0, 16384)]
@@ -91,7 +91,7 @@ def test_a_matrix_that_only_enlarges_changes_nothing(tmp_path, pan, write_video)
 
 
 def test_a_mirrored_clip_of_two_fields_is_shown_by_its_matrix(tmp_path, pan):
-    """Deinterlacing keeps what a frame says of itself."""
+    """Deinterlacing keeps the side data of frames."""
     graph = av.filter.Graph()
     nodes = [
         graph.add_buffer(width=128, height=96, format="yuv444p", time_base="1/25"), graph.add("setfield", "tff"),
@@ -131,7 +131,7 @@ def test_pictures_are_shown_by_their_exif_orientation(tmp_path, pan, code, suffi
 
 @pytest.mark.parametrize(("other", "words"), [(3, "turned by 180 degrees"), (6, "turned clockwise"), (2, "mirrored")])
 def test_pictures_that_differ_in_orientation_are_refused(tmp_path, pan, other, words):
-    """Whether the pixels or the notes of such a sequence are one take, nobody can tell by its headers."""
+    """The headers cannot tell whether the pixels or the orientation tags of such a sequence are consistent."""
     write_pictures(tmp_path / "a", pan(4), [1, 1, other, other])
     with pytest.raises(JobError) as caught:
         list(open_source(str(tmp_path / "a")).frames(None, None))

@@ -1,4 +1,4 @@
-"""Pictures and frames are put together by the whole set of numbers, not one by one."""
+"""Pictures are assigned to frames by their whole set of numbers, not one by one."""
 
 import pytest
 
@@ -6,25 +6,25 @@ from torch_backend.footage.pairing import Counted, pair, pairing_words
 
 
 def step_of(paired):
-    """What was added to the pictures' numbers; None where they were taken in order."""
+    """Number that was added to the pictures' numbers; None if the pictures were taken in order."""
     steps = {frame - picture for frame, picture in paired.numbers.items()}
     return steps.pop() if len(steps) == 1 else None
 
 
 CASES = [
-    # pictures, frames, (first, last) of the clip, shift of the import, step expected for masks and for cameras
+    # pictures, frames, (first, last) of the clip, shift of the import, expected step for masks and for cameras
     (range(1, 101), range(1, 101), (1, 100), 0, 0),
     (range(0, 100), range(1, 101), (1, 100), 0, 1),
-    (range(0, 150), range(1, 101), (1, 150), 0, 1),  # of the whole clip, which was imported in part
+    (range(0, 150), range(1, 101), (1, 150), 0, 1),  # pictures of the whole clip, which was imported in part
     (range(0, 150), range(1, 101), (1, 200), 0, 1),
-    (range(0, 101), range(1, 101), (1, 100), 0, 1),  # one too many whichever way
+    (range(0, 101), range(1, 101), (1, 100), 0, 1),  # one picture too many for either numbering
     (range(0, 120), range(1, 101), (1, 100), 0, 1),
     (range(0, 120), range(1001, 1101), (1001, 1100), 1000, 1001),
-    (range(0, 120), range(5, 101), (5, 100), 0, 0),  # with handles around the clip
+    (range(0, 120), range(5, 101), (5, 100), 0, 0),  # pictures include handles around the clip
     (range(0, 120), range(0, 100), (0, 119), 0, 0),
     (range(1, 101), range(0, 100), (0, 99), 0, -1),
     (range(1, 151), range(51, 101), (1, 150), 0, 0),
-    (range(1, 51), range(51, 101), (1, 150), 0, 50),  # of the range alone
+    (range(1, 51), range(51, 101), (1, 150), 0, 50),  # pictures of the range only
     (range(99, 120), range(101, 111), (101, 110), 0, 0),
     (range(0, 10), range(101, 111), (101, 110), 0, 101),
     (range(1, 121), range(1011, 1101), (1001, 1120), 0, 1000),
@@ -33,7 +33,7 @@ CASES = [
     (range(1001, 1101), range(1001, 1101), (1001, 1100), 1000, 0),
     (range(0, 150), range(1001, 1051), (951, 1100), 950, 951),
     (range(1, 151), range(1001, 1051), (951, 1100), 950, 950),
-    (range(0, 100), range(1, 101), None, 0, 1),  # of an import that did not keep the clip's length
+    (range(0, 100), range(1, 101), None, 0, 1),  # an import that did not record the clip's length
     (range(1, 151), range(51, 101), None, 0, 0),
 ]
 

@@ -1,4 +1,4 @@
-"""Plates: the source's own pixels, found again by number in real files, without the lens."""
+"""Plates: the source's pixels, found by frame number in real files and undistorted."""
 
 import os
 from fractions import Fraction
@@ -21,7 +21,7 @@ from torch_backend.shot import Shot, write_json
 
 
 def solved(shot, radial=0.0, **told):
-    """What a solve with one radial lens leaves of `shot`, undistorted as the solve does it."""
+    """Write a solve with one radial lens for `shot`, and undistort its frames as the solve does."""
     record = load_frames(shot)
     width, height = record["width"], record["height"]
     zoom = 0.97 if radial else 1.0
@@ -71,7 +71,7 @@ def working_of(shot, frame, folder=""):
 def test_a_clip_of_the_working_size_is_the_undistorted_frames(tmp_path, shot_of, pan, write_video):
     write_video(tmp_path / "a.mp4", pan(10))
     shot = shot_of(tmp_path / "a.mp4", radial=-0.1)
-    os.remove(tmp_path / "a.mp4")  # not needed
+    os.remove(tmp_path / "a.mp4")  # the clip is not needed at the working size
     plates = Plates(shot)
     assert (plates.width, plates.height, plates.note, plates.deep) == (64, 48, "", False)
     assert plates.frames == list(range(1, 11))
@@ -119,7 +119,7 @@ def test_light_beyond_white_and_below_black_passes(tmp_path, shot_of, kind):
     for picture in pictures:
         picture[10:20, 10:20], picture[30:36, 30:36] = 50.0, -0.01
         picture[0, 0] = np.nan
-    shot = shot_of(write_sequence(tmp_path / "f", pictures, "exr"))  # of the working size, which is rounded
+    shot = shot_of(write_sequence(tmp_path / "f", pictures, "exr"))  # size of the working frames, which are rounded
     plates = Plates(shot)
     assert plates.deep and plates.note == ""
     got, want = plates.linear(1003).numpy(), np.nan_to_num(pictures[2].astype(np.float32))
@@ -142,7 +142,7 @@ def test_the_lens_is_taken_out_at_the_sources_size_as_at_the_working_size(tmp_pa
     small, working = resize_float(plates.display(1002).numpy(), 128, 96), working_of(shot, 1002)
     assert np.abs(small - working)[2:-2, 2:-2].max() < 1 / 255
     assert np.abs(small - working_of(shot, 1002, "raw"))[2:-2, 2:-2].max() > 10 / 255
-    # Not softer than the solve's own way at that size.
+    # As sharp as the solve's own undistortion at that size.
     where = load_plate_lenses(shot)[1002].where(256, 192)
     whole = Undistorter(where)(pictures[1])
     assert np.abs(plates.display(1002).numpy() - plate_encoding.display(whole)).max() < 1e-4
@@ -163,7 +163,7 @@ def test_a_lamp_wears_no_black_ring(tmp_path, shot_of):
 
 
 def every_frame(path, order, first=None, start_known=True):
-    """Whether each frame of `order` reads as the sequential decode has it; and if it was found by seeking."""
+    """(whether each frame of `order` equals the sequential decode, whether the reader could seek)."""
     source = open_source(str(path))
     want = {f.number: f for f in source.frames(first, None)}
     begin = want[min(want)].seconds
@@ -203,7 +203,7 @@ VIDEOS = {
 def test_every_frame_is_the_one_that_import_counted(tmp_path, pan, write_video, name, order):
     write_video(tmp_path / name, pan(70, speed=4), crf="20", preset="veryfast", pix_fmt="yuv420p", **VIDEOS[name])
     right, sought = every_frame(tmp_path / name, order)
-    assert right and sought == (name != "bare.h264")  # which has no times: it is counted
+    assert right and sought == (name != "bare.h264")  # this file has no times, so frames are counted
 
 
 def test_a_varying_rate_and_a_range_whose_start_was_not_kept(tmp_path, pan, write_video):
@@ -214,7 +214,7 @@ def test_a_varying_rate_and_a_range_whose_start_was_not_kept(tmp_path, pan, writ
 
 
 def test_what_a_seek_gets_wrong_is_counted_instead(tmp_path, pan, write_video):
-    """Times that are a frame off, as of a container that rewrites them: the picture tells."""
+    """Times are one frame off, as in a container that rewrites them; the pixel comparison detects this."""
     write_video(tmp_path / "a.mp4", pan(60), g="10")
     source = open_source(str(tmp_path / "a.mp4"))
     want = {f.number: f.pixels for f in source.frames(None, None)}
@@ -256,14 +256,14 @@ def test_moved_and_copied_footage_is_found_other_footage_is_refused(tmp_path, pa
     os.rename(tmp_path / "clips", old / "clips")
     os.rename(shot.root, old / shot.root.name)
     shot = Shot.open(old / shot.root.name)
-    os.utime(old / "clips" / "a.mp4", (1, 1))  # a copy has a time of its own
+    os.utime(old / "clips" / "a.mp4", (1, 1))  # a copy has another modification time
     assert (Plates(shot).width, Plates(shot).note) == (128, "")
     write_video(old / "clips" / "a.mp4", pan(10, height=96, width=128, seed=5))
     assert "is not what was imported" in Plates(shot).note
 
 
 def test_an_import_whose_chroma_was_scaled_up_otherwise_is_known_again(tmp_path, write_video, shot_of):
-    """As an earlier version did: edges of colour are elsewhere, brightness is not. Its key says nothing."""
+    """An earlier version moved colour edges but not brightness, and used another key."""
     rng = np.random.default_rng(0)
     wide = gaussian_filter(rng.random((64, 140, 3)), (1.5, 1.5, 0))
     wide = (255 * (wide - wide.min()) / (wide.max() - wide.min())).astype(np.uint8)
@@ -318,6 +318,6 @@ def test_no_more_plates_are_held_than_asked_and_the_last_ones_stay(tmp_path, pan
     plates._read = lambda frame: read.append(frame) or plain(plates, frame)
     for frame in as_frozen(list(range(1, 21))):
         plates.display(frame)
-    assert sorted(read) == list(range(1, 21))  # once each, in the order of a freeze
+    assert sorted(read) == list(range(1, 21))  # each frame is read once, in the order of a freeze
     plates.close()
     assert plates.kept == 0 and plates.display(5).shape == (96, 128, 3)

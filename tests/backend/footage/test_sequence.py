@@ -1,4 +1,4 @@
-"""Image sequences: real EXR and PNG files, their numbers, depth and colour."""
+"""Image sequences: real EXR and PNG files, their numbers, bit depth and colour."""
 
 import av
 import numpy as np
@@ -31,7 +31,7 @@ def write(path, pixels, names=None, window=None, full=None, **attributes):
 
 
 def write_parts(path, parts):
-    """`parts`: (name of the part, names of its channels, pixels), one after the other."""
+    """Write a multi-part file; `parts`: (name of the part, names of its channels, pixels)."""
     specs = [spec_of(pixels, names, oiio__subimagename=part) for part, names, pixels in parts]
     out = oiio.ImageOutput.create(str(path))
     assert out.open(str(path), specs), out.geterror()
@@ -46,14 +46,14 @@ def flat(*values, kind=np.float32):
 
 
 def first_of(folder, **options):
-    """The source in `folder`, after a full reading, and its first frame's pixel in the middle, as linear light."""
+    """(source of `folder` after reading all frames, linear light of the first frame's centre pixel)."""
     source = open_source(str(folder), **options)
     frames = list(source.frames(None, None))
     return source, light(frames[0].pixels[4, 4])
 
 
 def light(pixels):
-    """Linear light of pixels as a source gives them."""
+    """Linear light of a source's pixels."""
     if pixels.dtype == np.float16:
         return pixels.astype(np.float32)
     return srgb_to_linear(pixels / np.iinfo(pixels.dtype).max)
@@ -65,7 +65,7 @@ def said(source):
 
 @pytest.fixture
 def exrs(tmp_path):
-    """Frames 1001 to 1010 of scene-linear half floats: a ramp that brightens frame by frame."""
+    """Frames 1001 to 1010 of scene-linear half floats: a ramp that gets brighter with every frame."""
     ramp = np.linspace(0.0, 0.9, 64, dtype=np.float32)
     for i in range(10):
         pixels = np.tile((ramp * (0.5 + 0.05 * i))[None, :, None], (48, 1, 3)).astype(np.float16)
@@ -98,7 +98,7 @@ def test_a_pattern_that_matches_nothing_says_how_one_is_written(exrs):
 
 
 def write_shades(folder, names):
-    """Pictures of which each is brighter than the one before."""
+    """Write pictures, each brighter than the one before."""
     folder.mkdir(parents=True, exist_ok=True)
     for n, name in enumerate(names):
         write(folder / name, flat(*[10 * n + 5] * 3, kind=np.uint8))
@@ -190,7 +190,7 @@ def test_whatever_openimageio_reads_is_a_sequence(tmp_path, pan, suffix):
 
 
 def test_pictures_that_are_not_read_are_named_with_what_to_do(tmp_path, pan):
-    """QOI is to OpenImageIO and FFmpeg what AVIF is: the one does not know it, the other takes it for a short video."""
+    """QOI behaves like AVIF: OpenImageIO does not know the format, and FFmpeg reads the picture as a short video."""
     qoi = av.CodecContext.create("qoi", "w")
     qoi.width, qoi.height, qoi.pix_fmt = 64, 48, "rgb24"
     picture = bytes(qoi.encode(av.VideoFrame.from_ndarray(pan(1)[0], "rgb24"))[0])
@@ -394,8 +394,8 @@ def test_a_file_with_the_layer_elsewhere_is_read_there_and_one_without_it_refuse
 
 def test_transparent_pictures_keep_their_colour_and_say_that_alpha_is_not_taken(tmp_path):
     pixels = flat(0.3, 0.2, 0.1, 1.0)
-    pixels[4] = [0.15, 0.1, 0.05, 0.5]  # the same colour, half covered
-    pixels[5] = [0.2, 0.1, 0.0, 0.0]  # pure light
+    pixels[4] = [0.15, 0.1, 0.05, 0.5]  # the same colour, alpha 0.5
+    pixels[5] = [0.2, 0.1, 0.0, 0.0]  # emission with alpha 0
     for i in range(3):
         write(tmp_path / f"a.{i}.exr", pixels)
     source, pixel = first_of(tmp_path)
@@ -413,7 +413,7 @@ def test_eight_bit_alpha_does_not_darken_either(tmp_path, suffix, associated):
     source = open_source(str(tmp_path))
     got = next(iter(source.frames(None, None))).pixels[4, 4]
     expected = np.array([200, 100, 50])
-    if suffix == "png":  # OpenImageIO divides when it writes a PNG
+    if suffix == "png":  # OpenImageIO unpremultiplies when it writes a PNG
         expected = oiio.ImageInput.open(str(tmp_path / "a.0.png"), spec_of(stored, oiio__UnassociatedAlpha=1))
         expected = expected.read_image(oiio.UINT8)[4, 4, :3]
     assert np.abs(got.astype(int) - expected).max() <= 1
@@ -446,7 +446,7 @@ def test_a_crop_window_is_told(tmp_path):
 
 
 def test_damaged_headers_leave_their_frames_out(exrs):
-    """OpenImageIO quotes the damaged bytes in its error, which are no text."""
+    """OpenImageIO's error message contains the damaged bytes, which are not valid text."""
     for number, name in ((1006, b"channels"), (1007, b"chlist")):
         file = exrs / f"shot.{number}.exr"
         content = file.read_bytes()

@@ -1,4 +1,4 @@
-"""Sequences: the colours of their files become Rec.709 light."""
+"""Colours of image sequences are converted to linear Rec.709."""
 
 import struct
 
@@ -19,7 +19,8 @@ PRIMARIES = {
 
 
 def to_rec709(name):
-    """The matrix from these primaries to Rec.709's by their definition, white adapted after Bradford, in float64."""
+    """Matrix from the named primaries to Rec.709 by definition, with Bradford adaptation of the white point, in
+    float64."""
 
     def to_xyz(corners):
         columns = np.array([[x / y, 1.0, (1.0 - x - y) / y] for x, y in corners]).T
@@ -88,7 +89,7 @@ def test_film_log_becomes_light(tmp_path, transfer):
 
 
 def profile(name):
-    """A colour profile with nothing in it but its name."""
+    """ICC profile that only contains its name."""
     text = name.encode() + b"\0"
     described = b"desc" + bytes(4) + struct.pack(">I", len(text)) + text + bytes(78)
     head = struct.pack(">I4sI4s4s4s", 144 + len(described), b"none", 0x02100000, b"mntr", b"RGB ", b"XYZ ")
@@ -111,7 +112,8 @@ def test_a_colour_profile_that_is_not_applied_is_told(tmp_path, name, words):
 
 
 def write_cineon(path, codes):
-    """8 x 8 pixels of one colour in ten bits, by Kodak's description of the format: OpenImageIO only reads it."""
+    """Write 8 x 8 pixels of one 10-bit colour by Kodak's format description, because OpenImageIO cannot write
+    Cineon."""
     head = struct.pack(">6I8s100s12s12s36x", 0x802A5FD7, 2048, 1024, 1024, 0, 2304, b"V4.5", b"", b"", b"")
     head += struct.pack(">BB2x", 0, 3)
     for i in range(8):

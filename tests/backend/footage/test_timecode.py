@@ -1,4 +1,4 @@
-"""Timecode: counted by hand, against the rule of dropping, through files and into frozen frames."""
+"""Timecode: compared with hand counts and the drop-frame rule, through files and into frozen frames."""
 
 from fractions import Fraction
 
@@ -35,7 +35,7 @@ def test_a_timecode_moves_on(start, frames, fps, expected):
 
 
 def test_dropped_numbers_never_come():
-    """All frames of eleven minutes, one after another: each code once, and none of those that are dropped."""
+    """Every seventh frame of eleven minutes: each code occurs once, and no dropped number occurs."""
     codes = [later("00:00:00;00", n, 29.97) for n in range(0, 20_000, 7)]
     assert len(set(codes)) == len(codes) and codes == sorted(codes)
     assert not any(c[6:8] == "00" and int(c[9:]) < 2 and int(c[3:5]) % 10 for c in codes)
@@ -70,7 +70,7 @@ def test_videos_carry_it(tmp_path, pan, suffix):
 
 @pytest.fixture
 def with_timecode(tmp_path, pan):
-    """with_timecode(suffix, code): a sequence from 1001 whose files say so, or nothing if the code is empty."""
+    """with_timecode(suffix, code): a sequence from 1001 whose files store this timecode; an empty code stores none."""
 
     def make(suffix="exr", code="10:00:00:00"):
         folder = tmp_path / f"{suffix}{len(code)}"

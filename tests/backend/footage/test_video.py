@@ -1,4 +1,4 @@
-"""Videos: real files written by the tests, decoded to the pixels and times that went in."""
+"""Videos: real files written by the tests, decoded to the original pixels and times."""
 
 import os
 from fractions import Fraction
@@ -47,7 +47,7 @@ def test_variable_rate_has_real_timestamps(tmp_path, pan, write_video):
 
 
 def test_ten_bit_video_keeps_its_depth(tmp_path, frame_of_planes):
-    """Planes of our own: FFmpeg's scaler writes what it reads, off by 1 of 256 both ways."""
+    """The planes are built here because FFmpeg's scaler has errors of 1 in 256 in both directions."""
     luma = np.linspace(64, 940, 64).round().astype(np.uint16)
     planes = [np.tile(luma, (48, 1)), *np.full((2, 48, 64), 512, np.uint16)]
     with av.open(str(tmp_path / "a.mkv"), "w") as container:
@@ -59,15 +59,16 @@ def test_ten_bit_video_keeps_its_depth(tmp_path, frame_of_planes):
     source, got = decoded(tmp_path / "a.mkv")
     assert source.info.deep
     assert got[0].pixels.dtype == np.uint16
-    # 10 bits: one step is 64 of 65535; 8 bits would err by up to 128.
+    # One step of 10 bits is 64 of 65535; 8 bits would have errors of up to 128.
     assert np.abs(got[0].pixels[20, :, 0] - (luma - 64.0) * (65535 / 876)).max() < 16
 
 
 @pytest.fixture
 def interlaced(tmp_path, frame_of_planes):
-    """interlaced(top_first): 12 H.264 frames of two instants each, of stripes that move; each fourth is a key frame.
+    """interlaced(top_first): 12 interlaced H.264 frames of moving stripes; every fourth is a key frame.
 
-    Returns the file, and grey pictures [12, 96, 128] that a progressive camera would have taken with the first fields.
+    Returns the file, and the grey pictures [12, 96, 128] that a progressive camera takes at the times of the first
+    fields.
     """
 
     def picture(instant):
@@ -116,7 +117,7 @@ def test_interlaced_clips_become_whole_pictures_and_say_so(interlaced, top_first
 
 
 def woven(frames, top_first=True):
-    """Each two of the frames as the fields of one."""
+    """Interlace each pair of frames as the two fields of one frame."""
     out = []
     for first, second in zip(frames[::2], frames[1::2], strict=True):
         both = first.copy()
@@ -153,7 +154,7 @@ def test_a_progressive_clip_is_none_of_fields(tmp_path, pan, write_video, what):
     frames = pan(40, 96, 128, speed=3)
     if what == "still then moving":
         frames = [frames[0]] * 20 + frames[:20]
-    elif what == "stripes":  # lines as fine as fields, that stand in the world
+    elif what == "stripes":  # lines as fine as fields, static in the scene
         lines = np.where(np.arange(96)[:, None, None] % 2, 40, -40)
         frames = [np.clip(f.astype(int) + lines, 0, 255).astype(np.uint8) for f in frames]
     else:
@@ -164,7 +165,7 @@ def test_a_progressive_clip_is_none_of_fields(tmp_path, pan, write_video, what):
 
 
 def test_a_plate_of_an_interlaced_clip_is_the_frame_that_was_imported(interlaced):
-    """Sought, so that decoding begins at a key frame: the filter needs the frame before, too."""
+    """After a seek, decoding begins at a key frame; the deinterlacing filter also needs the frame before."""
     path, _ = interlaced()
     source, got = decoded(path)
     known = Known({f.number: f.seconds for f in got}, 0.0, lambda number, plate: True)
@@ -198,7 +199,7 @@ def test_damaged_packets_are_skipped_with_a_warning_and_keep_their_numbers(tmp_p
 
 @pytest.fixture
 def broken_off(tmp_path, pan, write_video):
-    """broken_off(suffix, share): the first part of a clip of 24 frames, whose header stands at its beginning."""
+    """broken_off(suffix, share): the first part of a clip of 24 frames whose header is at the beginning of the file."""
 
     def make(suffix, share):
         whole = tmp_path / f"whole.{suffix}"
@@ -218,7 +219,7 @@ def test_a_file_that_breaks_off_says_how_much_of_it_there_is(broken_off, suffix)
     assert 12 <= len(got) < 24
     assert [f.number for f in got] == list(range(1, len(got) + 1))
     assert [w[0] for w in source.warnings] == [f"broken.{suffix} breaks off after frame {len(got)}: it announces 24."]
-    asked, got = decoded(broken_off(suffix, 0.75), 2, 10)  # before it breaks off: nothing to say
+    asked, got = decoded(broken_off(suffix, 0.75), 2, 10)  # the range ends before the break: no warning
     assert ([f.number for f in got], asked.warnings) == (list(range(2, 11)), [])
 
 
@@ -230,7 +231,7 @@ def test_less_than_half_of_a_file_is_refused(broken_off, suffix, share):
 
 
 def test_a_clip_that_changes_its_size_ends_there_and_says_so(tmp_path, pan, write_video):
-    """Motion JPEG, whose pictures carry their own size."""
+    """Motion JPEG stores the size in every picture."""
     write_video(tmp_path / "a.mkv", pan(12), codec="mjpeg", pix_fmt="yuvj444p")
     write_video(tmp_path / "b.mkv", pan(12, height=64, width=48), codec="mjpeg", pix_fmt="yuvj444p")
     with av.open(str(tmp_path / "both.mkv"), "w") as target:
@@ -309,7 +310,7 @@ def test_sound_alone_is_no_video(tmp_path):
 
 @pytest.mark.parametrize("how", ["index missing", "copy broken off", "never closed", "zeros behind"])
 def test_a_recording_that_was_not_finished_is_told_so(tmp_path, pan, write_video, how):
-    """MP4 and QuickTime have their index last."""
+    """MP4 and QuickTime store their index at the end."""
     write_video(tmp_path / "a.mp4", pan(8))
     data = (tmp_path / "a.mp4").read_bytes()
     at = data.index(b"moov") - 4
@@ -328,7 +329,7 @@ def test_a_recording_that_was_not_finished_is_told_so(tmp_path, pan, write_video
 
 @pytest.fixture
 def two_streams(tmp_path, pan):
-    """A QuickTime file of two videos of one size, and the first frame of each."""
+    """QuickTime file with two video streams of equal size, and the first frame of each."""
     videos = [pan(8, seed=1), pan(8, seed=2)]
     with av.open(str(tmp_path / "a.mov"), "w") as container:
         streams = [container.add_stream("libx264", rate=24) for _ in videos]

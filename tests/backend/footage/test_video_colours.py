@@ -1,4 +1,4 @@
-"""Videos: the colours of their streams become Rec.709."""
+"""Colours of video streams are converted to Rec.709."""
 
 from fractions import Fraction
 
@@ -11,22 +11,22 @@ from torch_backend.footage.opening import open_source
 from torch_backend.footage.sources import Told
 
 PATCHES = np.array([[0.2, 0.2, 0.2], [0.5, 0.4, 0.3], [0.35, 0.5, 0.45], [0.3, 0.35, 0.55]])
-"""R'G'B' of four upright stripes."""
+"""R'G'B' of four vertical stripes."""
 D65 = (0.3127, 0.3290)
 CORNERS = {
     1: ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06), D65),
     9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046), D65),
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060), D65),
 }
-"""Primaries by their number in ITU-T H.273."""
+"""Chromaticities (R, G, B, white) of primaries, by their number in ITU-T H.273."""
 
 
 LUMA = {1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
-"""Shares of red and blue in luma, by matrix."""
+"""Weights of red and blue in luma, by matrix."""
 
 
 def ten_bits(rgb, kr, kb):
-    """Y, Cb and Cr of R'G'B' as a ten-bit file holds them."""
+    """Y, Cb and Cr codes of R'G'B' in a 10-bit file."""
     y = rgb @ [kr, 1 - kr - kb, kb]
     return np.rint([64 + 876 * y, *(512 + 448 * (rgb[:, i] - y) / (1 - k) for i, k in ((2, kb), (0, kr)))])
 
@@ -39,7 +39,7 @@ def from_ten_bits(codes, kr, kb):
 
 @pytest.fixture
 def write_patches(tmp_path):
-    """write_patches(transfer, primaries, matrix): ten-bit YCbCr 4:4:4, lossless, tagged so."""
+    """write_patches(transfer, primaries, matrix): a lossless 10-bit YCbCr 4:4:4 clip with these tags."""
 
     def write(transfer, primaries, matrix, patches=PATCHES):
         kr, kb = LUMA[matrix]
@@ -67,7 +67,7 @@ def write_patches(tmp_path):
 
 
 def to_rec709(primaries):
-    """The matrix between two gamuts of one white by their definition, in float64."""
+    """Matrix from the primaries to Rec.709 with equal white point, by definition, in float64."""
 
     def to_xyz(corners):
         columns = np.array([[x / y, 1.0, (1.0 - x - y) / y] for x, y in corners]).T
@@ -114,7 +114,7 @@ def test_wide_linear_and_hdr_video_becomes_rec709(write_patches, name):
     transfer, primaries, matrix, reference = CASES[name]
     stored = from_ten_bits(ten_bits(PATCHES, *LUMA[matrix]), *LUMA[matrix])
     expected = reference(stored, to_rec709(primaries))
-    if name not in ("linear", "PQ", "HLG"):  # those hold light, of which nothing is cut
+    if name not in ("linear", "PQ", "HLG"):  # those store light, which is not clipped
         expected = np.clip(expected, 0, 1)
     assert np.abs(expected - PATCHES).max() > 8 / 255, "the case should show whether it is converted"
     source, got = write_patches(transfer, primaries, matrix)
@@ -151,12 +151,12 @@ def test_a_transfer_function_that_is_not_known_is_told(write_patches):
         ((16, 1280), {}, {}, "it does not say by which matrix its colours are stored"),
         ((16, 1280), {"colorspace": 1}, {}, ""),
         ((48, 64), {}, {"matrix": "bt709"}, "its matrix or range was set by hand"),
-        ((48, 64), {"rotation": 90}, {}, ""),  # what Blender makes of it, Blender knows
+        ((48, 64), {"rotation": 90}, {}, ""),  # Blender applies the rotation itself
         ((48, 64), {"aspect": Fraction(2)}, {}, "its pixels are not square"),
     ],
 )
 def test_what_other_programs_would_show_otherwise_is_known(tmp_path, write_video, size, tags, told, unlike):
-    """FFmpeg, and so Blender, takes clips without a matrix as BT.601, however large they are."""
+    """FFmpeg, and therefore Blender, decodes clips without a matrix as BT.601 at any size."""
     made = {name: tags[name] for name in ("rotation", "aspect") if name in tags}
     frames = [np.full((*size, 3), 60, np.uint8)] * 3
     write_video(

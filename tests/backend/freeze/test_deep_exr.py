@@ -1,4 +1,4 @@
-"""Deep files: what is written comes back as OpenImageIO reads it, and a cut-off one is none."""
+"""Deep EXR files: OpenImageIO reads back what was written, and truncated files are detected."""
 
 import numpy as np
 import OpenImageIO as oiio
@@ -9,7 +9,7 @@ from torch_backend.freeze.exr import FrameMetadata
 
 
 def samples_of(path):
-    """[H, W] lists of (R, G, B, A, Z) of a deep file."""
+    """[H, W] lists of (R, G, B, A, Z) samples of a deep file."""
     file = oiio.ImageInput.open(str(path))
     spec, data = file.spec(), file.read_native_deep_image()
     assert spec.deep and spec.channelnames == DEEP_CHANNELS

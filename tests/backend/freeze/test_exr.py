@@ -111,12 +111,12 @@ def test_layers_made_while_they_are_written_are_never_whole_in_memory(tmp_path):
 
 @pytest.mark.parametrize("with_grain", [False, True])
 def test_what_a_frame_is_made_of_comes_back_and_may_be_absent(tmp_path, with_grain):
-    stored = layers(150, 60)  # more rows than are written at a time
+    stored = layers(150, 60)  # more rows than one write holds
     detail, grain = detail_of(stored), np.full((150, 60, 3), 0.25, np.float32) if with_grain else None
     path = write_frozen_exr(tmp_path / "a.exr", metadata=METADATA, grain=grain, detail=detail, margin=(3, 2), **stored)
     frame = read_frozen_exr(path)
     assert frame.detail is not None and frame.margin == (3, 2) and (frame.grain is not None) == with_grain
-    np.testing.assert_array_equal(frame.detail.source, detail.source)  # no half float holds such numbers
+    np.testing.assert_array_equal(frame.detail.source, detail.source)  # half floats cannot represent these numbers
     np.testing.assert_allclose(frame.detail.splat, detail.splat, rtol=2.0**-9 + 2.0**-11, atol=1e-6)
     assert np.sum(frame.detail.splat) == pytest.approx(detail.splat.sum(), rel=2e-5), "rounded, not cut off"
     np.testing.assert_allclose(frame.detail.plate, detail.plate, atol=0.5 / 256 + 1e-6)
@@ -161,7 +161,7 @@ def test_a_layer_that_is_a_row_of_the_table_needs_nothing_else_here(tmp_path, mo
     assert read_frozen_exr(write_frozen_exr(tmp_path / "b.exr", metadata=METADATA, **stored)).more == {}
     with pytest.raises(ValueError, match=r"Sky should be \[7, 9, 4\] like rgba"):
         write_frozen_exr(tmp_path / "c.exr", metadata=METADATA, more={"Sky": stored["depth"]}, **stored)
-    with pytest.raises(KeyError, match="Plate"):  # has an argument of its own
+    with pytest.raises(KeyError, match="Plate"):  # this layer has its own argument
         write_frozen_exr(tmp_path / "c.exr", metadata=METADATA, more={"Plate": stored["depth"]}, **stored)
 
 
@@ -193,7 +193,7 @@ def test_file_is_one_part_of_zipped_half_and_float_channels_in_linear_rec709(tmp
 
 @pytest.mark.parametrize("light", ["ap1", "ap0", "rec2020", "p3d65"])
 def test_frames_leave_in_the_light_of_the_footage_and_come_back_as_rec709(tmp_path, light):
-    """Colours, grain and splats alike; what a program reads in that light is what it would read in Rec.709's."""
+    """Colours, grain and splats are converted; decoded from that space they equal the Rec.709 values."""
     metadata = dataclasses.replace(METADATA, light=light)
     rng = np.random.default_rng(1)
     given = layers()

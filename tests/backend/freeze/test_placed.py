@@ -1,4 +1,4 @@
-"""Gaussians moved to a scene against float64 evaluation: shapes, colours in turned directions, the same picture."""
+"""Gaussians transformed to a scene, compared with float64: shapes, colours in rotated directions, the same picture."""
 
 import math
 
@@ -15,7 +15,7 @@ from torch_backend.raster.reference import rotation_matrices, sh_basis
 
 
 def rotation(seed: int) -> np.ndarray:
-    """A rotation drawn evenly, [3, 3] float64."""
+    """Uniformly distributed random rotation, [3, 3] float64."""
     q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.linalg.det(q)
@@ -35,14 +35,14 @@ def cloud(count: int, degree: int) -> PlyGaussians:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_colours_in_turned_directions_are_those_of_before(degree, seed):
-    """Against the definition, in float64: c'(R d) = c(d), for directions that nothing was fitted on."""
+    """Compared with the definition c'(R d) = c(d) in float64, for directions that the fit did not use."""
     turn, sh = rotation(seed), cloud(50, degree).sh
     directions = np.random.default_rng(seed + 10).standard_normal((200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     before = np.einsum("dk,nkc->dnc", sh_basis(torch.from_numpy(directions), degree).numpy(), sh.astype(np.float64))
     turned = sh_basis(torch.from_numpy(directions @ turn.T), degree).numpy()
     after = np.einsum("dk,nkc->dnc", turned, rotated_harmonics(sh, turn).astype(np.float64))
-    np.testing.assert_allclose(after, before, atol=2e-6)  # coefficients are kept as float32
+    np.testing.assert_allclose(after, before, atol=2e-6)  # coefficients are stored as float32
 
 
 def test_two_turns_are_one_and_a_turn_back_undoes_it():
@@ -55,7 +55,7 @@ def test_two_turns_are_one_and_a_turn_back_undoes_it():
 
 @pytest.mark.parametrize("scale", [0.02, 1.0, 37.5])
 def test_shapes_are_turned_scaled_and_moved(scale):
-    """Against the covariances: those of the moved world are s^2 R C R^T, and means s R x + t."""
+    """Covariances become s^2 R C R^T, means become s R x + t."""
     was, turn, shift = cloud(40, 1), rotation(9), np.array([3.0, -700.0, 0.25])
     now = placed(was, Similarity(turn, scale, shift))
     np.testing.assert_allclose(now.means, scale * was.means.astype(np.float64) @ turn.T + shift, rtol=1e-6, atol=1e-5)
@@ -72,7 +72,7 @@ def test_shapes_are_turned_scaled_and_moved(scale):
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_the_moved_camera_sees_the_same_picture(degree):
-    """Rendered: colour, and depth in the units of the scene."""
+    """Colour is compared, and depth in scene units."""
     was, where = cloud(300, degree), Similarity(rotation(4), 12.5, np.array([40.0, -9.0, 2.0]))
     K = torch.tensor([[[90.0, 0, 32], [0, 90.0, 24], [0, 0, 1]]])
 

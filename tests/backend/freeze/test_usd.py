@@ -1,4 +1,4 @@
-"""The USD stage read back by usd-core: its splats are the Gaussians, its camera sees what the solve saw."""
+"""The USD stage, read back by usd-core: its splats equal the Gaussians, its camera projects like the solve's."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_the_splats_are_the_gaussians(tmp_path, ending, degree):
 
 
 def seen(camera, frame: int, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Pixels [P, 2] of points by USD's own camera: GfCamera's frustum, y down, pixel centres at +0.5."""
+    """Pixels [P, 2] of points by USD's GfCamera frustum, y down, pixel centres at +0.5."""
     frustum = camera.GetCamera(Usd.TimeCode(frame)).frustum
     matrix = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
     ndc = np.array([tuple(matrix.Transform(Gf.Vec3d(*map(float, p)))) for p in points])
@@ -78,7 +78,7 @@ def test_the_camera_sees_what_the_solve_saw(tmp_path, varies, metres):
         fx, fy, cx, cy = frame.K
         truth = np.stack([fx * local[:, 0] / local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy], 1)
         np.testing.assert_allclose(seen(camera, frame.frame, WHERE.points(points), (1280, 720)), truth, atol=2e-3)
-    # Film backs are in tenths of a stage unit: 36 mm are 0.36 where a unit is a metre, 36 where it is a centimetre.
+    # Film backs are in tenths of a stage unit: 36 mm are 0.36 if the unit is a metre, 36 if it is a centimetre.
     assert camera.GetHorizontalApertureAttr().Get() == pytest.approx(0.36 / metres)
     assert len(camera.GetFocalLengthAttr().GetTimeSamples()) == (4 if varies else 0)
 

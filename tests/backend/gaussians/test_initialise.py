@@ -1,4 +1,4 @@
-"""Starting scales: the distance to the three nearest neighbours."""
+"""Initial scales: the distance to the three nearest neighbours."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Growing and shrinking: what rides along, what starts anew, what a split preserves."""
+"""Adding and removing Gaussians: copied state, reset state, and invariants of a split."""
 
 import pytest
 import torch
@@ -82,7 +82,7 @@ def test_split_keeps_mean_second_moment_and_mass():
     mixture = covariance(model, children).mean(0) + (spread[:, :, None] * spread[:, None, :]).mean(0)
     torch.testing.assert_close(mixture, cov, rtol=1e-4, atol=1e-6)
     opacity = torch.sigmoid(model.params["opacity_logits"][children]).detach()
-    # Two children over an axis 1.6 times shorter hold the parent's mass.
+    # Two children, with one axis 1.6 times shorter, keep the parent's mass.
     assert float(opacity.sum()) / 1.6 == pytest.approx(peak, rel=1e-4)
 
 

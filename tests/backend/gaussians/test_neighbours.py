@@ -1,4 +1,4 @@
-"""Nearest neighbours: in order, and where there are too few points."""
+"""Nearest neighbours: in order, and with too few points."""
 
 import numpy as np
 

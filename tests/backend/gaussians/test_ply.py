@@ -44,7 +44,7 @@ def test_bytes_are_channel_major_sh_and_wxyz(tmp_path):
 
 
 def test_reads_other_orders_types_and_comments(tmp_path):
-    """Exporters reorder, add colours, drop normals and append faces."""
+    """Exporters reorder properties, add colours, drop normals and append faces."""
     names = [n for n in property_names(1) if not n.startswith("n")][::-1]
     values = {name: float(i) for i, name in enumerate(property_names(1))}
     lines = ["ply", "format binary_little_endian 1.0", "comment made elsewhere", "element vertex 1"]

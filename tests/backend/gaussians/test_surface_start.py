@@ -1,4 +1,4 @@
-"""What training starts from where a solve knows surfaces: how many of their points, and which not."""
+"""Training starts from surface points of a solve: their number, and the points that are left out."""
 
 import shutil
 
@@ -17,8 +17,10 @@ HELD, FAR, COUNT = 7, 3, 400
 
 @pytest.fixture(scope="module")
 def dense(world, tmp_path_factory, quiet):
-    """(scene, images) of the tiny shot, whose surface points are replaced by ones whose colour tells what they are: red
-    those of a frame that is held out, green those far outside, blue all others."""
+    """(scene, images) of the tiny shot, with surface points whose colours mark their kind.
+
+    Points of a held-out frame are red, points far outside are green, all others are blue.
+    """
     shot = Shot(shutil.copytree(world.shot.root, tmp_path_factory.mktemp("dense") / "a.splannequin"))
     find_motion(shot, quiet(), static_model=None)
     with np.load(shot.solve / "points.npz") as stored:
@@ -45,7 +47,7 @@ def start(dense, budget=5000, **options):
 
 
 def blues(params) -> int:
-    """Points of surfaces among Gaussians; red and green ones are none that should be there."""
+    """Number of surface points among the Gaussians; asserts that there are no red and green ones."""
     colors = (params["sh0"][:, 0] * 0.28209479177387814 + 0.5).round(decimals=3)
     assert not (colors == torch.tensor([1.0, 0, 0])).all(1).any()
     assert not (colors == torch.tensor([0.0, 1, 0])).all(1).any()

@@ -1,4 +1,4 @@
-"""The lens both ways against pycolmap, and the maps against pictures that were sent through them."""
+"""The lens in both directions, compared with pycolmap; the maps, compared with pictures resampled by them."""
 
 import json
 import subprocess
@@ -37,7 +37,7 @@ LENSES = {
 
 @pytest.fixture(scope="module")
 def colmap(tmp_path_factory):
-    """By lens: pinhole and map of the worker, the model's parameters, points of the original and their rays."""
+    """By lens: the worker's pinhole and map, the model's parameters, points of the original and their rays."""
     code = (
         "import json, sys, numpy as np, pycolmap\n"
         "from torch_backend.sfm.answers import undistortion\n"
@@ -56,7 +56,7 @@ def colmap(tmp_path_factory):
 
 
 def solved(folder: Path, model: str, extra, focal: float, K, width=WIDTH, height=HEIGHT, **told) -> Shot:
-    """A shot as a solve leaves it."""
+    """Shot with the files of a solve."""
     shot = Shot.create(folder / "lens.splannequin")
     frames = [CameraFrame(n, np.eye(4).ravel().tolist(), [float(v) for v in K]) for n in (1, 2)]
     write_json(shot.solve / "cameras.json", CameraPath(width, height, frames).to_json())
@@ -79,12 +79,12 @@ def centres(width, height):
 
 
 def pixels_of(st, width, height):
-    """Coordinates in pixels, y down, of a map [H, W, 3]."""
+    """Pixel coordinates of a map [H, W, 3], y down."""
     return np.stack([st[..., 0].astype(float) * width, (1.0 - st[..., 1].astype(float)) * height], axis=-1)
 
 
 def bilinear(picture, at):
-    """Picture [H, W] at pixels [..., 2], centres at +0.5; NaN where a neighbour is missing."""
+    """Bilinear samples of a picture [H, W] at pixels [..., 2], centres at +0.5; NaN if a neighbour is missing."""
     height, width = picture.shape
     x, y = at[..., 0] - 0.5, at[..., 1] - 0.5
     i, j = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -102,7 +102,7 @@ def test_the_lens_is_colmaps_both_ways(colmap, shot_of, name):
     focal = LENSES[name][1][:2] if name == "tangential" else LENSES[name][1][:1] * 2
     assert lens.focal == pytest.approx(focal, abs=1e-9), "from solve.json and cameras.json alone"
     where = lens.to_original(centres(WIDTH, HEIGHT).reshape(-1, 2)).reshape(HEIGHT, WIDTH, 2)
-    np.testing.assert_allclose(where, of["where"], atol=2e-5)  # the worker's are float32
+    np.testing.assert_allclose(where, of["where"], atol=2e-5)  # the worker's values are float32
     rays = (lens.to_plate(of["points"]) - lens.centre) / lens.plate_focal
     np.testing.assert_allclose(rays, of["rays"][:, :2], atol=1e-8)
 
@@ -118,8 +118,10 @@ def test_there_and_back_is_the_identity_to_a_millionth_of_a_pixel(shot_of, name)
 
 @pytest.mark.parametrize("name", LENSES)
 def test_maps_in_float32_compose_to_the_identity_where_both_are_defined(shot_of, name):
-    """Each map looked up where the other one points: linear between entries would hide nothing above 1e-3 px, so the
-    model is asked at the float32 coordinates themselves."""
+    """Each map is composed with the other lens direction at its float32 coordinates.
+
+    The lens model is evaluated instead of the other map: linear interpolation would hide errors below 1e-3 px.
+    """
     lens = load_lens(shot_of(name))
     across, down = needed_margin(lens, WIDTH, HEIGHT)
     at = centres(WIDTH, HEIGHT)
@@ -138,12 +140,12 @@ def test_s_runs_right_and_t_runs_up_from_pixel_centres():
     np.testing.assert_allclose(st[0, 0], [0.5 / 16, 1 - 0.5 / 8, 1.0], atol=1e-7)  # top left
     np.testing.assert_allclose(st[-1, -1], [1 - 0.5 / 16, 0.5 / 8, 1.0], atol=1e-7)
     np.testing.assert_array_equal(st, redistort_map(lens, 16, 8))
-    half = redistort_map(lens, 8, 4, (0.5, 0.0))  # twice as wide, the plate in the middle
+    half = redistort_map(lens, 8, 4, (0.5, 0.0))  # twice as wide, with the plate in the middle
     assert half[0, 0, 0] == pytest.approx((0.5 / 8 + 0.5) / 2) and half[0, 0, 1] == pytest.approx(1 - 0.5 / 4)
 
 
 def wave(at):
-    """A smooth picture over original pixels [..., 2], 16 bit."""
+    """Smooth 16-bit picture as a function of original pixels [..., 2]."""
     return 30000 + 14000 * np.sin(at[..., 0] / 11.0 + 0.4) * np.cos(at[..., 1] / 9.0) + 9000 * np.cos(at[..., 0] / 17.0)
 
 
@@ -166,7 +168,7 @@ def test_a_plate_of_the_solve_comes_back_as_the_original_picture(colmap, shot_of
 @pytest.mark.parametrize("name", LENSES)
 @pytest.mark.parametrize("size", [(160, 120), (80, 60), (240, 180)])
 def test_with_overscan_no_pixel_lacks_data(shot_of, name, size):
-    """Frozen frames are rendered beyond the plate: here the picture is known by formula everywhere."""
+    """Frozen frames are rendered with overscan: here a formula gives the picture everywhere."""
     lens = load_lens(shot_of(name))
     width, height = size
     across, down = needed_margin(lens, width, height)
@@ -176,7 +178,8 @@ def test_with_overscan_no_pixel_lacks_data(shot_of, name, size):
     st = redistort_map(lens, WIDTH, HEIGHT, (across / width, down / height))
     assert st[..., :2].min() >= 0.0 and st[..., :2].max() <= 1.0
     back = bilinear(frozen, pixels_of(st, frozen.shape[1], frozen.shape[0]))
-    if name != "none":  # nothing is beyond the plate there, and a smaller frame's centres lie farther in
+    # without a lens there is nothing beyond the plate, and a smaller frame's centres are farther inside
+    if name != "none":
         assert np.isfinite(back).all()
     seen = np.isfinite(back)
     assert psnr(back[seen], wave(centres(WIDTH, HEIGHT))[seen]) > (45.0 if width >= WIDTH else 33.0)
@@ -203,10 +206,10 @@ def test_a_lens_that_folds_over_is_refused_in_words(tmp_path, model, extra):
 
 
 def test_a_fold_beyond_the_newton_start_is_not_taken_for_a_way_back():
-    """Past the fold a cubic's other root is a solution too: it shows the picture mirrored."""
+    """Beyond the fold, another root of the cubic is a solution too, which shows the picture mirrored."""
     lens = Lens(160, 120, (130.0, 130.0), (70.0, 70.0), (80.0, 60.0), k1=-0.25)
     with pytest.raises(JobError, match="folds over"):
-        lens.check()  # original pixels have a way back, but the plate's corners lie past the fold
+        lens.check()  # original pixels can be inverted, but the plate's corners are beyond the fold
 
 
 def test_maps_are_written_as_float_and_come_back_bit_for_bit(shot_of):
@@ -305,7 +308,7 @@ def test_overscan_on_the_command_line(text, value):
         ((1280, 720), (700.0, 700.0), (-0.6,), "bent"),
         ((1280, 720), (700.0, 700.0), (9.0,), "bent"),
         ((1280, 720), (700.0, 300.0), (0.0,), "bent"),
-        # examples/sitting.mp4; a phone; a phone's tele; an action camera; a 135 mm lens; a rendered pinhole.
+        # examples/sitting.mp4; a phone; a phone's tele; an action camera; a 135 mm lens; a rendered pinhole
         ((640, 480), (541.0, 541.0), (0.03,), ""),
         ((1280, 720), (940.0, 940.0), (0.05,), ""),
         ((720, 1280), (4300.0, 4300.0), (0.4,), ""),

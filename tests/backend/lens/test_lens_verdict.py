@@ -1,4 +1,4 @@
-"""Which lenses are believed, doubted and refused; a focal length that was given; a fisheye of our own."""
+"""Plausible, doubtful and refused lenses; a known focal length; a fisheye."""
 
 import json
 import math
@@ -39,7 +39,7 @@ def test_a_fisheye_is_as_wide_as_its_angles_and_not_as_a_pinhole_s():
         (fisheye(260.0, 0.02, -0.006), ""),
         (fisheye(260.0, -0.4), "folded"),
         (fisheye(260.0, 1.3), "strong"),
-        # The picture of a round fisheye ends before the corners, and so may its curve.
+        # The picture of a circular fisheye ends before the corners, and its curve may end there too.
         (fisheye(300.0, -0.1), ""),
     ],
 )
@@ -89,7 +89,7 @@ def test_a_given_focal_length_that_was_held_or_left_is_said():
 
 
 def solved(folder, tools, pictures, **request):
-    """(answer, poses by picture) of COLMAP alone: no frames are undistorted, no mattes found."""
+    """(answer, poses by picture) of COLMAP alone, without undistorted frames and mattes."""
     told, _ = tools.asked(folder, pictures, **request)
     names = told["solved"]
     (folder / "request.json").write_text(json.dumps(told))
@@ -106,7 +106,7 @@ def test_a_focal_length_that_is_to_be_held_is_held_to_the_pixel(tmp_path, tools)
 
 
 def test_a_focal_length_of_the_file_is_what_a_clip_gets_that_does_not_tell_its_own(tmp_path, tools):
-    """A wall seen straight on, as in test_solving: no number was given, the file had one."""
+    """A wall seen frontally, as in test_solving: the user gave no focal length, but the file has one."""
     poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(8)]
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0), -0.06) for pose in poses]
     found, _ = solved(tmp_path, tools, pictures, start_focal_px=310.0)
@@ -116,7 +116,7 @@ def test_a_focal_length_of_the_file_is_what_a_clip_gets_that_does_not_tell_its_o
 
 
 def test_a_fisheye_is_solved(tmp_path, tools):
-    """The room, cast ray by ray through a lens 120 degrees wide; nobody tells its focal length."""
+    """The room, ray-traced through a lens of 120 degrees; the focal length is unknown to the solve."""
     focal, poses = 160.0, tools.handheld(10)
     rays = tools.fisheye_rays(focal, 0.02)
     pictures = [tools.room().cast(pose, rays) for pose in poses]

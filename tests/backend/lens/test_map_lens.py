@@ -1,4 +1,4 @@
-"""The lens of an ST map as a formula: both ways, in every size, in files, and in the maps that are written of it."""
+"""The lens of an ST map as a polynomial: both directions, every size, in files, and in the maps written from it."""
 
 import numpy as np
 import OpenImageIO as oiio
@@ -21,7 +21,7 @@ def grid(width=WIDTH, height=HEIGHT):
 
 
 def lens_of(truth=TRUTH, forward=True, beyond=0.15, degree=5, **more):
-    """The lens of the undistorted picture's own size, from places that reach past it."""
+    """Lens at the undistorted picture's own size, fitted to points that extend beyond it."""
     size = np.array([truth.width, truth.height])
     plate = (grid().reshape(-1, 2) - size / 2) * (1.0 + 2.0 * beyond) + size / 2
     original = truth.to_original(plate) / size
@@ -31,7 +31,7 @@ def lens_of(truth=TRUTH, forward=True, beyond=0.15, degree=5, **more):
 
 
 def test_a_polynomial_and_its_slopes_are_what_their_terms_say():
-    """x^2 y - 3 in one, y in the other, over a box that is not the unit's."""
+    """The polynomials are x^2 y - 3 and y, over a box that is not the unit square."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-1.0, 2.0], [3.0, 5.0], (200, 2))
     x, y = points.T
@@ -62,7 +62,7 @@ def test_it_is_the_lens_both_ways_and_past_the_edge(forward):
 
 
 def test_a_narrower_map_goes_on_as_the_lens_does():
-    """Samples of the middle 80 % alone: the corners, which the way back has to find, are beyond them."""
+    """The fit only uses the middle 80 %; the inverse must find the corners beyond it."""
     lens = lens_of(beyond=-0.1)
     np.testing.assert_allclose(lens.to_plate(grid().reshape(-1, 2)), TRUTH.to_plate(grid().reshape(-1, 2)), atol=1e-4)
 
@@ -90,7 +90,7 @@ def test_the_window_is_the_widest_that_is_whole():
         assert at.min() > 0.4 and (at < [WIDTH - 0.4, HEIGHT - 0.4]).all()
         assert min(at.min(), *(np.array([WIDTH, HEIGHT]) - at.max(0))) < 0.6, "and not narrower than that"
     assert wider.window[0] > 1.01 and wider.window[0] == wider.window[1]
-    # The undistorted picture is twice as wide as high, the plate 4:3: as high, and as wide as its shape wants.
+    # The undistorted picture is 2:1, the plate 4:3. The plate keeps the height, and its width follows from its shape.
     low = widest(lens_of(barrel), 2.0, whole)
     assert low.window == pytest.approx((2.0 / 3.0, 1.0))
 
@@ -113,7 +113,7 @@ def test_numbers_that_are_no_lens_are_refused():
 
 @pytest.fixture
 def shot(tmp_path):
-    """Solved, with a lens of a map."""
+    """Solved shot whose lens comes from a map."""
     shot, lens = Shot.create(tmp_path / "lens.splannequin"), widest(lens_of(), WIDTH / HEIGHT)
     K = [140.0, 140.0, 80.0, 60.0]
     frames = [CameraFrame(n, np.eye(4).ravel().tolist(), K) for n in (1, 2)]
@@ -130,7 +130,7 @@ def st_pixels(file):
 
 
 def shift(a, b, at, reach=12):
-    """How far picture `b` lies from `a` around a place, pixels x, y: by their gradients, to first order."""
+    """Displacement (x, y) in pixels of picture `b` against `a` around a point, from gradients, to first order."""
     x, y = at
     cut = (slice(max(0, y - reach), y + reach), slice(max(0, x - reach), x + reach))
     gy, gx = np.gradient(a)
@@ -139,7 +139,7 @@ def shift(a, b, at, reach=12):
 
 
 def test_what_is_written_of_it_brings_a_plate_back_onto_the_original_at_its_corners(shot, tmp_path):
-    """Footage at twice the working size: to the plate by the plate's map, rendered with overscan, and back."""
+    """Footage at twice the working size: undistorted by the plate's map, rendered with overscan, and redistorted."""
     lens = load_lens(shot)
     assert isinstance(lens, MapLens) and load_plate_lenses(shot)[2] == lens and lens.intrinsics[0] == 140.0
     assert hash(lens) == hash(load_plate_lenses(shot)[1])
@@ -158,7 +158,7 @@ def test_what_is_written_of_it_brings_a_plate_back_onto_the_original_at_its_corn
     again = np.where(seen, again, original)
     for corner in ((20, 14), (width - 20, 14), (20, height - 14), (width - 20, height - 14), (width // 2, height // 2)):
         assert np.abs(shift(original, again, corner)).max() < 0.05
-    # With overscan nothing of the original lacks a place to look at.
+    # With overscan, every pixel of the original has a source.
     across, down = needed_margin(lens, width, height)
     assert across > 0 and margin(
         shot, type("P", (), {"overscan": -1.0})(), width, height, np.array([[280.0, 280.0, 160.0, 120.0]])

@@ -1,4 +1,4 @@
-"""ST maps as others write them: which conventions are taken, and in which words the rest is refused."""
+"""ST maps as other programs write them: supported conventions, and messages for the others."""
 
 import numpy as np
 import OpenImageIO as oiio
@@ -16,21 +16,22 @@ TRUTH = Lens(WIDTH, HEIGHT, (240.0, 240.0), (240.0, 240.0), (164.0, 86.0), -0.18
 
 
 class Heard(list):
-    """Keeps warnings."""
+    """Records warnings."""
 
     def warning(self, message, hint=""):
         self.append(message)
 
 
 def places(width, height, beyond=0.0):
-    """Pixel centres of a picture that goes on by a share of its size on every side, in its own pixels [h, w, 2]."""
+    """Pixel centres [h, w, 2] of a picture that is extended by a fraction of its size on every side, in its own
+    pixels."""
     across, down = round(beyond * width), round(beyond * height)
     x, y = np.arange(-across, width + across) + 0.5, np.arange(-down, height + down) + 0.5
     return np.stack(np.meshgrid(x, y), -1)
 
 
 def undistorting(width=WIDTH, height=HEIGHT, beyond=0.0, lens=TRUTH):
-    """[h, w, 2] of s and t, of an undistorted picture that goes on beyond the plate."""
+    """[h, w, 2] of s and t for an undistorted picture that extends beyond the plate."""
     ratio = width / WIDTH
     at = places(width, height, beyond)
     original = lens.to_original(at.reshape(-1, 2) / ratio).reshape(at.shape)
@@ -42,7 +43,7 @@ def redistorting(beyond=0.0):
 
 
 def written(folder, st, kind=oiio.FLOAT, names=("R", "G", "B"), name="map.exr", **window):
-    """A file of s and t; what more channels are named is 1."""
+    """Write a file of s and t; additional channels are 1."""
     st = np.asarray(st, np.float32)
     pixels = np.ones((*st.shape[:2], len(names)), np.float32)
     for n, channel in enumerate("RG"[: st.shape[2]]):
@@ -63,7 +64,8 @@ def read(path, way="undistort", layer="", **frames):
 
 
 def error_px(lens, beyond=0.0):
-    """Largest error of the way from the original, all of it, to the map's undistorted picture, pixels of 320 x 180."""
+    """Largest error, in pixels of 320 x 180, from original to the map's undistorted picture, over the whole
+    original."""
     at = places(WIDTH, HEIGHT)[::7, ::7].reshape(-1, 2)
     found = lens.map_of_plate(lens.to_plate(at))
     found = (found * (1.0 + 2.0 * beyond) - beyond) * [WIDTH, HEIGHT]
@@ -81,7 +83,7 @@ def test_both_ways_and_overscan_give_the_same_lens(tmp_path):
     assert error_px(back) < 2e-3 and heard == []
     over, _ = read(written(tmp_path, redistorting(0.1)), "redistort")
     assert error_px(over, 0.1) < 2e-3
-    # One lens, one plate: as wide as nothing is missing.
+    # All maps give the same lens and plate: the widest window without missing pixels.
     at = places(WIDTH, HEIGHT)[::9, ::9].reshape(-1, 2)
     for other in (back, over):
         np.testing.assert_allclose(other.to_original(at), wide.to_original(at), atol=0.05)
@@ -102,7 +104,7 @@ def test_maps_of_another_size_are_of_the_same_picture(tmp_path, size):
 
 
 def test_overscan_as_a_data_window_beyond_the_picture(tmp_path):
-    """As Nuke writes it: the display window is the plate's, coordinates and sizes are of that."""
+    """As written by Nuke: the display window is the plate, and coordinates and sizes refer to it."""
     st = undistorting(beyond=0.1)
     path = written(tmp_path, st, x=-32, y=-18, full_x=0, full_y=0, full_width=WIDTH, full_height=HEIGHT)
     lens, heard = read(path)
@@ -117,7 +119,8 @@ def test_t_may_run_down_and_that_is_said(tmp_path):
 
 
 def test_sixteen_bits_are_smoothed(tmp_path):
-    """A half float near 1 is a pixel wide at 2048: 0.3 px of 640 here, and worse beyond the picture."""
+    """Near 1, half floats have a step of one pixel at a width of 2048: 0.3 px at 640 here, and more outside the
+    picture."""
     lens, heard = read(written(tmp_path, undistorting(beyond=0.1), oiio.HALF))
     assert error_px(lens, 0.1) < 0.1
     assert "16-bit" in heard[0]

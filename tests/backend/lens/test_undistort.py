@@ -1,4 +1,4 @@
-"""Undistortion: the sampling against pictures with a formula, the map against the lens model."""
+"""Undistortion: sampling compared with pictures defined by a formula, the map compared with the lens model."""
 
 import json
 import subprocess
@@ -75,7 +75,7 @@ LENSES = {
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory):
-    """The worker's maps for 160x120 lenses; from a process of its own: pycolmap cannot share one with OpenImageIO."""
+    """The worker's maps for 160x120 lenses, from a separate process: pycolmap cannot be loaded with OpenImageIO."""
     code = (
         "import json, sys, numpy as np, pycolmap\n"
         "from torch_backend.sfm.answers import undistortion\n"
@@ -110,7 +110,7 @@ def test_the_map_is_the_lens_model_without_blank_pixels(maps, name):
     assert np.allclose(where, expected, atol=2e-4)
     assert tuple(pinhole[2:]) == (82.0, 57.0)
     assert_no_blank_pixels(where)
-    # The widest such view: somewhere its border touches that of the distorted picture.
+    # The widest such view: its border touches the border of the distorted picture at some point.
     gaps = [where[..., 0].min() - 0.5, where[..., 1].min() - 0.5]
     gaps += [159.5 - where[..., 0].max(), 119.5 - where[..., 1].max()]
     assert min(gaps) < 2e-3
@@ -133,7 +133,7 @@ def test_plates_of_any_size_lose_the_lens_that_the_working_frames_lost(maps, nam
     lens = PlateLens(imported.lens_from_colmap(model, 160, 120, params), tuple(pinhole))
     assert lens.is_none == (name == "none")
     np.testing.assert_allclose(lens.where(160, 120), where, atol=1e-4)
-    # A source of three times the size, but for a rounding: every third pixel centre is one of the working frame's.
+    # A source of three times the size, up to rounding: every third pixel centre is a pixel centre of the working frame.
     wide = lens.where(480, 361)[:, 1::3] / [3.0, 361 / 120]
     np.testing.assert_allclose(wide[..., 0].mean(0), lens.where(160, 361)[..., 0].mean(0, dtype=float), atol=1e-4)
     np.testing.assert_allclose(lens.where(480, 360)[1::3, 1::3] / 3.0, where, atol=1e-4)
@@ -141,7 +141,8 @@ def test_plates_of_any_size_lose_the_lens_that_the_working_frames_lost(maps, nam
 
 @pytest.mark.parametrize("kind", ["bent", "beyond the border", "turned"])
 def test_bands_are_the_matrix_in_float(kind):
-    """Undistorter is exact and large, BandUndistorter is to give the same; also past the border, and over all bands."""
+    """Undistorter is exact but needs much memory; BandUndistorter must agree, also outside the border and across
+    bands."""
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 65536, (200, 90, 3), dtype=np.uint16)
     at = identity(200, 90)
@@ -155,7 +156,7 @@ def test_bands_are_the_matrix_in_float(kind):
     )
     want = Undistorter(where)(picture)
     assert np.abs(np.clip(got, 0, 1) * 65535 - want).max() < 4
-    assert got.min() < 0 and got.max() > 1  # ringing is not cut
+    assert got.min() < 0 and got.max() > 1  # overshoot is not clipped
     with pytest.raises(ValueError, match=r"\[H, W, 2\]"):
         BandUndistorter(where[..., 0])
 
@@ -170,7 +171,7 @@ def test_bands_change_nothing_where_nothing_moves_and_reach_other_sizes():
 
 @pytest.mark.parametrize("name", ["barrel", "pincushion"])
 def test_there_and_back(maps, name):
-    """A smooth picture seen through the lens and undistorted is the picture seen without the lens."""
+    """A smooth picture that is distorted by the lens and undistorted equals the picture without the lens."""
 
     def scene(x, y):
         return 30000 + 20000 * np.sin(7.0 * x) * np.cos(6.0 * y)

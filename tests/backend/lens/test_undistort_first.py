@@ -1,4 +1,4 @@
-"""A clip whose lens is handed over as an ST map: solved straight, and said where the map is of another lens."""
+"""A clip with an ST map of its lens is solved undistorted, and a map of another lens is reported."""
 
 import numpy as np
 import OpenImageIO as oiio
@@ -21,7 +21,7 @@ TRUTH = Lens(WIDTH, HEIGHT, (220.0, 220.0), (220.0, 220.0), (WIDTH / 2, HEIGHT /
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory, tools):
-    """(shot, poses, folder of maps): a room through a barrel lens, imported."""
+    """(shot, poses, folder of maps): imported clip of a room through a barrel lens."""
     folder, room, poses = tmp_path_factory.mktemp("barrel"), tools.room(), tools.handheld(COUNT)
     rng = np.random.default_rng(2)
     for n, viewmat in enumerate(poses, start=1):
@@ -39,8 +39,10 @@ def clip(tmp_path_factory, tools):
 
 
 def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
-    """Points of the scene, through the solved cameras and the map's lens, lie where the real lens showed them: to a
-    quarter of a pixel, at the corners too. What the import found burnt in goes through the map as frames do."""
+    """Scene points project through the solved cameras and the map's lens to where the real lens showed them.
+
+    Errors stay below a quarter of a pixel, also at the corners. The map also undistorts the import's burnt-in mask.
+    """
     shot, poses, folder = clip
     config = SolveConfig(
         features=1200,
@@ -58,13 +60,13 @@ def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
     frame = read_png(shot.plate(5))
     expected = tools.room().render(
         poses[4], (*(2 * [220.0 * scale]), WIDTH / 2, HEIGHT / 2), 0.0
-    )  # the room through no lens at all
+    )  # the room without lens distortion
     assert np.abs(frame.astype(float) - expected)[8:-8, 8:-8].mean() < 3.0
     assert record["masks"]["ignore"]["source"] == str(shot.burnt_in)
     mask = read_png(shot.mask("ignore", 5))[..., 0] > 127
     assert mask[12, 30] and not mask[60, 100] and 0.5 < mask.sum() / (26 * 56) < 1.3
 
-    # The corners of what the camera sees, at a depth of some, in both worlds.
+    # The corners of the camera's view at some depth, in both worlds.
     path = CameraPath.load(shot.solve / "cameras.json")
     solved = np.array([np.reshape(one.viewmat, (4, 4)) for one in path.frames])
     u, v = np.meshgrid([12.0, 160.0, 308.0], [12.0, 120.0, 228.0])
@@ -92,7 +94,7 @@ def test_the_clip_is_solved_straight_and_the_map_is_its_lens(clip, tools):
 
 
 def between(one, two, points):
-    """Points in the axes of one camera -> in those of another; world-to-camera poses."""
+    """Map points from the axes of one camera to another's; `one` and `two` are world-to-camera poses."""
     world = (points - one[:3, 3]) @ one[:3, :3]
     return world @ two[:3, :3].T + two[:3, 3]
 
@@ -117,7 +119,7 @@ def test_other_cameras_and_a_map_are_one_lens_too_many(clip, tools):
 
 
 def test_a_map_is_told_by_what_is_in_it_and_not_by_where_it_lies(clip, tools):
-    """A copy of the file is the same solve; another way round is another one."""
+    """A copy of the file keeps the solve; another direction of the map does not."""
     from torch_backend.sfm.solving import _key  # pyright: ignore[reportPrivateUsage]
 
     frames = {"key": "k"}
@@ -145,6 +147,6 @@ def test_what_is_left_of_the_lens_is_measured_at_the_corner():
 
 
 def test_the_map_of_the_test_is_what_nuke_reads(clip):
-    """s to the right, t up."""
+    """s increases to the right, t upwards."""
     pixels = oiio.ImageBuf(str(clip[2] / "undistort.exr")).get_pixels(oiio.FLOAT)
     assert pixels[0, 0, 0] < pixels[0, -1, 0] and pixels[0, 0, 1] > pixels[-1, 0, 1]

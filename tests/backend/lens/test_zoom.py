@@ -1,4 +1,4 @@
-"""A lens that zooms is told from a camera that travels, by points at different depths."""
+"""A zooming lens is distinguished from a moving camera by points at different depths."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,10 @@ FOCAL = 500.0
 
 
 def frame(change: float, seed: int = 0, noise_px: float = 0.3, depths: tuple[float, float] = (2.0, 6.0)):
-    """(seen, points, pose) of a frame whose focal length is exp(`change`) times the solve's; the pose is a little off,
-    nearer to the scene, as a solve that knows no zoom leaves it."""
+    """(seen, points, pose) of a frame whose focal length is exp(`change`) times the solve's.
+
+    The pose has small errors and is nearer to the scene, as in a solve that assumes no zoom.
+    """
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.uniform(-1.5, 1.5, (300, 2)), rng.uniform(*depths, 300)])
     rotation, shift = quat_to_rotation(np.array([1.0, 0.025, -0.05, 0.01])), np.array([0.1, -0.05, 0.2])

@@ -1,4 +1,4 @@
-"""The motion matte of small worlds with exact cameras: a textured wall, and a board before it that stands or moves."""
+"""Motion mattes of small worlds with exact cameras: a textured wall, and a static or moving board in front."""
 
 import json
 import os
@@ -50,7 +50,7 @@ def still(n: float) -> tuple[float, float]:
 def build(
     root, where=still, travel=0.8, sway=1.0, wall: np.ndarray | None = None, numbers=NUMBERS, fps=10
 ) -> tuple[Shot, np.ndarray]:
-    """A solved shot and where the board is, bool [F, H, W]; `where(share)` is its place in world units at a time."""
+    """(solved shot, board mask bool [F, H, W]); `where(share)` is the board's position in world units at a time."""
     shot = Shot.create(root / "world.splannequin")
     wall, board = texture(1) if wall is None else wall, texture(2)
     y, x = np.mgrid[0.5:HEIGHT, 0.5:WIDTH].astype(np.float32)
@@ -105,7 +105,7 @@ def middle(mask: np.ndarray) -> np.ndarray:
 
 
 def inner(mask: np.ndarray, by: int = 3) -> np.ndarray:
-    """Without a margin; outside of it, `~grown(mask)`, the rest has one too."""
+    """Masks eroded by a margin. `~grown(mask)` keeps the same kind of margin outside the mask."""
     return np.array([cv2.erode(m.astype(np.uint8), np.ones((2 * by + 1,) * 2, np.uint8)) > 0 for m in mask])
 
 
@@ -115,7 +115,7 @@ def grown(mask: np.ndarray, by: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def swaying(tmp_path_factory, quiet):
-    """The board sways up and down by 0.08 units, 5 pixels."""
+    """The board sways up and down by 0.08 units, which are 5 pixels."""
     shot, board = build(tmp_path_factory.mktemp("sway"), lambda share: (0.0, 0.08 * np.sin(7 * share)))
     return shot, board, find_motion(shot, quiet(), static_model=None)
 
@@ -132,7 +132,7 @@ def test_what_moves_is_found_and_the_wall_is_still(swaying):
 
 
 def test_motion_along_epipolar_lines_is_found(tmp_path, quiet):
-    """The camera travels sideways only, and so does the board, to and fro: every match lies on its line."""
+    """Camera and board move only sideways, so every match lies on its epipolar line."""
     shot, board = build(tmp_path, lambda share: (0.1 * np.sin(7 * share), 0.0), sway=0.0)
     find_motion(shot, quiet(), static_model=None)
     labels = mattes(shot)
@@ -141,7 +141,7 @@ def test_motion_along_epipolar_lines_is_found(tmp_path, quiet):
 
 
 def test_a_slow_sway_of_half_a_pixel_is_found(tmp_path, quiet):
-    """Between neighbouring frames it is less than any flow can tell from its own noise."""
+    """Between neighbouring frames the motion is below the noise of optical flow."""
     numbers = list(range(1, 31))
     where = lambda share: (0.004 * np.sin(4 * share), 0.008 * np.sin(6 * share))  # noqa: E731
     shot, board = build(tmp_path, where, numbers=numbers)
@@ -158,7 +158,7 @@ def test_a_still_world_is_still(tmp_path, quiet):
 
 
 def test_a_bare_wall_before_which_something_moves_is_still(tmp_path, quiet):
-    """Flow is smooth: on a bare wall it is that of what moves before it."""
+    """Optical flow is smooth: on a bare wall it copies the motion of the object in front."""
     rng = np.random.default_rng(3)
     bare = (128 + rng.normal(0, 1, (900, 1200))).astype(np.uint8)
     shot, board = build(tmp_path, lambda share: (0.0, 0.08 * np.sin(7 * share)), wall=bare)
@@ -177,7 +177,7 @@ def test_a_tripod_has_a_matte_too(tmp_path, quiet):
 
 
 def test_a_frame_whose_pose_was_guessed_does_not_move(tmp_path, quiet):
-    """All of it is off by some pixels."""
+    """The guessed pose moves the whole frame by some pixels."""
     shot, _ = build(tmp_path)
     path = CameraPath.load(shot.solve / "cameras.json")
     path.frames[6].source = "interpolated"
@@ -187,7 +187,7 @@ def test_a_frame_whose_pose_was_guessed_does_not_move(tmp_path, quiet):
 
 
 def test_a_picture_that_is_lost_in_blur_does_not_move(tmp_path, quiet):
-    """One frame of a fast pan: everything in it differs from everything else."""
+    """One frame of a fast pan differs from its neighbours everywhere."""
     shot, _ = build(tmp_path)
     path = shot.frames / f"{NUMBERS[6]:06d}.png"
     write_png(path, cv2.blur(read_png(path), (13, 1)))
@@ -195,15 +195,15 @@ def test_a_picture_that_is_lost_in_blur_does_not_move(tmp_path, quiet):
 
 
 def test_frames_between_keys_have_a_matte_too(tmp_path, quiet):
-    """At 40 frames a second every second one of so short a clip is a key; the others take theirs by flow."""
+    """At 40 frames per second every second frame of such a short clip is a key; flow carries mattes to the others."""
     numbers = list(range(1, 33))
     shot, board = build(tmp_path, lambda share: (0.0, 0.15 * np.sin(14 * share)), travel=2.4, numbers=numbers, fps=40)
     assert Clip(shot).keys == [*range(0, 32, 2), 31]
     find_motion(shot, quiet(), static_model=None)
     labels = mattes(shot, numbers) == MOVING
-    between = range(7, 25, 2)  # the board is in the picture
+    between = range(7, 25, 2)  # while the board is in the picture
     assert min(labels[n][inner(board)[n]].mean() for n in between) > 0.7
-    # Its key's matte, left where it is, would be 7 pixels off.
+    # The key's unmoved matte would be 7 pixels away.
     assert np.mean([np.linalg.norm(middle(labels[n]) - middle(board[n])) for n in between]) < 3.0
 
 
@@ -224,7 +224,7 @@ def test_damaged_points_of_surfaces_are_found_again(swaying, tmp_path, quiet):
 
 
 def test_mattes_whose_search_was_cancelled_are_looked_for_again(swaying, tmp_path, quiet):
-    """Else a training that found the old ones outdated, and was paused, would go on without any."""
+    """Otherwise a training that found outdated mattes and was then paused would continue without any."""
     shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
     record = json.loads((shot.motion / "motion.json").read_text())
     write_json(shot.motion / "motion.json", {**record, "version": record["version"] - 1})
@@ -250,7 +250,7 @@ def test_a_clip_that_cannot_be_learnt_is_left_to_flow_with_a_word(swaying, tmp_p
 
 
 def test_what_neither_a_static_model_nor_most_frames_show_moves(tmp_path, quiet):
-    """A patch of the wall that is another one in one frame: flow sees it stand."""
+    """A patch of the wall differs in one frame, and optical flow sees no motion."""
     shot, _ = build(tmp_path)
     plain = {number: read_png(shot.plate(number)) for number in NUMBERS}
     pixels = plain[NUMBERS[6]].copy()
@@ -282,7 +282,7 @@ def test_mattes_of_other_cameras_are_not_read(swaying, tmp_path, quiet):
     assert not is_found(shot) and load_motion(shot, NUMBERS[0]) is None and motion_key(shot) != key
     with pytest.raises(Cancelled):
         find_motion(shot, quiet(cancel_at=("solve: motion", 0.3)))
-    assert load_motion(shot, NUMBERS[0]) is None  # some are of these cameras, not all
+    assert load_motion(shot, NUMBERS[0]) is None  # some mattes belong to these cameras, not all
 
 
 KILLED = """
@@ -305,7 +305,7 @@ find_motion(Shot(sys.argv[1]), Report(), static_model=None)
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
 def test_a_killed_search_goes_on_where_it_was(swaying, tmp_path, quiet):
-    """What was written is whole and stays; what comes after is as if nobody had been killed."""
+    """Files written before the kill stay; the later ones equal those of an undisturbed search."""
     shot = Shot(shutil.copytree(swaying[0].root, tmp_path / "a.splannequin"))
     shutil.rmtree(shot.solve / "motion")
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
@@ -320,7 +320,7 @@ def test_a_killed_search_goes_on_where_it_was(swaying, tmp_path, quiet):
     assert {p: p.stat().st_mtime_ns for p in left} == before
     assert [event[2] for event in report.events if event[0] == "progress"] == list(range(len(left) + 1, FRAMES + 1))
     assert (mattes(shot) == mattes(swaying[0])).all()
-    names = [f"{n:06d}{suffix}" for n in NUMBERS for suffix in (".png", ".npz")]  # of so few frames each is a key
+    names = [f"{n:06d}{suffix}" for n in NUMBERS for suffix in (".png", ".npz")]  # with so few frames, each is a key
     assert {p.name for p in (shot.solve / "motion").iterdir()} == {"motion.json", *names}
     one, other = load_surface(shot), load_surface(swaying[0])
     assert (one.xyz == other.xyz).all() and (one.frames == other.frames).all()
@@ -333,11 +333,11 @@ def test_a_shot_without_cameras_says_so(tmp_path, quiet):
     assert load_motion(shot, 1) is None
 
 
-# ------------------------------------------------------------------------------------------ points of what stands still
+# ------------------------------------------------------------------------------------------- points of static surfaces
 
 
 def seen_at(shot: Shot, number: int, xyz: np.ndarray) -> np.ndarray:
-    """[S, 2] int64, pixels (x, y) of a frame in which points are seen."""
+    """[S, 2] int64: pixels (x, y) of points in a frame."""
     camera = next(c for c in CameraPath.load(shot.solve / "cameras.json").frames if c.frame == number)
     local = xyz - -np.array(camera.viewmat).reshape(4, 4)[:3, 3]
     return np.floor(FOCAL * local[:, :2] / local[:, 2:] + [WIDTH / 2, HEIGHT / 2]).astype(int)
@@ -364,7 +364,7 @@ def test_points_of_a_still_world_lie_on_its_surfaces_and_cover_them(tmp_path, qu
 
 
 def test_what_moves_gives_no_points(swaying):
-    """Now and then a still point explains its matches, at a depth at which there is nothing."""
+    """By chance, a static point in empty space can explain the matches of a moving object."""
     shot, board, _ = swaying
     found = load_surface(shot)
     for n in range(3, 11):
@@ -400,7 +400,7 @@ def test_a_shot_solved_before_points_were_kept_has_them_when_it_is_solved_again(
     key, pictures = motion_key(shot), {p: p.read_bytes() for p in shot.motion.glob("*.png")}
     assert find_motion(shot, quiet(), static_model=None) == swaying[2] and not len(
         load_surface(shot).xyz
-    )  # a freeze asks for none
+    )  # a freeze requests no points
     assert find_motion(shot, quiet(), with_points=True, static_model=None) == swaying[2]
     assert (load_surface(shot).xyz == load_surface(swaying[0]).xyz).all()
     assert motion_key(shot) == key and {p: p.read_bytes() for p in shot.motion.glob("*.png")} == pictures
@@ -419,12 +419,12 @@ def test_points_go_with_the_mattes_and_a_damaged_file_is_done_without(swaying, t
     path = CameraPath.load(shot.solve / "cameras.json")
     path.frames[0].K[0] += 1.0
     write_json(shot.solve / "cameras.json", path.to_json())
-    assert not len(load_surface(shot).xyz)  # other cameras: they say nothing now
+    assert not len(load_surface(shot).xyz)  # the cameras have changed, so these points are invalid
     find_motion(shot, quiet(), static_model=None)
     assert len(load_surface(shot).xyz) > 2000 and set(load_surface(shot).frames) == set(NUMBERS)
 
 
-# ------------------------------------------------------------------------------------------------- what artists paint
+# ------------------------------------------------------------------------------------------------- painted mattes
 
 
 def paint(shot: Shot, pixels: np.ndarray, number: int = NUMBERS[0]) -> None:
@@ -486,7 +486,7 @@ def test_paint_stays_when_the_shot_is_solved_again(own, quiet):
     path = CameraPath.load(own.solve / "cameras.json")
     path.frames[0].K[0] += 1.0
     write_json(own.solve / "cameras.json", path.to_json())
-    assert (load_motion(own, NUMBERS[0]) == MOVING).all()  # also while there is nothing else
+    assert (load_motion(own, NUMBERS[0]) == MOVING).all()  # also if there are no other mattes
     find_motion(own, quiet(), static_model=None)
     assert (load_motion(own, NUMBERS[0]) == MOVING).all()
     assert (load_motion(own, NUMBERS[1]) == STILL).any()
@@ -515,7 +515,7 @@ def test_paint_that_announces_too_many_pixels_is_refused_before_they_are_read(ow
 
 @pytest.mark.parametrize("order", ["cv2, OpenImageIO, av", "OpenImageIO, av, cv2", "torch, av, cv2, OpenImageIO"])
 def test_opencv_lives_beside_the_other_readers_of_pictures(order, tmp_path):
-    """Each brings its own zlib, libpng or FFmpeg; pycolmap's collide with OpenImageIO's."""
+    """Each library brings its own zlib, libpng or FFmpeg; pycolmap's libraries conflict with OpenImageIO's."""
     clip = Path(__file__).resolve().parents[3] / "examples" / "sitting.mp4"
     code = f"""
 import {order}
@@ -544,7 +544,7 @@ def test_cameras_by_which_everything_moves_are_doubted(tmp_path, quiet):
     good, bad = quiet(), quiet()
     motion_after_solve(shot, good, static_model=None)
     assert not [event for event in good.events if event[0] == "warning"]
-    # Nearly on the spot, as a solve without depth has them: what is before the wall and the wall itself both move.
+    # The cameras hardly move, as in a solve without depth, so both the wall and the board in front seem to move.
     cameras = json.loads((shot.solve / "cameras.json").read_text())
     for n, frame in enumerate(cameras["frames"]):
         frame["viewmat"][3] *= 0.3

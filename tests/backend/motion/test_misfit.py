@@ -1,4 +1,4 @@
-"""What the world at rest lacks, in pictures drawn here."""
+"""Objects that are missing in the static model of a scene, in synthetic pictures."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ WIDTH, HEIGHT, UNIT, DEPTH = 160, 120, 0.5, 4.0
 Y, X = np.mgrid[0.5:HEIGHT, 0.5:WIDTH]
 GRID = (2.0 * X).astype(np.float32), (2.0 * Y).astype(np.float32)
 K = np.array([[320.0, 0.0, WIDTH], [0.0, 320.0, HEIGHT], [0.0, 0.0, 1.0]])
-"""In flow pixels, two to a point of the grid."""
+"""Intrinsics in flow pixels; a grid cell has two."""
 STEPS = (-6, -4, -2, 2, 4, 6)
-"""Places of the other cameras, in points of the grid by which the wall shifts."""
+"""Positions of the other cameras, as shifts of the wall in grid cells."""
 INVERSE = np.full((HEIGHT, WIDTH), 1.0 / DEPTH, np.float32)
 
 
 def wall(step: int = 0) -> np.ndarray:
-    """A plane at `DEPTH` from a camera that stands `step` points of the grid to the right."""
+    """Picture of a plane at `DEPTH` from a camera `step` grid cells to the right."""
     coarse = np.random.default_rng(3).uniform(60, 190, (30, 44, 3)).astype(np.uint8)
     whole = cv2.resize(coarse, (WIDTH + 16, HEIGHT), interpolation=cv2.INTER_CUBIC)
     return whole[:, 8 + step : 8 + step + WIDTH].copy()
@@ -65,7 +65,8 @@ def test_noise_alone_is_no_mover(sigma: float) -> None:
 
 
 def test_one_witness_that_errs_makes_no_mover() -> None:
-    """A model that is poor at a place, and frames that show another surface there since the depth is wrong."""
+    """First the model is wrong in an area; then the other frames show another surface there because of a wrong
+    depth."""
     poor = wall()
     poor[disc(8.0)] = 200, 30, 30
     assert not moving(noisy(wall(), 2.0, 1), noisy(poor, 2.0, 2), around(2.0)).any()
@@ -76,7 +77,7 @@ def test_one_witness_that_errs_makes_no_mover() -> None:
 
 
 def test_a_frame_that_is_unlike_everywhere_has_no_movers() -> None:
-    """A flash, or a pose that is wrong."""
+    """A flash, or a wrong pose."""
     assert moving(255 - wall(), wall(), around()).mean() < 0.01
     assert moving(wall(7), wall(), around()).mean() < 0.01
 
@@ -96,10 +97,10 @@ def test_the_values_are_those_of_double_precision() -> None:
     others = [sight(noisy(wall(), 8.0, seed)) for seed in (3, 4, 5, 6, 7)]
     median = np.median([other.colors for other in others], axis=0)
     gaps = [np.abs(frame.astype(np.float64) - each).max(-1) for each in (shown, median)]
-    taps = np.arange(-8, 9)  # OpenCV's kernel for float pictures reaches four sigmas
+    taps = np.arange(-8, 9)  # OpenCV's kernel for float pictures extends to four sigmas
     kernel = np.exp(-0.5 * (taps / (4.0 * UNIT)) ** 2)
     kernel /= kernel.sum()
     gaps = [cv2.sepFilter2D(gap, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101) for gap in gaps]
     expected = np.minimum(*gaps)
     found = misfit(sight(frame), INVERSE, shown, others, GRID, UNIT, MisfitConfig())
-    assert np.abs(found - expected / np.quantile(expected, 0.9)).max() < 0.08  # the fit of brightness sees the noise
+    assert np.abs(found - expected / np.quantile(expected, 0.9)).max() < 0.08  # the brightness fit is affected by noise

@@ -18,13 +18,13 @@ def small_room() -> Scene:
 
 @pytest.fixture(scope="session")
 def tools():
-    """Helpers, since tests cannot import this file: `benchmarks.raster_errors`, where Scene, cloud, ... live."""
+    """The module `benchmarks.raster_errors` with Scene, cloud, and others, because tests cannot import this file."""
     return raster_errors
 
 
 @pytest.fixture
 def generated(request):
-    """Call it once per generated case; the session's summary says how many there were."""
+    """Function to call once per generated case; the session's summary prints the counts."""
     name = request.node.originalname
     return lambda: GENERATED.update((name,))
 

@@ -1,4 +1,4 @@
-"""What `rasterize` refuses, by the name of the argument that is wrong."""
+"""Inputs that `rasterize` refuses; the message names the argument."""
 
 import math
 

@@ -1,4 +1,5 @@
-"""The compiled bodies against the float64 oracle: the CPU's, and the CUDA kernels on CPU fibers and on a GPU."""
+"""The compiled implementations, compared with the float64 reference: the CPU's, and the CUDA kernels on fibers and
+GPU."""
 
 import pytest
 import torch
@@ -10,14 +11,14 @@ on_compiled_bodies = pytest.mark.parametrize("body", [body for body in BODIES if
 
 
 def ran(scene, body, where=1.0, **options):
-    """As `Scene.gradients`, its images on the CPU."""
+    """Like `Scene.gradients`, with images on the CPU."""
     out, grads = scene.gradients(body, where, **options)
     return on_host(out), grads
 
 
 @on_compiled_bodies
 def test_room_matches_the_oracle(small_room, body):
-    # A pixel at the alpha cut may fall on either side of it. Few do, and gradients are compared on the others.
+    # A pixel at the alpha threshold may fall on either side. Few do, and gradients are compared on the other pixels.
     with torch.no_grad():
         same = (on_host(small_room.run(body)).alphas - small_room.run("reference").alphas).abs() < 3e-5
     assert same.float().mean() > 0.998
@@ -31,7 +32,7 @@ def test_room_matches_the_oracle(small_room, body):
     assert (out.weight_max - ref.weight_max).abs().max() < 5e-3
     assert relative(out.means2d_grad, ref.means2d_grad) < 1e-4
     assert relative(out.means2d_absgrad, ref.means2d_absgrad) < 1e-4
-    # Every unit of alpha in the image belongs to some Gaussian.
+    # All alpha in the image is attributed to some Gaussian.
     assert out.weight_sum.double().sum().item() == pytest.approx(out.alphas.double().sum().item(), rel=1e-5)
 
 
@@ -87,7 +88,7 @@ def test_cameras_of_a_batch_are_independent_and_their_gradients_add(body, degree
 @on_compiled_bodies
 def test_the_top_gaussian_is_the_one_with_the_largest_weight(body):
     scene = cloud(40, 41, 23, seed=6, channels=40)
-    # With one channel per Gaussian and no background, the image holds the weights themselves.
+    # With one channel per Gaussian and no background, the image equals the weights.
     scene.tensors |= {"colors": torch.eye(40).double(), "background": torch.zeros(40).double()}
     weights = scene.run("reference").colors
     scene.tensors |= {"colors": torch.rand(40, 3).double(), "background": torch.zeros(3).double()}

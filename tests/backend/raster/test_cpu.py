@@ -1,4 +1,4 @@
-"""The compiled CPU body against the float64 oracle."""
+"""The compiled CPU implementation, compared with the float64 reference."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ from torch_backend.raster import RasterSettings
 
 
 def test_a_median_depth_is_where_half_is_crossed_or_that_of_the_largest_weight(tools):
-    """A tile has pixels of both kinds: 37 x 21 px of 60 Gaussians, the top contributor asked too and not."""
+    """Some pixels reach an alpha of one half, others do not: 37 x 21 px, 60 Gaussians, `with_top` or not."""
     for with_top in (False, True):
         scene = tools.cloud(60, 37, 21, seed=11, with_depth=True, with_top=with_top)
         cpu, ref = scene.run("cpu"), scene.run("reference")
@@ -50,7 +50,7 @@ def test_gradients_of_what_no_camera_sees_are_zero_whatever_memory_held(tools, c
         tensors |= {"sh": tensors["sh"][:, :1].clone(), "sh_rest": tensors["sh"][:, 1:].clone()}
     scene = tools.Scene(tensors, scene.Ks.repeat(cameras, 1, 1), 50, 41, scene.options)
     _, expected = scene.gradients("reference", sh_degree=1)
-    torch.use_deterministic_algorithms(True)  # torch then fills memory that nobody has written with NaN
+    torch.use_deterministic_algorithms(True)  # makes torch fill uninitialised memory with NaN
     try:
         _, grads = scene.gradients("cpu", sh_degree=1)
     finally:
@@ -74,7 +74,8 @@ def test_one_thread_and_many_agree_bitwise(tools):
     one, one_grads = scene.gradients("cpu", settings=RasterSettings(threads=1))
     for threads in (2, 5):
         many, many_grads = scene.gradients("cpu", settings=RasterSettings(threads=threads))
-        filled = {name: value for name, value in vars(one).items() if name != "hits"}  # of the CUDA body alone
+        # only the CUDA implementation has this field
+        filled = {name: value for name, value in vars(one).items() if name != "hits"}
         for name, value in filled.items():
             assert torch.equal(value, getattr(many, name)), name
         for name, grad in one_grads.items():

@@ -1,4 +1,4 @@
-"""The CUDA body against the float64 oracle: on Warp's CPU fibers everywhere, on the GPU too where there is one."""
+"""The CUDA implementation, compared with the float64 reference: on Warp's CPU fibers, and on a GPU if there is one."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ needs_gpu = pytest.mark.skipif(not GPU, reason="needs an NVIDIA GPU")
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=needs_gpu)])
 def device(request) -> torch.device:
-    """'cpu' means fibers."""
+    """Device of the kernels; 'cpu' runs fibers."""
     return torch.device(request.param)
 
 
@@ -34,7 +34,7 @@ def run(scene, device, leaves=None, **options) -> Any:
 
 
 def gradients(scene, device, where=1.0, **options) -> tuple[Any, dict[str, Any]]:
-    """As `Scene.gradients`, on `device`; everything that comes back lies on the CPU."""
+    """Like `Scene.gradients`, on `device`; all results are on the CPU."""
     leaves, generator = scene.leaves(), torch.Generator().manual_seed(5)
     out = run(scene, device, leaves, **options)
     where = torch.as_tensor(where, dtype=torch.float32)
@@ -56,7 +56,7 @@ def assert_same_images(a: RasterOutput, b: RasterOutput):
 
 
 def covering(tools, n=24, width=130, height=90):
-    """Gaussians that each cover the image: more tiles than one thread lists, more hits than a first call holds."""
+    """Gaussians that cover the whole image: more tiles than one thread lists, more hits than the initial list holds."""
     scene = tools.cloud(n, width, height, seed=8, with_contributions=True)
     scene.tensors["log_scales"] = scene.tensors["log_scales"] * 0.1 + 0.5
     scene.tensors["opacity_logits"] -= 2.0
@@ -78,7 +78,7 @@ def test_forward_is_deterministic_and_passes_keep_their_own_state(tools, device)
 
 
 def test_a_camera_that_is_no_number_is_refused_on_fibers_and_sees_nothing_on_a_gpu(tools, device):
-    """Values on a GPU are not checked: the host would wait for them."""
+    """Values on a GPU are not checked, because the host would have to synchronise."""
     scene = tools.cloud(40, 30, 22, seed=3)
     scene.Ks = scene.Ks * math.nan
     if device.type == "cuda":
@@ -98,7 +98,7 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
     wanted, held = small.hits.tolist()
     assert held == 96 < wanted, "the list should have been too short"
     if GPU:
-        torch.cuda.synchronize()  # what the device wanted arrives whenever it arrives
+        torch.cuda.synchronize()  # the demand arrives asynchronously
     large, large_grads = gradients(scene, device)
     assert large.hits[0] == wanted
     assert large.hits[1] >= wanted * 1.3
@@ -107,7 +107,7 @@ def test_hits_beyond_the_list_cost_time_only(tools, device, monkeypatch):
     ref, ref_grads = scene.gradients("reference")
     assert tools.psnr(large.colors, ref.colors) >= 90
     tools.assert_gradients(large_grads, ref_grads, 1e-3)
-    # Once known, the demand stays covered when a quieter view comes in between.
+    # A smaller view in between does not reduce the known demand.
     run(tools.cloud(5, 130, 90), device)
     assert run(scene, device).hits[1] >= wanted
 
@@ -118,13 +118,13 @@ def test_the_first_call_of_a_size_lists_all_its_hits(tools, device, monkeypatch)
     with torch.no_grad():
         wanted, held = run(covering(tools), device).hits.tolist()
         assert wanted > 4 * 24 and wanted <= held <= wanted * 4 // 3 + 1
-        # Twice the Gaussians of a round of growth: nobody has to find out by a slow call.
+        # Twice as many Gaussians, as after a round of growth, still fit at the first call.
         wanted, held = run(covering(tools, n=48), device).hits.tolist()
     assert wanted <= held
 
 
 def test_kernels_of_a_module_are_made_together(monkeypatch):
-    # One that came later would make Warp unload the others, under CUDA graphs that hold them.
+    # If a kernel were added later, Warp would unload the others, which CUDA graphs still use.
     wp = initialised_warp()
     monkeypatch.setattr(cuda, "_kernels", {("", 0): cuda._structure(wp)})
     monkeypatch.setattr(cuda, "module_name", lambda name, channels=0: "tests.raster.cuda.fresh")

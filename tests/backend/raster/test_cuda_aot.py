@@ -1,4 +1,4 @@
-"""The CUDA body compiles for every GPU generation we promise, on machines without a GPU too."""
+"""The CUDA implementation compiles for every supported GPU generation, also on machines without a GPU."""
 
 import re
 
@@ -24,7 +24,7 @@ def test_kernels_compile_for_every_architecture(module, tmp_path, capfd):
         assert re.search(rf"^\.target sm_{arch}\b", text, re.MULTILINE)
         for name, _ in MODULES[module]:
             assert re.search(rf"\.entry {name}_\w*cuda_kernel_forward", text), name
-        # Everything has to stay in registers: arrays in local memory are what makes such kernels slow.
+        # All data must stay in registers: arrays in local memory make such kernels slow.
         assert "__local_depot" not in text
     assert capfd.readouterr() == ("", "")
 

@@ -1,7 +1,7 @@
-"""The text that a GPU compiles of our kernels, run on the CPU: what Warp's cpu device has, to the bit, but for sums of
-another order.
+"""Kernel code as compiled for GPUs, run on the CPU.
 
-Under sanitizers: `python -m benchmarks.device_text --sanitize`.
+Results equal those of Warp's cpu device bit for bit, except for sums in another order. With sanitizers: `python -m
+benchmarks.device_text --sanitize`.
 """
 
 import sys
@@ -16,7 +16,7 @@ OTHERS = {"ssim_pass", "adam", "plane_samples", "plane_gradients", "plane_points
 
 @pytest.fixture(scope="module")
 def launches():
-    """Launches of small scenes on fibers and of the other kernels, and (hits, room in their list) of each scene."""
+    """Launches of small scenes on fibers and of the other kernels; and (hits, list capacity) of each scene."""
     if sys.platform != "linux":
         pytest.skip("the emulator's fibers are Linux's")
     if device_text.compiler() is None:

@@ -1,4 +1,4 @@
-"""Inputs that break rasterisers, on every body; `benchmarks/raster_cases.py` states the bounds against the oracle."""
+"""Difficult rasteriser inputs on every implementation; `benchmarks/raster_cases.py` states the error bounds."""
 
 import math
 
@@ -27,7 +27,8 @@ def assert_sane(out, grads):
 
 
 def assert_case(case, body):
-    """The body is as near to the oracle on a case as `CASES` says, and everything is finite."""
+    """Assert that the implementation meets the case's bounds in `CASES` against the reference, and all values are
+    finite."""
     bound, errors = CASES[case], compare(size(case, body), body)
     assert_sane(errors.out, errors.grads)
     assert_sane(errors.oracle, errors.oracle_grads)
@@ -61,7 +62,7 @@ def test_non_finite_gaussian_is_culled_and_the_others_stay(tools, name, bad, bod
         out, grads = scene.gradients(body)
         assert_sane(out, grads)
         if name in ("log_scales", "opacity_logits") and not math.isnan(bad) and (name, bad) != ("log_scales", math.inf):
-            return  # a scale of 0 and an opacity of 0 or 1 are extreme, not wrong
+            return  # a scale of 0 and an opacity of 0 or 1 are extreme but valid
         assert torch.allclose(out.colors, expected.colors, atol=1e-6)
         assert out.radii[0, 7] == 0
         for key, grad in grads.items():
@@ -98,7 +99,7 @@ def test_poisoned_gaussians_show_in_their_radii_though_not_in_the_image(body):
 
 @on_every_body
 def test_ssim_sees_no_nan_of_a_poisoned_scene(body):
-    # Convolution smears one NaN over a square; a culled Gaussian gives it none.
+    # Convolution spreads one NaN over a square; a culled Gaussian produces none.
     scene = size("NaN and infinities in every input", body)
     _, dtype, device = BODIES[body]
     leaves = scene.leaves(dtype, device)
@@ -136,7 +137,7 @@ def test_infinite_and_enormous_scales_are_culled(tools, body):
 @on_every_body
 @pytest.mark.parametrize("log_scale", [-50.0, -20.0, -8.0, 4.0, 8.0, 12.0, 20.0, 29.0, 40.0])
 def test_extreme_scales(tools, log_scale, body):
-    # At e^12, the cull at VARIANCE_MAX decides, on either side of which bodies may round: only sane there.
+    # At e^12 the cull at VARIANCE_MAX depends on rounding, so results are only checked for finite values there.
     for axes in ([0], [0, 1], [0, 1, 2]):
         scene = tools.cloud(12, 20, 18, seed=3)
         scene.tensors["log_scales"][:, axes] = log_scale
@@ -150,7 +151,7 @@ def test_extreme_scales(tools, log_scale, body):
 
 @on_every_body
 def test_what_overflows_and_is_culled_gets_zero_gradients(tools, body):
-    # Found by the property tests: zero times the infinite derivative of a determinant that overflows float32 is NaN.
+    # Found by the property tests: a determinant that overflows float32 has an infinite derivative, and 0 * inf is NaN.
     scene = tools.cloud(6, 16, 16, settings=RasterSettings(threads=1, antialiased=True))
     scene.tensors["means"][2:5] = torch.tensor([0.0, 0.0, 0.1]).double()
     huge = torch.tensor([[18.4, 18.4, -1.0], [29.0, 29.0, 29.0], [18.4, -1.0, -1.0]]).double()
@@ -163,7 +164,7 @@ def test_what_overflows_and_is_culled_gets_zero_gradients(tools, body):
 
 @on_every_body
 def test_a_point_is_as_wide_as_the_low_pass(tools, body):
-    # sigma^2 = 0.3 px^2: alpha of the pixel beside the mean is opacity * exp(-1 / 0.6).
+    # sigma^2 = 0.3 px^2: the alpha of the pixel next to the mean is opacity * exp(-1 / 0.6).
     scene = tools.single(9, 9, mean=(0.5 / 16 * 2, 0.5 / 16 * 2, 2.0), scale=1e-9, logit=2.0)
     scene.Ks = tools.camera(9, 9, 16.0, 4.0, 4.0)
     out, grads = scene.gradients(body)
@@ -176,7 +177,7 @@ def test_a_point_is_as_wide_as_the_low_pass(tools, body):
 
 @on_every_body
 def test_a_point_keeps_half_a_percent_of_its_opacity_when_antialiased(tools, body):
-    # The covariance before the blur is 1e-20 px^2: the ratio of determinants underflows, its floor holds.
+    # The covariance before the blur is 1e-20 px^2: the ratio of determinants underflows, so its lower bound applies.
     scene = tools.single(9, 9, mean=(0.5 / 16 * 2, 0.5 / 16 * 2, 2.0), scale=1e-11, logit=9.0)
     scene.Ks = tools.camera(9, 9, 16.0, 4.0, 4.0)
     out, grads = scene.gradients(body, settings=RasterSettings(antialiased=True))
@@ -240,8 +241,8 @@ def test_the_case_of_the_frustums_edge_has_gaussians_beyond_the_clamp():
 
 @on_every_body
 def test_footprint_beyond_the_frustum_is_bounded_by_the_clamp(tools, body):
-    # Seen from where no training view was, a splat may lie 80 degrees aside: x / z = 6 without the clamp, 0.65 with it.
-    # sigma^2 <= |J|^2 s^2 + 0.3, |J|^2 <= (f / z)^2 (2 + u^2 + v^2); the ellipse ends at sqrt(2 ln 255 opacity) sigma.
+    # In a view far from all training views, a splat may be 80 degrees off-axis: x / z = 6, clamped to 0.65. sigma^2 <=
+    # |J|^2 s^2 + 0.3, |J|^2 <= (f / z)^2 (2 + u^2 + v^2); the ellipse ends at sqrt(2 ln 255 opacity) sigma.
     scene = tools.single(32, 32, focal=32.0, mean=(6.0, 0.0, 1.0), scale=0.5, logit=10.0)
     scene.tensors["log_scales"][0] = torch.log(torch.tensor([0.05, 0.05, 5.0]).double())
     out, grads = scene.gradients(body)
@@ -253,7 +254,7 @@ def test_footprint_beyond_the_frustum_is_bounded_by_the_clamp(tools, body):
 
 @on_every_body
 def test_no_gradient_passes_the_frustum_clamp(tools, body):
-    # Beyond the clamp, u is constant: the covariance knows the mean by its depth alone.
+    # Outside the clamp, u is constant: the covariance depends on the mean only through its depth.
     scene = tools.single(16, 16, focal=16.0, mean=(1.4, 0.3, 1.5), scale=0.6)
     scene.tensors["log_scales"] += torch.tensor([0.0, 0.2, 0.5])
     assert abs(1.4 / 1.5) > 0.65
@@ -264,7 +265,7 @@ def test_no_gradient_passes_the_frustum_clamp(tools, body):
 
 @on_every_body
 def test_a_crop_with_the_principal_point_aside_is_the_crop_of_the_image(tools, body):
-    # x / z = 0.81 is inside the image, though further off its axis than a clamp about the image's centre would allow.
+    # x / z = 0.81 is inside the image, but outside a clamp about the image's centre.
     scene = tools.single(64, 16, focal=32.0, mean=(0.81 * 2, 0.1, 2.0), scale=0.3)
     scene.tensors["log_scales"] += torch.tensor([-0.5, -0.5, 1.5])
     scene.Ks = tools.camera(64, 16, 32.0, 34.0, 8.0)
@@ -276,7 +277,8 @@ def test_a_crop_with_the_principal_point_aside_is_the_crop_of_the_image(tools, b
 
 @on_every_body
 def test_overscan_changes_no_pixel_within_it(tools, body):
-    """A fat Gaussian far beside the frame, whose slope the frame's own frustum holds, whatever is rendered around."""
+    """The slope of a large Gaussian far outside the frame is clamped by the frame's frustum, independent of
+    overscan."""
     across, down = 4, 2
     scene = tools.single(32, 16, focal=16.0, mean=(1.6 * 1.5, 0.1, 1.5), scale=0.6)
     scene.tensors["log_scales"] += torch.tensor([0.3, 0.2, 0.8])
@@ -338,8 +340,9 @@ def test_pixel_stops_once_it_is_opaque(body):
 
 @on_every_body
 def test_faint_gaussians_lose_their_gradient_where_they_can_be_counted(tools, body):
-    # After a reset to 0.01, alpha passes 1/255 within 1.37 sigma only; at 0.0039 nowhere. Training can see it: no
-    # radius, no weight. (Without the cut, gradients would reach 3 sigma and further, in every body differently.)
+    # After a reset to 0.01, alpha exceeds 1/255 only within 1.37 sigma; at 0.0039 nowhere. Training can detect this:
+    # radius and weight are 0. Without the threshold, gradients would reach beyond 3 sigma, differently in each
+    # implementation.
     faint, dead = math.log(0.01 / 0.99), math.log(0.0039 / 0.9961)
     out, grads = tools.single(17, 17, focal=20.0, scale=0.3, logit=faint).gradients(body, with_contributions=True)
     sigma = math.sqrt((20 * 0.3 / 2) ** 2 + 0.3)
@@ -355,7 +358,7 @@ def test_faint_gaussians_lose_their_gradient_where_they_can_be_counted(tools, bo
 
 @on_every_body
 def test_opaque_gaussians_reach_beyond_three_sigma(tools, body):
-    # The extent follows the opacity: 3.33 sigma for an opaque one.
+    # The extent depends on the opacity: 3.33 sigma for an opaque Gaussian.
     scene = tools.single(41, 9, focal=20.0, scale=0.6, logit=20.0)
     out = scene.run(body)
     sigma = math.sqrt(6.0**2 + 0.3)
@@ -450,7 +453,7 @@ def test_no_cameras(tools, body):
 
 @on_every_body
 def test_a_tall_image_needs_more_tile_spans_than_are_kept(tools, body):
-    # Counting and emitting must agree on every (Gaussian, tile) pair, whether the spans were kept or not.
+    # Counting and emitting must agree on every (Gaussian, tile) pair, with and without stored spans.
     count, height = (12, 64) if body == "cuda" else (300, 480)
     scene = _column(tools, count, height)
     errors = compare(scene, body)

@@ -1,4 +1,4 @@
-"""Memory of every body on inputs that a careless one would fill it with, each in a process of its own."""
+"""Peak memory of every implementation on inputs that could exhaust it, each in a separate process."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[3]
 COMPILED = [body for body in BODIES if not body.startswith("reference")]
 on_compiled_bodies = pytest.mark.parametrize("body", COMPILED)
 on_every_program = pytest.mark.parametrize("body", [body for body in BODIES if body != "reference32"])
-"""The reference in float32 is the same program: it allocates the same tensors, half as large."""
+"""Without the float32 reference, which allocates the same tensors at half the size."""
 
 CHILD = """
 import resource, sys
@@ -31,11 +31,11 @@ start = peak()
 
 
 def in_a_child(code, body, timeout=240):
-    """Run code in a process of its own, because the peak of memory is that of a process; its last line as numbers."""
+    """Run code in a separate process, because peak memory is measured per process; return its last line as numbers."""
     pytest.importorskip("resource", reason="no peak of memory on this system")
     if sys.platform != "linux":
         pytest.skip("ru_maxrss has other units here")
-    # Without it glibc learns to keep blocks that were freed, and peaks vary twofold.
+    # Otherwise glibc learns to keep freed blocks, and peaks vary by a factor of two.
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MALLOC_MMAP_THRESHOLD_": "65536"}
     run = subprocess.run(
         [sys.executable, "-c", CHILD + code, body],
@@ -51,7 +51,7 @@ def in_a_child(code, body, timeout=240):
 
 @on_every_program
 def test_one_gaussian_over_millions_of_pixels_takes_memory_by_the_pixel(body):
-    # More than 2^24 pixels on the CPU, beyond which float32 cannot count: its weights and gradients still add up.
+    # On the CPU more than 2^24 pixels, the largest count of float32; weights and gradients must still add up.
     side = {"cpu": 4128, "gpu": 4128, "cuda": 64}.get(body, 256)
     grown, weight, gradient = in_a_child(
         f"""
@@ -66,7 +66,8 @@ print(peak() - start, out.weight_sum.item() / alpha, leaves["colors"].grad[0, 0]
     )
     assert weight == pytest.approx(1, abs=1e-3)
     assert gradient == pytest.approx(1, abs=1e-3)
-    # Image, alpha and their gradients: 32 bytes. The oracle keeps tens of tensors per (pixel, Gaussian) for autograd.
+    # Image, alpha and their gradients: 32 bytes. The reference keeps tens of tensors per (pixel, Gaussian) for
+    # autograd.
     each = 100 if body in COMPILED else 2000
     assert grown <= each * side * side + 64e6
 
@@ -86,14 +87,14 @@ print(peak() - start, 0, 0)
 """,
         body,
     )
-    # The oracle blends 2^20 (pixel, Gaussian) pairs at once, whose forty tensors are large beside ten thousand.
+    # The reference blends 2^20 (pixel, Gaussian) pairs at once; its forty tensors exceed the ten thousand Gaussians.
     step = 40 * 2**20 * BODIES[body][1].itemsize if oracle else 64e6
     assert grown <= 4096 * count + step
 
 
 @on_compiled_bodies
 def test_more_hits_than_an_index_holds_are_refused_before_memory_is_taken(body):
-    # 200,000 Gaussians over 11,236 tiles each: 2.2e9 pairs, above 2^31. Nobody has that memory.
+    # 200,000 Gaussians over 11,236 tiles each: 2.2e9 pairs, above 2^31 and any available memory.
     if body == "cuda":
         pytest.skip("on fibers this would take hours; its list has a fixed capacity, see test_cuda.py")
     grown, refused, _ = in_a_child(
@@ -115,7 +116,7 @@ print(peak() - start, refused, 0)
 
 @on_every_body
 def test_images_wider_than_a_tile_column_can_say_are_refused(tools, body):
-    # 600,000 px are 37,500 tiles; a column has 15 bits. Pixel positions of that size are inexact in float32, too.
+    # 600,000 px are 37,500 tiles; a column index has 15 bits. Pixel positions of that size are also inexact in float32.
     scene = tools.single(600_000, 1, focal=1000.0, mean=(1100.0, 0.0, 2.0), scale=0.05)
     with pytest.raises(ValueError, match="width"):
         scene.run(body)

@@ -1,7 +1,7 @@
-"""What holds for every input, tried on generated ones. SPLANNEQUIN_CASES=20000 asks for that many cases per property.
+"""Properties that hold for every input, on generated inputs. SPLANNEQUIN_CASES=20000 sets the cases per property.
 
-Examples are derandomised (tests/conftest.py): a run tries the same ones as the run before. On CPU fibers, which are
-slow, the CUDA body gets a small share.
+Examples are derandomised (tests/conftest.py): every run tests the same ones. The CUDA implementation gets few cases on
+CPU fibers, which are slow.
 """
 
 import dataclasses
@@ -19,12 +19,12 @@ from torch_backend.raster.constants import ALPHA_MIN
 
 ASKED = int(os.environ.get("SPLANNEQUIN_CASES", "0"))
 SHARE = {"cpu": 1.0, "reference": 0.25, "reference32": 0.25, "cuda": 0.05, "gpu": 0.5}
-"""Cases per body relative to the CPU's, by how fast it is."""
+"""Cases per implementation relative to the CPU's, by speed."""
 on_every_body = pytest.mark.parametrize("body", BODIES)
 
 
 def for_all(strategy, body, usual, generated, holds):
-    """Assert `holds(example)` for `usual` examples (or as many as asked for), times the body's share."""
+    """Assert `holds(example)` for `usual` (or SPLANNEQUIN_CASES) examples, times the implementation's share."""
 
     @settings(
         max_examples=max(5, round(SHARE[body] * (ASKED or usual))),
@@ -79,9 +79,9 @@ IN_VIEW = [
 """Means, quaternions, log-scales, opacity logits and colours of two Gaussians."""
 SIZES = st.sampled_from([(1, 1), (7, 5), (16, 16), (17, 3), (20, 18), (1, 33)])
 NEAR = 0.0625
-"""A float32 number, so that all bodies cull by the same plane."""
+"""Near plane; a float32 number, so that all implementations cull by the same plane."""
 POINTS = st.sampled_from([(0.5, 0.5), (0.1, 0.8), (-0.6, 0.5), (1.5, 1.4)])
-"""Principal point as a share of the image: centred, off centre, outside twice."""
+"""Principal point as a fraction of the image size: centred, off centre, twice outside."""
 
 
 @st.composite
@@ -115,7 +115,7 @@ def gaussians(draw):
 
 VIEWS = st.sampled_from([1, 1, 1, 2, 0])
 BANDS = st.sampled_from([(None, 3), (None, 1), (0, 3), (1, 4), (2, 3)])
-"""(degree of the harmonics, channels in all)."""
+"""(degree of the harmonics, number of channels)."""
 KINDS = gaussians()
 
 
@@ -143,7 +143,8 @@ def scenes(draw, least=0, most=6, kind=KINDS, views=VIEWS, sizes=SIZES, points=P
         tensors["colors"] = normal(n, channels if degree is None else channels - 3)
     tensors["background"] = normal(channels)
     viewmats = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
-    viewmats[:, :2, 3] += 0.1 * normal(count, 2) * torch.arange(count)[:, None]  # depths stay exact: they are cut
+    # depths stay exact, because the near plane cuts them
+    viewmats[:, :2, 3] += 0.1 * normal(count, 2) * torch.arange(count)[:, None]
     tensors["viewmats"] = viewmats
     px, py = draw(points)
     Ks = camera(width, height, 0.9 * max(width, height), px * width, py * height).repeat(count, 1, 1)
@@ -157,7 +158,7 @@ def scenes(draw, least=0, most=6, kind=KINDS, views=VIEWS, sizes=SIZES, points=P
 
 @st.composite
 def good_gaussians(draw):
-    """One that is well inside the view, neither tiny nor huge."""
+    """A Gaussian well inside the view, neither tiny nor huge."""
     u = [draw(UNIT) for _ in range(3)]
     depth = 2.5 + u[2]
     quat = draw(st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT))
@@ -172,7 +173,7 @@ def good_gaussians(draw):
 
 @st.composite
 def good_scenes(draw, **options):
-    """Scenes of such Gaussians, one camera, no two depths alike (rounding must not change the order)."""
+    """Scenes of `good_gaussians` with one camera and distinct depths, so that rounding cannot change the order."""
     scene = draw(scenes(least=1, kind=good_gaussians(), views=st.just(1), **options))
     order = scene.tensors["means"][:, 2].argsort()
     rank = torch.empty_like(order)
@@ -190,7 +191,7 @@ def run(scene, body):
 
 
 def assert_sane(scene, out, grads):
-    """What holds of one body's output on any scene."""
+    """Assert properties of one implementation's output that hold for every scene."""
     for name in ("colors", "alphas", "means2d", "weight_sum", "weight_max", "means2d_grad", "means2d_absgrad"):
         assert torch.isfinite(getattr(out, name)).all(), name
     if out.depth_expected is not None:
@@ -215,7 +216,8 @@ def assert_sane(scene, out, grads):
 
 
 def assert_alike(one, other, count, bound=2e-3):
-    """Two images of `count` Gaussians: equal within `bound`, but for alphas of 1/255 in one and not in the other."""
+    """Assert that two images of `count` Gaussians are equal within `bound`, except for alphas near the threshold of
+    1/255."""
     gap = (one.alphas - other.alphas).abs()
     same = gap < SAME_SIDE
     assert (gap <= count * ALPHA_MIN + bound).all()
@@ -258,13 +260,13 @@ def test_any_numbers_give_sane_images_and_gradients(body, generated):
         out = scene.run(body, leaves)
         assert torch.isfinite(out.alphas).all()
         assert torch.isfinite(out.colors).all()
-        # A bounded loss: colours may be as large as float32 allows, and then the gradients of positions are, too.
+        # A bounded loss: colours may be as large as float32 allows, and so would the gradients of positions be.
         (out.alphas.sum() + torch.tanh(out.colors).sum()).backward()
         for name, leaf in leaves.items():
             assert not torch.isnan(leaf.grad).any(), name
             assert torch.isfinite(leaf.grad).all() or color.nan_to_num().abs().max() > 1e6, name
 
-    # Two Gaussians in view with up to four of their numbers replaced by any; or nothing but any numbers.
+    # Two Gaussians in view with up to four numbers replaced by arbitrary ones; or only arbitrary numbers.
     replaced = st.dictionaries(st.integers(0, 27), ANY, max_size=4)
     patched = replaced.map(lambda new: [new.get(i, value) for i, value in enumerate(IN_VIEW)])
     values = st.one_of(patched, st.lists(ANY, min_size=28, max_size=28))
@@ -349,7 +351,7 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(body, generate
         other = Scene(moved, scene.Ks, scene.width, scene.height, scene.options).run(body)
         assert_alike(scene.run(body), other, len(quats))
 
-    flat = good_scenes(bands=st.sampled_from([(None, 3), (0, 3)]))  # higher harmonics are tied to the world's axes
+    flat = good_scenes(bands=st.sampled_from([(None, 3), (0, 3)]))  # higher harmonics depend on the world's axes
     turns = st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT)
     for_all(st.tuples(flat, turns, st.tuples(UNIT, UNIT, UNIT)), body, 150, generated, holds)
 
@@ -379,7 +381,7 @@ def test_scaling_the_world_scales_the_depth(body, generated):
 
 @on_every_body
 def test_two_halves_make_the_image(body, generated):
-    # Other tiles, another principal point. The means are so near to the middle that no half clamps a Jacobian.
+    # Tiles and principal point change. Means are near the centre, so that no half clamps a Jacobian.
     def holds(scene):
         scene.tensors["means"][:, 0] *= 0.25
         whole = scene.run(body)
@@ -400,7 +402,7 @@ def test_two_halves_make_the_image(body, generated):
 
 @st.composite
 def fans(draw):
-    """One long Gaussian anywhere before the camera, mostly outside the view."""
+    """One long Gaussian anywhere in front of the camera, mostly outside the view."""
     depth = draw(st.floats(0.125, 4, width=32))
     mean = (draw(st.floats(-8, 8, width=32)) * depth, draw(st.floats(-8, 8, width=32)) * depth, depth)
     quat = draw(st.tuples(st.floats(0.125, 1, width=32), UNIT, UNIT, UNIT))
@@ -409,7 +411,7 @@ def fans(draw):
 
 @on_every_body
 def test_footprints_at_the_frustum_edge_are_bounded(body, generated):
-    # sigma^2 <= |J|^2 s^2 + 0.3 with the clamped x/z and y/z in J; the ellipse ends at sqrt(2 ln 255) sigma at most.
+    # sigma^2 <= |J|^2 s^2 + 0.3 with clamped x/z and y/z in J; the ellipse ends at most at sqrt(2 ln 255) sigma.
     def holds(scene):
         out, grads = run(scene, body)
         assert_sane(scene, out, grads)
@@ -443,7 +445,7 @@ def test_a_camera_of_a_batch_sees_what_it_sees_alone(body, generated):
             assert (grads[name] - total).norm() <= 1e-4 * (1 + total.norm()), name
 
     def squared(scene):
-        """Output and the gradients of the sum of its squared colours, to which every camera adds its own part."""
+        """Output and gradients of the sum of squared colours, to which every camera adds its own part."""
         _, dtype, device = BODIES[body]
         leaves = scene.leaves(dtype, device)
         out = scene.run(body, leaves)

@@ -1,4 +1,4 @@
-"""The oracle itself: against closed forms and a loop over pixels, and its gradients against finite differences."""
+"""The float64 reference, compared with closed forms and a loop over pixels; its gradients, with finite differences."""
 
 import math
 
@@ -12,7 +12,7 @@ from torch_backend.raster.reference import rotation_matrices, sh_basis
 
 
 def pixel_alphas(scene, antialiased=False):
-    """Alphas [H, W, N] before cut and clamp, and camera depths [N], by the textbook, one Gaussian after the other."""
+    """Textbook alphas [H, W, N] before threshold and clamp, and camera depths [N], computed per Gaussian."""
     tensors, K, viewmat = scene.tensors, scene.Ks[0].numpy(), scene.tensors["viewmats"][0].numpy()
     ys, xs = np.mgrid[: scene.height, : scene.width] + 0.5
     alphas, depths = [], []
@@ -39,7 +39,7 @@ def pixel_alphas(scene, antialiased=False):
 
 
 def blended(scene):
-    """What a loop over pixels and Gaussians makes of `pixel_alphas`, by the names of RasterOutput; colours only."""
+    """Blend `pixel_alphas` in a loop over pixels and Gaussians; a dict with names of RasterOutput, colours only."""
     alphas, depths = pixel_alphas(scene)
     height, width, n = alphas.shape
     colors, background = scene.tensors["colors"].numpy(), scene.tensors["background"].numpy()
@@ -79,7 +79,7 @@ def test_centre_pixel_of_one_gaussian_is_the_closed_form(tools):
     opacity = 1 / (1 + math.exp(-0.7))
     assert out.alphas[0, 8, 8].item() == pytest.approx(opacity, rel=1e-12)
     assert out.colors[0, 8, 8].tolist() == pytest.approx([0.8 * opacity, 0.4 * opacity, 0.2 * opacity])
-    # sigma in px: 20 * 0.2 / 2 = 2, squared and blurred 4.3; three pixels aside.
+    # sigma is 20 * 0.2 / 2 = 2 px; squared and blurred it is 4.3; the pixel is three pixels away.
     assert out.alphas[0, 8, 11].item() == pytest.approx(opacity * math.exp(-0.5 * 9 / 4.3), rel=1e-12)
     assert out.depth_expected[0, 8, 8].item() == pytest.approx(2.0)
     assert out.depth_median[0, 8, 8].item() == 2.0
@@ -104,11 +104,11 @@ def test_front_covers_back_whatever_the_order_of_the_inputs(tools):
 
 @pytest.mark.parametrize("shift", [0.0, 2.5])
 def test_images_contributions_and_top_ids_are_those_of_a_loop_over_pixels(tools, shift):
-    # Three by two tiles, two of them cut by the image's edges; with the shift, pixels reach clamp and stop.
+    # Three by two tiles, two of them cut by the image's border; with the shift, pixels reach the clamp and stop.
     scene = tools.cloud(60, 37, 21, seed=11, channels=4)
     scene.tensors["log_scales"] += 0.3 * shift
     scene.tensors["opacity_logits"] += shift
-    for name in ("means", "quats", "log_scales", "opacity_logits"):  # equals: the first one is in front
+    for name in ("means", "quats", "log_scales", "opacity_logits"):  # with equal depths the first Gaussian is in front
         scene.tensors[name][50:] = scene.tensors[name][:10]
     out = scene.run("reference", with_depth=True, with_contributions=True, with_top=True)
     expected = blended(scene)
@@ -164,7 +164,7 @@ def test_quaternions_of_any_length_give_rotations():
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_are_those_of_finite_differences(tools, antialiased):
-    # Broad, faint Gaussians: no pixel near the cut, the clamp or the stop, so that differences see a smooth function.
+    # Wide, faint Gaussians keep every pixel away from threshold, clamp and stop, so that the function is smooth.
     scene = tools.cloud(3, 4, 3, seed=3, channels=4, degree=2)
     scene.tensors["means"] *= torch.tensor([0.1, 0.1, 1.0])
     scene.tensors["log_scales"] = scene.tensors["log_scales"] * 0.3 + 1.5
@@ -204,6 +204,6 @@ def test_absgrad_sums_magnitudes_over_pixels(tools):
     leaves = scene.leaves(torch.float64)
     out = scene.run("reference", leaves)
     out.colors[..., 0].sum().backward()
-    # Symmetric about the mean: the signed sum cancels, the absolute one does not.
+    # Symmetric about the mean: the signed sum cancels, the sum of absolute values does not.
     assert out.means2d_grad[0, 0] < 1e-12
     assert out.means2d_absgrad[0, 0] > 0.1

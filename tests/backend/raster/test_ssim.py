@@ -1,4 +1,4 @@
-"""The compiled SSIMs against the same formulas in float64 torch, differentiated by autograd."""
+"""The compiled SSIM implementations, compared with the same formulas in float64 torch and autograd."""
 
 import threading
 
@@ -12,7 +12,7 @@ from torch_backend.train import losses
 
 
 def reference(x, y):
-    """Mean SSIM of float64 [H, W, C]: windows cut at the border and renormalised, by convolution and autograd."""
+    """Mean SSIM of float64 [H, W, C] by convolution; windows are cut at the border and renormalised."""
     offsets = torch.arange(-5, 6, dtype=torch.float64)
     window = torch.exp(-0.5 * (offsets / 1.5) ** 2)
     kernel = (window[:, None] * window[None])[None, None]
@@ -27,7 +27,7 @@ def reference(x, y):
 
 
 def pair(height, width, channels, noise=0.1):
-    """A smooth target and a noisy image that leaves [0, 1] here and there, as renders do."""
+    """A smooth target and a noisy image that partly leaves [0, 1], as renders do."""
     g = torch.Generator().manual_seed(height * 1000 + width * 10 + channels)
     coarse = torch.rand(1, channels, 3, 4, generator=g)
     target = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bilinear", align_corners=True)
@@ -41,7 +41,7 @@ BODIES = {
     "fibers": (ssim_cuda.ssim, ssim_cuda.photometric, "cpu"),
     "gpu": (ssim_cuda.ssim, ssim_cuda.photometric, "cuda"),
 }
-"""Body: SSIM, the loss, device. `fibers` runs the CUDA kernel on Warp's cpu device."""
+"""Map from implementation to (SSIM, loss, device). `fibers` runs the CUDA kernel on Warp's cpu device."""
 on_every_body = pytest.mark.parametrize(
     "body",
     [
@@ -72,7 +72,7 @@ def test_value_and_gradient_match_float64(body, height, width, channels):
 @pytest.mark.parametrize(("height", "width"), [(11, 11), (37, 23), (13, 640), (640, 13)])
 def test_the_loss_and_its_gradient_match_float64(body, height, width, hides):
     image, target = pair(height, width, 3)
-    image[3, 4] = target[3, 4]  # the slope of |x - y| is 0 there
+    image[3, 4] = target[3, 4]  # here the slope of |x - y| is 0
     generator = torch.Generator().manual_seed(6)
     ignored = torch.rand(height, width, generator=generator) > 0.8 if hides else None
     _, loss, device = BODIES[body]
@@ -143,7 +143,7 @@ def test_callers_in_several_threads_do_not_mix():
 
 
 def test_sizes_may_alternate():
-    """Scratch is reused between calls; what an earlier size left must not leak into the next."""
+    """Scratch memory is reused between calls; data of an earlier size must not affect the next."""
     first, second = pair(48, 64, 3), pair(21, 30, 1)
     before = ssim(*first), ssim(*second)
     assert torch.equal(ssim(*first), before[0])

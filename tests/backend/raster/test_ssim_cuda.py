@@ -1,4 +1,4 @@
-"""The GPU's SSIM kernel; its values and gradients are with those of the other bodies in test_ssim.py."""
+"""The GPU's SSIM kernel; test_ssim.py checks its values and gradients together with the other implementations."""
 
 import pytest
 import torch
@@ -47,7 +47,7 @@ def test_refuses_what_it_cannot_do():
 
 @pytest.mark.parametrize("arch", [75, 90, 120])
 def test_kernels_compile_for_gpus_that_are_not_here(tmp_path, arch):
-    """NVRTC comes with Warp: a GPU's code is made without one. Adam's kernel too."""
+    """NVRTC is part of Warp, so GPU code compiles without a GPU; this includes Adam's kernel."""
     wp = initialised_warp()
     for kernel in (ssim_cuda.kernel(), adam._kernel()):
         folder = tmp_path / kernel.key

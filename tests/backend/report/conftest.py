@@ -1,4 +1,4 @@
-"""The first frame of the bundled clip and what is done to it; the tiny world as a folder of truth."""
+"""The first frame of the bundled clip and damaged versions of it; the tiny world as a ground-truth folder."""
 
 import sys
 from pathlib import Path
@@ -26,7 +26,7 @@ def frame() -> torch.Tensor:
 
 @pytest.fixture(scope="session")
 def damaged(frame):
-    """Damages that a metric has to tell: blur with sigma 1 and 3, and a ghost 6 px aside."""
+    """Damages that a metric must detect: blur with sigma 1 and 3, and a ghost shifted by 6 px."""
 
     def blur(sigma: float) -> torch.Tensor:
         return torch.from_numpy(gaussian_filter(frame.numpy().astype(np.float64), (sigma, sigma, 0))).float()
@@ -36,7 +36,7 @@ def damaged(frame):
 
 @pytest.fixture(scope="session")
 def write_truth(quiet):
-    """Makes a folder of truth of the tiny world: `write_truth(folder)` -> World. Two instants, four poses."""
+    """write_truth(folder): writes a ground-truth folder of the tiny world, with two instants and four poses."""
     build_world, module = sys.modules[quiet.__module__].build_world, sys.modules[quiet.__module__]
 
     def write(folder: Path):
@@ -62,7 +62,7 @@ def save(path: Path, image: torch.Tensor) -> None:
 
 
 def regions_of(world, module, t: int, p: int) -> dict[str, torch.Tensor]:
-    """The regions by truth; the wall is 4 away, which is where pixels of another pose come to lie at t*."""
+    """Ground-truth regions. The wall's depth of 4 gives the pixels of plate t* that show a pose's pixels."""
     without = {k: v[~world.moving] for k, v in world.at(t / (module.FRAMES - 1)).items()}
     pose = {"viewmats": world.viewmats[p : p + 1], "Ks": world.K[None], "background": torch.full((3,), 0.5)}
     wall = rasterize(**without, **pose, width=module.WIDTH, height=module.HEIGHT).colors[0].clamp(0, 1)

@@ -1,4 +1,4 @@
-"""The ablation on the tiny world, and its switches, records and table."""
+"""The ablation benchmark on the tiny world: switches, records and table."""
 
 import argparse
 import dataclasses
@@ -43,7 +43,7 @@ def test_a_rule_is_off_and_on_again(rule):
     before = [held(switch) for switch in rule.switches]
     with pytest.raises(ArithmeticError), switched_off(frozenset({rule.name})):
         assert all(held(switch) is not was for switch, was in zip(rule.switches, before, strict=True))
-        raise ArithmeticError  # even if what is measured fails
+        raise ArithmeticError  # restored even if the measurement fails
     assert [held(switch) for switch in rule.switches] == before
     config = detail_config(frozenset({rule.name}))
     assert all(functools.reduce(getattr, name.split("."), config) == value for name, value in rule.numbers.items())
@@ -62,7 +62,7 @@ def test_groups_of_variants():
 
 
 def brightened(step, made=None):
-    """Developing that changes the scene, whatever it may keep of the tiny run on this processor; `made` counts."""
+    """Develop step that also brightens the scene, so that it has an effect on every CPU; `made` counts its calls."""
 
     def brighten(*args, **more):
         if made is not None:
@@ -74,7 +74,7 @@ def brightened(step, made=None):
 
 
 def test_steps_that_variants_share_are_made_once(instants, clip):
-    """With `develop` off the steps before it are those of today; with frame rules off all of them are."""
+    """Switching `develop` off reuses the earlier steps; switching a frame rule off reuses all steps."""
     made = Counter[str]()
     with replaced("instant.repairs", "develop", functools.partial(brightened, made=made)):
         today = instants.make(frozenset())
@@ -153,13 +153,13 @@ def test_digests_tell_content_and_not_objects():
 
 
 def test_what_is_let_go_is_held_against_what_was_painted(clip, tmp_path, monkeypatch):
-    """The whole plate is painted as another state: a frame's share that is let go of is its IoU."""
+    """The whole plate is painted as another state, so the removed fraction of a frame is its IoU."""
     t_star, frame = clip.run.train_frames[6], clip.run.train_frames[2]
     whole = Polygon(np.array([(0, 0), (clip.width, 0), (clip.width, clip.height), (0, clip.height)], float), "", OTHER)
     painted = Painted("tiny", "", clip.width, clip.height, (Pair(t_star, frame, 0, (whole,)),))
     case, store = Case("tiny", clip, [], None), Store(tmp_path)
     masks.judge_masks(case, store)
-    assert not store.records()  # nobody painted it
+    assert not store.records()  # no masks were painted for this clip
     monkeypatch.setattr(masks, "CLIPS", (clip.shot.info().source.rpartition("/")[2].partition(".")[0],))
     monkeypatch.setattr(masks, "load_masks", lambda _: painted)
     monkeypatch.setattr(masks, "load_plate_lenses", lambda _: {frame: AsItIs()})
@@ -171,7 +171,7 @@ def test_what_is_let_go_is_held_against_what_was_painted(clip, tmp_path, monkeyp
 
 
 class AsItIs:
-    """A lens that bends nothing."""
+    """Lens without distortion."""
 
     def where(self, width: int, height: int) -> np.ndarray:
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)

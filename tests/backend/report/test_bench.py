@@ -1,4 +1,5 @@
-"""The benchmark on the tiny world: children train, freeze, score and are killed; the report reads what they left."""
+"""The benchmark on the tiny world: child processes train, freeze, score and are killed; the report reads their
+results."""
 
 import dataclasses
 import json
@@ -36,7 +37,7 @@ def scene(tmp_path_factory, write_truth):
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory, scene):
-    """Results of static and auto, run by children, and of auto's run asked otherwise."""
+    """Results of static and auto from child processes, and of auto's run with another query."""
     results = tmp_path_factory.mktemp("results")
     runs, said = plan([f"truth:{scene[0]}"], results, **SIZE)
     runs = only(runs, ("auto", "support"), ("static", "none"))
@@ -64,7 +65,7 @@ def test_the_plan_is_every_host_with_and_without_and_says_what_is_missing(scene,
     main = {r.run_name for r in runs if r.variant == "default"}
     asked = [r for r in runs if r.variant.startswith("frozen")]
     assert {r.supervision for r in asked} == {"none", "paper", "support"}
-    assert {r.run_name for r in asked} <= main  # trained once, asked twice
+    assert {r.run_name for r in asked} <= main  # trained once, queried twice
     assert not only(plan([f"truth:{scene[0]}"], tmp_path)[0], ("auto", "none"))
 
 
@@ -82,7 +83,7 @@ def test_a_run_is_named_after_scene_and_settings():
     assert spec.query == "nearest" and RunSpec("", "", "mlp", "paper", "preview").query == "plain"
     changed = [{"scene_key": "abd"}, {"seed": 1}, {"query": "plain"}, {"overrides": {"exposure.on": False}}]
     assert len({spec.run_id, *(dataclasses.replace(spec, **c).run_id for c in changed)}) == 5
-    assert dataclasses.replace(spec, query="plain").run_name == spec.run_name  # trained once, asked twice
+    assert dataclasses.replace(spec, query="plain").run_name == spec.run_name  # trained once, queried twice
 
 
 def test_an_override_that_does_not_exist_is_refused():
@@ -106,13 +107,13 @@ def test_a_record_holds_every_frame_and_its_regions(done, scene):
         assert unseen[103, 103] is None and unseen[103, 114] > 5  # t*'s own pose sees nothing new
         assert record.host == spec.host and record.iterations == 60 and record.heldout_psnr_db is not None
         assert record.jobs == 2 and record.threads == max(1, len(cores()) // 2) and 0 < record.step_ms < 60_000
-        # Measured on the plate as 8-bit PNG here, by the trainer on the same in half precision.
+        # The benchmark measures 8-bit PNG plates, the trainer the same plates in half precision.
         psnr = [row.psnr_db["whole"] for row in record.heldout]
         assert psnr and sum(psnr) / len(psnr) == pytest.approx(record.heldout_psnr_db, abs=0.02)
         assert record.frozen_fps > 0 and 1e4 < record.model_bytes < 1e7 and record.train_cpu_seconds > 0
         assert all((results / p.ours).is_file() and (results / p.truth).is_file() for p in record.pictures)
         assert [p.psnr_db for p in record.pictures] == sorted(p.psnr_db for p in record.pictures)
-        # The same with plate detail; what is delivered at t*'s own pose is the truth itself, and does not count.
+        # The same with plate detail. The delivered frame at t*'s own pose equals the truth and is left out.
         poses = [(r.t_star, r.pose) for r in record.rows]
         for shown in (DEVELOPED, WITHHELD):
             assert [(r.t_star, r.pose) for r in record.detailed[shown].rows] == poses
@@ -154,7 +155,7 @@ def test_published_settings_are_what_is_trained(scene, tmp_path):
 
 
 def test_the_last_third_of_a_run_has_a_pace_of_its_own(tmp_path):
-    # Ten measurements of 100 steps of 20 ms, from the 7th on of 50 ms; the 8th was made twice, around an interruption.
+    # Ten measurements of 100 steps: 20 ms per step, then 50 ms from the 7th on; an interruption repeated the 8th.
     rows = [{"iteration": 100 * n, "seconds": 2.0 * min(n, 6) + 5.0 * max(0, n - 6)} for n in range(1, 11)]
     rows.insert(7, {"iteration": 800, "seconds": 99.0})
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -194,7 +195,7 @@ def test_killed_twice_it_ends_as_if_it_had_not_been(done, tmp_path, write_truth)
         bench.send_signal(signal.SIGKILL)
         bench.wait()
         log.unlink(missing_ok=True)
-    # What the killed ones started may still be at its last checkpoint: nothing waits for that here.
+    # Children of the killed process may still be writing their last checkpoint; nothing waits for them here.
     assert run_plan(specs, again, 2) == []
     for spec in specs:
         assert not working(spec.run_id)
@@ -205,7 +206,7 @@ def test_killed_twice_it_ends_as_if_it_had_not_been(done, tmp_path, write_truth)
 
 
 def working(run_id: str) -> bool:
-    """True if a child of that run is alive."""
+    """True if a child process of that run is alive."""
     found = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True)
     return any(run_id in line and "--work" in line for line in found.stdout.splitlines())
 

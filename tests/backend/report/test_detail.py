@@ -1,4 +1,4 @@
-"""The benchmarks of plate detail on a trained shot whose moving patch is known."""
+"""Benchmarks of plate detail on a trained shot with a known moving patch."""
 
 import itertools
 import json
@@ -48,7 +48,7 @@ def test_delivered_is_the_plate_where_nothing_moves_and_withheld_is_not(shot, tm
 
 
 def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
-    """The patch goes up to 7 pixels a frame, of frames that are 320 wide; frozen it does not."""
+    """At a width of 320 the patch moves by up to 7 pixels per frame in the plates, but not in the frozen frames."""
     clip = open_clip(shot.root, width=320, develop=False)
     t_star = clip.frames[8]
     found = detail_flow.judge_flow(clip, t_star, [(109, 110), (110, 111)])
@@ -57,7 +57,7 @@ def test_what_moves_in_the_plates_stands_in_the_freeze(shot):
     assert restless["plate"] > 1.5 * restless["delivered"] and restless["plate"] > 3 * restless["splats"]
     assert restless["plate"] > 10 * steady["plate"] and steady["delivered"] == pytest.approx(steady["plate"], rel=1e-3)
     assert all(found["clip"][what]["moving"]["pixels"] > 5000 for what in detail_flow.WHAT)
-    # The tiny world is smooth at this size: where no flow is to be had, none is told.
+    # The tiny world is too smooth at this size, so no flow is reported.
     assert [(row["frame"], row["next"]) for row in found["frames"]] == [(109, 110), (110, 111)]
     assert found["clip"]["delivered"]["excess_px"] is None
     assert "| t* 109, plate | – | – |" in detail_flow.table("tiny", [found])[2]
@@ -91,12 +91,12 @@ def test_a_frame_that_is_not_the_clips_is_refused_in_words(shot, tmp_path, capsy
 
 
 def test_costs_are_of_plates_of_that_size(shot, tmp_path):
-    """A child reads plates twice as wide from footage, not the working frames, and tells seconds and memory."""
+    """A child process reads plates of twice the width from the footage and reports seconds and memory."""
     clip = open_clip(shot.root)
     poses = detail_cost.middle_poses(clip, 2)
     assert poses == [108, 109]
     before = (shot.root / "frames" / "frames.json").read_bytes()
-    with pytest.raises(ValueError, match="not read: .*no cameras"):  # of a lens that is not told
+    with pytest.raises(ValueError, match="not read: .*no cameras"):  # the solve has no lens
         detail_cost.enlarged(shot, tmp_path / "without", 2, poses)
     solved = Shot.open(shutil.copytree(shot.root, tmp_path / shot.root.name))
     lens = {"camera_model": "PINHOLE", "distortion": [], "focal_px": 60.0}

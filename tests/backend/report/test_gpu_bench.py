@@ -1,4 +1,4 @@
-"""The script for a card that is at hand for half an hour goes through its stages without one."""
+"""The script for a GPU that is available for half an hour runs through its stages without a GPU."""
 
 import json
 

@@ -61,7 +61,7 @@ def test_a_region_is_judged_by_its_own_pixels():
 def test_an_empty_region_has_no_figure(noisy):
     none = torch.zeros(noisy[0].shape[:2], dtype=torch.bool)
     few = none.clone()
-    few[0, :4] = True  # 4 of 2240 pixels: below the least share
+    few[0, :4] = True  # 4 of 2240 pixels, below the minimum share
     rows = score(*noisy, {"none": none, "few": few})
     assert rows["none"] == {"pixels": 0, "psnr_db": None, "ssim": None, "st_lpips": None, "flip": None}
     assert rows["few"]["psnr_db"] is None and rows["few"]["pixels"] == 4
@@ -81,7 +81,7 @@ def test_sizes_that_differ_are_refused():
 
 @needs_lpips
 def test_st_lpips_of_the_bundled_frame(frame, damaged):
-    """The package's own network gives the same on this frame, to 1e-8 (seen on 2026-11-21, beside a CPU torch)."""
+    """The package's own network gives the same values on this frame within 1e-8 (2026-11-21, with CPU torch)."""
     values = {name: float(error_maps(image, frame)["st_lpips"].mean()) for name, image in damaged.items()}
     assert values["blur1"] == pytest.approx(0.158, abs=0.002)
     assert values["blur3"] == pytest.approx(0.687, abs=0.005)
@@ -141,7 +141,7 @@ def test_what_is_missing_is_said():
 def test_best_share_and_gradient_energy():
     truth = torch.zeros(10, 10, 3)
     image = truth.clone()
-    image[0] = 1.0  # a tenth of the pixels is wrong altogether
+    image[0] = 1.0  # a tenth of the pixels is completely wrong
     assert best_share_psnr(image, truth, 0.9) == 120.0
     assert best_share_psnr(image, truth, 1.0) == pytest.approx(10.0)
     edge = torch.zeros(8, 8, 3)
@@ -179,7 +179,7 @@ def test_a_clear_gain_is_a_win_and_its_mirror_a_loss():
 
 
 def test_runs_that_disagree_decide_nothing_however_many_frames_they_have():
-    """Two runs up by 3, two down by 1: 400 frames say +1 with a tiny error, the four runs do not."""
+    """Two runs differ by +3, two by -1: 400 frames suggest +1 with a tiny error, the four runs do not."""
     result = paired(rows(1.0, frames=100, spread=2.0, noise=0.01), rows(0.0, frames=100))
     assert result.mean > 5 * result.frame_se
     assert result.verdict == "undecided" and result.se == pytest.approx(2 / math.sqrt(3), abs=0.05)
@@ -193,7 +193,7 @@ def test_few_runs_are_compared_by_freezes_then_by_frames():
     one = {("s", "exact", 0, 0, 0): 1.0}
     assert paired(one, {("s", "exact", 0, 0, 0): 0.0}).verdict == "undecided"
     assert paired(one, {}) is None
-    three = {("s", "exact", 0, 0, p): 5.0 + 0.01 * p for p in range(3)}  # 500 standard errors of three frames
+    three = {("s", "exact", 0, 0, p): 5.0 + 0.01 * p for p in range(3)}  # three frames, 500 standard errors from zero
     assert paired(three, dict.fromkeys(three, 0.0)).verdict == "undecided"
 
 

@@ -1,4 +1,4 @@
-"""The bench of the model behind the picture: what it judges, and on which frames."""
+"""Benchmark of the model without plates: judged models and frames."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from torch_backend.shot import Shot, write_json
 def test_a_trained_run_is_judged_frozen_and_developed_on_frames_that_it_has_not_seen(trained, tmp_path):
     world, _ = trained
     command = [str(world.shot.root), "--run", "main", "--results", str(tmp_path), "--t-star", "103", "--develop"]
-    # So sharp a run loses on plate t* unless that is learnt more than others, and is left as it was then.
+    # Without a large `instant_share`, developing makes this sharp run worse on plate t*, and its result is discarded.
     assert main([*command, "--develop-set", "steps=40", "gain=-99", "instant_share=0.6", "--held", "1"]) == 0
     result = json.loads((tmp_path / "model.json").read_text())
     figures = result["figures"]
@@ -37,7 +37,7 @@ def test_what_the_mask_ignores_is_not_judged(trained, tmp_path):
     shot = Shot(shutil.copytree(world.shot.root, tmp_path / "logo.splannequin"))
     plate = shot.frames / "000109.png"
     pixels = read_png(plate)
-    pixels[: len(pixels) // 2] = 255 - pixels[: len(pixels) // 2]  # half the plate shows something else
+    pixels[: len(pixels) // 2] = 255 - pixels[: len(pixels) // 2]  # half of the plate shows something else
 
     def whole(name: str) -> float:
         assert main([str(shot.root), "--run", "main", "--results", str(tmp_path / name), "--t-star", "103"]) == 0

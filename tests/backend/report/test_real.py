@@ -1,4 +1,4 @@
-"""The regions of a real clip come from its motion matte: still, far from movers; what is unknown is neither."""
+"""Regions of a real clip from its motion mattes: static, away from movers; unknown pixels belong to neither region."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def shot(quiet, tmp_path_factory):
 
 
 def painted(shot, frame: int) -> np.ndarray:
-    """A band of each label, painted over the frame's matte."""
+    """Paint a band of each label over the frame's matte."""
     info = shot.info()
     labels = np.full((info.height, info.width), STILL, np.uint8)
     labels[:, : info.width // 4] = MOVING

@@ -1,4 +1,4 @@
-"""The report of example records: made here from the bundled frame and its damages, so that what is right is known."""
+"""Report of example records, which are built from the bundled frame with known damages."""
 
 import json
 import os
@@ -36,7 +36,7 @@ STRENGTH = {"none": 0.9, "paper": 0.6, "support": 0.35}
 
 
 def example(results: Path, frame: torch.Tensor, scene: str, seed: int, host: str, supervision: str) -> RunRecord:
-    """A record whose frames are blurred and shifted crops of a real one, the more the fewer anchors there are."""
+    """Record whose frames are blurred and shifted crops of a real frame; fewer anchors mean stronger damage."""
     height, width = 90, 160
     rng = np.random.default_rng([len(scene), seed, len(host), len(supervision)])
     strength = 0.3 if host == "auto" else 0.8 if host == "static" else STRENGTH[supervision]
@@ -86,7 +86,7 @@ def example(results: Path, frame: torch.Tensor, scene: str, seed: int, host: str
 
 
 def sharper(row: FrameScore, gain: float) -> FrameScore:
-    """The same frame, better by `gain` dB everywhere."""
+    """The same frame with all PSNR values raised by `gain` dB."""
     regions = {
         name: {**of, "psnr_db": None if of["psnr_db"] is None else of["psnr_db"] + gain}
         for name, of in row.regions.items()
@@ -108,7 +108,7 @@ def results(tmp_path_factory, frame):
 def report(results):
     said = ["SC-GS is not in this report: the trainer has no host 'control_points'."]
     write_report(results, results / "report", None, said, "python3 splannequin.py bench <quick>")
-    # A person may want to look at it: REPORT_EXAMPLE=/tmp/example pytest ...
+    # For manual inspection: REPORT_EXAMPLE=/tmp/example pytest ...
     if os.environ.get("REPORT_EXAMPLE"):
         shutil.copytree(results / "report", os.environ["REPORT_EXAMPLE"], dirs_exist_ok=True)
     return results / "report"
@@ -155,7 +155,7 @@ def test_what_is_compared_with_what(results):
 
 
 def test_every_table_has_a_row_of_what_is_delivered(results):
-    """And figures of it: in the table of who wins by region, beside splats alone in the others."""
+    """It also has figures: by region in the table of wins, and beside splats alone in the other tables."""
     tables = {table.title: table for table in all_tables(load_records(results))}
     kinds = ("developed", "plate detail, plate withheld", "plate detail")
     for title, table in tables.items():
@@ -171,7 +171,7 @@ def test_every_table_has_a_row_of_what_is_delivered(results):
     cost = {row[0]: row for row in tables["What it cost (synthetic scenes)"].rows}
     fps, held = (tables["What it cost (synthetic scenes)"].header.index(n) for n in ("frozen frames / s", "moving"))
     assert cost["auto (ours), plate detail"][fps] == "3.0" and cost["auto (ours)"][fps] == "240.0"
-    # A run's own frames at their own times are no freezes.
+    # A run's own frames at their own times are not frozen frames.
     assert cost["auto (ours), plate detail"][held] == "–" != cost["auto (ours)"][held]
 
 

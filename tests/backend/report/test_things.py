@@ -1,4 +1,4 @@
-"""What hard scenes are judged by, on pictures of a few pixels."""
+"""Metrics of hard scenes, on pictures of a few pixels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def plain(color: torch.Tensor) -> torch.Tensor:
 
 @pytest.fixture
 def apple():
-    """(truth, behind, mask): an apple of 4x4 pixels before a wall, one of which the wall paints alike."""
+    """(truth, background, mask): an apple of 4x4 pixels in front of a wall; at one pixel the wall has its colour."""
     mask = torch.zeros(8, 12, dtype=torch.bool)
     mask[2:6, 4:8] = True
     truth, behind = plain(WALL), plain(WALL)
@@ -51,7 +51,7 @@ def test_a_pixel_is_recalled_if_near_the_truth_and_nearer_than_to_what_is_behind
     assert recalled(green, truth, behind, mask) == (0, 15), "like neither"
     alike = (truth + 0.16).where(mask[..., None], truth)
     assert recalled(alike, truth, behind, mask) == (0, 15) and recalled(truth + 0.14, truth, behind, mask) == (15, 15)
-    close = truth.lerp(behind, 0.3)  # 0.12 from the truth, but only 0.08 from what is behind
+    close = truth.lerp(behind, 0.3)  # 0.12 from the truth, but only 0.08 from the background
     assert recalled(close, truth, truth.lerp(behind, 0.5), mask)[0] == 0
 
 
@@ -71,7 +71,7 @@ def test_a_pane_is_opened_where_the_matte_says_so():
 
 
 class Framed:
-    """Two frames of a clip with a pane on the left half of the first and the whole of the second."""
+    """Two frames with a pane: it covers the left half of the first frame and the whole second frame."""
 
     def __init__(self, shot: Shot) -> None:
         self.shot = shot
@@ -87,7 +87,7 @@ def test_the_matte_on_panes_is_a_share_of_their_pixels(tmp_path):
     shot = Shot.create(tmp_path / "panes.splannequin")
     shot.update(width=16, height=4)
     first, second = (torch.full((4, 16), STILL, dtype=torch.uint8).numpy() for _ in range(2))
-    first[:, :4], first[:, 8:] = MOVING, MOVING  # the latter is no pane
+    first[:, :4], first[:, 8:] = MOVING, MOVING  # the right part is outside the pane
     second[:, :8] = UNKNOWN
     for frame, labels in ((1, first), (2, second)):
         write_matte(shot.root / PAINTED / f"{frame:06d}.png", labels)
@@ -96,7 +96,7 @@ def test_the_matte_on_panes_is_a_share_of_their_pixels(tmp_path):
 
 
 def record(host: str, supervision: str, counts: list[list[int]], error: float) -> RunRecord:
-    """A run of two poses: an apple that is found so often, glass that is off by `error`, a wall by half of that."""
+    """Record of two poses: recall counts of an apple, glass with error `error`, a wall with half of it."""
     glass = torch.zeros(30, 40, dtype=torch.bool)
     glass[:, :20] = True
     truth = torch.full((30, 40, 3), 0.5)

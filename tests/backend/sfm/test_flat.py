@@ -1,4 +1,4 @@
-"""A flat scene is told from one with depth by its points, whatever lies off the plane by error."""
+"""Flat scenes are distinguished from scenes with depth by their points, despite outliers."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ RNG = np.random.default_rng(0)
 
 
 def turned(points):
-    """In no particular frame of reference."""
+    """Points in a random frame of reference."""
     axes = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
     return points @ axes * 7.0 + RNG.normal(size=3) * 30.0
 
 
 @pytest.fixture
 def poster():
-    """[3000, 3] of a plane, a hundredth of them misplaced."""
+    """[3000, 3] points of a plane, 1 % of them misplaced."""
     points = np.concatenate([RNG.uniform(-1, 1, (3000, 2)) * [2.0, 1.0], RNG.normal(0, 1e-3, (3000, 1))], axis=1)
     points[:30] += RNG.normal(0, 0.5, (30, 3))
     return points

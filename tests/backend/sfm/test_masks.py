@@ -1,4 +1,4 @@
-"""Masks in a solve: what they keep out of it, how they lie over the undistorted frames, what may move with them."""
+"""Masks in a solve: excluded features, undistorted masks, and motion at their borders."""
 
 import shutil
 
@@ -30,14 +30,14 @@ COUNT, FEATURES = 11, 1500
 
 
 def board(n):
-    """bool [240, 320]: where a board is that goes across the picture by itself."""
+    """bool [240, 320]: a board that moves across the picture."""
     x, y = np.meshgrid(np.arange(320), np.arange(240))
     return (abs(x - (115 + 9 * n)) < 105) & (abs(y - (110 + 2 * n)) < 92)
 
 
 @pytest.fixture(scope="module")
 def masked(tmp_path_factory, tools):
-    """The room with a patterned board in front that covers half of the picture, solved with a mask of the board."""
+    """The room with a patterned board in front that covers half of the picture; the solve has a mask of the board."""
     folder = tmp_path_factory.mktemp("masked")
     poses = tools.handheld(COUNT)
     (folder / "clip").mkdir()
@@ -72,7 +72,7 @@ def test_the_camera_is_solved_from_what_is_not_masked(masked):
 
 
 def test_the_mask_lies_over_the_undistorted_frames_as_over_the_filmed_ones(masked):
-    """The board is patterned and the mask its outline: undistorted by another map it would end beside the board."""
+    """The mask ends at the board's outline. With another undistortion map, it would not."""
     shot, *_ = masked
     lens = read_json(shot.solve_record)["lenses"][0]["params"]
     focal, cx, cy, k = lens[0], *lens[1:4]
@@ -163,7 +163,7 @@ def test_a_logo_is_painted_over_before_flow_looks_and_nothing_moves_at_its_rim()
     logo = np.zeros((240, 320), bool)
     logo[100:140, 200:260] = True
     burnt = np.where(logo[..., None], np.uint8(255), plain)
-    burnt[99:141, 199:261] |= 32  # its soft edge
+    burnt[99:141, 199:261] |= 32  # soft edge of the logo
     assert np.abs(painted_over(burnt, logo).astype(int) - plain).max() < 8
     labels = np.full((240, 320), MOVING, np.uint8)
     limited(labels, logo, None)

@@ -1,4 +1,4 @@
-"""Pairs are matched by several processes, and nothing of the database shows by how many."""
+"""Pairs are matched by several processes, and the database does not depend on their number."""
 
 import json
 import shutil
@@ -27,7 +27,7 @@ match(request)
 
 
 def matched(folder: Path, least: int, python: str = sys.executable) -> list:
-    """Everything in the database after `folder`'s request was matched, at least so many pairs a process."""
+    """All matches in the database after `folder`'s request was processed, with at least `least` pairs per process."""
     command = [sys.executable, "-P", "-c", MATCH, str(folder / REQUEST_FILE), str(least), python]
     root = Path(__file__).resolve().parents[3]
     subprocess.run(command, env=child_environment(root), check=True, stdout=subprocess.DEVNULL)
@@ -39,7 +39,7 @@ def matched(folder: Path, least: int, python: str = sys.executable) -> list:
 
 @pytest.fixture(scope="module")
 def alone(solved, tmp_path_factory):
-    """(A folder with a request, and the database that one process makes.)"""
+    """(folder with a request, database contents of one process)."""
     folder = tmp_path_factory.mktemp("alone")
     names = sorted(path.name for path in solved.shot.raw.glob("*.png"))[:8]
     request = {
@@ -51,7 +51,7 @@ def alone(solved, tmp_path_factory):
 
 
 def unmatched(folder: Path, into: Path) -> Path:
-    """A copy of a folder whose database has features alone."""
+    """Copy of a folder whose database has only features."""
     shutil.copytree(folder, into)
     with sqlite3.connect(into / "database.db") as database:
         database.execute("delete from matches")

@@ -1,4 +1,4 @@
-"""Which points of a solve are trained from, and when they tell too little of depth."""
+"""Points of a solve that training uses, and when they constrain depth too little."""
 
 import numpy as np
 import pytest

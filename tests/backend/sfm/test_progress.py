@@ -1,4 +1,4 @@
-"""A solve is one bar with one estimate, and its cameras are there before it ends."""
+"""A solve has one progress bar with one estimate, and its cameras are available before it ends."""
 
 import json
 import shutil
@@ -18,7 +18,7 @@ FRAMES = {"width": 640, "height": 480, "frames": [{"solve": n % 2 == 0} for n in
 
 
 class Heard(Reporter):
-    """Keeps the bar; ends all in the moment in which the cameras are known if asked to, as a kill would."""
+    """Records the progress; with `stop`, cancels when the cameras are known, as a kill would."""
 
     def __init__(self, stop=False):
         self.bar, self.metrics, self.stop = [], [], stop
@@ -71,7 +71,7 @@ def test_a_search_for_motion_that_goes_on_begins_at_nothing_and_what_is_no_stage
 
 
 def test_the_estimate_is_of_all_that_is_left():
-    """Half of the weight took as long as the other half will, whatever stages it is made of."""
+    """Half of the weight is done, so the other half will take as long, independent of its stages."""
     now = [100.0]
     heard = Heard()
     bar = OneBar(heard, {"features": 30.0, "matches": 20.0, "motion": 50.0}, lambda: now[0])

@@ -1,4 +1,4 @@
-"""A camera that turns on the spot, told from one that passes a wall: by homographies that are known."""
+"""A purely rotating camera is distinguished from one that passes a wall, with known homographies."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def turn(yaw, pitch=0.0):
 
 
 def pairs(moved):
-    """(homographies, shifts of the picture's middle) of pairs whose second camera is `moved` [3, 3] in rays."""
+    """(homographies, shifts of the picture's centre) of pairs whose second camera is transformed by `moved` [3, 3]."""
     homographies = np.array([LENS @ m @ np.linalg.inv(LENS) for m in moved])
     middle = np.array([320.0, 240.0, 1.0])
     there = homographies @ middle
@@ -39,7 +39,7 @@ def test_a_sway_of_a_hundredth_of_the_distance_is_turning_still():
 
 @pytest.mark.parametrize("normal", [FACING, np.array([0.6, 0.0, 0.8])])
 def test_walking_past_a_wall_is_not(normal):
-    """A wall is explained by homographies as well as a turn is. Seen straight on it shifts as a turn's middle does."""
+    """Homographies explain a wall as well as a rotation; seen frontally, both shift the picture's centre alike."""
     moved = [np.eye(3) + np.outer([0.02 * n, 0.0, 0.0], normal) for n in range(1, 12)]
     assert not is_pure_rotation(*pairs(moved), SIZE)
     turned = [r + np.outer([0.02 * n, 0.0, 0.0], normal) for n, r in enumerate(TURNS, 1)]

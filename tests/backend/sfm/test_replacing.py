@@ -1,4 +1,4 @@
-"""A solve over a finished one: the old one stays until the new one is whole, wherever the process is killed."""
+"""A new solve replaces a finished one only when it is complete, wherever the process is killed."""
 
 import hashlib
 import shutil
@@ -43,14 +43,15 @@ solve_shot(shot, SolveConfig(), Report(), sys.argv[4])
 
 
 def contents(shot):
-    """{name: hash} of what readers of a solved shot read; the motion matte comes after, and knows whose it is."""
+    """{name: hash} of the files that readers of a solved shot use; motion mattes come later and store their solve's
+    key."""
     files = [p for folder in (shot.frames, shot.solve) for p in folder.rglob("*") if p.is_file()]
     read = [p for p in files if p.name != "colmap.log" and not {"scratch", "motion"} & {*p.parts}]
     return {p.relative_to(shot.root).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in read}
 
 
 def of_old(shot, before):
-    """True if all that readers read is as it was; what a killed process left beside it is not read."""
+    """True if all files that readers use are unchanged; leftovers of a killed process are ignored."""
     now = contents(shot)
     return {name: now.get(name) for name in before} == before
 

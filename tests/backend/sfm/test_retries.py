@@ -1,4 +1,4 @@
-"""What is tried where the first solve fails: by COLMAP, of a rendered room that its first try cannot take."""
+"""Retry strategies after a failed first solve, with COLMAP on a rendered room that the first attempt cannot solve."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ LENS = {"doubt": "", "held": False, "found_deg": 60.0, "view_deg": 60.0, "found_
 
 
 def attempt(kind, registered=20, lens=LENS, error=0.8, solved=60):
-    """A try that came to a fault of `kind`, or to none; none registered: a failure."""
+    """Attempt with a fault of `kind`, or without one; `registered` 0 is a failure."""
     fault = Fault(kind, JobError(f"It is {kind}.", "Hint.", ExitCode.SOLVE)) if kind else None
     found = {"registered": registered, "reprojection_error_px": error, "lens": lens}
     answer = {"result": found} if registered else {"failure": "bare"}
@@ -26,7 +26,7 @@ def attempt(kind, registered=20, lens=LENS, error=0.8, solved=60):
 
 
 def rungs(best, **changes):
-    """(name, changed) of all that is tried while `best` stays the best."""
+    """(name, changes) of all strategies that are tried while `best` stays the best."""
     done = ["first"]
     found = []
     while (rung := next_strategy(best, {**ASKED, **changes}, set(done))) is not None:
@@ -57,7 +57,7 @@ OPENCV, FISHEYE = ("lens", "OPENCV"), ("lens", "OPENCV_FISHEYE")
         (attempt("unmatched", 0), MATCHING),
         (attempt("few"), [*MATCHING, OPENCV, ("global", "global")]),
         (attempt("poor", 40), [*MATCHING, OPENCV, ("global", "global")]),
-        # All frames found their place, and fit badly: more matches do not help.
+        # All frames are registered with a large error: more matches do not help.
         (attempt("poor", 60, error=3.0), [OPENCV, ("pairs", True)]),
         (attempt("lens", 60), [OPENCV, ("pairs", True)]),
         (attempt("lens", 60, {**LENS, "doubt": "bent", "found_bend": -0.3}), [FISHEYE, ("pairs", True)]),
@@ -114,7 +114,7 @@ def test_of_two_tries_that_came_to_the_same_the_first_keeps_its_files(tmp_path, 
 
 @pytest.fixture(scope="module")
 def fog(tmp_path_factory, tools):
-    """The room through fog, 6 % of its contrast: COLMAP's own threshold finds nothing in it."""
+    """The room through fog at 6 % contrast: COLMAP's default threshold finds no features."""
     folder = tmp_path_factory.mktemp("fog")
     clip = tools.write_clip(folder, tools.handheld(10), noise=0.3, contrast=0.06)
     shot = Shot.create(folder / "fog.splannequin")
@@ -132,7 +132,7 @@ def test_a_clip_that_the_first_try_cannot_take_is_solved_with_more_features_and_
     assert report.warnings[0].startswith("The frames show too little to match: ")
     assert report.warnings[0].endswith("Trying again with up to 2000 features a frame, faint ones too.")
     assert record["focal_px"] == pytest.approx(300.0, rel=0.02)
-    # Both tries' words are in the log, and nothing of either is left besides.
+    # The log has the output of both attempts, and their other files are removed.
     assert not (fog.solve / "scratch").exists() and (fog.solve / "colmap.log").stat().st_size
 
 
@@ -180,7 +180,7 @@ def test_a_fisheye_that_was_taken_for_an_ordinary_lens_is_solved_as_one(tmp_path
 
 
 def test_what_cannot_be_solved_is_refused_after_all_tries_and_each_runs(tmp_path, tools):
-    """Five frames of a room, and nothing in the other six."""
+    """Five frames show a room, the other six show noise."""
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)) for pose in tools.handheld(14)[:5]]
     rng = np.random.default_rng(3)
     pictures += [rng.integers(0, 256, (240, 320, 3), np.uint8) for _ in range(6)]

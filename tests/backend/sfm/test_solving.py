@@ -1,4 +1,4 @@
-"""The whole solve, by COLMAP, of a rendered room: against the cameras it was rendered from."""
+"""The whole solve with COLMAP on a rendered room, compared with the cameras that rendered it."""
 
 import json
 import shutil
@@ -33,7 +33,7 @@ def cameras(shot):
 
 
 def align(viewmats, truths):
-    """Scale, rotation, translation from the solve's world to the true one: the rotation from all orientations."""
+    """(scale, rotation, translation) from the solve's world to the true one; the rotation uses all orientations."""
     u, _, vt = np.linalg.svd(sum(true[:3, :3].T @ got[:3, :3] for got, true in zip(viewmats, truths)))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     source, target = (np.array([camera_centre(v) for v in group]) for group in (viewmats, truths))
@@ -57,7 +57,7 @@ def test_cameras_are_those_it_was_rendered_from(solved):
     viewmats = np.array([np.reshape(f.viewmat, (4, 4)) for f in path.frames])
     scale, rotation, shift = align(viewmats, solved.poses)
     centres = scale * np.array([camera_centre(v) for v in viewmats]) @ rotation.T + shift
-    # The path is 1.5 long.
+    # The camera path is 1.5 long.
     assert np.abs(centres - [camera_centre(v) for v in solved.poses]).max() < 0.01
     for viewmat, true in zip(viewmats, solved.poses):
         between = viewmat[:3, :3] @ rotation.T @ true[:3, :3].T
@@ -76,7 +76,7 @@ def test_undistorted_frames_are_what_a_pinhole_sees(solved, tools):
         return np.sqrt(((a.astype(float) - b) ** 2).mean())
 
     path = cameras(solved.shot)
-    # A sideways path trades a little focal length for depth: the lens that made the pictures is what they show.
+    # On a sideways path, focal length and depth are slightly ambiguous; frames show the lens that rendered them.
     bias = 300.0 / read_json(solved.shot.solve / "solve.json")["focal_px"]
     for i in (0, 7, 20):
         fx, fy, cx, cy = np.array(path.frames[i].K) * [bias, bias, 1.0, 1.0]
@@ -141,7 +141,7 @@ def test_a_solved_shot_is_left_alone(solved, tools):
 
 
 def test_every_frame_of_a_solve_has_a_motion_matte(solved):
-    """Those that the step left out too. Nothing moves in the room."""
+    """This includes frames that the step left out. Nothing moves in the room."""
     path = cameras(solved.shot)
     for camera in path.frames:
         labels = load_motion(solved.shot, camera.frame)
@@ -163,7 +163,7 @@ def test_a_solve_holds_without_its_motion_matte_and_the_next_one_finds_it(solved
 
 
 def test_the_same_frames_give_the_same_cameras(solved, tools, tmp_path):
-    """To the last bit: seeds are fixed, and nothing that adds or matches does so in two threads."""
+    """Bit-identical: seeds are fixed, and no sums or matches are computed in two threads."""
     shot = Shot.create(tmp_path / "again.splannequin")
     import_footage(shot, solved.shot.info().source, FootageConfig(step=2), tools.recorder())
     solve_shot(shot, SolveConfig(features=1500), tools.recorder())
@@ -172,7 +172,7 @@ def test_the_same_frames_give_the_same_cameras(solved, tools, tmp_path):
 
 
 def test_pairs_are_matched_by_one_thread_of_a_process():
-    """Two get wrong products of OpenBLAS now and then: too seldom for a test to meet."""
+    """With two threads OpenBLAS occasionally returns wrong products, too rarely for a test."""
     code = "from torch_backend.sfm.pairs import one_thread\nassert one_thread().num_threads == 1"
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -276,7 +276,7 @@ def test_a_poor_solve_says_which_frames_worked_and_only_what_can_help(step, part
 
 def test_a_failed_solve_leaves_colmaps_last_words_in_the_job_s_log(tmp_path, tools):
     shot = imported(tmp_path, tools, [tools.look([0.1 * i - 0.8, 0.02 * i, 0.0], yaw=-0.03 * i) for i in range(17)])
-    for n in range(109, 118):  # a whole clip of it would not have been imported
+    for n in range(109, 118):  # the import would refuse a whole clip of noise
         noise = np.random.default_rng(n).integers(0, 256, (240, 320, 3), np.uint8)
         write_png(shot.frames / f"raw/{n:06d}.png", noise)
     folder = new_job(shot, "solve", SolveParams(retry=False))
@@ -302,7 +302,7 @@ def test_a_lens_that_no_camera_has_is_refused(focal, message):
 
 
 def test_a_lens_that_runs_off_is_held_at_a_usual_one_and_said(tmp_path, tools):
-    """A wall seen straight on: far away through a long lens looks like near by through a short one."""
+    """A frontal wall is ambiguous: far through a long lens looks like near through a short one."""
     poses = [tools.look([-0.5 + 0.1 * i, -0.4, 3.6 + 0.02 * i]) for i in range(10)]
     shot, report = imported(tmp_path, tools, poses), tools.recorder()
     solve_shot(shot, SolveConfig(features=1000), report)
@@ -329,7 +329,7 @@ def test_a_doubtful_lens_is_said(lens, words):
 
 
 def refused(shot, tools):
-    """The sentence of a refusal; nothing was tried after the first solve."""
+    """Message of a refusal; asserts that nothing was tried after the first solve."""
     report = tools.recorder()
     with pytest.raises(JobError) as error:
         solve_shot(shot, SolveConfig(features=1000), report)
@@ -367,7 +367,7 @@ def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, tools):
 
 
 def test_a_worker_that_is_stopped_with_its_job_is_no_failure(tmp_path, tools, monkeypatch):
-    """Ctrl-C of a console may reach both; the worker is dead then before its parent looks up."""
+    """Ctrl-C of a console may reach both processes, so the worker is dead when its parent checks."""
     report, listen = tools.recorder(), child._listen
 
     def interrupted(*words):

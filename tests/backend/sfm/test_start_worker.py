@@ -1,4 +1,4 @@
-"""A package that COLMAP's process cannot load is an environment that is incomplete, not a solve that broke."""
+"""A package that COLMAP's process cannot load means an incomplete environment, not a failed solve."""
 
 import json
 
@@ -23,7 +23,7 @@ BROKEN = {
 
 
 def answer(tmp_path, tools, monkeypatch, package):
-    """What a child says in whose environment pycolmap is this package."""
+    """Error of a child process that imports a pycolmap module with this content."""
     (tmp_path / "packages").mkdir()
     (tmp_path / "packages" / "pycolmap.py").write_bytes(package)
     (tmp_path / "request.json").write_text(json.dumps({"images": str(tmp_path)}))

@@ -1,7 +1,7 @@
-"""Clips that no cameras can be found for, each refused in a sentence of its own.
+"""Clips without a camera solution, each refused with a specific message.
 
-Real pictures (examples/sitting.mp4) where they make the clip: a tripod and a head that turns show one place, so one
-frame, warped, is what they film. The others are of the rendered room.
+They use real pictures (examples/sitting.mp4) if possible: a tripod and a rotating camera show one place, so one warped
+frame is enough. The others show the rendered room.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ SITTING = Path(__file__).resolve().parents[3] / "examples" / "sitting.mp4"
 
 @pytest.fixture(scope="module")
 def sitting(tmp_path_factory, tools):
-    """The first nine frames of the example, 320 x 240: 0.8 s, in which the camera has not gone anywhere."""
+    """The first nine frames of the example at 320 x 240: 0.8 s, in which the camera hardly moves."""
     shot = Shot.create(tmp_path_factory.mktemp("sitting") / "short.splannequin")
     import_footage(shot, str(SITTING), FootageConfig(first=1, last=9, step=1, working_height=240), tools.recorder())
     return shot
@@ -36,7 +36,7 @@ def clip(folder, pictures):
 
 
 def refused(tools, folder, source, fps=8.0, **settings):
-    """(sentence, hint, warnings) of what a solve of a clip refuses with."""
+    """(message, hint, warnings) of the refusal of a clip."""
     shot, report = Shot.create(folder / "a.splannequin"), tools.recorder()
     import_footage(shot, source, FootageConfig(step=1, fps=fps), tools.recorder())
     return refusal(shot, report, **settings)
@@ -62,7 +62,7 @@ def test_a_tripod(tmp_path, tools, sitting):
 
 
 def test_a_camera_that_pans_on_its_tripod(tmp_path, tools, sitting):
-    """The frame through the homographies of a turning camera, with the sensor's noise of its own in each."""
+    """One frame, warped by the homographies of a rotating camera, with independent sensor noise in each picture."""
     picture, lens = still(sitting), np.array([[287.0, 0.0, 160.0], [0.0, 287.0, 120.0], [0.0, 0.0, 1.0]])
     rng = np.random.default_rng(0)
     pictures = []
@@ -81,11 +81,11 @@ def test_a_range_that_is_too_short(tools, sitting):
 
 
 def test_shake(tmp_path, tools):
-    """The first frames are sharp; then whoever holds the camera stumbles."""
+    """The first frames are sharp; then the camera shakes."""
     poses, noise = tools.handheld(11), np.random.default_rng(1)
     pictures = [tools.room().render(pose, (300.0, 300.0, 160.0, 120.0)).astype(np.float64) for pose in poses]
     for n in range(5, 11):
-        wide = min(41, 14 * (n - 4))  # not from one frame to the next: that would be a cut
+        wide = min(41, 14 * (n - 4))  # increases gradually, because a sudden change would be detected as a cut
         pictures[n] = uniform_filter1d(uniform_filter1d(pictures[n], wide, axis=1), wide, axis=0)
     source = clip(tmp_path, [picture + noise.normal(0.0, 0.5, picture.shape) for picture in pictures])
     message, hint, _ = refused(tools, tmp_path, source, retry=False)

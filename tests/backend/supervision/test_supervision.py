@@ -1,4 +1,4 @@
-"""Support bitmaps and the two anchoring rules, against values worked out by hand."""
+"""Support bitmaps and the two anchoring rules, compared with hand-computed values."""
 
 import math
 
@@ -85,7 +85,7 @@ def test_confidence_is_one_for_the_static_and_decays_for_the_moving():
 
 
 class Ramp:
-    """A field whose mean delta is its time along x: what an anchor should be is then known."""
+    """Field whose mean delta equals the time along x, so that anchors are known."""
 
     def __init__(self):
         self.slope = torch.tensor(1.0, requires_grad=True)
@@ -99,7 +99,7 @@ class Ramp:
 
 
 def anchor(m, field, bins):
-    """The support loss of whatever is drawn from all open Gaussians; None if nothing is."""
+    """Support loss of the pairs drawn from all open Gaussians; None without pairs."""
     config, centres = SupervisionConfig(), torch.linspace(0, 1, bins)
     rows = torch.nonzero(m.open).flatten()
     pairs = drawn(m, rows, config, 0)
@@ -122,7 +122,7 @@ def test_drawn_pairs_are_unsupported_and_half_of_them_near_support():
 
 
 def test_support_loss_is_zero_where_time_interpolates_between_anchors():
-    """Seen at both ends: a linear motion lies exactly between its anchors."""
+    """A Gaussian is seen at both ends: a linear motion lies exactly between its anchors."""
     m = model([[1, 0, 0, 0, 1]])
     loss = anchor(m, Ramp(), 5)
     assert float(loss.detach()) == pytest.approx(0.0, abs=1e-6)
@@ -134,8 +134,8 @@ def test_support_loss_pulls_an_extrapolation_back():
     loss = anchor(m, field, 5)
     loss.backward()
     assert float(loss.detach()) > 0
-    assert float(field.slope.grad) > 0  # descending it slows the drift
-    assert m.params["means"].grad is None  # canonical parameters are not moved
+    assert float(field.slope.grad) > 0  # gradient descent slows the drift
+    assert m.params["means"].grad is None  # canonical parameters do not change
 
 
 def test_support_loss_needs_open_gaussians_that_were_seen():
@@ -204,7 +204,7 @@ def test_a_field_may_look_for_motion_before_it_has_to_pay():
 
 
 def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
-    """Its owner moved on: the frames say that it is not there, and nothing pulls it back to where it was seen."""
+    """Its Gaussian moved away: frames show that it is gone, so nothing pulls it back."""
     m = model([[1, 1, 0, 0, 0, 0]] * 2)
     m.hidden[0] = False
     config = SupervisionConfig()
@@ -222,7 +222,7 @@ def test_what_is_in_plain_view_and_does_not_paint_is_left_alone():
 def test_hidden_is_out_of_the_frame_or_behind_what_is_seen():
     K = torch.tensor([[10.0, 0, 16.0], [0, 10.0, 8.0], [0, 0, 1]])
     viewmat = torch.eye(4)
-    viewmat[2, 3] = 1.0  # the camera stands one unit back
+    viewmat[2, 3] = 1.0  # the camera is one unit behind the origin
     means = torch.tensor([[0.0, 0, 2], [0, 0, 1], [0, 0, 2.9], [9.0, 0, 2], [0, 0, -3], [1.0, 0, 4], [0, 0, 2.2]])
     count = len(means)
     m = model([[0, 0]] * count)
@@ -233,14 +233,14 @@ def test_hidden_is_out_of_the_frame_or_behind_what_is_seen():
     depth = torch.full((16, 32), 3.0)
     depth[8, 18] = 1e10  # a hole in the picture
     mark_hidden(m, torch.arange(count), torch.tensor([1]), state, viewmat, K, depth)
-    # On the surface, before it, behind it, right of the frame, behind the camera, in the hole, large and half behind.
+    # On the surface, in front, behind, right of the frame, behind the camera, in the hole, and large and half behind.
     assert m.hidden[:, 1].tolist() == [False, False, True, True, True, False, False]
     assert not bool(m.hidden[:, 0].any())
 
 
 @pytest.mark.parametrize(("moves_away", "anchored"), [(True, False), (False, True)])
 def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
-    """A dot on a wall fades, in plain view or behind a post that comes before it: only then is it a guess."""
+    """A dot on a wall fades: in plain view, or behind a post in front of it. Only the covered dot is a guess."""
     from torch_backend.raster import rasterize
 
     wall = torch.stack(torch.meshgrid(torch.linspace(-2, 2, 17), torch.linspace(-1.5, 1.5, 13), indexing="ij"), -1)
@@ -274,7 +274,7 @@ def test_gone_and_covered_are_told_apart_by_a_render(moves_away, anchored):
 def test_detectors_against_gradients_made_by_hand():
     K = torch.tensor([[10.0, 0, 16.0], [0, 20.0, 8.0], [0, 0, 1]])
     means = torch.tensor([[0.0, 0, 2]] * 4)
-    # NDC gradient = pixel gradient * half the image; pixel gradient = gradient of the mean * depth / focal length.
+    # NDC gradient = pixel gradient * half the image size; pixel gradient = gradient of the mean * depth / focal length.
     pull = torch.tensor([[1.0, -1.0, 0], [-1.0, 1.0, 0], [-1.0, 3.0, 0], [0, 0, 7.0]])
     sums = [1 * 2 / 10 * 16 - 1 * 2 / 20 * 8, -3.2 + 0.8, -3.2 + 2.4, 0.0]
     norm = torch.tensor([0.5, 1e-8, 1e-10, 0.0])
@@ -299,7 +299,7 @@ def test_detectors_against_gradients_made_by_hand():
 
 
 def test_the_signed_sum_agrees_with_the_rasterisers_own_norm():
-    """The gradient of the means across the line of sight is the screen gradient, up to the Gaussian's shape."""
+    """The mean's gradient across the line of sight is the screen gradient, up to the effect of the Gaussian's shape."""
     from torch_backend.raster import rasterize
 
     g = torch.Generator().manual_seed(0)

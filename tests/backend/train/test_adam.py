@@ -1,4 +1,5 @@
-"""The fused Adam against torch's, on both bodies: equal paths, skipped rows, steps left out, checkpoints."""
+"""The fused Adam, compared with torch's on both implementations: equal results, skipped rows, dropped steps,
+checkpoints."""
 
 import math
 import subprocess
@@ -63,7 +64,7 @@ def test_a_row_twice_as_far_moves_twice_as_fast(kernel):
     reach = 4.0
     ours = parameters()[:4]
     with torch.no_grad():
-        for p in ours:  # from nearer than one unit, which counts as one, to a hundred
+        for p in ours:  # from below one unit, which counts as one, to a hundred
             p.mul_(torch.logspace(-2, 2, len(p)).view(-1, *[1] * (p.dim() - 1)))
     theirs = [torch.nn.Parameter(p.detach().double()) for p in ours]
     fused = FusedAdam([{**g, "reach": reach} for g in groups(ours)], eps=1e-15, kernel=kernel)
@@ -193,14 +194,14 @@ def test_parameters_without_gradient_stay_without_state(kernel):
     assert q not in optimizer.state
     assert float(q.detach().abs().max()) == 0.0
     before = p.detach().clone()
-    p.grad, q.grad = None, torch.ones(4)  # another one than in the step before
+    p.grad, q.grad = None, torch.ones(4)  # not the one of the step before
     optimizer.step()
     assert torch.equal(p.detach(), before) and float(q.detach().abs().min()) > 0.0
 
 
 @pytest.mark.parametrize("kernel", BODIES)
 def test_moments_that_are_put_back_count_from_the_next_step(kernel):
-    """As a repair does in mid-run: the same parameter, other moments, and other memory under the parameter."""
+    """As in a repair during a run: the parameter stays the same, but its moments and its memory are replaced."""
     p, q = (torch.nn.Parameter(torch.ones(6)) for _ in range(2))
     ours, theirs = FusedAdam([p], lr=0.1, kernel=kernel), torch.optim.Adam([q], lr=0.1, eps=1e-15)
     for step in range(6):
@@ -225,7 +226,7 @@ def gaussians():
 
 @pytest.mark.parametrize("kernel", BODIES)
 def test_checkpoints_of_torch_adam_go_on(kernel):
-    """State names are torch's: what torch.optim.Adam wrote, the fused one continues, to rounding."""
+    """State names are torch's: the fused Adam continues a state of torch.optim.Adam, up to rounding."""
     old, new = gaussians(), gaussians()
     generator = torch.Generator().manual_seed(6)
     first = torch.optim.Adam(list(old.params.values()), lr=1e-2, eps=1e-15, fused=True)
@@ -268,7 +269,7 @@ def test_growth_keeps_moments_and_later_groups_join(kernel):
 
 @pytest.mark.parametrize("kernel", BODIES)
 def test_what_growth_replaced_is_let_go_of(kernel):
-    """On a card it is most of a run's memory, and a step's forward pass comes before the optimiser's next."""
+    """On a GPU these are most of a run's memory, and the next forward pass comes before the next optimiser step."""
     model = gaussians()
     optimizer = FusedAdam([{"params": [p], "rows": True} for p in model.params.values()], lr=1e-2, kernel=kernel)
     give_gradients(model.params.values(), torch.Generator().manual_seed(8))
@@ -290,7 +291,7 @@ def test_wrong_calls_are_named():
 
 
 def test_restored_moments_lie_where_their_parameter_does():
-    """A checkpoint is read to the CPU; torch's `meta` device stands for a card here."""
+    """Checkpoints are loaded to the CPU; torch's `meta` device stands for a GPU here."""
     stored = {f"adam.{name}.a": torch.ones(5, 3) for name in ("exp_avg", "exp_avg_sq")}
     stored["adam.step.a"] = torch.tensor(7.0)
     for device, dtype in (("meta", torch.float32), ("cpu", torch.float64)):

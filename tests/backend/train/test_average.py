@@ -1,4 +1,4 @@
-"""A run keeps the mean of its last steps: against float64, over a kill, and on frames that nobody trained on."""
+"""A run keeps the mean of its last steps: compared with float64, after a kill, and on held-out frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A training with depth maps: they are fitted, what moves is nearer to its true depth, nothing stale is believed."""
+"""Training with depth maps: their fit, more accurate depth of moving objects, and detection of outdated maps."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ from torch_backend.train.model import render
 
 
 def true_depth(world, n):
-    """[H, W] of a frame of the tiny world, its units."""
+    """[H, W]: true depth of a frame of the tiny world, in its units."""
     out = rasterize(
         **world.at(n / (FRAMES - 1)), viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=WIDTH, height=HEIGHT,
         with_depth=True,
@@ -34,7 +34,7 @@ def true_depth(world, n):
 
 
 def write_depth(world, folder: Path, of=lambda depth, n: 0.4 * depth, noise=0.02, frames=range(FRAMES)) -> Path:
-    """Depth maps of the tiny world as 16-bit PNG, with noise."""
+    """Write depth maps of the tiny world as 16-bit PNG, with noise."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(0)
     for n in frames:
@@ -46,7 +46,7 @@ def write_depth(world, folder: Path, of=lambda depth, n: 0.4 * depth, noise=0.02
 
 @pytest.fixture(scope="module")
 def swaying(tmp_path_factory):
-    """A tiny world of its own, whose lens is told and whose patch is painted as moving."""
+    """A tiny world with a lens in its solve, whose patch is painted as moving."""
     world = build_world(tmp_path_factory.mktemp("swaying"))
     paint_motion(world)
     write_json(
@@ -61,7 +61,7 @@ def asked(run, depth=""):
 
 
 def moving_error(world, run):
-    """Median relative error of the depth of what moves, inside, at each frame's own time."""
+    """Median relative depth error of moving objects, away from their borders, at each frame's own time."""
     model, scene, errors = load_run(world.shot, run).model, load_scene(world.shot), []
     for n in range(FRAMES):
         matte = cv2.imread(str(world.shot.root / PAINTED_FOLDER / f"{FIRST + n:06d}.png"), cv2.IMREAD_GRAYSCALE) > 200
@@ -75,7 +75,7 @@ def moving_error(world, run):
 
 @pytest.fixture(scope="module")
 def pairs(swaying, quiet, tmp_path_factory):
-    """Runs without-SEED and with-SEED of two seeds, without and with depth maps."""
+    """World with the runs without-SEED and with-SEED for two seeds, without and with depth maps."""
     folder = write_depth(swaying, tmp_path_factory.mktemp("maps") / "depth")
     for seed in (0, 1):
         for name, depth in ((f"without-{seed}", ""), (f"with-{seed}", folder)):
@@ -90,10 +90,10 @@ def test_what_moves_is_nearer_to_its_true_depth(pairs, seed):
 
 @pytest.mark.parametrize("pose", [6, 8])
 def test_the_depth_of_a_frozen_frame_is_measured_by_the_map_of_its_instant(pairs, pose):
-    """From plate t* itself and from beside it, against the world as it stood at t*."""
+    """Views are plate t* itself and another pose; the truth is the world at t*."""
     t_star = 6
     deep, scene = load_run(pairs.shot, "with-0"), load_scene(pairs.shot)
-    # The maps of one beside the splats of the other, which have what moves 7 to 12 % too far.
+    # Combine the maps of one run with the splats of the other, whose moving objects are 7 to 12 % too far.
     run = dataclasses.replace(load_run(pairs.shot, "without-0"), folder=deep.folder, depth_key=deep.depth_key)
     frozen = freeze_at(run.model, float(scene.times[t_star]), span_of(scene, run))
     image = render_frozen(frozen, scene.viewmats[pose], scene.Ks[pose], WIDTH, HEIGHT)
@@ -127,7 +127,7 @@ def test_fitted_maps_are_the_true_depth_whatever_scale_and_shift_they_had(swayin
     report = quiet()
     summary = train_shot(swaying.shot, asked(name, folder), report)
     facts, scene = summary["depth"], load_scene(swaying.shot)
-    # The tiny world has two depths: a line through both is right, of whatever kind.
+    # The tiny world has two depths, so a line through both fits for either kind of map.
     assert facts["residual"] < 0.02 and facts["frames"] == FRAMES
     assert any(facts["linear_in"] in event[4] for event in report.events if event[:2] == ("progress", "depth"))
     fitted = load_run(swaying.shot, name).depth()
@@ -214,7 +214,7 @@ def test_the_deviation_is_pseudo_hubers_loss_in_standard_deviations():
     loss.backward()
     pulls = [0.0, 0.5 / math.sqrt(1.25) / 0.1 / 4.0, 0.0, 3.0 / math.sqrt(10.0) / 0.1 / 4.0]
     np.testing.assert_allclose(inverse.grad.numpy()[0], pulls, atol=1e-9)
-    spread = torch.tensor([[[0.5, 0.26]]], dtype=torch.float64)  # of 0.4 and 0.6: right on average
+    spread = torch.tensor([[[0.5, 0.26]]], dtype=torch.float64)  # of 0.4 and 0.6, whose mean is correct
     assert float(deviation(spread, wanted[:, :, :1])) == pytest.approx(math.sqrt(2.0) - 1.0)
 
 

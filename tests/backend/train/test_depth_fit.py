@@ -1,4 +1,4 @@
-"""Lines between depth maps and the solve's points, against lines that the test drew."""
+"""Linear fits of depth maps to the solve's points, compared with known lines."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,13 @@ FRAMES = 12
 
 
 def scene(rng, count=400):
-    """Depths of points: half on a wall at 6, the rest from 1.5 to 5."""
+    """Depths of points: half on a wall at 6, the others from 1.5 to 5."""
     return np.concatenate([np.full(count // 2, 6.0), rng.uniform(1.5, 5.0, count // 2)])
 
 
 def sequence(kind, slopes, shifts, noise=0.02, hidden=0.0, seed=0):
-    """Frame -> (values, depths): maps of that kind, with noise as a share of their spread, some points hidden."""
+    """Map from frame to (values, depths) for maps of a kind, with noise relative to their spread and some hidden
+    points."""
     rng, samples = np.random.default_rng(seed), {}
     for n in range(FRAMES):
         depth = scene(rng)

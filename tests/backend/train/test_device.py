@@ -1,4 +1,4 @@
-"""A run lives on one device: what can be said about that on a machine without a GPU, and the run itself on one with."""
+"""A run stays on one device: checks that work without a GPU, and runs on a GPU if there is one."""
 
 import sys
 from pathlib import Path
@@ -24,7 +24,7 @@ needs_gpu = pytest.mark.skipif(bool(cuda_refusal()), reason="no GPU")
 
 
 class NamedDevices(TorchFunctionMode):
-    """Notes each call by a station that makes a tensor without saying where."""
+    """Records each call in a station that creates a tensor without a device."""
 
     def __init__(self):
         super().__init__()
@@ -58,7 +58,7 @@ def test_stations_say_where_every_tensor_is_made(world, quiet, method, supervisi
     params = TrainParams(run=name, iterations=60, max_gaussians=1500, method=method, supervision=supervision)
     with NamedDevices() as mode:
         train_shot(world.shot, params, quiet())
-        develop = "on" if method == "auto" else "off"  # it is the same for all
+        develop = "on" if method == "auto" else "off"  # developing does not depend on the method
         freeze_shot(world.shot, FreezeParams(run=name, take=name, first=101, last=102, develop=develop), quiet())
     assert mode.found == set()
 
@@ -118,7 +118,7 @@ def test_a_run_goes_on_on_the_other_device_and_freezes_there(world, quiet):
 
 @needs_gpu
 def test_a_gpu_run_is_as_good_as_a_cpu_run(world, quiet):
-    """Without a field: with one, five seeds of this small a run are 10 dB apart on one device."""
+    """Without a field: with one, five seeds of such a small run differ by 10 dB on the same device."""
     found = {}
     for device in ("cpu", "cuda"):
         params = TrainParams(
@@ -143,7 +143,7 @@ def test_bad_frames_are_left_out_on_the_gpu_too(world, quiet):
     images = load_images(scene, scene.solved, 64, 48).cuda()
     report = quiet()
     trainer = Trainer(scene, images, scene.solved, config_from_params(TrainParams()), report, {}, "cuda")
-    trainer.images = images * float("nan")  # not before: colours begin as the frames'
+    trainer.images = images * float("nan")  # only now, because colours are initialised from the frames
     before = {name: p.detach().clone() for name, p in trainer.model.gaussians.params.items()}
     for _ in range(9):
         trainer.step()

@@ -1,4 +1,4 @@
-"""Exposure: interpolation in time, premultiplied colour, and that a drift is found."""
+"""Exposure: interpolation in time, premultiplied colour, and recovery of a drift."""
 
 import pytest
 import torch

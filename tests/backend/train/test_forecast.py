@@ -1,4 +1,4 @@
-"""How long a training will take: arithmetic, the clock, and what a run on the processor says of itself."""
+"""Estimate of a training's duration: arithmetic, the clock, and the estimates of a run on the CPU."""
 
 import pytest
 
@@ -31,7 +31,7 @@ def test_the_work_of_a_run_that_grows_is_the_sum_of_its_steps():
 def test_the_first_step_does_not_count_and_what_is_between_neither():
     now = [0.0]
     watch, told = Stopwatch(lambda: now[0]), []
-    now[0] = 100.0  # loading, compiling
+    now[0] = 100.0  # loading and compiling
     for n in range(STEPS + 3):
         now[0] += 50.0 if n == 0 else 0.2
         told.append(watch.step(10.0))

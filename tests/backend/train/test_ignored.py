@@ -1,4 +1,4 @@
-"""A logo burnt into every frame, and a mask of it: what is behind it is learnt from where other frames see it."""
+"""A burnt-in logo with a mask: training learns the hidden area from frames that show it."""
 
 import math
 
@@ -25,7 +25,7 @@ LOGO[30:40, 6:22] = True
 
 @pytest.fixture(scope="module")
 def logo_world(tmp_path_factory):
-    """The tiny shot with a logo, solved with a mask of it."""
+    """The tiny shot with a logo, solved with a mask of the logo."""
     world = build_world(tmp_path_factory.mktemp("logo"))
     record = read_json(world.shot.solve_record) if world.shot.solve_record.is_file() else {"version": 1}
     write_json(world.shot.solve_record, {**record, "masks": {IGNORE: {"key": "logo"}}})
@@ -50,7 +50,7 @@ def test_frames_with_the_same_mask_share_it_and_half_covered_pixels_count(logo_w
 
 
 def shown_behind(world, quiet, ignored):
-    """[P, 3] what a run of a few steps shows where the logo is, in a frame, and what is there in truth."""
+    """([P, 3] pixels behind the logo in a frame of a short run, the same pixels in the truth)."""
     scene = load_scene(world.shot)
     config = config_from_params(TrainParams(iterations=300, max_gaussians=1500, holdout=0, method="static"))
     images = load_images(scene, scene.solved, WIDTH, HEIGHT)
@@ -82,7 +82,7 @@ def test_a_run_is_known_by_what_it_ignores(logo_world, quiet):
 
 
 def test_ignored_pixels_have_no_share_in_any_figure_and_a_covered_frame_has_none(logo_world, quiet):
-    """What stands in for them is the render itself: counted, it would be perfect."""
+    """Ignored pixels are replaced by the render itself, so counting them would give a perfect score."""
     scene = load_scene(logo_world.shot)
     config = config_from_params(TrainParams(iterations=300, max_gaussians=300, holdout=0, method="static"))
     images = load_images(scene, scene.solved, WIDTH, HEIGHT)

@@ -1,4 +1,4 @@
-"""SSIM, PSNR and the loss; SSIM against float64 is in raster/test_ssim.py."""
+"""SSIM, PSNR and the loss; raster/test_ssim.py compares SSIM with float64."""
 
 import pytest
 import torch

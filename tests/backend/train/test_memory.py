@@ -1,4 +1,4 @@
-"""What of a run fits a card of 4, 6, 8 or 12 GB, by arithmetic; a pretended card: tests/backend/card/test_card.py."""
+"""Memory plans of runs on GPUs with 4, 6, 8 or 12 GB; tests/backend/card/test_card.py uses a simulated GPU."""
 
 import pytest
 
@@ -10,7 +10,7 @@ SIZE = (1920, 1080)
 FRAMES = 300
 IMAGES = FRAMES * SIZE[0] * SIZE[1] * 6
 DESKTOP = 900_000_000
-"""What a desktop and a driver keep of a card."""
+"""Bytes of a GPU that a desktop and a driver use."""
 
 
 def plan(card_gb: float, method: str = "auto", gaussians: int = 1_000_000, **more: int) -> MemoryPlan:
@@ -59,7 +59,7 @@ def test_frames_that_would_fill_a_card_wait_in_host_memory():
 def test_too_little_is_said_in_words():
     with pytest.raises(JobError, match="0.5 GB free, too little to train 1,000,000 Gaussians on images of 1920 x 1080"):
         plan(1.4)
-    with pytest.raises(JobError, match="too little"):  # a run that only goes on cannot have fewer than it has
+    with pytest.raises(JobError, match="too little"):  # a resumed run cannot have fewer Gaussians than it has
         plan_memory(
             config_from_params(TrainParams(preset="final")), SIZE, FRAMES, IMAGES, 3_000_000_000, gaussians=1_000_000
         )

@@ -1,4 +1,4 @@
-"""What mattes call moving: it goes on trial and counts little before; nothing else opens; runs are known by mattes."""
+"""Moving areas of mattes: only Gaussians there go on trial, nothing else opens, and mattes are part of a run's key."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from torch_backend.train.trainer import Trainer
 
 @pytest.fixture(scope="module")
 def painted_world(tmp_path_factory):
-    """A tiny shot whose mattes show the patch; tests leave its mattes alone."""
+    """Tiny shot whose mattes show the patch; tests must not change its mattes."""
     world = build_world(tmp_path_factory.mktemp("painted"))
     paint_motion(world)
     return world
@@ -49,7 +49,8 @@ def trainer_of(world, quiet, steps, movers=True, **changes):
 
 
 def centred_on_movers(trainer, margin):
-    """int [N]: in how many frames the centre of each Gaussian projects into what moves, widened by `margin` pixels."""
+    """int [N]: number of frames in which a Gaussian's centre projects into moving pixels, dilated by `margin`
+    pixels."""
     means, counts = trainer.model.gaussians.params["means"].detach(), 0
     for n, index in enumerate(trainer.train_ids):
         wide = torch.nn.functional.max_pool2d(trainer.movers[n][None].float(), 2 * margin + 1, 1, margin)[0] > 0
@@ -95,7 +96,7 @@ def test_what_lies_in_movers_goes_on_trial_and_nothing_else(painted_world, quiet
 
 
 def test_when_growth_of_a_long_run_ends_who_is_open_and_paints_no_mover_closes(painted_world, quiet):
-    """Children of what is open are open: some are put beside the patch here, with a change of their own."""
+    """Children of open Gaussians are open. Here some are placed near the patch, with a change of their own."""
     trainer = trainer_of(painted_world, quiet, 140)
     model, config = trainer.model, trainer.config
     movers = model.gaussians.open.clone()
@@ -105,7 +106,7 @@ def test_when_growth_of_a_long_run_ends_who_is_open_and_paints_no_mover_closes(p
     strays = torch.nonzero(beside).flatten()[:20]
     model.gaussians.open[strays] = True
     mean = mean_of(model, strays)
-    trainer.config.densify.every = 1000  # no round of growth at that step
+    trainer.config.densify.every = 1000  # no round of growth at this step
     trainer.iteration = round(config.densify.stop * config.iterations)
     schedule_events(trainer)
     assert model.gaussians.open[strays].all(), "a short run is left alone"

@@ -1,4 +1,4 @@
-"""What a run is trained on: working frames, on a card the source's own; and that a run stays what it was begun as."""
+"""Training pictures: working frames, or the source's own on a GPU; a run keeps the kind that it started with."""
 
 import json
 
@@ -19,7 +19,7 @@ from torch_backend.train.pictures import pictures_of, training_size
 
 @pytest.fixture
 def shot(tmp_path, world, quiet):
-    """The tiny shot, filmed twice as large as it was solved."""
+    """The tiny shot, filmed at twice the size of its solve."""
     (tmp_path / "source").mkdir()
     rng = np.random.default_rng(3)
     for n in range(16):
@@ -127,7 +127,7 @@ def test_a_run_goes_on_with_the_numbers_it_was_begun_with_whatever_the_device(sh
         patched.setattr(identity, "config_from_params", lambda params, on_card=False: config_from_params(params, True))
         train_shot(shot, on_card, quiet(cancel_at=("training", 0.1)))
     report = quiet()
-    resumed = TrainParams(**{**vars(on_card), "width": 1920, "device": "cpu"})  # as Blender asks for a paused run
+    resumed = TrainParams(**{**vars(on_card), "width": 1920, "device": "cpu"})  # as Blender requests a paused run
     assert train_shot(shot, resumed, report)["width_px"] == 128
     assert any(event[0] == "progress" and "resumed at step" in event[4] for event in report.events)
     warned = [event[1] for event in report.events if event[0] == "warning"]

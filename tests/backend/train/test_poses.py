@@ -1,4 +1,4 @@
-"""Corrections of cameras: rigid, without a part that all share, found where a camera is wrong, kept from what moves."""
+"""Camera corrections: rigid, without a common part, recovery of wrong cameras, and no influence of moving objects."""
 
 import numpy as np
 import pytest
@@ -49,14 +49,14 @@ def test_the_gauge_holds_and_held_frames_follow_their_neighbours():
     with torch.no_grad():
         poses.values[:] = torch.tensor([3.0, 100.0, 1.0, 2.0, 4.0])[:, None]
     poses.fix_gauge({1})
-    assert poses.values[[0, 2, 3, 4], 0].tolist() == pytest.approx([0.5, -1.5, -0.5, 1.5])  # their mean, 2.5, is out
+    assert poses.values[[0, 2, 3, 4], 0].tolist() == pytest.approx([0.5, -1.5, -0.5, 1.5])  # minus their mean, 2.5
     assert float(poses.values.detach()[1, 0]) == pytest.approx(-0.5)
     between = poses.at(np.array([0.0, 0.6, 1.0, 2.0]))
     assert between[:, 3].tolist() == pytest.approx([0.5, -1.0, 1.5, 1.5])
 
 
 def wrong_cameras(world, quiet, on):
-    """The tiny shot with cameras that are off by about half a pixel, trained while it is static: (trainer, truth)."""
+    """(trainer, true cameras) of the tiny shot with camera errors of about half a pixel, trained as a static scene."""
     scene = load_scene(world.shot)
     truth = scene.viewmats.clone()
     wrong = 0.008 * torch.randn(len(truth), 6, generator=torch.Generator().manual_seed(3))
@@ -73,8 +73,7 @@ def wrong_cameras(world, quiet, on):
 
 
 def shifts(trainer, viewmats):
-    """[F, P, 2] px: how far the scene's points lie in these cameras from where the solve's see them, less what all
-    frames share."""
+    """[F, P, 2] pixel shifts of the scene's points against the solve's cameras, minus the mean over all frames."""
     seen = []
     for cameras in (viewmats, trainer.scene.viewmats):
         pixel = (trainer.scene.points @ cameras[:, :3, :3].mT + cameras[:, None, :3, 3]) @ trainer.Ks.mT

@@ -1,5 +1,7 @@
-"""When a step is recorded, replayed or launched, on what facts (`step_facts`). That a replay is the
-step that was recorded: `card/test_card.py`."""
+"""When a step is recorded, replayed or launched, depending on its facts (`step_facts`).
+
+`card/test_card.py` tests that a replay equals the recorded step.
+"""
 
 import contextlib
 import dataclasses
@@ -19,7 +21,7 @@ from torch_backend.train.trainer import Trainer
 
 
 class Again:
-    """Carries the work out anew at each replay, on the facts that lie there then."""
+    """Executes the work at each replay, on the current facts."""
 
     def __init__(self, fails=False, room=True, short=0):
         self.fails, self.room, self.short, self.made, self.dropped = fails, room, short, 0, 0
@@ -74,7 +76,7 @@ def equal(one, two):
 
 
 class EveryOther:
-    """Depth maps of every second trained frame: another depth in each."""
+    """Depth maps of every second trained frame, with a different depth in each."""
 
     every, weight = 2, 0.02
 
@@ -125,7 +127,7 @@ def test_a_recording_that_found_too_little_room_is_tried_again(trained):
 
 
 def test_a_longer_list_of_hits_is_recorded_anew(trained, monkeypatch):
-    rooms = [100] * 9 + [200] * 999  # a held-out frame, say, wants more
+    rooms = [100] * 9 + [200] * 999  # for example, a held-out frame needs more
     monkeypatch.setattr("torch_backend.train.recorder.listed", lambda *_: rooms.pop(0))
     plain, recording = trained(None), Again()
     recorded = trained(recording)
@@ -154,7 +156,7 @@ def test_a_finished_run_goes_with_the_last_who_knows_it(trained):
     gc.collect()
     gc.disable()
     try:
-        run = trained(Again(), steps=1)  # this stand-in's recordings know the run
+        run = trained(Again(), steps=1)  # this stand-in's recordings reference the run
         gone = weakref.ref(run.recorder)
         del run
         assert gone() is None
@@ -181,7 +183,7 @@ def test_where_memory_ends_the_recordings_go_first_and_the_run_stays_as_it_is(tr
     loop._make_room()
     assert recorded.recorder.refused != "" and recorded.pieces is None
     assert len(recorded.model.gaussians) == before and len(recorded.report.events) == told
-    with pytest.raises(JobError, match="too little memory"):  # so few Gaussians have nothing else to give
+    with pytest.raises(JobError, match="too little memory"):  # so few Gaussians cannot be reduced further
         loop._make_room()
 
 

@@ -1,6 +1,6 @@
-"""The card's self-test, here on Warp's cpu device (fibers): what it finds, and that it is asked once.
+"""The GPU self-test, here on Warp's cpu device (fibers): its findings, and their caching.
 
-On a pretended card, and with kernels that do not launch: tests/backend/card/test_card.py.
+tests/backend/card/test_card.py runs it on a simulated GPU, also with kernels that fail to launch.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ def cards(nvidia_smi):
 
 @pytest.fixture
 def other_adam(monkeypatch):
-    """other_adam(old, new): Adam's kernel with another text."""
+    """other_adam(old, new): replaces a part of the source of Adam's kernel."""
 
     def change(old: str, new: str) -> None:
         source = adam._source
@@ -43,7 +43,7 @@ def other_adam(monkeypatch):
 
 
 def test_kernels_that_compute_something_else_are_found(other_adam, monkeypatch):
-    monkeypatch.setattr(self_test, "_frame", lambda device: [])  # walked on a pretended card
+    monkeypatch.setattr(self_test, "_frame", lambda device: [])  # tested on a simulated GPU
     other_adam("r[1] * (g[i] - m[i])", "1.02f * r[1] * (g[i] - m[i])")
     found = run_self_test(torch.device("cpu"))
     assert len(found.checks) == 5 and found.lasting
@@ -119,7 +119,7 @@ def test_a_card_is_tested_once_and_again_after_an_update(tmp_path: Path, cards):
     cards("NVIDIA GeForce RTX 4070, 590.10.01, 8.9")
     card_verdict(tmp_path, test)
     assert len(asked) == 4 and asked[1] != asked[2]
-    (tmp_path / "splannequin-card.json").write_text("[]")  # damaged: as if it were not there
+    (tmp_path / "splannequin-card.json").write_text("[]")  # a damaged file counts as missing
     assert card_verdict(tmp_path, test).problem == "it is broken" and len(asked) == 6
 
 
@@ -133,7 +133,7 @@ def test_what_may_be_otherwise_the_next_time_is_not_kept(tmp_path: Path):
 
 
 def test_a_failure_that_is_not_confirmed_speaks_against_no_card(tmp_path: Path):
-    """The first of two tests met something that is gone: the card is used, now and later."""
+    """The first of two tests fails by a temporary fault: the GPU is used, now and later."""
     answers = ["a kernel does not build or run on it (unspecified launch failure)", ""]
     found = card_verdict(tmp_path, lambda key: SelfTest(key=key, problem=answers.pop(0)))
     assert found.problem == "" and not answers
@@ -143,7 +143,7 @@ def test_a_failure_that_is_not_confirmed_speaks_against_no_card(tmp_path: Path):
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 @pytest.mark.parametrize(("name", "kept"), [("SIGKILL", False), ("SIGTERM", False), ("SIGSEGV", True), ("", False)])
 def test_a_test_that_was_killed_is_tried_again_by_the_next_job(tmp_path: Path, monkeypatch, name, kept):
-    """A real child that ends so, or gives up with exit code 1: only one that crashes twice speaks against the card."""
+    """A real child process that is killed, or exits with code 1: only a GPU whose test crashes twice is rejected."""
     ends = f"os.kill(os.getpid(), signal.{name})" if name else "sys.exit('there is no disk')"
     child = tmp_path / "child.py"
     child.write_text(f"import os, signal, sys\nopen({str(tmp_path / 'asked')!r}, 'a').write('x')\n{ends}\n")

@@ -1,4 +1,4 @@
-"""What moves is learnt from softened pictures: the loss against its definition, and who asks for it."""
+"""Moving areas are trained on softened pictures: the loss compared with its definition, and the runs that use it."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from torch_backend.train.losses import photometric
 from torch_backend.train.softened import SoftenedMovers
 
 H, W = 90, 162
-"""No multiples of a block."""
+"""Not multiples of the block size."""
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def pictures():
 
 
 def soft(picture, block):
-    """Means of blocks, one by one."""
+    """Block means, computed one by one."""
     rows, columns = range(0, H, block), range(0, W, block)
     means = [[picture[y : y + block, x : x + block].mean(dim=(0, 1)) for x in columns] for y in rows]
     return torch.stack([torch.stack(row) for row in means])
@@ -45,7 +45,7 @@ def test_it_is_the_loss_of_what_stands_still_and_the_loss_of_soft_movers(picture
 
 
 def test_only_the_mean_of_what_moves_counts(pictures):
-    """Its details may be anywhere within a pixel of the soft picture; those of what stands still may not."""
+    """Details of moving areas may move within a pixel of the soft picture; details of static areas may not."""
     image, target, movers = pictures
     with torch.no_grad():
         image.copy_(target)
@@ -63,7 +63,7 @@ def test_only_the_mean_of_what_moves_counts(pictures):
 
 
 def test_a_hand_that_is_far_from_where_it_should_be_is_pulled_there(pictures):
-    """A bar of 2 px that lies 2.5 px beside its place: in whole pictures it is as wrong wherever it goes."""
+    """A bar of 2 px is 2.5 px from its place; at full resolution, small shifts do not change its error."""
     _, _, movers = pictures
     movers[0, :, 60:140] = True
     across = torch.arange(W, dtype=torch.float64) + 0.5

@@ -1,4 +1,4 @@
-"""What is not finite, or thrown out of all proportion, is dropped or mended and named; the run goes on."""
+"""Non-finite or extreme values are dropped or repaired and reported; the run continues."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ RATES = ("lr", "lr_start", "lr_end")
 
 @pytest.fixture
 def begin(world, quiet):
-    """(method, steps) -> a trainer on the tiny world after that many steps; the field joins after 20 of 60."""
+    """begin(method, steps): trainer on the tiny world after that many steps; the field is added after 20 of 60."""
 
     def make(method="hexplane", steps=25, **changes) -> Trainer:
         scene = load_scene(world.shot)
@@ -42,7 +42,7 @@ def begin(world, quiet):
 
 
 def go_on(trainer: Trainer, steps: int) -> list[float]:
-    """The loop of `Trainer.run`, without its checkpoints; returns the losses of the steps that were applied."""
+    """Run the loop of `Trainer.run` without checkpoints; return the losses of the applied steps."""
     losses = []
     for _ in range(steps):
         schedule_events(trainer)
@@ -79,7 +79,7 @@ def gaussian(name, value, row=7):
 
 
 def without_length(trainer):
-    """Nor momentum that would turn it."""
+    """Also without momentum, which would rotate it."""
     p = trainer.model.gaussians.params["quats"]
     p.data[7] = trainer.optimizer.state[p]["exp_avg"][7] = 0.0
 
@@ -93,7 +93,7 @@ def of_the_exposure(trainer):
 
 
 def of_a_moment(trainer):
-    """Seen before the next step, which would make a NaN of it and cost the Gaussian."""
+    """The number is noticed before the next step, which would turn it into NaN and drop the Gaussian."""
     p = trainer.model.gaussians.params["means"]
     trainer.optimizer.state[p]["exp_avg_sq"][7, 0] = math.inf
     trainer.inspect_nonfinite()
@@ -118,7 +118,7 @@ def test_one_bad_number_is_named_and_the_run_goes_on(begin, poison, words):
     before = float(torch.tensor(go_on(trainer, 5)).mean())
     count = len(trainer.model.gaussians)
     poison(trainer)
-    after = go_on(trainer, 9)  # densification, which drops some of these by itself, is due at 40
+    after = go_on(trainer, 9)  # densification, which drops some of these, is due at 40
     trainer.inspect_nonfinite()
     said = warnings(trainer)
     assert len(said) == 1
@@ -180,7 +180,7 @@ def test_a_frame_with_bad_pixels_is_left_out_from_then_on(begin, supervision):
     go_on(trainer, 19)
     (said,) = warnings(trainer)
     assert f"left frame {trainer.scene.frames[trainer.train_ids[5]]} out" in said
-    assert len(go_on(trainer, 40)) == 40  # among them, with `paper`, those that look at a second frame
+    assert len(go_on(trainer, 40)) == 40  # with `paper`, some of these steps use a second frame
     assert len(warnings(trainer)) == 1
     assert finite(trainer)
     assert len(trainer.model.gaussians) >= 0.9 * count
@@ -193,7 +193,7 @@ def test_a_bad_frame_does_not_keep_the_gate_shut(begin):
     open_gate(trainer)
     go_on(trainer, 5)
     assert 5 in trainer.soundness.unusable
-    trainer.config.gate.pixels = 1e-6  # any change at all is motion
+    trainer.config.gate.pixels = 1e-6  # any change counts as motion
     harden_gate(trainer)
     assert bool(trainer.model.gaussians.open.any())
     assert finite(trainer)
@@ -201,10 +201,11 @@ def test_a_bad_frame_does_not_keep_the_gate_shut(begin):
 
 @pytest.mark.parametrize("host", HOSTS)
 def test_a_field_that_throws_gaussians_out_of_their_place_is_put_back(begin, host):
-    """One step at a hundred thousand times its rates: what is out of the picture has no gradient to come back by."""
+    """One step at 100,000 times the learning rates: Gaussians outside the picture have no gradient to return by."""
     trainer = begin(host, 30)
     before = {name: p.detach().clone() for name, p in trainer.model.field.named_parameters()}
-    loss = float(torch.tensor(go_on(trainer, 19)).mean())  # it goes back to the look before the last
+    # the field returns to the state of the second last inspection
+    loss = float(torch.tensor(go_on(trainer, 19)).mean())
     normal = trainer._schedule_rates
     fields = {id(p) for p in trainer.model.field.parameters()}
     rates = [group["lr_start"] for group in trainer.optimizer.param_groups]
@@ -235,7 +236,7 @@ def test_a_field_that_throws_gaussians_out_of_their_place_is_put_back(begin, hos
 
 @pytest.mark.parametrize(("share", "times", "said"), [(0.2, 7.0, 1), (0.2, 5.0, 0), (0.05, 7.0, 0)])
 def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(begin, share, times, said):
-    """Far is measured by where what moves is: the scene's extent, with its background, is many times as large."""
+    """The bound is relative to the extent of moving Gaussians; the extent of the whole scene is many times larger."""
     trainer = begin("hexplane", 30)
     means = trainer.model.gaussians.params["means"].detach()[trainer.model.open_rows()]
     shift = torch.zeros_like(means)
@@ -247,7 +248,7 @@ def test_a_field_that_comes_apart_at_one_instant_between_two_looks_is_put_back(b
 
 
 def farthest(trainer: Trainer) -> torch.Tensor:
-    """[N] how far each Gaussian goes at most, 0 for those that stand still, in scene units along one axis."""
+    """[N]: largest displacement of each Gaussian along one axis in scene units, 0 if it is static."""
     rows = trainer.model.open_rows()
     far = torch.zeros(len(trainer.model.gaussians))
     with torch.no_grad():
@@ -258,7 +259,7 @@ def farthest(trainer: Trainer) -> torch.Tensor:
 
 
 def bound_between(trainer: Trainer, count: int) -> torch.Tensor:
-    """Makes the `count` Gaussians that go farthest be out of their place; bool [N] who they are."""
+    """Set the bound so that the `count` farthest Gaussians are out of place; return them as bool [N]."""
     far = farthest(trainer)
     first, second = far.sort(descending=True).values[count - 1 : count + 1]
     assert first > second
@@ -284,12 +285,13 @@ def test_who_is_thrown_out_of_its_place_is_dropped_and_nobody_else(begin):
 
 @pytest.mark.parametrize("method", ["auto", "hexplane"])
 def test_a_round_of_growth_drops_what_is_thrown_behind_a_gate_alone(begin, method):
-    """A bare host stays as it was published."""
+    """Published hosts without a gate stay as published."""
     trainer = begin(method, 30)
     if method == "auto":
-        trainer.policy.gate_hardened(trainer.iteration)  # so soon nothing would stay open
+        trainer.policy.gate_hardened(trainer.iteration)  # so early, no Gaussian would stay open
     trainer.config.densify.every = trainer.iteration
-    trainer.densifier.config.budget = trainer.densifier.config.prune_opacity = 0  # nothing else comes or goes
+    # no other Gaussians are added or dropped
+    trainer.densifier.config.budget = trainer.densifier.config.prune_opacity = 0
     count = len(trainer.model.gaussians)
     thrown = bound_between(trainer, 3)
     kept = trainer.model.gaussians.params["means"].detach()[~thrown].clone()
@@ -322,7 +324,7 @@ def test_a_field_that_was_put_back_keeps_its_rates_when_the_run_is_resumed(begin
 
 
 def test_a_resumed_run_drops_who_is_thrown_as_an_unbroken_one_does(begin, tmp_path):
-    """Until its next look it would know no bound, and a round of growth may come first."""
+    """Without a stored bound it would drop nothing until its next inspection, and a round of growth may come first."""
     trainer = begin("hexplane", 30)
     trainer.soundness.memory.heed(torch.full((len(trainer.model.open_rows()), 3), 1e6))
     worst = float(trainer.soundness.memory._worst)
@@ -398,7 +400,7 @@ def test_a_gaussian_too_large_for_its_place_is_dropped(begin):
 
 
 def test_a_step_that_memory_did_not_suffice_for_opens_the_gate_once(begin):
-    """`_step_that_fits` asks what is due again, at the same step, once there is room."""
+    """Once there is memory, `_step_that_fits` schedules the events of the same step again."""
     trainer = begin("auto", steps=0)
     while trainer.model.field is None:
         go_on(trainer, 1)

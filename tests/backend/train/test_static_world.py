@@ -1,4 +1,4 @@
-"""What a static model of a clip shows, and what mattes have of it."""
+"""Renders of a static model of a clip, and their use for mattes."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from torch_backend.train.static_world import STAGE, steps_for
 
 
 def patch_of(world: World, n: int, time: float) -> np.ndarray:
-    """[H, W] in 0..1: how much of each pixel of frame `n` the patch that sways would cover at a time."""
+    """[H, W] in 0..1: coverage of the swaying patch in each pixel of frame `n`, at the given time."""
     state = {name: value[world.moving] for name, value in world.at(time).items()}
     out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=WIDTH, height=HEIGHT)
     return out.alphas[0].numpy()
@@ -71,7 +71,7 @@ def test_a_shot_that_is_not_solved_is_one_sentence(tmp_path, quiet):
 
 
 def test_a_training_finds_mattes_of_an_earlier_version_again(tmp_path, quiet):
-    """It would guess what moves without them, and say nothing."""
+    """Without new mattes, the training would guess moving areas and give no warning."""
     shot = build_world(tmp_path).shot
     find_motion(shot, quiet(), static_model=None)
     record = shot.motion / "motion.json"

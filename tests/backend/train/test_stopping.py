@@ -1,4 +1,4 @@
-"""Only what a scene needs: what decides, on which frames, and that a resumed run decides the same."""
+"""Stopping policy: criteria, probe frames, and equal decisions after a resume."""
 
 import copy
 import io
@@ -40,7 +40,7 @@ from torch_backend.train.trainer import Trainer
 
 @pytest.fixture(scope="module")
 def long_world(tmp_path_factory, quiet):
-    """The tiny shot, long enough to have probe frames: (scene, images)."""
+    """(scene, images) of the tiny shot, extended so that it has probe frames."""
     module = sys.modules[quiet.__module__]
     patch = pytest.MonkeyPatch()
     patch.setattr(module, "FRAMES", 30)
@@ -86,10 +86,10 @@ def test_growth_is_judged_per_tenth_and_only_when_there_was_some():
     measured = [(100 * n, round(1000 * 1.1**n), 20.0 + 0.2 * n) for n in range(6)]
     assert growth_gain(measured) == pytest.approx(0.2, rel=0.01)
     flat = [*measured, *((100 * n, round(1000 * 1.1**n), 21.0 - 0.01 * (n % 2)) for n in range(6, 11))]
-    assert growth_gain(flat) < 0.03  # what was gained before does not count any more
+    assert growth_gain(flat) < 0.03  # earlier gains no longer count
     assert growth_gain([(n, 1000 + n, 20.0 + n) for n in range(20)]) is None
     assert growth_gain(measured[:2]) is None
-    assert growth_gain(measured, measured[-1][0] - measured[0][0] + 1) is None  # too short a while to tell
+    assert growth_gain(measured, measured[-1][0] - measured[0][0] + 1) is None  # too short to decide
     assert growth_gain(measured, measured[-1][0] - measured[0][0]) == growth_gain(measured)
 
 
@@ -111,7 +111,7 @@ def test_correlation_follows_the_period_and_knows_noise():
     hidden = torch.ones(60, 40)
     hidden[20:40] = 0
     swing = torch.sin(2 * math.pi * frames[:, None] / 24 + phase)
-    swing[20:40] = 100.0  # nobody saw this
+    swing[20:40] = 100.0  # frames in which it is not visible
     assert correlation_frames(swing, hidden) == pytest.approx(4.0, rel=0.3)
 
 
@@ -138,7 +138,7 @@ def test_probe_frames_are_not_trained_on_until_they_join(long_world, quiet):
     runs = [trainer_of(long_world, quiet, **never) for _ in range(2)]
     probes = runs[0].policy.probes
     assert len(probes) == 3
-    runs[1].images[probes] = 1.0  # as good as no picture at all
+    runs[1].images[probes] = 1.0  # destroys these pictures
     for trainer in runs:
         while trainer.iteration < 60:
             schedule_events(trainer)
@@ -167,7 +167,7 @@ def test_what_harmonics_gained_is_scaled_by_what_they_may_still_learn(rates_end)
 
 
 def test_a_degree_that_gains_too_little_is_dropped_for_good(long_world, quiet, tmp_path):
-    """What is left out is gone from the checkpoint too, and what stays can be frozen."""
+    """Dropped coefficients are absent from the checkpoint too, and the rest can be frozen."""
     trainer = finish(trainer_of(long_world, quiet, needs__sh_gain=1e9), tmp_path)
     assert trainer.model.sh_degree == 0
     assert trainer.policy.degrees.keys() == {1}
@@ -195,7 +195,7 @@ def test_growth_ends_when_it_gains_too_little(long_world, quiet, tmp_path):
 
 
 def test_growth_is_not_judged_while_a_field_is_on_trial(long_world, quiet):
-    """What the probes lose as a field opens says nothing of the Gaussians."""
+    """Losses on the probe frames while a field opens are not caused by the number of Gaussians."""
     trainer = trainer_of(long_world, quiet, needs__growth_gain=1e9)
     ended = []
     opened = FieldOpened(30, 1.0)
@@ -212,7 +212,7 @@ def test_growth_is_not_judged_while_a_field_is_on_trial(long_world, quiet):
 
 @dataclass
 class Numbers:
-    """A run as the policy sees it, without one: PSNR by SH degree, and what exposure and field add."""
+    """Stand-in for a run, as the policy sees it: PSNR by SH degree, and gains of exposure and field."""
 
     iteration: int
     sh_degree: int = 1
@@ -245,12 +245,12 @@ def test_the_policy_yields_a_decision_and_changes_nothing_of_the_run():
     assert vars(run) == before
     assert policy.sh_degree(2) == 0
     assert list(decisions) == []
-    assert list(policy.decide(run)) == []  # decided once
+    assert list(policy.decide(run)) == []  # each decision is made once
     assert not list(policy_of(sh_gain=0.001).decide(run))
 
 
 def test_what_a_degree_was_dropped_from_is_what_joins():
-    """Where both fall on one step, the last look at the probes is at the model without the harmonics."""
+    """If both happen at one step, the last measurement of the probes uses the model without the harmonics."""
     policy, run = policy_of(sh_gain=0.1), Numbers(60)
     for decision in policy.decide(run):
         run.sh_degree = decision.degree
@@ -279,7 +279,7 @@ def test_facts_come_back_from_runs_of_other_versions():
 
 def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
     trainer = finish(trainer_of(long_world, quiet, needs__stop_gain=1e9), tmp_path)
-    assert trainer.policy.stopped == 80  # the first measurement after the gate has given up waiting for motion
+    assert trainer.policy.stopped == 80  # first measurement after the gate has stopped waiting for motion
     assert trainer.iteration == 90
     group = trainer.optimizer.param_groups[0]
     trainer._schedule_rates()
@@ -297,7 +297,7 @@ def test_a_run_that_gains_nothing_anneals_and_ends(long_world, quiet, tmp_path):
 
 @pytest.mark.parametrize(("softened", "stopped"), [(0.0, 30), (0.5, 70)])
 def test_no_end_is_looked_for_while_pictures_are_soft_nor_across_their_end(softened, stopped):
-    """Sharp probes gain nothing from softened pictures, so what they say spans whole pictures alone."""
+    """Sharp probe frames do not improve with softened pictures, so gains are only measured over whole pictures."""
     policy = StoppingPolicy(StoppingConfig(join=1.0), 60, RunSchedule(100, 10, 0.6, 0.7, 0.15, 0.2, softened))
     policy.growth_ended, policy.facts.hardened = 10, 20
     for step in range(1, 101):
@@ -333,12 +333,12 @@ def test_published_hosts_are_left_alone(long_world, quiet):
         trainer = Trainer(scene, images, scene.solved, config_from_params(params), quiet())
         assert trainer.policy.probes == []
         assert trainer.policy.held == set()
-    for method in ("auto", "static"):  # the one is compared with the other: both decide
+    for method in ("auto", "static"):  # the methods are compared with each other, so both use the policy
         assert trainer_of(long_world, quiet, method=method).policy.held == set(probe_frames(len(scene.solved), 12))
 
 
 def test_time_nodes_follow_the_motion(long_world, quiet, tmp_path):
-    """One sway over the clip of 30 frames: half of the frames' number of nodes would be 15."""
+    """One sway over a clip of 30 frames; half of the number of frames would be 15 nodes."""
     trainer = finish(trainer_of(long_world, quiet, iterations=300, needs__sh_gain=1e9), tmp_path)
     assert trainer.model.field is not None
     nodes = trainer.policy.facts.time_nodes
@@ -351,7 +351,7 @@ def test_the_console_shows_the_table(trained):
     rows = {row["what"]: row for row in summary["modelled"]}
     moving = rows["moving Gaussians"]
     assert moving["seconds"] + rows["static world"]["seconds"] == pytest.approx(summary["train_seconds"], abs=0.1)
-    assert moving["gain_db"] is None  # 14 frames have no probes: nothing was measured
+    assert moving["gain_db"] is None  # 14 frames have no probe frames, so nothing was measured
     stream = io.StringIO()
     Console(stream)(Event("metric", 0, 0.0, {"stage": "train", "values": summary}))
     lines = stream.getvalue().splitlines()

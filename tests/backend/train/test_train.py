@@ -1,4 +1,4 @@
-"""A run on a tiny world with truth: it learns, it opens the gate where things move, it resumes exactly."""
+"""A run on a tiny world with ground truth: it learns, opens the gate where objects move, and resumes exactly."""
 
 import hashlib
 import json
@@ -142,11 +142,11 @@ def test_a_state_can_be_asked_for_without_pulling_what_is_canonical(world, quiet
 
 @pytest.mark.parametrize("host", ["mlp", "control_points"])
 def test_any_host_works_behind_the_gate_and_resumes(world, quiet, host, monkeypatch):
-    """More Gaussians, split and pruned while the field is there: a host's own parameters grow with them."""
+    """Gaussians are split and pruned while the field exists: a host's own parameters must follow."""
 
     def easily_moved():
         config = preview()
-        config.gate.pixels = 1e-3  # 200 steps are too few for a network to show what moves
+        config.gate.pixels = 1e-3  # 200 steps are too few for a network to detect motion
         return config
 
     preview = PRESETS["preview"]
@@ -183,7 +183,7 @@ def test_wrong_choices_are_named():
 
 
 def test_the_gate_opens_after_a_fifth_of_the_run_at_most_600_steps_and_what_hangs_on_it_with_it():
-    """Ghosts of movers that a longer static stage makes are never put right (docs/decisions.md)."""
+    """Ghosts of moving objects from a longer static stage are never removed (docs/decisions.md)."""
     preview, standard, final = (config_from_params(TrainParams(preset=preset)) for preset in PRESETS)
     opened, degrees = [400, 600, 600], [300, 1350, 1350]
     for c, steps, degree in zip((preview, standard, final), opened, degrees, strict=True):
@@ -212,11 +212,11 @@ def test_near_and_far_means_move_by_as_many_pixels(world, quiet):
         config.lr_means_reach = reach
         trainer = Trainer(scene, images, scene.solved, config, quiet())
         means = trainer.model.gaussians.params["means"]
-        with torch.no_grad():  # the scene lies a few units away: some of it comes near, some goes far
+        with torch.no_grad():  # the scene is a few units away: some points become near, some far
             means *= torch.logspace(-1, 1, len(means))[:, None]
         before = means.detach().clone()
         trainer.step()
-        pulled = means.grad.abs() > 1e-9  # Adam's first step is as long as its rate, whatever pulls
+        pulled = means.grad.abs() > 1e-9  # Adam's first step has the length of its rate, independent of the gradient
         length = before.norm(dim=1, keepdim=True).clamp_min(1.0).expand_as(means)
         expected = config.lr_means * (length / (reach or 1.0)) ** exponent
         assert int(pulled.sum()) > 100
@@ -229,13 +229,13 @@ def iteration_of(folder):
 
 
 def files_of(run):
-    """Name -> hash of every file of a run, without what is trained to take its place."""
+    """Map from name to hash of every file of a run, without the folder of its replacement."""
     files = [p for p in run.rglob("*") if p.is_file() and "next" not in p.parts]
     return {str(p.relative_to(run)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
 def begun_in(run):
-    """The folders in which trainings that will take the run's place are at work."""
+    """Folders of trainings that will replace the run."""
     return sorted(p.parent for p in run.glob("next/*/checkpoint.safetensors"))
 
 
@@ -266,7 +266,7 @@ def test_a_finished_run_stays_until_one_of_other_settings_is_done(world, quiet):
 
 
 def test_an_evaluation_that_a_cancel_ended_is_made_when_the_run_goes_on(world, quiet, monkeypatch):
-    """Cancelled in its evaluation once and once more, and in that after its last step: its curve has no hole."""
+    """Two cancels in an evaluation, and two in the last one: the curve has no gap."""
     train_shot(world.shot, short(world, "whole"), quiet())
     measured, goes_on = Trainer.frame_psnrs, []
 
@@ -329,7 +329,7 @@ def test_a_finished_run_that_begins_anew_stays_too(world, quiet):
 
 
 def test_a_training_that_was_begun_behind_a_link_is_not_gone_on_with(world, quiet, tmp_path):
-    """A shot folder may come from anywhere, and a link in it lead to somebody else's run."""
+    """A shot folder may come from anywhere, and a link in it may lead to another user's run."""
     train_shot(world.shot, short(world, "linked"), quiet())
     with pytest.raises(Cancelled):
         train_shot(world.shot, short(world, "linked", seed=5), quiet(cancel_at=("training", 0.5)))
@@ -343,7 +343,7 @@ def test_a_training_that_was_begun_behind_a_link_is_not_gone_on_with(world, quie
 
 
 def test_paused_runs_of_one_name_wait_side_by_side(world, quiet):
-    """Hours of a paused run are not lost because somebody tried other settings for a minute."""
+    """A short training with other settings must not delete hours of a paused run."""
     for seed in (1, 2, 3):
         with pytest.raises(Cancelled):
             train_shot(world.shot, short(world, "paused", seed=seed), quiet(cancel_at=("training", 0.5)))
@@ -358,7 +358,7 @@ def test_paused_runs_of_one_name_wait_side_by_side(world, quiet):
 
 
 def test_a_kill_while_the_new_run_takes_its_place_is_made_up_for(world, quiet, tmp_path):
-    """The files are replaced one after the other; the state after each is built by hand."""
+    """Files are replaced one after the other; the state after each replacement is built by hand."""
     shot = Shot(shutil.copytree(world.shot.root, tmp_path / "s.splannequin", ignore=shutil.ignore_patterns("runs")))
     run, old, new = shot.run("main"), tmp_path / "old", tmp_path / "new"
     for seed, folder in ((0, old), (5, new)):
@@ -401,7 +401,7 @@ def test_a_run_of_other_cameras_is_refused(tmp_path, quiet):
 
 
 def test_a_run_of_other_pictures_is_refused_and_trained_anew(tmp_path, quiet):
-    """Another grade of the same footage, with cameras that were given: they are the same to the byte."""
+    """Another grade of the same footage with imported cameras, whose files are identical byte by byte."""
     import sys
 
     world = sys.modules[quiet.__module__].build_world(tmp_path)
@@ -427,7 +427,7 @@ def test_a_run_of_other_pictures_is_refused_and_trained_anew(tmp_path, quiet):
 
 
 def test_a_run_is_known_by_its_content_whatever_the_time_of_its_file(world, quiet, tmp_path):
-    """A disk may round times as it likes, and `cp -r` gives new ones."""
+    """A disk may round modification times, and `cp -r` changes them."""
     train_shot(world.shot, short(world, "timed"), quiet())
     checkpoint = world.shot.run("timed") / CHECKPOINT_FILE
     run = load_run(world.shot, "timed")
@@ -491,7 +491,7 @@ def test_inside_frustum():
 
 @pytest.mark.parametrize("wrong", ["exposure", "field"])
 def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wrong):
-    """Whole, and of the right version, but a tensor lacks or has another shape: of another build, or edited."""
+    """The file is complete and of the right version, but a tensor is missing or has another shape."""
     shutil.copytree(world.shot.root, tmp_path / "misfit.splannequin")
     shot = Shot.open(tmp_path / "misfit.splannequin")
     asked = TrainParams(run="misfit", iterations=30, max_gaussians=300, method="hexplane")
@@ -511,7 +511,7 @@ def test_a_checkpoint_that_does_not_fit_is_a_sentence(world, quiet, tmp_path, wr
 
 
 def test_a_card_that_fails_says_nothing_of_the_checkpoint():
-    """It must not be told to train anew what is in order."""
+    """The message must not ask for a new training if the checkpoint is sound."""
     for error in (torch.OutOfMemoryError("CUDA out of memory."), torch.AcceleratorError("an illegal memory access")):
         assert isinstance(error, MISFITS) and misfit(Path("checkpoint"), error, ExitCode.TRAIN) is error
     told = misfit(Path("checkpoint"), RuntimeError("size mismatch\nfor a"), ExitCode.TRAIN)

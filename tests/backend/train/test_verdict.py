@@ -1,4 +1,4 @@
-"""A run says in words whether it holds: figures into sentences, figures against known motion, and whole small runs."""
+"""Verdict of a run in sentences: sentences from figures, figures compared with known motion, and small whole runs."""
 
 import dataclasses
 import re
@@ -18,7 +18,7 @@ FRAMES = list(range(1, 75, 3))
 
 
 def figures(**changes) -> RunFigures:
-    """Those of `sitting`'s preview, changed."""
+    """Figures of the preview run of `sitting`, with changes."""
     none = np.zeros((len(FRAMES), GRID, GRID), np.float32)
     still = RunFigures(640, FRAMES, none + 0.02, none + 0.01, 0.021, 0.0, 0.0256, 24.4, 22.8, True)
     return dataclasses.replace(still, **changes)
@@ -100,7 +100,7 @@ def test_regions_and_frames_in_words():
         assert region_words(one) == expected
     assert region_words(cells + 1.0) == region_words(cells) == "most of the picture"
     shares = lost_at(4, 7, 0, 0) + lost_at(40, 61, 3, 3) - 0.02
-    shares[FRAMES.index(49)] = 0.0  # one good frame does not part a span
+    shares[FRAMES.index(49)] = 0.0  # one good frame does not split a span
     spans = spans_of(FRAMES, shares, shares > 0.3)
     assert [where_words(span) for span in spans] == ["frames 40 to 61, lower right", "frames 4 to 7, upper left"]
     assert where_words({"first": 4, "last": 4, "region": "top"}) == "frame 4, top"
@@ -108,7 +108,7 @@ def test_regions_and_frames_in_words():
 
 
 def test_travel_is_measured_in_the_view_and_only_where_somebody_saw_it():
-    """A point that goes 0.5 units across at depth 2 with a focal length of 100 px: 25 px, in float64 by hand."""
+    """A point moves by 0.5 units at depth 2 with a focal length of 100 px: 25 px, computed by hand."""
     places = torch.tensor([[0.0, 0.0, 2.0], [0.25, 0.0, 2.0], [0.5, 0.0, 2.0]])[:, None].repeat(1, 5, 1)
     places[2, 1] = torch.nan  # seen at the first two times only
     places[1:, 2] = torch.nan  # seen once
@@ -130,7 +130,7 @@ def test_edges_and_grain_are_explained_and_a_figure_that_is_missing_is_not():
 
 
 def walk_through(shot):
-    """Paints somebody over the frames who crosses the picture, with other folds in the clothes on every frame."""
+    """Paint a person who crosses the picture into the frames, with other clothes in every frame."""
     random = np.random.default_rng(3)
     files = sorted(shot.frames.glob("*.png"))
     for n, path in enumerate(files):
@@ -142,7 +142,7 @@ def walk_through(shot):
 
 
 def test_a_run_tells_how_far_things_travel(trained):
-    """The patch of the small world sways by 0.4 units at depth 3.2, of 64 pixels: more than people who hold still."""
+    """The small world's patch sways by 0.4 units at depth 3.2, which is more than people who hold still."""
     world, summary = trained
     there = [world.at(time)["means"][world.moving][0] for time in (0.25, 0.75)]
     true = float((there[0] - there[1])[0]) * 60.0 / 3.2

@@ -1,6 +1,6 @@
-"""Frames made of plates, of a world that is known exactly: a wall, and a board before it that goes to and fro.
+"""Plate compositing in a world with exact ground truth: a wall, and a board in front that sways.
 
-The model has both where they are, but soft; what the plates show beside, fine stripes, is nowhere in it.
+The model has exact geometry, but only soft colours. The plates also show fine stripes, which the model lacks.
 """
 
 import math
@@ -40,12 +40,12 @@ SWAY = 0.8
 
 
 def board_at(frame):
-    """x of the board's middle at a frame; it is in the middle at frame 7."""
+    """x of the board's centre at a frame; the board is centred at frame 7."""
     return SWAY * math.sin((frame - 7) * math.pi / 12)
 
 
 def soft(x, y, board):
-    """Colours [..., 3] that the model has, too."""
+    """Soft colours [..., 3], which plates and model share."""
     if board:
         return np.stack([0.75 + 0.08 * np.sin(4 * x), 0.45 + 0.05 * np.cos(5 * y), 0.35 + 0 * x], -1)
     wave = 0.12 * np.sin(1.7 * x + 0.5) * np.cos(1.3 * y)
@@ -53,16 +53,16 @@ def soft(x, y, board):
 
 
 def fine(x, y, board):
-    """What only the plates have, [...]."""
+    """Fine stripes [...], which only the plates have."""
     step = 0.09 if board else 0.14
     return 0.1 * np.sin(2 * math.pi * x / step) * np.cos(2 * math.pi * y / step)
 
 
 def seen(viewmat, board, beyond=(0, 0)):
-    """(picture [H, W, 3] float64 display-referred, where the board is [H, W]); the board's middle is at x = `board`."""
+    """(display-referred picture [H, W, 3] float64, mask of the board [H, W]); the board's centre is at x = `board`."""
     y, x = np.mgrid[-beyond[1] : H + beyond[1], -beyond[0] : W + beyond[0]] + 0.5
     rays = np.stack([(x - W / 2) / FOCAL, (y - H / 2) / FOCAL, np.ones_like(x)], -1)
-    centre = -np.asarray(viewmat, np.float64)[:3, 3]  # no camera is turned
+    centre = -np.asarray(viewmat, np.float64)[:3, 3]  # cameras are not rotated
     places = [centre + rays * (z - centre[2]) for z in (WALL, BOARD)]
     on = (abs(places[1][..., 0] - board) < HALF[0]) & (abs(places[1][..., 1]) < HALF[1])
     pictures = []
@@ -90,7 +90,7 @@ def sheet(x, y, z, step, board):
 
 
 class Sways(Deformation):
-    """The board's motion, exactly."""
+    """The board's exact motion."""
 
     def forward(self, means, times, own=None):
         x = SWAY * torch.sin((times * (FRAMES - 1) - 6) * math.pi / 12).expand(len(means))
@@ -108,11 +108,11 @@ class World:
         return Plates(self.shot)
 
     def compositor(self):
-        # Surfaces are where they are: a real model's are not, which the default minds.
+        # Geometry is exact here; the default expects the depth errors of a real model.
         return Compositor(self.run, self.scene, self.plates(), CompositeConfig(depth_error=0.01))
 
     def output(self, frame, t_star):
-        """A frame of a take at the clip's own pose."""
+        """Output frame of a take at the clip's own pose."""
         K = self.scene.camera_at(W, H)[frame - 1]
         return OutputFrame(frame, self.scene.viewmats[frame - 1], K, float(t_star), float(frame))
 
@@ -125,16 +125,16 @@ class World:
         return (compositor or self.compositor()).frame(output, frozen, image, W, H, withheld)
 
     def truth(self, output):
-        """(picture [H, W, 3] of the frozen instant, where the board is)."""
+        """(picture [H, W, 3] of the frozen instant, mask of the board)."""
         return seen(output.viewmat, 99.0 if self.still else board_at(output.t_star))
 
     def seen_at(self, frame):
-        """What plate `frame` shows."""
+        """(picture of plate `frame`, mask of the board)."""
         return seen(self.scene.viewmats[frame - 1], 99.0 if self.still else board_at(frame))
 
 
 def path():
-    """[FRAMES, 4, 4] the clip's cameras: none is turned."""
+    """[FRAMES, 4, 4] cameras of the clip, without rotation."""
     viewmats = torch.eye(4).repeat(FRAMES, 1, 1)
     viewmats[:, 0, 3] = torch.linspace(0.35, -0.35, FRAMES)
     viewmats[:, 1, 3] = 0.05 * torch.sin(torch.arange(FRAMES) * 1.3)
@@ -142,10 +142,9 @@ def path():
 
 
 def build(folder, report, still=False, logo=None, drawn=None):
-    """A shot on disk as import, solve and a painter leave it: plates of 16 bits, working frames half as large.
+    """Write a shot as import, solve and painted mattes leave it: 16-bit plates, working frames half as large.
 
-    `logo` [H, W] bool is burnt into all plates, and the solve was given a mask of it. `drawn(picture, n)` changes
-    plate n.
+    `logo` [H, W] bool is burnt into all plates and masked in the solve. `drawn(picture, n)` changes plate n.
     """
     viewmats = path()
     shot, source = Shot.create(folder / "board.splannequin"), folder / "source"
@@ -186,7 +185,7 @@ def build(folder, report, still=False, logo=None, drawn=None):
 
 
 def solved(shot, viewmats):
-    """What a solve without a lens leaves."""
+    """Write a solve without lens distortion."""
     width, height = W // 2, H // 2
     k = [FOCAL / 2, FOCAL / 2, width / 2, height / 2]
     cameras = [CameraFrame(n, v.flatten().tolist(), k) for n, v in enumerate(viewmats, 1)]
@@ -199,7 +198,7 @@ def solved(shot, viewmats):
 
 
 def ignore(shot, logo):
-    """What a solve with a mask leaves beside the cameras."""
+    """Write the mask that a solve stores with its cameras."""
     write_json(shot.solve_record, {**read_json(shot.solve_record), "masks": {"ignore": {"key": "logo"}}})
     shot.masks("ignore").mkdir()
     for n in range(1, FRAMES + 1):
@@ -218,7 +217,7 @@ def still_world(tmp_path_factory, quiet):
 
 @pytest.fixture(scope="module")
 def made(world):
-    """(pose, t*) -> frame, each made once."""
+    """made(pose, t*): composited frame, computed once."""
     compositor, frames = world.compositor(), {}
 
     def get(frame, t_star):
@@ -234,7 +233,7 @@ def dilate(mask, by):
 
 
 def off(a, b, where):
-    """Root of the mean squared difference there."""
+    """Root mean squared difference of the pixels in `where`."""
     return float(np.sqrt(np.square(np.asarray(a, np.float64) - np.asarray(b))[where].mean()))
 
 
@@ -305,7 +304,7 @@ def test_warp_matte_and_fill_are_the_frame(world, made):
 
 
 def replace_pose(output, shift):
-    """The same camera elsewhere, as a path of the artist's own has it."""
+    """Output of a moved camera, as in an artist's camera path."""
     viewmat = output.viewmat.clone()
     viewmat[:3, 3] += torch.tensor(shift)
     return replace(output, viewmat=viewmat, exposed_like=output.t_star)
@@ -319,7 +318,7 @@ def test_the_plate_of_the_instant_is_its_own_frame(world, made):
 
 @pytest.mark.parametrize(("frame", "t_star"), [(3, 11), (10, 4)])
 def test_the_plate_may_stand_where_the_motion_matte_is_black(world, made, frame, t_star):
-    """Not so where the board stands in the frame's own plate and no longer at t*: the plate would show it twice."""
+    """Where the board has left its place by t*, the matte must be white: the plate would show the board twice."""
     result = made(frame, t_star)
     gone = world.seen_at(frame)[1] & ~world.truth(world.output(frame, t_star))[1]
     assert gone.mean() > 0.02 and (result.motion.numpy()[gone] > 0.9).mean() > 0.95
@@ -331,7 +330,7 @@ def test_the_plate_may_stand_where_the_motion_matte_is_black(world, made, frame,
 
 
 def test_stripes_of_what_sways_come_from_other_plates_moved_as_the_model_moves_it(world):
-    """At the end of its way the board moves by 2 pixels from one frame to the next: half a stripe."""
+    """At the end of its path the board moves by 2 pixels per frame, which is half a stripe."""
     output = world.output(12, 13)
     result = world.make(output, withheld=[13])
     truth, on = world.truth(output)
@@ -341,7 +340,7 @@ def test_stripes_of_what_sways_come_from_other_plates_moved_as_the_model_moves_i
 
 
 def test_far_from_plate_t_star_a_wrong_depth_is_made_up_for_by_the_own_plate(tmp_path, quiet, monkeypatch):
-    """From one end of the path to the other a depth that is 3 % off misplaces stripes of plate t* by a quarter."""
+    """Between the ends of the path, a depth error of 3 % shifts the stripes of plate t* by a quarter."""
     monkeypatch.setitem(globals(), "SWAY", 0.003)
     world = build(tmp_path, quiet())
     means = world.run.model.gaussians.params["means"]
@@ -424,7 +423,7 @@ def test_a_camera_of_ones_own_at_a_pose_of_the_clip_is_that_plate(still_world):
     output = replace(still_world.output(9, 4), frame=1001, exposed_like=4.0)
     result = still_world.make(output)
     assert result.primary == 9
-    # A depth that is wrong moves nothing between two cameras in one place.
+    # Between two cameras at one place, a wrong depth moves nothing.
     assert (result.st - identity()).abs().max() < 0.02 / W
     assert off(result.color, still_world.seen_at(9)[0], np.ones((H, W), bool)) < 2e-3
 
@@ -457,9 +456,9 @@ def test_overscan_goes_on_around_the_same_frame(world, made):
     inside, wide = made(frame, t_star), world.make(world.output(frame, t_star), beyond=(across, down))
     assert wide.linear.shape == (H + 2 * down, W + 2 * across, 3)
     middle = (slice(down, -down), slice(across, -across))
-    around = [world.seen_at(frame + step)[1] for step in (-1, 0, 1)]  # plates beside it have a say
+    around = [world.seen_at(frame + step)[1] for step in (-1, 0, 1)]  # neighbouring plates affect the result
     still = ~dilate(np.any([*around, world.truth(world.output(frame, t_star))[1]], axis=0), 16)
-    still[:4] = still[-4:] = still[:, :4] = still[:, -4:] = False  # mattes end softly at the plate's own border
+    still[:4] = still[-4:] = still[:, :4] = still[:, -4:] = False  # mattes fade at the plate's border
     for name in ("linear", "st", "matte", "plate", "source"):
         np.testing.assert_array_equal(getattr(wide, name)[middle][still], getattr(inside, name)[still], err_msg=name)
     assert (wide.color[middle] - inside.color).abs().mean() < 2e-3
@@ -502,13 +501,13 @@ def test_a_frame_made_some_rows_at_a_time_is_the_same(world, monkeypatch, case):
     for name in [*vars(whole), "color"]:
         a, b = getattr(parts, name), getattr(whole, name)
         if isinstance(a, torch.Tensor) and name != "source":
-            np.testing.assert_allclose(a, b, atol=1e-4, err_msg=name)  # a half float at 0.5 is off by 2.4e-4
+            np.testing.assert_allclose(a, b, atol=1e-4, err_msg=name)  # half floats near 0.5 have errors of 2.4e-4
 
 
 def test_bars_beside_the_picture_are_the_frames_own_plate_s(world):
-    """No part of the scene, so no splat and no other plate has anything to say there."""
+    """Bars are not part of the scene, so neither splats nor other plates show anything there."""
     output, bars = world.output(4, 7), np.zeros((H, W), bool)
-    bars[:, : W // 2] = True  # also over the board, whose pixels there are no frame's but t*'s
+    bars[:, : W // 2] = True  # also covers the board, whose pixels must come from t*
     config = CompositeConfig(depth_error=0.01)
     compositor = Compositor(
         world.run, world.scene, world.plates(), config, bars=lambda frame: bars if frame == 4 else None

@@ -1,4 +1,4 @@
-"""Grain of a plate against grain that was put there, and grain as it is drawn."""
+"""Measured grain of a plate, compared with added grain; and synthesised grain."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ HEIGHT, WIDTH = 192, 320
 
 
 def scene(texture: float = 0.1) -> np.ndarray:
-    """[H, W, 3] in 0..1: gradients over most levels, half of it textured."""
+    """[H, W, 3] in 0..1: gradients over most levels, one half textured."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     picture = np.stack([0.1 + 0.8 * x / WIDTH, 0.1 + 0.8 * y / HEIGHT, 0.5 + 0.2 * np.sin(x / 60) * np.cos(y / 50)], -1)
     busy = (x // 32 + y // 32) % 2 == 1
@@ -22,7 +22,7 @@ def scene(texture: float = 0.1) -> np.ndarray:
 
 
 def noise(seed: int, softness: float) -> np.ndarray:
-    """[H, W, 3] of deviation 1, blurred in the Fourier domain, which owes nothing to the code under test."""
+    """[H, W, 3] of standard deviation 1, blurred in the Fourier domain, independently of the tested code."""
     white = np.random.default_rng(seed).standard_normal((HEIGHT, WIDTH, 3)) @ np.linalg.cholesky(AGREEMENT).T
     fy, fx = np.fft.fftfreq(HEIGHT)[:, None], np.fft.fftfreq(WIDTH)[None, :]
     low = np.exp(-2.0 * (np.pi * softness) ** 2 * (fy**2 + fx**2))
@@ -83,7 +83,7 @@ def flat(value: float, alpha: float = 1.0, size: tuple[int, int] = (WIDTH, HEIGH
 
 
 def test_drawn_grain_is_what_was_measured():
-    """Added to a clean picture and looked at as a plate is: the same deviation, softness, agreement."""
+    """Synthesised grain on a clean picture is measured with the same deviation, softness and channel correlation."""
     frames = []
     for k in range(4):
         picture = scene().astype(np.float32)

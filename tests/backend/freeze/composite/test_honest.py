@@ -1,4 +1,4 @@
-"""What moved is let go of whole, though mattes miss parts of it: nothing of it stays, no speck and no outline."""
+"""A moved object is removed completely, although mattes miss parts: no fragment and no outline remains."""
 
 from dataclasses import replace
 
@@ -15,9 +15,9 @@ from torch_backend.freeze.take.frames import small_share
 from torch_backend.freeze.views.source_views import VisibilityConfig
 
 FRAME, T_STAR = 3, 11
-"""The board stands wholly apart in these two."""
+"""The board's positions in these two frames do not overlap."""
 BLIND = {"state": StateConfig(weights=StateWeights(-5.0, 10.0, 0.0, 0.0, 0.0, 0.0))}
-"""Of `CompositeConfig`: motion mattes alone tell the state."""
+"""`CompositeConfig` options with which only motion mattes decide the state."""
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def world(tmp_path_factory, quiet):
 
 
 class Stays(Deformation):
-    """No motion: the board stands where it is at T_STAR."""
+    """No motion: the board stays at its position at T_STAR."""
 
     def forward(self, means, times, own=None):
         return Deltas(torch.tensor([board_at(T_STAR), 0.0, 0.0]).expand(len(means), 3))
@@ -37,9 +37,9 @@ def erode(mask, by):
 
 
 def make(world, mattes, source_views=None, masked=None, **config):
-    """The frame at T_STAR; `mattes` frame -> bool [H, W], of those that are not as they should be.
+    """Composited frame at T_STAR; `mattes` maps frames to bool [H, W] mattes that replace the correct ones.
 
-    `masked`: bool [H, W], what plate t* is not to show; None: nothing.
+    `masked`: bool [H, W], pixels of plate t* to ignore, or None.
     """
 
     def moving(frame):
@@ -55,7 +55,8 @@ def make(world, mattes, source_views=None, masked=None, **config):
 
 
 def shows_its_own_board(world, made):
-    """Share of the pixels where the frame's own plate has the board and t* has not, that look like that board."""
+    """Fraction of pixels that look like the frame's own board, where its plate shows the board and the truth at t* does
+    not."""
     (plate, on), (truth, there) = world.seen_at(FRAME), world.truth(world.output(FRAME, T_STAR))
     gone = on & ~dilate(there, 4)
     assert gone.sum() > 3000
@@ -64,14 +65,14 @@ def shows_its_own_board(world, made):
 
 
 def test_a_matte_that_ends_short_of_what_moves_leaves_nothing_of_it(world):
-    """The flow misses 9 pixels of the board all around: in the frame's own plate and in those that fill."""
+    """The flow misses the outer 9 pixels of the board in the frame's own plate and in the filling plates."""
     short = {frame: erode(world.seen_at(frame)[1], 9) for frame in range(1, 14) if frame != T_STAR}
     assert shows_its_own_board(world, make(world, short)) < 0.01
     assert shows_its_own_board(world, make(world, short, **BLIND)) > 0.1, "else there is nothing to mend"
 
 
 def test_what_is_held_still_and_was_elsewhere_at_t_star_is_not_shown(world):
-    """For a second nobody moves, so no matte says anything; plate t* shows the wall, as the frozen frame does."""
+    """Nobody moves for a second, so mattes are empty; plate t* shows the wall, and so does the frozen frame."""
     still = {frame: np.zeros((H, W), bool) for frame in range(FRAME - 2, FRAME + 3)}
     made = make(world, still)
     assert shows_its_own_board(world, made) < 0.01
@@ -81,7 +82,8 @@ def test_what_is_held_still_and_was_elsewhere_at_t_star_is_not_shown(world):
 
 
 def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
-    """As before, but the model leaves the board where it was at t*: that plate and plate t* differ has to do."""
+    """As above, but the model keeps the board at its place at t*: only the difference between both plates shows the
+    change."""
     before = world.run.model
     world.run.model = replace(before, field=Stays())
     still = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
@@ -94,7 +96,7 @@ def test_what_the_model_knows_at_no_time_is_not_shown_either(world):
 
 
 def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
-    """At the plate's own time the board stood before the wall: there the frozen render shows what never moves."""
+    """At the plate's time the model shows the board where the frozen render shows the static wall."""
     none = {frame: np.zeros((H, W), bool) for frame in range(1, 14)}
     made, alone = make(world, none), make(world, none, **BLIND)
     gone = erode(world.seen_at(FRAME)[1], 6) & ~dilate(world.truth(world.output(FRAME, T_STAR))[1], 6)
@@ -103,7 +105,7 @@ def test_what_no_matte_sees_is_let_go_of_where_the_model_knows_of_it(world):
 
 
 def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(world):
-    """The model has the wall wrong in a spot, at every time: that is no motion."""
+    """The model has a wrong colour in a spot of the wall at all times, which is not motion."""
     spot = world.run.model.gaussians.params["means"][:, :2]
     wrong = (spot - torch.tensor([-2.2, 1.7])).norm(dim=1) < 0.4
     colors = world.run.model.gaussians.params["sh0"]
@@ -125,7 +127,7 @@ def test_where_plate_t_star_is_not_borne_out_by_the_model_its_own_plate_stays(wo
 
 
 def test_plates_that_fill_show_nothing_of_it_either(world):
-    """Flow found the board in the frame's own plate alone, and the model leaves it where it was at t*."""
+    """Flow found the board only in the frame's own plate, and the model keeps the board at its place at t*."""
     before = world.run.model
     world.run.model = replace(before, field=Stays())
     try:
@@ -147,7 +149,7 @@ def test_where_mattes_ended_short_the_wall_is_as_sharp_as_its_plates(world):
 
 
 def test_what_moves_and_no_plate_near_t_star_shows_is_a_guess(world):
-    """Its Gaussians are known at every time, as those that were never opened are: the plates have to say it."""
+    """The model renders these Gaussians at every time with full support, so only the plates can reveal the guess."""
     output = world.output(FRAME, T_STAR)
     board = erode(world.truth(output)[1], 6)
     wall = ~dilate(world.seen_at(FRAME)[1] | world.truth(output)[1], 24)

@@ -1,4 +1,4 @@
-"""Depth of what moves by the artist's map: right where the map is, from plate t* and from beside it."""
+"""Depth of moving objects from the artist's map: correct where the map is, in plate t* and in other views."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def camera(shift: float) -> NDArray[np.float64]:
 
 
 def world(shift: float, mover: float = MOVER) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """(inverse depth, moving, card), [H, W] each: a mover before a wall, and a card before its left part."""
+    """(inverse depth, moving, card), each [H, W]: a moving object before a wall, and a card in front of its left
+    part."""
     rays = rays_of(K, (HEIGHT, WIDTH))
 
     def hit(depth: float, left: float, right: float, top: float, bottom: float) -> NDArray[Any]:
@@ -45,7 +46,7 @@ def world(shift: float, mover: float = MOVER) -> tuple[NDArray[Any], NDArray[Any
 
 
 def instant(splats_off: float, sigma: float = 0.02, hole: bool = False) -> InstantDepth:
-    """Splats have the mover so much too far, as a share; the map has the truth."""
+    """Depth at t*: splats place the moving object too far by the fraction `splats_off`; the map has the true depth."""
     true, moving, _ = world(0.0)
     splats = np.where(moving, true / (1.0 + splats_off), true).astype(np.float32)
     deviation = (sigma * true).astype(np.float32)
@@ -65,7 +66,8 @@ def instant(splats_off: float, sigma: float = 0.02, hole: bool = False) -> Insta
 
 
 def corrected(shift: float, splats_off: float, **more: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """(depth of the mover over the truth, stated relative deviation, depth of all else over the truth) in a view."""
+    """(depth of the mover / truth, stated relative deviation, depth of all else / truth) in a view shifted by
+    `shift`."""
     true, moving, _ = world(shift)
     splats = np.where(moving, true / (1.0 + splats_off), true).astype(np.float32)
     view = KeyView(camera(shift), K, splats, splats, splats, splats)
@@ -97,7 +99,7 @@ def test_where_the_map_has_a_hole_the_splats_stay_or_take_their_neighbours_corre
 
 
 def test_what_plate_t_star_does_not_show_is_not_measured_by_it():
-    """Beyond the card at t*, the map has the card's depth."""
+    """Behind the card, the map at t* holds the card's depth."""
     true, moving, _ = world(0.5)
     splats = np.where(moving, true / 1.06, true).astype(np.float32)
     view = KeyView(camera(0.5), K, splats, splats, splats, splats)

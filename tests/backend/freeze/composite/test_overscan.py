@@ -1,4 +1,4 @@
-"""A take with overscan: the same camera with more pixels, a frame in a larger picture, and the way back to the lens."""
+"""A take with overscan: the same camera with more pixels, with the frame inside; and redistortion with the lens."""
 
 import json
 
@@ -20,7 +20,7 @@ RANGE = {"t_star": 105, "first": 104, "last": 105, "develop": "off"}
 
 @pytest.fixture(scope="module")
 def lens(trained):
-    """The tiny world filmed through a barrel lens, as its solve would tell it."""
+    """The tiny world with a barrel lens in its solve."""
     world, _ = trained
     told = {"version": 1, "camera_model": "SIMPLE_RADIAL", "distortion": [-0.2], "focal_px": 61.9}
     write_json(world.shot.solve / "solve.json", told)
@@ -46,7 +46,8 @@ def test_the_frame_inside_is_the_take_without_overscan(trained, lens, plain, qui
         np.testing.assert_array_equal(whole.metadata.K, frame.metadata.K)
         for name in ("rgba", "support", "motion"):
             off = np.abs(getattr(whole, name)[6:-6, 8:-8] - getattr(frame, name))
-            # The slope of a Gaussian's projection is held at a little beyond the frame, and the frame is larger here.
+            # The slope of a Gaussian's projection is clamped slightly beyond the frame; with overscan the frame is
+            # larger.
             assert off.max() < 2e-2, name
             if name == "rgba":
                 aside = np.abs(whole.rgba[6:-6, 9:-7] - frame.rgba).mean()
@@ -54,7 +55,7 @@ def test_the_frame_inside_is_the_take_without_overscan(trained, lens, plain, qui
         sigma = frame.more["DepthSigma"]
         assert sigma.shape == frame.depth.shape and (sigma[frame.depth < NO_DEPTH] > 0).all()
         off = np.abs(whole.depth[6:-6, 8:-8] - frame.depth)
-        reach = 4 * SurfaceDepthConfig().radii[0] + 1  # windows of windows
+        reach = 4 * SurfaceDepthConfig().radii[0] + 1  # reach of nested windows
         inner = np.s_[reach:-reach, reach:-reach]
         assert (off / frame.depth)[inner].max() < 1e-4
         assert (off < 2.0 * sigma).mean() > 0.99, "surfaces at the border are measured with what is beyond it"

@@ -1,4 +1,4 @@
-"""The posterior of a plate's state: what counts as evidence, and how log-odds become a matte."""
+"""Posterior of a plate's state: the evidence, and the matte from its log-odds."""
 
 from dataclasses import fields, replace
 
@@ -16,7 +16,7 @@ from torch_backend.freeze.views.source_views import SourceViews
 from torch_backend.freeze.views.target_view import target_view
 
 FRAME, T_STAR = 3, 11
-"""The board stands wholly apart in these two."""
+"""The board's positions in these two frames do not overlap."""
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def world(tmp_path_factory, quiet):
 
 @pytest.fixture(scope="module")
 def found(world):
-    """(evidence of plate FRAME against t*, where its board is [H, W], where the board of t* is [H, W])."""
+    """(evidence of plate FRAME against t*, evidence without t*, mask of the plate's board, mask of the board at t*)."""
     output = world.output(FRAME, T_STAR)
     frozen = freeze_at(world.run.model, world.scene.time_of_frame(T_STAR), 1.0)
     image = render_frozen(frozen, output.viewmat, output.K, W, H)
@@ -69,7 +69,8 @@ def test_log_odds_become_a_soft_border():
 
 
 def test_fitting_finds_the_evidence_that_tells_and_leaves_the_rest():
-    """One piece of evidence tells where the plate is wrong, the others are noise; there the fill is right."""
+    """One kind of evidence marks where the plate is wrong, the others are noise; where it is wrong, the fill is
+    right."""
     torch.manual_seed(0)
     wrong = torch.zeros(2, 32, 40)
     wrong[:, 8:24, 10:30] = 1.0

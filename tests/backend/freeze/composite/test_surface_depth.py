@@ -1,4 +1,4 @@
-"""Depth of surfaces: planes stay planes, plates correct what splats have wrong, edges are those of the picture."""
+"""Surface depth: planes stay planar, plates correct wrong splat depths, and edges follow the picture."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from torch_backend.freeze.composite.surface_depth import (
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
 NORMAL, DISTANCE = np.array([0.25, -0.35, 1.0]), 4.0
-"""Points of the plane: NORMAL @ point = DISTANCE."""
+"""Plane of the points p with NORMAL @ p = DISTANCE."""
 
 
 def rays() -> NDArray[Any]:
@@ -32,7 +32,7 @@ def rays() -> NDArray[Any]:
 
 
 def view_of(shift: float, texture: NDArray[Any], wrong: float = 1.0) -> KeyView:
-    """A camera moved to the right that looks at a textured plane; its inverse depth is off by a factor."""
+    """View of a textured plane from a camera shifted to the right; its inverse depth is wrong by a factor."""
     viewmat = np.eye(4)
     viewmat[0, 3] = -shift
     inverse = (rays() @ NORMAL) / (DISTANCE - NORMAL[0] * shift)
@@ -93,7 +93,7 @@ def test_windows_over_an_edge_do_not_smear_it() -> None:
 
 
 def test_a_ragged_edge_takes_the_pictures_line() -> None:
-    """What moves ends where the picture's colour does, though splats reach up to two pixels beyond it."""
+    """Moving objects end at the picture's colour edge, although splats reach up to two pixels beyond."""
     columns = np.arange(80)[None].repeat(60, 0)
     ragged = 40 + np.random.default_rng(2).integers(-2, 3, 60)[:, None]
     inverse = np.where(columns < ragged, 0.5, 0.2).astype(np.float32)
@@ -107,7 +107,7 @@ def test_a_ragged_edge_takes_the_pictures_line() -> None:
 
 
 def test_key_views_that_agree_outvote_splats_that_are_wrong() -> None:
-    """A wall whose splats are a tenth too far: two key views know better, a third is as wrong as the splats."""
+    """Splats of a wall are 10 % too far: two key views have the true depth, a third is as wrong as the splats."""
     true = np.full((HEIGHT, WIDTH), 0.25, np.float32)
     K = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
 

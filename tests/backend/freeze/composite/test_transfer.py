@@ -1,4 +1,4 @@
-"""Displays on tensors are those of files, far beyond white and below black."""
+"""Display encodings of tensors equal those of files, far above white and below black."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The freeze as a warp, against a float64 reference: values far beyond white and below black, files old and broken."""
+"""The freeze as a warp, compared with float64: values far above white and below black, old and damaged files."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ METADATA = WarpMetadata(1012, 1010, 1030.5, 70, 41, "0123abc")
 
 
 def plate_of(width: int, height: int, seed: int = 1) -> torch.Tensor:
-    """[h,w,3]: noise of -0.2 to 1.2, a twentieth of it highlights of 25 to 50."""
+    """[h,w,3]: noise of -0.2 to 1.2, with highlights of 25 to 50 in 5 % of the pixels."""
     rng = np.random.default_rng(seed)
     plate = rng.uniform(-0.2, 1.2, (height, width, 3))
     hot = rng.uniform(size=(height, width)) < 0.05
@@ -32,14 +32,14 @@ def plate_of(width: int, height: int, seed: int = 1) -> torch.Tensor:
 
 
 def identity(width: int, height: int) -> torch.Tensor:
-    """[H,W,2] in float32, as it is worked out elsewhere."""
+    """[H,W,2] identity ST map, computed in float32 like other programs."""
     x = (np.arange(width, dtype=np.float32) + np.float32(0.5)) / np.float32(width)
     y = np.float32(1.0) - (np.arange(height, dtype=np.float32) + np.float32(0.5)) / np.float32(height)
     return torch.from_numpy(np.stack(np.meshgrid(x, y), axis=2))
 
 
 def waves(width: int, height: int) -> torch.Tensor:
-    """The identity on the left half, smooth displacements of up to 1.5 pixels on the right, beyond the border too."""
+    """Identity in the left half, smooth displacements of up to 1.5 pixels in the right half, also beyond the border."""
     st = identity(width, height).double()
     y, x = np.mgrid[0:height, 0:width]
     moved = torch.from_numpy(np.stack([1.5 * np.sin(y / 9.0 + x / 31.0) / width, np.cos(x / 13.0) / height], axis=2))
@@ -47,7 +47,7 @@ def waves(width: int, height: int) -> torch.Tensor:
 
 
 def reference(plate: np.ndarray, st: np.ndarray) -> np.ndarray:
-    """Bilinear in float64, the border extended."""
+    """Bilinear sampling in float64 with extended borders."""
     height, width = plate.shape[:2]
     x = np.clip(st[..., 0].astype(np.float64) * width - 0.5, 0, width - 1)
     y = np.clip((1.0 - st[..., 1].astype(np.float64)) * height - 0.5, 0, height - 1)
@@ -85,7 +85,7 @@ def test_a_frame_of_another_size_than_the_plate_looks_where_it_should():
 
 @pytest.mark.parametrize("device", ["cpu"] + (["cuda"] if torch.cuda.is_available() else []))
 def test_plate_matte_and_fill_give_the_frozen_frame_back_from_the_file(tmp_path, device):
-    """Values of 50 beside dark ones and below 0, something else over a part of it, holes."""
+    """Includes values of 50 near dark ones, values below 0, areas of other content, and holes."""
     rng, size = np.random.default_rng(5), (70, 41)
     plate, st = plate_of(*size).to(device), snap(waves(*size).to(device), size)
     matte = torch.from_numpy(rng.integers(0, 1025, size[::-1]) / 1024.0).float().to(device)

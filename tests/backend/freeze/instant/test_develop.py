@@ -1,4 +1,4 @@
-"""Developed instants: what they show, what they may not lose, what is kept of them and when it is used."""
+"""Developed instants: their picture, protection against losses, storage and use."""
 
 import dataclasses
 import math
@@ -48,7 +48,7 @@ T_STAR = 105
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory, quiet):
-    """As everywhere, but of few steps: developing is for a run that is not as sharp as its pictures yet."""
+    """As in other tests, but with few steps: developing improves runs that are not yet as sharp as their pictures."""
     world = build_world(tmp_path_factory.mktemp("young"))
     paint_motion(world)
     summary = train_shot(world.shot, TrainParams(iterations=250, holdout=8, max_gaussians=1500), quiet())
@@ -57,7 +57,7 @@ def trained(tmp_path_factory, quiet):
 
 @pytest.fixture(scope="module")
 def made(trained, quiet):
-    """(run, scene, the field's own instant, the developed one, which is kept)."""
+    """(run, scene, instant of the field, developed instant, which is stored)."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     report = quiet()
@@ -74,7 +74,7 @@ def field(run, scene, t_star=T_STAR):
 
 
 def shown(run, scene, frozen, frame):
-    """[H, W, 3] from the pose of a frame, over grey."""
+    """[H, W, 3]: render from the pose of a frame over grey."""
     i = scene.frames.index(frame)
     K = scene.camera_at(scene.width, scene.height)[i]
     image = render_frozen(
@@ -84,7 +84,7 @@ def shown(run, scene, frozen, frame):
 
 
 def scores(world, run, scene, frozen, frames=(102, 105, 110, 115)):
-    """(dB of what moves at t*, dB of what does not), against the truth, from several poses."""
+    """(dB of moving pixels at t*, dB of static pixels), compared with the truth from several poses."""
     off = {"moving": [], "still": []}
     for frame in frames:
         truth = world.image(frame - 101, (T_STAR - 101) / 15)
@@ -148,14 +148,14 @@ def test_developed_gaussians_travel_with_those_they_descend_from(made):
 
 
 def halves(run, frozen):
-    """Rows of what moves: (those on the left, those on the right)."""
+    """Rows of moving Gaussians: (left half, right half)."""
     rows = run.model.open_rows()
     x = frozen.state["means"][rows, 0]
     return rows[x < x.median()], rows[x >= x.median()]
 
 
 def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
-    """The field without half of what moves, as if it had never learnt that."""
+    """The field lacks half of the moving Gaussians, as if it had never learnt them."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen = field(run, scene)
@@ -173,13 +173,13 @@ def test_what_a_scene_lacks_of_a_mover_is_set_where_the_rest_of_it_is(trained):
     assert abs(deep[0] / deep[1] - 1.0) < 0.1
     before, after = (scores(world, run, scene, each) for each in (halved, mended))
     assert after[0] > before[0] + 1.0 and after[1] > before[1] - 0.3
-    for frame in (101, 112):  # at other times nobody knows where it was
+    for frame in (101, 112):  # at other times their position is unknown
         moved = SceneFlow(run, scene, mended, T_STAR).moved(mended.state, frame)
         assert bool((torch.sigmoid(moved["opacity_logits"][added]) < 1e-6).all())
 
 
 def test_floaters_are_hidden_and_nothing_that_stands_still(trained):
-    """Part of what moves in a colour that plate t* does not have there."""
+    """A part of the moving Gaussians has a colour that plate t* does not show there."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen = field(run, scene)
@@ -194,7 +194,7 @@ def test_floaters_are_hidden_and_nothing_that_stands_still(trained):
 
 
 def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
-    """Written, read again, and refused where a row is gone."""
+    """The instant is written, read again, and refused if a row is missing."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, t_star = field(run, scene, 109), 109
@@ -223,7 +223,7 @@ def test_an_instant_with_added_gaussians_is_kept_whole(trained, monkeypatch):
 
 
 def in_tatters(run, frozen):
-    """(the scene with part of the wall opened by mistake and faded at t*, rows of that part)."""
+    """(scene with a part of the wall wrongly opened and faded at t*, rows of that part)."""
     wall = torch.arange(len(frozen.support))[frozen.motion < 0.5]
     wall = wall[frozen.state["means"][wall, 0] > frozen.state["means"][wall, 0].median()]
     run.model.gaussians.open[wall] = True
@@ -249,12 +249,12 @@ def test_what_a_field_harms_is_closed_and_what_plate_t_star_needs_stays_open(tra
 
 
 def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(trained):
-    """In tatters at t*, and mattes call all of it moving: no still pixel says anything against it."""
+    """The wall is wrongly opened at t*, and mattes call everything moving, so no static pixel contradicts it."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     torn, wall = in_tatters(run, field(run, scene))
     closed = []
-    for nearer in (0.0, 1e9):  # no plate sees it from near, every one does
+    for nearer in (0.0, 1e9):  # no plate counts as nearer, then every plate does
         moving = lambda frame: torch.ones(scene.height, scene.width)  # noqa: E731
         mended = apply_static_baseline(run, scene, torn, T_STAR, moving, StaticBaselineConfig(nearer=nearer))
         closed.append(float((mended.motion[wall] < 0.5).float().mean()))
@@ -262,12 +262,12 @@ def test_plates_that_see_a_thing_from_near_are_asked_though_it_moves_there(train
 
 
 def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
-    """Of what sways more is asked where the mattes say that nothing moves; of what went farther, never."""
+    """`doubted` closes Gaussians that sway outside of moving mattes, but never those that moved far."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, blind = field(run, scene), lambda frame: torch.zeros(scene.height, scene.width)
     left = {}
-    for sways in (0.0, 1e9):  # all of it went far, none did
+    for sways in (0.0, 1e9):  # all of them moved far, then none
         for doubted in (1.0, 1e9):
             mended = apply_static_baseline(
                 run, scene, frozen, T_STAR, blind, StaticBaselineConfig(sways=sways, doubted=doubted)
@@ -278,7 +278,7 @@ def test_what_went_far_needs_no_matte_to_be_believed_at_t_star(trained):
 
 
 def test_what_is_seen_from_afar(trained):
-    """Only what some frame saw from less than half as far counts, and only from frames that saw it."""
+    """A Gaussian is undersampled if some frame that saw it was less than half as far away."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     centres = -(scene.viewmats[:, :3, :3].mT @ scene.viewmats[:, :3, 3:])[..., 0]
@@ -310,11 +310,12 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_where_it_moves(trained)
 
 
 def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(trained):
-    """A face that is closed, and that one frame calls moving: others teach it what they see beside it."""
+    """The Gaussians are closed, and one frame's matte calls them moving; other frames must not teach those seen from
+    afar."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frames = [frame for frame in run.train_frames if frame != T_STAR]
-    frozen, once = field(run, scene), spread(frames[1:-1], len(frames) // 4)[-1]  # a probe
+    frozen, once = field(run, scene), spread(frames[1:-1], len(frames) // 4)[-1]  # a probe frame
 
     def moving(frame: int) -> torch.Tensor:
         return torch.full((scene.height, scene.width), float(frame == once))
@@ -334,16 +335,16 @@ def test_of_what_t_star_sees_from_afar_nothing_is_learnt_though_it_was_closed(tr
 
 
 def test_what_moves_stays_open_though_no_matte_sees_it_anywhere(tmp_path, quiet):
-    """Plates in which it stands elsewhere are no evidence that it does harm at t*."""
+    """Plates in which the object is elsewhere do not prove that its field is harmful at t*."""
     world = build_world(tmp_path)
     paint_motion(world)
-    # Of a run of fewer steps, which has opened a tenth as many, chance decides.
+    # A run with fewer steps opens a tenth as many Gaussians, and the result is random.
     train_shot(world.shot, TrainParams(iterations=900, holdout=8, max_gaussians=1500), quiet())
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     frozen, rows = field(run, scene), run.model.open_rows()
     blind = apply_static_baseline(run, scene, frozen, T_STAR, lambda frame: torch.zeros(scene.height, scene.width))
     was, now = (scores(world, run, scene, f)[0] for f in (frozen, blind))
-    # By six trainings, three seeds each of two rates: 0.43 to 0.58, and at most 1.1 dB.
+    # Six trainings (three seeds at two learning rates) gave 0.43 to 0.58, and at most 1.1 dB.
     assert float((blind.motion[rows] > 0.5).float().mean()) > 0.35 and now > was - 2.0
 
 
@@ -353,11 +354,11 @@ def test_a_developed_instant_is_nearer_to_the_truth(trained, made):
     (moving, still), (was_moving, was_still) = (scores(world, run, scene, f) for f in (now, frozen))
     assert (
         still > was_still + 0.3 and moving > was_moving - 0.3
-    )  # 3.3 and more, 0.5 and more by three seeds of the training
+    )  # three seeds of the training gave at least 3.3 and 0.5
 
 
 def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):
-    """The patch has gone pale and grey in the field; plate t* still shows it."""
+    """The field has a pale and grey patch; plate t* still shows the original patch."""
     world, _ = trained
     run, scene = load_run(world.shot, "main"), load_scene(world.shot)
     rows = run.model.open_rows()
@@ -370,10 +371,10 @@ def test_what_the_field_lost_comes_back_and_the_wall_behind_stays(trained):
 
 
 def test_what_has_gone_in_the_other_plates_is_not_erased(trained, made):
-    """In plates far from t* the patch stands elsewhere, and the wall is seen where it stood."""
+    """In plates far from t* the patch is elsewhere, and its place at t* shows the wall."""
     world, _ = trained
     run, scene, frozen, _ = made
-    config = DevelopConfig(steps=200, gain=-99.0)  # whatever it does to frames that are left out
+    config = DevelopConfig(steps=200, gain=-99.0)  # accepts any change on held-out frames
     now = develop(run, scene, frozen, T_STAR, motion_mattes(world.shot), config)
     before, after = (scores(world, run, scene, f, (113, 114, 115))[0] for f in (frozen, now))
     assert after > before - 1.0 and not torch.equal(now.state["sh0"], frozen.state["sh0"])
@@ -410,14 +411,14 @@ def test_where_still_pixels_gain_too_little_what_moves_is_developed_alone(traine
 
 
 def plate_error(run, scene, shot, frozen, frame):
-    """Mean squared error of what moves in a frame, from its own pose."""
+    """Mean squared error of the moving pixels of a frame, from the frame's own pose."""
     plate = read_image(scene.image_path(scene.frames.index(frame)), scene.width, scene.height)
     moves = torch.from_numpy(load_motion(shot, frame)) > 127
     return float((shown(run, scene, frozen, frame) - plate).square().mean(-1)[moves].mean())
 
 
 def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_neighbours_bear(apart, monkeypatch):
-    """In them what moves looks otherwise."""
+    """In the neighbouring plates the moving object has another colour."""
     shot, run, scene, frozen = apart
     path = scene.image_path(scene.frames.index(T_STAR))
     plate, moves = read_png(path), load_motion(shot, T_STAR) > 127
@@ -434,7 +435,7 @@ def test_what_plate_t_star_alone_says_of_what_moves_is_believed_as_far_as_its_ne
 
 @pytest.fixture
 def apart(trained, tmp_path):
-    """A copy of the shot whose run is its own: (shot, run, scene, the field's instant)."""
+    """(shot, run, scene, instant of the field) of a copy of the shot that the test may change."""
     world, _ = trained
     root = shutil.copytree(world.shot.root, tmp_path / "tiny.splannequin", ignore=shutil.ignore_patterns("takes"))
     shutil.rmtree(root / "runs" / "main" / "developed", ignore_errors=True)
@@ -558,7 +559,7 @@ def test_scrubbing_shows_an_instant_as_soon_as_it_has_been_developed(trained, ma
 
 @pytest.mark.parametrize("t_star", [101, 116])
 def test_a_run_in_which_nothing_moves_is_developed_at_its_ends(world, quiet, t_star):
-    """No open Gaussians, and a shot without mattes."""
+    """The run has no open Gaussians, and the shot has no mattes."""
     if not (world.shot.run("still") / "summary.json").is_file():
         train_shot(world.shot, TrainParams(run="still", iterations=60, method="static", holdout=0), quiet())
     run, scene = load_run(world.shot, "still"), load_scene(world.shot)

@@ -1,4 +1,4 @@
-"""What plate t* shows and the scene lacks: where it is found, how deep it is set, and what is left alone."""
+"""Pixels of plate t* that the scene lacks: detection, depth, and cases that must not be changed."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ ARM_AT, HAND_AT = np.s_[60:76, 80:160], np.s_[56:80, 50:80]
 
 
 def seen(*things):
-    """(picture [H, W, 3], the same as a render): a dark wall and, before it, things of skin at (place, depth)."""
+    """(picture [H, W, 3], the same as a render): a dark wall, and skin-coloured objects in front at (area, depth)."""
     picture, depth = DARK.expand(HEIGHT, WIDTH, 3).clone(), torch.full((HEIGHT, WIDTH), WALL)
     for at, deep in things:
         picture[at], depth[at] = SKIN, deep
@@ -52,7 +52,7 @@ def test_nothing_is_added_where(plate, scene, matte):
 
 
 def test_a_stray_splat_beside_a_hand_does_not_pull_it_near():
-    """Half of what holds it decides: the arm's outline is longer."""
+    """The depth is the median over the outline, most of which belongs to the arm."""
     scene = [(ARM_AT, ARM), (np.s_[64:68, 44:48], 0.5)]
     missing, inverse = asked([(ARM_AT, ARM), (HAND_AT, ARM), (np.s_[64:68, 44:48], ARM)], scene)
     assert bool((inverse[missing > 0.5] - 1.0 / ARM).abs().max() < 1e-6)

@@ -1,4 +1,4 @@
-"""The light of a take at a point: coloured splats all round it, exact directions and light, kept, refused."""
+"""Panorama of a take's light at a point: splats in known directions and colours, caching, refusals."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ COLORS = {
     (0, 0, 1): (0.6, 0.2, 0.8),
     (0, 0, -1): (0.3, 0.9, 0.9),
 }
-"""Direction from the point, in the scene's axes -> display-referred sRGB."""
+"""Map from direction (from the point, in scene axes) to display-referred sRGB."""
 POINT = np.array([1.5, -0.5, 0.75])
 
 
@@ -41,19 +41,20 @@ def fibonacci(count):
 
 
 def of_the_nearest(along):
-    """[..., 3] float64 sRGB of the axis that a direction is nearest to, and [...] the cosine to it."""
+    """([..., 3] float64 sRGB of the axis nearest to a direction, [...] cosine to this axis)."""
     axes, colors = (np.array(list(x), np.float64) for x in (COLORS, COLORS.values()))
     cosines = np.asarray(along, np.float64) @ axes.T
     return colors[cosines.argmax(-1)], cosines.max(-1)
 
 
 def to_light(srgb):
-    """IEC 61966-2-1 in float64."""
+    """sRGB decoding (IEC 61966-2-1) in float64."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def ball(radius=4.0, missing=None, count=3000):
-    """Opaque splats on a ball about POINT in six colours, in the scene's axes; without those `missing` says."""
+    """Opaque splats on a sphere around POINT in six colours, in scene axes, without the directions that `missing`
+    selects."""
     along = fibonacci(count)
     if missing is not None:
         along = along[~missing(along)]
@@ -91,7 +92,7 @@ def test_every_direction_has_its_colour_as_light(quiet):
     picture = rendered(ball(), quiet)
     along = truth(SMALL.width)
     srgb, cosine = of_the_nearest(along)
-    sure = cosine > 0.9  # away from where two colours meet
+    sure = cosine > 0.9  # away from the borders between colours
     assert sure.mean() > 0.25
     np.testing.assert_allclose(picture[sure][:, :3], to_light(srgb)[sure], atol=0.01)
     assert picture[..., 3].min() > 0.98
@@ -118,9 +119,9 @@ def test_what_is_near_or_around_the_point_does_not_smear(quiet):
     near = splats(POINT + np.array([[0.03, 0.02, 0.0]]), white, 0.05, 6.0)
     around = splats(POINT + np.array([[0.3, 0.0, 0.1]]), white, 0.4, 6.0)
     needle = splats(POINT + np.array([[0.0, 2.0, 0.0]]), white, 0.05, 6.0)
-    needle.log_scales[:, 1] = np.log(1.5)  # it reaches to the point, and through it
+    needle.log_scales[:, 1] = np.log(1.5)  # it extends through the point
     wide = splats(POINT + np.array([[0.0, 0.0, -3.0]]), white, 0.02, 6.0)
-    wide.log_scales[:, :2] = np.log(2.0)  # flat, and 34 degrees of it one standard deviation
+    wide.log_scales[:, :2] = np.log(2.0)  # flat; one standard deviation spans 34 degrees
     assert np.abs(rendered(joined(ball(), near, around, needle, wide), quiet) - clean).max() < 1e-3
     aside = splats(POINT + np.array([[-1.0, 0.0, 0.0]]), white, 0.05, 6.0)
     with_aside = rendered(joined(ball(), aside), quiet)
@@ -129,7 +130,7 @@ def test_what_is_near_or_around_the_point_does_not_smear(quiet):
 
 
 def test_colours_are_those_that_the_clip_saw():
-    """Harmonics of degree 1 that say red from below and blue from above: seen from below, it stays red all round."""
+    """Harmonics make a splat red from below and blue from above. A clip that saw it from below gives red everywhere."""
     gaussians = splats(POINT + np.array([[0.0, 0.0, -4.0]]), [[0.5, 0.5, 0.5]], 0.3, 6.0)
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 2] = (0.8, 0.0, -0.8)  # times z of the ray from the camera to the splat
@@ -148,11 +149,11 @@ def test_colours_are_those_that_the_clip_saw():
 
 
 PLACEMENT = contract.Placement([0, 0, 2, 1, 2, 0, 0, 5, 0, 2, 0, -1, 0, 0, 0, 1])
-"""A turned scene, of twice the solve's size."""
+"""A rotated scene at twice the solve's scale."""
 
 
 def lit(shot, run="none", checkpoint=""):
-    """Folder of a take of a shot whose splats are the ball about POINT, without those far below it."""
+    """Folder of a take whose splats are the sphere around POINT, without its bottom."""
     folder = TakeFolder(shot.take("lit"))
     told = {"version": 1, "take": "lit", "run": run, "checkpoint": checkpoint, "t_star_frame": 105}
     write_json(folder.facts, {**told, "placement": PLACEMENT.to_json()})
@@ -163,7 +164,7 @@ def lit(shot, run="none", checkpoint=""):
 
 @pytest.fixture(scope="module")
 def take(tmp_path_factory):
-    """(solved tiny world of its own, `lit` folder of it): no run, so no exposure."""
+    """(solved tiny world, its `lit` folder). The world has no run, so no exposure."""
     world = build_world(tmp_path_factory.mktemp("lit"))
     return world, lit(world.shot)
 
@@ -216,7 +217,7 @@ def test_it_is_made_once_and_anew_for_another_point_or_take(take, quiet):
 
 
 def test_a_shot_that_was_moved_since_is_seen_where_it_stands_now(take, quiet, tmp_path):
-    """The same point of the frozen scene, from a scene that stands a quarter turn further, twice as large."""
+    """The same point of the frozen scene, after the scene was rotated by a quarter turn and scaled by two."""
     world, folder = take
     still = read(make_light(world.shot, params(), quiet(), SMALL)["light"])
     turn = np.array([[0.0, -2, 0, 3], [2, 0, 0, 0], [0, 0, 2, -1], [0, 0, 0, 1]])
@@ -227,7 +228,7 @@ def test_a_shot_that_was_moved_since_is_seen_where_it_stands_now(take, quiet, tm
     moved = turn[:3, :3] @ POINT + turn[:3, 3]
     position = ",".join(map(repr, moved.tolist()))
     told = make_light(world.shot, params(position=position, placement=str(file)), quiet(), SMALL)
-    # +X has become +Y: a quarter of the picture to the left.
+    # +X has become +Y, a quarter of the picture to the left.
     assert np.abs(read(told["light"]) - np.roll(still, -SMALL.width // 4, axis=1)).mean() < 0.005
 
 

@@ -1,4 +1,4 @@
-"""Panoramas: directions, faces put together, and the fill, against closed forms in float64."""
+"""Panoramas: directions, assembly of cube faces, and filling, compared with closed forms in float64."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ WIDTH = 128
 
 
 def true_directions(width):
-    """[H, W, 3] float64: the formula of Cycles, u = 1/2 - atan2(y, x) / 2 pi, v = 1/2 + asin(z) / pi from below."""
+    """[H, W, 3] float64: Cycles' formula, u = 1/2 - atan2(y, x) / 2 pi, v = 1/2 + asin(z) / pi, with v from below."""
     u = (np.arange(width) + 0.5) / width
     v = 1.0 - (np.arange(width // 2) + 0.5) / (width // 2)
     longitude, latitude = 2 * np.pi * (0.5 - u), np.pi * (v - 0.5)
@@ -19,7 +19,7 @@ def true_directions(width):
 
 
 def smooth(along):
-    """[..., 4]: a colour of direction that has no sixfold symmetry, covered everywhere."""
+    """[..., 4]: smooth colour of a direction, without sixfold symmetry, alpha 1 everywhere."""
     x, y, z = np.moveaxis(np.asarray(along, np.float64), -1, 0)
     return np.stack([0.5 + 0.4 * x + 0.1 * y * z, 0.5 + 0.4 * y, 0.5 + 0.4 * z - 0.1 * x * y, np.ones_like(x)], -1)
 
@@ -45,7 +45,7 @@ def test_faces_make_one_picture_without_seams():
 def test_a_cap_is_filled_smoothly_and_its_share_is_told():
     along = true_directions(256)
     known = smooth(along)
-    known[along[..., 0] < 0.5] = 0.0  # three quarters of the sphere, with both poles and the seam in it
+    known[along[..., 0] < 0.5] = 0.0  # unknown in three quarters of the sphere, including both poles and the seam
     color, share = sphere.filled(known.astype(np.float32))
     assert share == pytest.approx(0.75, abs=0.005)
     covered = along[..., 0] >= 0.5
@@ -59,7 +59,7 @@ def test_a_cap_is_filled_smoothly_and_its_share_is_told():
 
 def test_half_covered_pixels_keep_half_of_their_colour():
     known = np.ones((32, 64, 4), np.float32) * np.float32([0.2, 0.4, 0.6, 1.0])
-    known[10:20] *= 0.5  # premultiplied: the same colour, half there
+    known[10:20] *= 0.5  # premultiplied: the same colour, alpha 0.5
     color, share = sphere.filled(known)
     np.testing.assert_allclose(color, np.broadcast_to([0.2, 0.4, 0.6], color.shape), atol=1e-5)
     assert share == pytest.approx(0.5 * 64 * sphere.solid_angles(64, 32)[10:20].sum())

@@ -1,4 +1,4 @@
-"""Takes put together of others, against the world's truth: a thing at an instant of its own, a thing that lives on."""
+"""Combined takes, compared with the world's truth: an object at another instant, and an object that keeps moving."""
 
 import dataclasses
 import json
@@ -20,11 +20,11 @@ from torch_backend.raster import rasterize
 
 FIRST, LAST = 104, 111
 INSTANTS = {"early": 105, "late": 113}
-"""The patch is elsewhere at each."""
+"""Instants of the two takes; the patch's places differ."""
 
 
 def covered(world, pose, t):
-    """[H, W] bool: what the patch covers from a pose at the time of frame `t`."""
+    """[H, W] bool: pixels that the patch covers from a pose at the time of frame `t`."""
     state = {name: value[world.moving] for name, value in world.at((t - 101) / 15).items()}
     n = pose - 101
     out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
@@ -33,7 +33,7 @@ def covered(world, pose, t):
 
 @pytest.fixture(scope="module")
 def world(trained_copy, quiet, tmp_path_factory):
-    """The tiny world with a take at each instant, and the patch's matte in both."""
+    """The tiny world with a take at each instant, and mattes of the patch in both takes."""
     world = trained_copy
     for name, t_star in INSTANTS.items():
         asked = FreezeParams(take=name, t_star=t_star, first=FIRST, last=LAST, passes=True)
@@ -52,7 +52,7 @@ def frame_of(world, take, number):
 
 
 def error(world, take, number, t, where):
-    """Mean squared error, scene-linear, against the world from a frame's pose at the time of frame `t`."""
+    """Mean squared error in linear light against the world from a frame's pose at the time of frame `t`."""
     truth = srgb_to_linear(world.image(number - 101, (t - 101) / 15).numpy())
     return float(np.square(frame_of(world, take, number).rgba[..., :3] - truth)[where].mean())
 
@@ -73,8 +73,8 @@ def test_a_thing_stands_as_another_instant_has_it(world, quiet):
         late = covered(world, n, 113) & ~covered(world, n, 105)
         assert np.mean(combined_frame.depth[late] == frame_of(world, "late", n).depth[late]) > 0.5
         assert combined_frame.more.keys() == early.more.keys() >= {"Vector", "Normal", "Position", "DepthSigma"}
-    # No worse by half a dB than the take of that instant by itself, in which the rest of the world is the same: mattes
-    # of 64 pixels are a pixel off.
+    # At most half a dB worse than the take of that instant alone, whose other pixels show the same world. Mattes at 64
+    # pixels have errors of one pixel.
     assert np.mean(ours) <= np.mean(takes) * 10**0.05 and np.mean(ours) < 0.5 * np.mean(apart)
     preview = read_png(TakeFolder(world.shot.take("both")).preview(107)).astype(int)
     alone = read_png(TakeFolder(world.shot.take("late")).preview(107)).astype(int)
@@ -146,7 +146,7 @@ def frame_like(value):
 
 
 class Lone(Source):
-    """A take with one matte, which is no file."""
+    """A take with one matte in memory."""
 
     def __init__(self, matte):
         super().__init__("take", TakeFolder("."), {}, {"it": ""}, "exr")
@@ -162,10 +162,10 @@ def test_what_touches_a_living_thing_is_part_of_it_and_borders_are_soft():
     alive = with_motion(matte, np.zeros_like(matte), motion)
     assert alive[25, 22] == 1.0 and alive[7, 52] == 0.0 and alive[12, 12] == 1.0
     behind = np.zeros_like(matte)
-    behind[18:34, 22:28] = 1.0  # another thing, which moves and is touched
+    behind[18:34, 22:28] = 1.0  # another moving object, which is touched
     parted = with_motion(matte, behind, motion)
     assert parted[15, 19] == 1.0 and parted[25, 22] == 0.0 and np.array_equal(parted[matte > 0.5], matte[matte > 0.5])
-    depth = np.where(motion > 0.5, 5.0, 2.0).astype(np.float32)  # all that moves and touches is far behind
+    depth = np.where(motion > 0.5, 5.0, 2.0).astype(np.float32)  # all moving and touched pixels are far behind
     frame = dataclasses.replace(frame_like(0.0), motion=motion, depth=depth)
     alone = Lone(matte)
     assert alone.shows("it", 1, frame, is_live=False)[2, 25, 22] == 0.0

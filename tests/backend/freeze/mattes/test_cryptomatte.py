@@ -1,4 +1,4 @@
-"""Cryptomattes against the specification: hashes of its reference code, the header, and shares that are read back."""
+"""Cryptomattes, compared with the specification: hashes of its reference code, the header, and coverage read back."""
 
 import json
 
@@ -28,7 +28,8 @@ def test_identifiers_are_ordinary_floats():
     bits = np.array([identifier(name) for name in names], np.uint32)
     exponents = bits >> 23 & 255
     assert exponents.min() > 0 and exponents.max() < 255
-    assert (bits != np.array([murmur3(name.encode()) for name in names], np.uint32)).any()  # some needed it
+    # some exponents had to be changed
+    assert (bits != np.array([murmur3(name.encode()) for name in names], np.uint32)).any()
     assert np.isfinite(as_float(identifier("")))
 
 

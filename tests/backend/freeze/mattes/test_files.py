@@ -1,4 +1,4 @@
-"""Single mattes: both formats give back what was written, with overscan where the format has it."""
+"""Single mattes: round trip of both formats, with overscan if the format supports it."""
 
 import numpy as np
 import OpenImageIO as oiio

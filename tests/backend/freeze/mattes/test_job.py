@@ -1,4 +1,4 @@
-"""Mattes of a take of the tiny world: against its truth at every pose, kept, made anew, removed, refused."""
+"""Mattes of a take of the tiny world, compared with its truth at every pose; caching, updates, removal, refusals."""
 
 import json
 
@@ -17,7 +17,7 @@ T_STAR, LASSO = 105, 108
 
 
 def truth(world, pose):
-    """[H, W] bool: what the patch covers from a pose while time stands still."""
+    """[H, W] bool: pixels that the patch covers from a pose at the frozen instant."""
     state = {name: value[world.moving] for name, value in world.at((T_STAR - 101) / 15).items()}
     n = pose - 101
     out = rasterize(**state, viewmats=world.viewmats[n : n + 1], Ks=world.K[None], width=64, height=48)
@@ -31,7 +31,7 @@ def outline(mask):
 
 @pytest.fixture
 def take(trained_copy, quiet, tmp_path, request):
-    """(world, folder of a take of its own, writes a file of lassos)."""
+    """(world, folder of a new take, function that writes a lasso file)."""
     world = trained_copy
     name = f"m{abs(hash(request.node.name)) % 10**9}"
     freeze_shot(world.shot, FreezeParams(take=name, t_star=T_STAR, first=104, last=112, detail="off"), quiet())

@@ -1,4 +1,4 @@
-"""Files of lassos: what is read, how it is scaled, and what is refused in words."""
+"""Lasso files: reading, scaling, and refusals with a message."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Votes and membership against the rasteriser's own reference, pixel by pixel."""
+"""Votes and membership of Gaussians, compared pixel by pixel with the rasteriser's reference implementation."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def scene(means, scales, logits):
 
 
 def test_a_vote_is_the_share_of_what_is_seen():
-    """Against float64 weights of each Gaussian, one at a time in its own channel."""
+    """Compared with float64 weights; each Gaussian is rendered in a separate channel."""
     frozen = scene([[0.0, 0.0, 2.0], [0.2, 0.1, 3.0], [-0.5, 0.0, 2.5]], [0.2, 0.3, 0.1], [2.0, 3.0, 0.5])
     generator = torch.Generator().manual_seed(3)
     weights = torch.rand(24, 32, 2, generator=generator)
@@ -45,7 +45,8 @@ def test_who_stands_outside_of_the_picture_is_not_seen():
 
 
 def test_a_wall_that_shines_through_a_person_is_none_of_them():
-    """A person 2 in front of the camera, their back at 2.15, a wall at 3: one Gaussian behind the person, one aside."""
+    """A person's front at depth 2, back at 2.15, and a wall at 3 with one Gaussian behind the person and one beside
+    them."""
     means = [[0.0, 0.0, 2.0], [0.0, 0.0, 2.15], [0.0, 0.0, 3.0], [1.3, 0.0, 3.0]]
     frozen = scene(means, [0.2, 0.2, 0.2, 0.1], [0.0] * 4)
     person = torch.zeros(24, 32)
@@ -60,7 +61,7 @@ def test_a_wall_that_shines_through_a_person_is_none_of_them():
 
 def test_members_are_rendered_as_shares_of_what_is_known():
     frozen = scene([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]], [0.3, 0.6], [0.0, 4.0])
-    votes = torch.tensor([[0.0, 0.0], [8.0, 10.0]])  # nobody saw the first
+    votes = torch.tensor([[0.0, 0.0], [8.0, 10.0]])  # the first Gaussian was never seen
     members = membership(votes)
     assert members.tolist() == [[0.0, 0.0], [0.800000011920929, 1.0]]
     middle = render_members(frozen, members, VIEW, K, 32, 24)[12, 16]
@@ -72,7 +73,7 @@ def test_what_is_far_from_a_thing_and_was_not_seen_is_none_of_it():
     means = torch.cat([line, torch.tensor([[1.0, 0.5 * RIM, 0.0], [1.0, 3.0 * RIM, 0.0], [0.5, 2.0, 0.0]])])
     votes = torch.zeros(104, 2)
     votes[:101] = 5.0
-    votes[103] = torch.tensor([4.0, 4.0])  # seen: what was seen is believed
+    votes[103] = torch.tensor([4.0, 4.0])  # seen, so its votes are kept
     known = membership(rule_out(votes, means))
     assert known[101].tolist() == [0.0, 0.0] and known[102].tolist() == [0.0, 1.0] and known[103].tolist() == [1.0, 1.0]
     assert torch.equal(rule_out(torch.zeros(104, 2), means), torch.zeros(104, 2))

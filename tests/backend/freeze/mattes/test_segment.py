@@ -1,4 +1,4 @@
-"""A thing is separated from what surrounds it: pictures with known outlines, and the guided filter's definition."""
+"""Segmentation of an object: pictures with known outlines, and the definition of the guided filter."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ def disc(shape, centre, radius):
 
 
 def ring(centre, radius, wobble, seed=0, corners=40):
-    """A lasso around a disc, up to `wobble` pixels off."""
+    """Lasso around a disc with errors of up to `wobble` pixels."""
     turn = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
     away = radius + np.random.default_rng(seed).uniform(-wobble, wobble, corners)
     return np.stack([centre[0] + away * np.cos(turn), centre[1] + away * np.sin(turn)], axis=1)
@@ -75,7 +75,7 @@ def test_nothing_stays_nothing():
 
 
 def test_the_guided_filter_is_the_mean_of_linear_fits():
-    """Against float64 least squares in every window, away from the border."""
+    """Compared with float64 least squares in every window, away from the border."""
     generator = np.random.default_rng(5)
     guide = generator.uniform(0.0, 1.0, (15, 15, 3))
     values = (guide[..., 0] > 0.5).astype(np.float64)

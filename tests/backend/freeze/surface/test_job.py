@@ -1,4 +1,4 @@
-"""The surface of a take of the tiny world: against its wall and its patch, kept, made anew, refused."""
+"""The surface of a take of the tiny world, compared with its wall and patch; caching, updates, refusals."""
 
 import json
 
@@ -17,7 +17,7 @@ T_STAR = 105
 
 @pytest.fixture(scope="module")
 def take(trained, quiet):
-    """(world, folder of a take of its own)."""
+    """(world, folder of a take)."""
     world, _ = trained
     freeze_shot(world.shot, FreezeParams(take="solid", t_star=T_STAR, first=102, last=116, detail="off"), quiet())
     return world, TakeFolder(world.shot.take("solid"))
@@ -56,7 +56,7 @@ def test_the_surface_is_the_true_one(take, quiet):
     assert np.median(of_two_plates) < 0.01
     middles = points[triangles].mean(1)
     assert 0.02 < people.mean() < 0.5
-    # How far away the patch is comes from a short training: only where it is in the picture is sure.
+    # A short training gives no exact distance of the patch, so only its position in the picture is checked.
     aside = np.linalg.norm((middles - np.clip(middles, low, high))[:, :2], axis=1)
     assert np.median(aside[people]) < 0.1 < np.median(aside[~people])
     assert np.median(middles[people][:, 2]) < np.median(middles[~people][:, 2]) == pytest.approx(4.0, abs=0.1)

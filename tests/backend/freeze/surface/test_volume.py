@@ -1,4 +1,4 @@
-"""Depth of known surfaces, fused and extracted, against the surfaces in float64."""
+"""Fusion of known depth maps and surface extraction, compared with the surfaces in float64."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ CENTRE, RADIUS, WALL = np.array([0.1, -0.1, 2.5]), 0.4, 4.0
 
 
 def seen(x: float, noise: float = 0.0) -> View:
-    """A ball before a wall, from a camera that stands at x and is turned a little towards the ball."""
+    """A ball in front of a wall, from a camera at x that is turned slightly towards the ball."""
     turn = -0.15 * x
     rotation = np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
     centre = np.array([x, 0.05 * x, 0.0])

@@ -10,7 +10,7 @@ ALARM = (226, 74, 51)
 
 
 def pictures(folder, name, count, height=48, width=64, dtype=np.uint8):
-    """Flat pictures whose red tells the index and whose blue tells the row."""
+    """Flat pictures; red encodes the index, blue the row."""
     paths = []
     for index in range(count):
         picture = np.empty((height, width, 3), dtype)
@@ -94,7 +94,7 @@ def test_a_note_stands_under_the_title_in_as_many_lines_as_it_needs(tmp_path):
     bare, one, many = sheets[0], sheets[3], sheets[40]
     assert len(bare) < len(one) < len(many) and bare.shape[1] == one.shape[1] == many.shape[1]
     top = box(is_colour(one, (100, 0, 250)))[0]
-    title = box(is_colour(bare, (100, 0, 250)))[0] - 12  # where the pictures stand without a note
+    title = box(is_colour(bare, (100, 0, 250)))[0] - 12  # top of the pictures without a note
     assert (one[title:top].max(axis=-1) > 120).any(), "the note is drawn"
     assert is_colour(many[:, -16:], GROUND).all(), "and never over the border"
 

@@ -1,4 +1,4 @@
-"""Deep pictures of frozen frames: over each other their samples are the frame, and CG goes between its surfaces."""
+"""Deep pictures of frozen frames: their samples composite to the frame, and CG merges between its surfaces."""
 
 import json
 from itertools import pairwise
@@ -17,7 +17,7 @@ from torch_backend.freeze.take.deep import DeepSamples
 from torch_backend.shot import write_json
 
 PLACED = Placement([0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0])
-"""A quarter turn, 2.5 times as large."""
+"""Rotation by a quarter turn and a scale of 2.5."""
 
 
 def over(front, back):
@@ -25,7 +25,7 @@ def over(front, back):
 
 
 def flattened(image):
-    """[H, W, 4] of a deep file or picture, as OpenImageIO flattens it."""
+    """[H, W, 4]: a deep file or picture, flattened by OpenImageIO."""
     flat = oiio.ImageBufAlgo.flatten(image if isinstance(image, oiio.ImageBuf) else oiio.ImageBuf(str(image)))
     return np.asarray(flat.get_pixels(oiio.FLOAT), np.float32).reshape(flat.spec().height, flat.spec().width, -1)[
         ..., :4
@@ -33,7 +33,7 @@ def flattened(image):
 
 
 def card(spec, depth, rgba):
-    """A deep picture of one sample a pixel."""
+    """Deep picture with one sample per pixel."""
     flat = oiio.ImageSpec(spec.width, spec.height, 5, oiio.FLOAT)
     flat.channelnames, flat.x, flat.y = DEEP_CHANNELS, spec.x, spec.y
     image = oiio.ImageBuf(flat)
@@ -45,7 +45,7 @@ def card(spec, depth, rgba):
 
 @pytest.fixture(scope="module")
 def take(trained_copy, quiet, tmp_path_factory):
-    """A deep take of the world: a patch at 3.2 before a wall at 4."""
+    """Deep take of the world: a patch at depth 3.2 in front of a wall at 4."""
     file = tmp_path_factory.mktemp("placed") / "placement.json"
     write_json(file, PLACED.to_json())
     asked = FreezeParams(
@@ -79,13 +79,13 @@ def test_over_each_other_the_samples_are_the_frame(take):
 
 
 def test_cg_between_both_surfaces_is_the_analytic_over(take):
-    """Merged by OpenImageIO as by Nuke: before what lies behind it, behind what lies before it."""
+    """OpenImageIO merges like Nuke: each surface covers what lies behind it."""
     folder, _ = take
     samples, spec = samples_of(folder / "deep" / "000105.exr")
     counts = np.vectorize(len)(samples)
     two = samples[counts == 2]
     at = float(np.median([0.5 * (near[4] + far[4]) for near, far in two]))
-    cg = np.float32([0.0625, 0.375, 0.125, 0.5])  # as halves have them
+    cg = np.float32([0.0625, 0.375, 0.125, 0.5])  # exact in half floats
     merged = oiio.ImageBufAlgo.deep_merge(oiio.ImageBuf(str(folder / "deep" / "000105.exr")), card(spec, at, cg), False)
     expected = np.zeros((*samples.shape, 4), np.float32)
     for place in np.ndindex(samples.shape):
@@ -98,7 +98,8 @@ def test_cg_between_both_surfaces_is_the_analytic_over(take):
 
 
 def test_two_surfaces_become_two_samples_of_the_frames_colour():
-    """Red splats over half of a pixel, blue ones behind: the plate's colour is shared out to both, to the last 1e-6."""
+    """Red splats cover half of a pixel, blue ones are behind: both samples composite to the plate's colour within
+    1e-6."""
     weight = torch.tensor([[[0.3, 0.0, 0.995, 0.0]], [[0.5, 0.9, 0.0, 0.0]]])
     red, blue = torch.tensor([0.8, 0.1, 0.0]), torch.tensor([0.0, 0.1, 0.6])
     light = weight[..., None] * torch.stack([red, blue])[:, None, None]

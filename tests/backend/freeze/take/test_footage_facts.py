@@ -1,4 +1,4 @@
-"""What a take says of its footage: where it is, what its numbers mean, the map that takes its lens away."""
+"""Footage facts in take.json: path, meaning of values, and the map that undistorts the footage."""
 
 import json
 
@@ -21,11 +21,11 @@ from torch_backend.shot import Shot
 
 
 class Quiet(Reporter):
-    """A reporter that says nothing."""
+    """Reporter that discards all messages."""
 
 
 def pictures(folder, count=9, size=(96, 128), suffix="png", **attributes):
-    """A camera that pans over a smooth texture."""
+    """Write pictures of a camera that pans over a smooth texture."""
     folder.mkdir()
     y, x = np.mgrid[0 : size[0], 0 : size[1] + 4 * count]
     wide = np.stack([0.5 + 0.3 * np.sin(x / 9 + k) * np.cos(y / (7 + k)) for k in range(3)], -1)
@@ -68,7 +68,7 @@ def test_footage_without_a_lens(tmp_path, shot_of):
 
 
 def test_the_map_takes_the_lens_away_as_plates_do_at_full_size(tmp_path, shot_of):
-    """Where to look in the footage, in its own pixels; seen through it, the footage is the plate."""
+    """The map gives positions in the footage's pixels; sampled with it, the footage equals the plate."""
     shot = shot_of(pictures(tmp_path / "plate"), radial=-0.2)
     facts, take = facts_of(shot)
     assert facts["map"] == "stmap/undistort.exr"
@@ -122,6 +122,6 @@ def test_footage_that_is_gone_or_another_is_not_named(tmp_path, shot_of):
 
 
 def test_how_a_picture_is_turned_is_told(tmp_path, shot_of):
-    """Blender shows pictures as they are stored."""
+    """Blender shows pictures as stored, without their orientation tag."""
     facts = facts_of(shot_of(pictures(tmp_path / "plate", suffix="exr", Orientation=6)))[0]
     assert facts["size"] == [96, 128] and facts["unlike"] == "its pictures are turned clockwise by their header"

@@ -1,4 +1,4 @@
-"""Frozen frames of the tiny world against its truth: pixels, mattes, depth, stale frames, cancellation."""
+"""Frozen frames of the tiny world, compared with its truth: pixels, mattes, depth, stale frames, cancellation."""
 
 import json
 import shutil
@@ -39,7 +39,7 @@ from torch_backend.train.self_test import SelfTest
 
 
 def test_a_video_that_cannot_be_replaced_is_missed_in_words_and_ends_no_freeze(quiet, tmp_path):
-    """As Windows refuses while a player has it open; a folder in its place is refused everywhere."""
+    """Windows refuses to replace a file that a player has open. A folder in its place is refused on all systems."""
     report, frames = quiet(), [np.zeros((16, 16, 3), np.uint8)]
     (tmp_path / "video.mp4").mkdir()
     with missable("video", report):
@@ -90,14 +90,14 @@ def test_two_instants_differ_where_the_patch_moved_and_nowhere_else(trained, tak
     moved = truth > 0.1
     still = truth < 0.002
     assert difference[moved].mean() > 0.05
-    # A few pixels beside the patch are let go of with it: a fortieth of a step of 255, on average of all.
+    # A few pixels around the patch are removed with it: on average 1/40 of an 8-bit step.
     assert difference[still].mean() < (1e-4 if detail == "on" else 0.012)
     assert np.quantile(difference[still], 0.98) == 0.0 or detail == "off"
     assert early.motion[moved].mean() > 0.35 > 0.15 > early.motion[still].mean()
 
 
 def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(trained, quiet):
-    """They are the old model's: the key of the new one would keep them for good."""
+    """These frames show the old model; with the new model's key they would be kept forever."""
     world, _ = trained
     run = shutil.copytree(world.shot.run("main"), world.shot.run("trained meanwhile"))
     tensors, meta = load_checkpoint(run / "checkpoint.safetensors")
@@ -106,7 +106,7 @@ def test_frames_of_a_run_that_is_trained_while_it_is_frozen_are_not_believed(tra
     class TrainsMeanwhile(quiet):
         def warning(self, message, hint=""):
             super().warning(message, hint)
-            if "was not trained on" in message:  # said between the loading of the model and the first frame
+            if "was not trained on" in message:  # this message comes between loading the model and the first frame
                 save_checkpoint(run / "checkpoint.safetensors", tensors, meta)
 
     asked = dict(run=run.name, take="meanwhile", t_star=109, first=105, last=105, only_missing=True)
@@ -257,7 +257,7 @@ def test_what_ends_before_the_first_frame_leaves_the_take_of_before(trained, qui
 
 
 def test_a_take_stays_until_the_one_that_replaces_it_is_done(trained, quiet):
-    """Another instant under the same name, cancelled, gone on with, killed while it takes over, and finished."""
+    """Another instant under the same name: cancelled, continued, killed during the replacement, and finished."""
     world, _ = trained
     ask = dict(take="again", develop="off", first=103, last=108)
     freeze_shot(world.shot, FreezeParams(**ask, t_star=104), quiet())
@@ -277,7 +277,7 @@ def test_a_take_stays_until_the_one_that_replaces_it_is_done(trained, quiet):
     assert 0 < len(begun) < 6
     other = dict(ask, take="beside")
     freeze_shot(world.shot, FreezeParams(**other, t_star=106), quiet())
-    (folder / "take.json").unlink()  # as a kill at the worst moment leaves it: some frames old, some new, one moved
+    (folder / "take.json").unlink()  # the state after a kill at the worst moment: some old frames, some new, one moved
     first = min(begun)
     for name in (f"preview/{first[:6]}.png", f"warp/{first}", first):
         (beside / name).rename(folder / name)
@@ -314,7 +314,7 @@ def test_camera_path_of_its_own_size(trained, quiet, tmp_path):
 
 
 def test_frames_that_the_footage_lacks_are_frozen_through_a_camera_between(trained, quiet, tmp_path):
-    """107 and 109 are lost; a gap of more than two seconds stays one."""
+    """Frames 107 and 109 are lost. A gap of more than two seconds would stay a gap."""
     world, _ = trained
     shot = Shot(tmp_path / "lost.splannequin")
     shutil.copytree(world.shot.root, shot.root, ignore=shutil.ignore_patterns("takes", "jobs"))

@@ -1,4 +1,4 @@
-"""Motion blur of a camera's own path: against a mean of many frames, on cameras that stand, and in keys."""
+"""Motion blur of a camera path, compared with the mean of many frames; static cameras; keyed cameras."""
 
 import json
 
@@ -19,7 +19,7 @@ ASK = dict(t_star=105, develop="off", grain=False, only_missing=True)
 
 
 def between(a, b, share):
-    """[4, 4] float64 between two world-to-camera poses: slerp of the rotation, line of centres."""
+    """[4, 4] float64: interpolated world-to-camera pose, by slerp of the rotation and linear centres."""
     a, b = np.linalg.inv(a), np.linalg.inv(b)
     pose = np.eye(4)
     pose[:3, :3] = Slerp([0, 1], Rotation.from_matrix([a[:3, :3], b[:3, :3]]))(share).as_matrix()
@@ -28,7 +28,7 @@ def between(a, b, share):
 
 
 def save_path(file, poses, first=1):
-    """Writes a path of 64 x 48 pixels with these poses."""
+    """Write a camera path of 64 x 48 pixels with these poses."""
     K = [60.0, 60.0, 32.0, 24.0]
     frames = [CameraFrame(first + n, np.asarray(pose).flatten().tolist(), K, "blender") for n, pose in enumerate(poses)]
     write_json(file, CameraPath(64, 48, frames).to_json())
@@ -50,7 +50,7 @@ def psnr(a, b):
 
 @pytest.fixture(scope="module")
 def moves(trained_copy):
-    """Three poses that pan and travel, about 10 pixels a frame."""
+    """Three poses of a panning and moving camera, about 10 pixels per frame."""
     middle = trained_copy.viewmats[7].double().numpy()
     poses = []
     for n in (-1, 0, 1):
@@ -67,7 +67,7 @@ def test_a_blurred_frame_is_the_mean_of_many(trained_copy, moves, tmp_path, quie
     path = save_path(tmp_path / "path.json", moves)
     facts = freeze_shot(shot, FreezeParams(take=f"blur {detail}", camera_path=path, shutter=180.0, **ask), quiet())
     freeze_shot(shot, FreezeParams(take=f"sharp {detail}", camera_path=path, **ask), quiet())
-    shares = (np.arange(32) + 0.5) / 32 - 0.5  # of a shutter that is open for half a frame
+    shares = (np.arange(32) + 0.5) / 32 - 0.5  # times of a shutter that is open for half a frame
     cameras = [between(moves[1], moves[2 if s > 0 else 0], abs(s) / 2) for s in shares]
     many = save_path(tmp_path / "many.json", cameras)
     freeze_shot(shot, FreezeParams(take=f"many {detail}", camera_path=many, **ask), quiet())
@@ -138,11 +138,11 @@ def shifted(x):
 
 
 def test_a_blurs_length_is_its_geometry():
-    """A wall 4 away, a camera that travels 0.4 to the right and then 0.8 a frame: 60 * 0.4 / 4 = 6, then 12 pixels."""
+    """At depth 4 the camera moves by 0.4, then 0.8 per frame: 60 * 0.4 / 4 = 6 pixels, then 12."""
     blur = MotionBlur(cameras(shifted(0.0), shifted(-0.4), shifted(-1.2)), 180.0)
     depth = torch.full((48, 64), 4.0)
     depth[:10] = NO_DEPTH
-    for frame, length in zip(blur.frames, (3.0, 4.5, 6.0), strict=True):  # at the ends it moves on
+    for frame, length in zip(blur.frames, (3.0, 4.5, 6.0), strict=True):  # at the ends the motion is extrapolated
         found = blur.lengths(frame, frame.K, depth, 0)
         np.testing.assert_allclose(found[10:], length, atol=1e-3)
         assert not found[:10].any()
@@ -164,7 +164,7 @@ def test_samples_are_bounded_and_one_frame_alone_stands():
 
 @pytest.mark.parametrize("softness", [0.0, 0.7, 1.5])
 def test_the_grain_that_a_blur_leaves_is_that_of_noise_blurred_so(softness):
-    """Noise that is read linearly between its pixels, averaged over a line: the share of its variance that is left."""
+    """Fraction of the variance left in noise that is sampled linearly and averaged along a line."""
     rng = np.random.default_rng(4)
     x = np.arange(-12, 13)
     row = np.exp(-0.5 * (x / softness) ** 2) if softness else (x == 0).astype(float)

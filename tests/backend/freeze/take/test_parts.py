@@ -1,4 +1,5 @@
-"""A take in parts: the same bytes as at once, whatever the order, twice, after a kill, and not from another run."""
+"""A take rendered in parts equals one rendered at once, for any order, repeated, after a kill; other runs are
+refused."""
 
 import os
 import signal
@@ -17,7 +18,7 @@ ASK = dict(t_star=104, first=103, last=108, only_missing=True, deep=True)
 
 @pytest.fixture(scope="module")
 def own(trained_copy, quiet):
-    """A copy of the trained shot, with a take that was made at once."""
+    """Copy of the trained shot with a take that was rendered at once."""
     shot = trained_copy.shot
     freeze_shot(shot, FreezeParams(take="whole", **ASK), quiet())
     return shot
@@ -137,7 +138,7 @@ def counted(source, target):
 os.replace = counted
 freeze_part(shot, params, Quiet())
 """
-"""Freezes two frames at another instant, and kills itself after so many files have taken their names."""
+"""Freezes two frames at another instant, and kills itself after `writes` files are renamed to their final names."""
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
@@ -158,7 +159,7 @@ def test_what_a_killed_part_of_another_instant_left_is_in_no_frame(own, quiet, w
 
 
 def test_a_part_stops_when_its_take_is_opened_with_something_else(own, quiet):
-    """A host that slept through the new job would write old frames over new ones."""
+    """A stalled host must not overwrite the new job's frames with old ones."""
     params = FreezeParams(take="straggler", **{**ASK, "last": 105, "develop": "off"})
     open_take(own, params, quiet())
     other = FreezeParams(take="straggler", **{**ASK, "last": 105, "t_star": 110, "develop": "off"})

@@ -1,4 +1,4 @@
-"""Passes of frozen frames: of a tilted plane against geometry, and of a take against its own depth and cameras."""
+"""Passes of frozen frames: a tilted plane compared with geometry, and a take compared with its depth and cameras."""
 
 import math
 from itertools import pairwise
@@ -21,7 +21,7 @@ SCENE = SimpleNamespace(scale=0.5, centre=np.array([0.3, -0.1, 2.0]))
 
 
 def camera(frame, centre, turn):
-    """A camera that pans by `turn` radians, at a place in the model's units."""
+    """Camera at `centre` in the model's units, panned by `turn` radians."""
     c, s = math.cos(turn), math.sin(turn)
     rotation = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
     viewmat = np.eye(4)
@@ -32,11 +32,11 @@ def camera(frame, centre, turn):
 
 FRAMES = [camera(1, [0.0, 0.0, 0.0], 0.0), camera(2, [0.2, -0.05, 0.1], 0.03), camera(3, [0.25, 0.1, 0.1], -0.02)]
 PLANE = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
-"""Normal of the plane n . x = 2, away from the cameras."""
+"""Normal of the plane n . x = 2; it points away from the cameras."""
 
 
 def plane_depth(output):
-    """(depth [H, W], points [H, W, 3]) of the plane from a camera, float64."""
+    """(depth [H, W], points [H, W, 3]) of the plane seen by a camera, float64."""
     K, view = output.K.double().numpy(), output.viewmat.double().numpy()
     y, x = np.mgrid[:H, :W] + 0.5
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
@@ -52,7 +52,7 @@ def projected(points, output):
 
 
 def made(output, depth, bands=1):
-    """The layers whole, made in so many bands."""
+    """Complete layers, computed in `bands` bands."""
     layers = Passes(FRAMES, SCENE, TURNED).of(output, output.K, torch.from_numpy(depth))
     cuts = [n * H // bands for n in range(bands + 1)]
     return {name: np.concatenate([layer[slice(a, b)] for a, b in pairwise(cuts)]) for name, layer in layers.items()}
@@ -77,7 +77,7 @@ def test_a_planes_passes_are_its_geometry(bands):
 
 def test_a_step_in_depth_tilts_no_normal_and_nothing_is_nowhere():
     depth, _ = plane_depth(FRAMES[1])
-    depth[:, W // 2 :] *= 0.7  # the same plane, nearer: seen from the camera it has the same normal
+    depth[:, W // 2 :] *= 0.7  # a parallel, nearer plane, with the same normal
     depth[:5] = NO_DEPTH
     found = made(FRAMES[1], depth)
     facing = np.broadcast_to(-(TURNED.rotation @ PLANE), (H - 5, W, 3))
@@ -95,7 +95,7 @@ def test_at_the_ends_of_a_take_nothing_is_beyond():
 
 
 def test_a_takes_passes_lie_on_its_cameras(trained, tmp_path, quiet):
-    """A position projects to its own pixel and depth; moved by its vector, to where the next frame has it."""
+    """Each position projects to its pixel and depth; moved by its vector, it matches the next frame's position."""
     world, _ = trained
     placement = Placement([0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0])
     write_json(tmp_path / "placement.json", placement.to_json())

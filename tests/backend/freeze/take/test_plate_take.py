@@ -1,4 +1,4 @@
-"""Takes made of plates, as files: what stands beside the frames, killed and gone on with, light beyond white."""
+"""Files of takes composited from plates: the files beside the frames, resuming after a kill, light above white."""
 
 import dataclasses
 import hashlib
@@ -34,7 +34,7 @@ RANGE = {"t_star": 105, "first": 103, "last": 108}
 
 
 def digest(path):
-    """Of all that a picture holds but the time at which it was written."""
+    """Digest of a picture's pixels and metadata without the time of writing."""
     image = oiio.ImageBuf(str(path))
     told = image.spec().serialize("text", "detailed").splitlines()
     told = [line for line in told if not line.strip().startswith(("DateTime", "oiio:SourcePath"))]
@@ -42,7 +42,7 @@ def digest(path):
 
 
 def files(folder):
-    """Digests of a take's frames, warps and previews by their place in it."""
+    """Digests of a take's frames, warps and previews by relative path."""
     found = [*folder.glob("*.exr"), *(folder / "warp").glob("*.exr"), *(folder / "preview").glob("*.png")]
     return {str(path.relative_to(folder)): digest(path) for path in found}
 
@@ -55,7 +55,7 @@ def take(trained, quiet):
 
 
 def test_terms_behind_a_frame_are_its_decisions(trained, take, tmp_path, quiet):
-    """`--debug-terms`: the same frames, rendered anew, and the log-odds give back the matte."""
+    """With `--debug-terms`, the frames are rendered again without change, and the log-odds reproduce the matte."""
     world, _ = trained
     before = files(take[0])
     freeze_shot(world.shot, FreezeParams(take="whole", only_missing=True, debug_terms=str(tmp_path), **RANGE), quiet())
@@ -88,7 +88,7 @@ def test_a_frame_is_its_warp_over_the_plate(trained, take):
     assert [row["frame"] for row in rows] == list(range(103, 109))
     assert facts["detail"]["plate_share"] == pytest.approx(np.mean([row["plate_share"] for row in rows]), abs=1e-3)
     assert all(np.mean(row["regions"]) == pytest.approx(row["invented_share"], abs=0.02) for row in rows)
-    assert rows[2]["plate_share"] > 0.999, "frame 105 is its plate"  # a pixel of 3072 may be another's
+    assert rows[2]["plate_share"] > 0.999, "frame 105 is its plate"  # one pixel of 3072 may come from another plate
 
 
 def test_without_detail_splats_alone_are_left(trained, take, quiet):
@@ -138,7 +138,7 @@ freeze_shot(Shot.open(sys.argv[1]), FreezeParams(take=sys.argv[2], t_star=105, f
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
 def test_a_killed_take_goes_on_to_the_same_files(trained, take, quiet):
-    """It died with a warp written and its frame not."""
+    """The process was killed after it had written a warp but not its frame."""
     world, _ = trained
     name = "killed"
     words = ["-P", "-c", CHILD, str(world.shot.root), name, str(ROOT)]
@@ -187,7 +187,7 @@ def test_a_painted_matte_makes_frames_stale(trained, quiet):
 
 
 def test_a_ramp_that_runs_is_the_clip(trained, quiet):
-    """Each frame at its own instant: plates, bit for bit but for half floats; then time stands still."""
+    """In frames at their own instant, pixels equal the plate up to half-float rounding. Later frames stay at 105."""
     world, _ = trained
     ramp = {str(n): float(min(n, 105)) for n in range(101, 117)}
     part = dict(t_star_per_frame=ramp, first=104, last=106, develop="off")
@@ -202,7 +202,7 @@ def test_a_ramp_that_runs_is_the_clip(trained, quiet):
 
 @pytest.fixture(scope="module")
 def bright(tmp_path_factory, world, quiet):
-    """A still wall filmed on half-float EXR twice as large as it is solved, with lamps of 50 and below black."""
+    """Static wall in half-float EXR at twice the size of the solve, with lamps of 50 and values below black."""
     folder = tmp_path_factory.mktemp("bright")
     (folder / "source").mkdir()
     rng = np.random.default_rng(4)
@@ -248,7 +248,8 @@ def test_light_beyond_white_and_below_black_is_the_plates(bright, quiet):
 
 
 def test_acescg_footage_is_frozen_in_acescg(bright, quiet):
-    """The same frames, told of as ACEScg in the record: frames and warps leave in its light, and stale ones go."""
+    """The record declares the footage as ACEScg: frames and warps are written in ACEScg, and stale ones are
+    replaced."""
     ask = FreezeParams(take="aces", t_star=108, first=103, last=103, develop="off", only_missing=True)
     freeze_shot(bright, ask, quiet())
     folder = bright.take("aces")
@@ -275,7 +276,7 @@ LAMP = 20.0
 
 @pytest.fixture(scope="module")
 def lit(tmp_path_factory, world, quiet):
-    """The wall filmed as scene-linear EXR, its patch a lamp that hangs still: imported, trained on."""
+    """Trained shot of the wall in scene-linear EXR; its patch is a static lamp."""
     folder = tmp_path_factory.mktemp("lit")
     (folder / "source").mkdir()
     state = world.at(0.0)
@@ -304,7 +305,7 @@ def lit(tmp_path_factory, world, quiet):
 
 
 def test_a_lamp_is_a_lamp_in_splats_alone(lit, quiet):
-    """Cut at white, it could be no brighter than 1; and what is no lamp is as it was."""
+    """Frames clipped at white could not exceed 1. Pixels away from the lamp are unchanged."""
     facts = freeze_shot(lit, FreezeParams(t_star=108, first=106, last=106, detail="off", develop="off"), quiet())
     frame = read_frozen_exr(lit.take("freeze") / "000106.exr")
     source = oiio.ImageBuf(str(lit.root.parent / "source" / "a.106.exr")).get_pixels(oiio.FLOAT)
@@ -323,7 +324,7 @@ def test_a_lamp_is_a_lamp_in_splats_alone(lit, quiet):
 
 
 def test_a_lamp_that_plates_fill_stays_a_lamp(lit, quiet):
-    """Seen from between the clip's frames, from which no plate is looked at as it stands."""
+    """The camera is between two frames of the clip, so every plate is resampled."""
     path = CameraPath.from_json(json.loads((lit.solve / "cameras.json").read_text()))
     before, after = (np.array(path.frames[n].viewmat) for n in (5, 6))
     between = dataclasses.replace(path.frames[5], viewmat=(0.5 * (before + after)).tolist())

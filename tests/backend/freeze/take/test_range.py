@@ -1,4 +1,4 @@
-"""Parts of a take: range and step, which frames are stale, and the grain beside the picture."""
+"""Partial takes: range and step, stale frames, and the grain layer."""
 
 import json
 import shutil
@@ -93,7 +93,7 @@ def test_a_newer_run_makes_every_frame_stale(trained, quiet):
 
 
 def test_frames_of_an_earlier_version_are_made_anew_and_that_is_said_once(trained, quiet):
-    """Their previews say nothing of the take that they are of."""
+    """Their previews do not name the take that they belong to."""
     world, _ = trained
     folder = world.shot.take("old")
     ask = FreezeParams(
@@ -128,7 +128,7 @@ def test_a_frame_with_a_file_of_another_take_is_rendered_again(trained, quiet, k
 
 
 def test_a_copied_shot_has_the_frames_that_it_had(trained, quiet, tmp_path):
-    """As `cp -r` copies it: run and frames have other times."""
+    """`cp -r` changes the modification times of run and frames."""
     world, _ = trained
     ask = FreezeParams(take="copied", t_star=104, first=101, last=103, only_missing=True)
     freeze_shot(world.shot, ask, quiet())
@@ -180,5 +180,5 @@ def test_plates_bring_their_own_grain(trained, quiet):
     plates = read_frozen_exr(world.shot.take("plates") / "000112.exr")
     assert np.max(facts["grain"]["deviation_8bit"]) > 0
     assert plates.detail.plate.min() < 0.9 and (plates.detail.plate == 1.0).mean() > 0.5
-    own = plates.grain[plates.detail.plate == 1.0]  # half precision: a matte of 0.9999 is read as 1
+    own = plates.grain[plates.detail.plate == 1.0]  # half-float rounding turns a matte of 0.9999 into 1
     assert np.abs(own).max() < 1e-4 < np.abs(plates.grain).max()

@@ -1,4 +1,4 @@
-"""Frames by several processes: the same bytes as by one, whoever is killed meanwhile; and nobody is left behind."""
+"""Frames rendered by several processes equal those of one, also if one is killed; no process is left behind."""
 
 import dataclasses
 import os
@@ -22,7 +22,7 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="on
 
 
 def opened(shot, take, report):
-    """A take ready to be rendered: (params, take, frames)."""
+    """A take that is ready for rendering: (params, take, frames)."""
     params = FreezeParams(take=take, t_star=104, first=103, last=106)
     made = planned(shot, params, report)
     make_folders(made.folder, made.spec)
@@ -35,7 +35,7 @@ def files(folder: TakeFolder):
 
 
 def helpers():
-    """Process ids of our children that render frames."""
+    """Process ids of child processes that render frames."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -55,14 +55,14 @@ def own(trained_copy):
 
 @pytest.fixture(scope="module")
 def alone(own, quiet):
-    """(files, shares) of a take that one process rendered."""
+    """(files, plate shares) of a take that one process rendered."""
     _, take, frames = opened(own, "one-process", quiet())
     shares = render_frames(take, frames, set(), quiet())
     return files(take.folder), shares
 
 
 def test_three_processes_write_the_same_bytes(own, quiet, alone):
-    """Two: see the next test, and what a cancel leaves."""
+    """The next test and the test of a cancel use two processes."""
     params, take, frames = opened(own, "three-processes", quiet())
     shares = render_side_by_side(own, params, take, frames, {103}, quiet(), 3)
     expected = {name: data for name, data in alone[0].items() if "000103" not in name}
@@ -111,7 +111,7 @@ def test_a_cancel_ends_all_of_them_and_keeps_whole_frames(own, quiet, alone):
 
 
 def test_what_stops_one_of_them_is_told_as_if_there_were_one(own, quiet):
-    """A plate that cannot be read ends the take with the same sentence."""
+    """An unreadable plate ends the take with the same message."""
     params, take, frames = opened(own, "one-unreadable", quiet())
     plate = own.plate(104)
     data = plate.read_bytes()

@@ -1,4 +1,4 @@
-"""What leaves of a take lies on its camera: splats and cameras read back, against the frames and their depth."""
+"""Exported splats and cameras of a take, read back and compared with its frames and depth."""
 
 import json
 
@@ -18,12 +18,12 @@ from torch_backend.gaussians.ply import PlyGaussians, read_ply
 from torch_backend.raster import rasterize
 
 TURNED = [0.0, -2.5, 0.0, 4.0, 0.0, 0.0, 2.5, 1.0, -2.5, 0.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0]
-"""A floor that was turned, moved, and a scale that was set."""
+"""Placement with a rotated and moved floor and a scale."""
 SIZE = (64, 48)
 
 
 def rendered(gaussians: PlyGaussians, viewmat: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(alpha [H, W], median depth [H, W]) of splats through a camera."""
+    """(alpha [H, W], median depth [H, W]) of splats seen by a camera."""
     state = [torch.from_numpy(np.array(part)) for part in gaussians]
     seen = rasterize(
         *state[:4], sh=state[4], viewmats=torch.from_numpy(viewmat).float()[None], Ks=torch.from_numpy(K).float()[None],
@@ -33,7 +33,7 @@ def rendered(gaussians: PlyGaussians, viewmat: np.ndarray, K: np.ndarray) -> tup
 
 
 def camera_of(stage, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """(viewmat [4, 4] OpenCV, K [3, 3] for `SIZE`) of the camera of a stage, by USD's own frustum."""
+    """(viewmat [4, 4] OpenCV, K [3, 3] for `SIZE`) of a stage's camera, from USD's frustum."""
     camera = UsdGeom.Camera.Get(stage, CAMERA).GetCamera(Usd.TimeCode(frame))
     viewmat = np.diag([1.0, -1.0, -1.0, 1.0]) @ np.array(camera.frustum.ComputeViewMatrix()).T
     window = np.array([tuple(camera.frustum.GetWindow().GetMin()), tuple(camera.frustum.GetWindow().GetMax())])
@@ -55,7 +55,7 @@ def splats_of(stage) -> PlyGaussians:
 
 @pytest.fixture(scope="module")
 def taken(trained, quiet):
-    """The tiny shot with a take of splats alone, frozen for a scene whose floor was turned and whose scale was set."""
+    """The tiny shot with a splats-only take, frozen for a scene with a rotated floor and a scale."""
     world, _ = trained
     shot = world.shot
     write_json(shot.placement, Placement(TURNED, 0.01, file_digest(shot.cameras)).to_json())
@@ -68,7 +68,7 @@ def taken(trained, quiet):
 
 @pytest.mark.parametrize("kind", ["ply", "usd"])
 def test_the_splats_of_a_take_lie_on_its_camera(taken, kind):
-    """Through the exported camera: means in the solve's pixels, and the picture as deep as the take's Z."""
+    """In the exported camera, means project to the solve's pixels, and the rendered depth equals the take's Z."""
     shot, facts = taken
     stage = Usd.Stage.Open(facts["usd"])
     splats = read_ply(facts["ply"]) if kind == "ply" else splats_of(stage)
@@ -87,8 +87,9 @@ def test_the_splats_of_a_take_lie_on_its_camera(taken, kind):
         image = read_frozen_exr(shot.take("placed") / f"{number:06d}.exr")
         solid = (alpha > 0.9) & (image.rgba[..., 3] > 0.9)
         assert solid.mean() > 0.5
-        # Z is measured from the plates, the splats' is that of single Gaussians: medians agree, single pixels do less.
-        # Between neighbouring plates of 64 x 48 pixels a parallax of 0.4 % is less than a hundredth of a pixel.
+        # Z is measured from the plates, the splats' depth from single Gaussians: medians agree better than single
+        # pixels. Between neighbouring plates of 64 x 48 pixels, a parallax of 0.4 % is less than a hundredth of a
+        # pixel.
         assert abs(np.median((depth / 2.5 / image.depth)[solid]) - 1.0) < 4e-3, "depth"
 
 
@@ -106,7 +107,7 @@ def test_both_files_hold_the_same_splats_and_the_take_says_where(taken):
 
 @pytest.mark.parametrize("kind", ["ply", "usd"])
 def test_an_export_after_set_scale_places_the_take_anew(taken, tmp_path, kind):
-    """Nothing is frozen again: what was placed is moved on."""
+    """The take is not frozen again; its splats are transformed."""
     shot, facts = taken
     file = tmp_path / "twice.json"
     write_json(file, Placement([2.0 * v for v in TURNED[:15]] + [1.0], 1.0).to_json())
@@ -140,7 +141,7 @@ def test_what_cannot_be_exported_is_said(taken, tmp_path):
 
 
 def test_an_environment_without_usd_freezes_all_the_same(taken, quiet, tmp_path, monkeypatch):
-    """It was set up by an earlier version: said in words, and no stage of an earlier freeze passes for this one."""
+    """An environment of an earlier version lacks USD: a warning is shown, and an old stage file is removed."""
     shot, facts = taken
 
     def missing(name: str):

@@ -1,4 +1,4 @@
-"""A take says in words how much of it is plate, where it will not hold and what to do. Figures into sentences."""
+"""Verdict of a take in sentences: plate coverage, weak areas, and advice, derived from figures."""
 
 import json
 
@@ -12,7 +12,7 @@ FRAMES = list(range(1, 41))
 
 
 def facts(lost=(), share=0.9, row=3, column=0, around=0.02, **more) -> dict:
-    """take.json of a take whose cell (row, column) is a guess in the frames `lost`."""
+    """take.json of a take whose cell (row, column) is guessed in the frames `lost`."""
     rows = []
     for frame in FRAMES:
         cells = np.full((4, 4), around)

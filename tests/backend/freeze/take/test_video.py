@@ -8,7 +8,7 @@ from torch_backend.freeze.take.video import rational_fps, write_video
 
 
 def moving_picture(count, height, width):
-    """Smooth, saturated colour that slides, with a hard-edged block in it."""
+    """Smooth, saturated, sliding colours with a hard-edged block."""
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
     for index in range(count):
         red = 0.5 + 0.45 * np.sin((x + 3 * index) / 17.0)
@@ -48,7 +48,7 @@ def test_decodes_to_the_same_pictures(tmp_path, size):
 
 
 def test_flat_colours_keep_their_rec709_values(tmp_path):
-    """A wrong matrix or range shifts saturated patches by ten codes and more."""
+    """A wrong matrix or range would shift saturated patches by ten codes or more."""
     colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [0, 0, 0], [128, 60, 200]], np.uint8)
     patches = np.repeat(np.repeat(colours[None], 64, axis=0), 64, axis=1)
     path = tmp_path / "video.mp4"
@@ -133,7 +133,7 @@ def test_an_error_while_frames_are_made_keeps_the_old_video(tmp_path):
 
 
 def test_without_h264_it_says_so_and_still_writes(tmp_path, monkeypatch):
-    """Some builds of PyAV come without x264."""
+    """Some builds of PyAV lack x264."""
     monkeypatch.setattr(av, "codecs_available", {"mpeg4"})
     stored = list(moving_picture(4, 120, 160))
     path = tmp_path / "video.mp4"

@@ -1,4 +1,4 @@
-"""Frames written beside the next: in order, one at a time, errors told, nothing left half done."""
+"""Frames written in a thread during the next frame: in order, one at a time, with errors reported, no partial files."""
 
 import threading
 
@@ -13,7 +13,7 @@ def test_a_frame_is_written_while_the_next_is_made():
     with WriteBeside() as out:
         out.write(lambda: done.append(free.wait(20)), 1)
         assert done == []
-        free.set()  # what the main thread does next lets the first end: it does not wait for it
+        free.set()  # the main thread reaches this line, so it does not wait for the write
     assert done == [True]
 
 

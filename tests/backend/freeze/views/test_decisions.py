@@ -1,4 +1,4 @@
-"""Decisions that do not hang on the last bit: no pixel of a frozen frame jumps by 1, wherever a threshold lies."""
+"""Decisions are insensitive to rounding: no pixel of a frozen frame jumps by 1, wherever a threshold lies."""
 
 import pytest
 import torch
@@ -26,7 +26,8 @@ def test_of_choices_that_are_equally_good_the_first_is_taken():
 
 @pytest.fixture(scope="module")
 def frame(trained):
-    """frame(by): [H, W, 5] colour, support and motion at a pose aside, with Gaussians off by a share `by`."""
+    """frame(by): [H, W, 5] colour, support and motion from another pose, with Gaussians perturbed by the fraction
+    `by`."""
     world, _ = trained
     run, scene, plates = load_run(world.shot, "main", torch.device("cpu")), load_scene(world.shot), Plates(world.shot)
     compositor, (pose, t_star) = Compositor(run, scene, plates), (113, 106)

@@ -1,4 +1,4 @@
-"""Points, their places in other views and pictures there, against plain loops in float64."""
+"""Points, their projections in other views, and resampled pictures, compared with float64 loops."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ W, H = 37, 29
 
 @pytest.fixture(scope="module")
 def camera():
-    """(viewmat, K) of a camera that is turned and off its place."""
+    """(viewmat, K) of a rotated and translated camera."""
     rng = np.random.default_rng(5)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     viewmat = np.eye(4)
@@ -112,7 +112,7 @@ def test_smaller_pictures_are_means_and_larger_ones_lie_between(picture):
     for width, height in ((20, 10), (10, 5), (80, 40)):
         found = resized(slope, width, height)
         want = pixel_centres(width, height) * (40 / width)
-        np.testing.assert_allclose(found[3:-3, 3:-3], want[3:-3, 3:-3], atol=1e-4)  # borders end otherwise
+        np.testing.assert_allclose(found[3:-3, 3:-3], want[3:-3, 3:-3], atol=1e-4)  # borders are handled differently
     small = resized(float32(picture[..., 0]), 9, 7)
     assert small.shape == (7, 9)
     assert float(small.mean()) == pytest.approx(picture[..., 0].mean(), abs=0.05)

@@ -1,4 +1,4 @@
-"""How a plate shows points, against the same in float64; hidden, behind, beyond, ignored, and what is no number."""
+"""Visibility of points in a plate, compared with float64: hidden, behind, outside, ignored, and NaN."""
 
 import math
 
@@ -12,7 +12,7 @@ WIDTH, HEIGHT, TOLERANCE, SOFT = 37, 21, 0.03, 2.0
 
 
 def reference(points, viewmat, K, surface, ignored):
-    """float64 (pixels, depth, visible, moving, explained) of points [N, 3]."""
+    """Reference in float64: (pixels, depth, visible, moving, explained) of points [N, 3]."""
     local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = local[:, 2]
     front = z > 1e-6
@@ -37,7 +37,8 @@ def reference(points, viewmat, K, surface, ignored):
 
 @pytest.fixture(scope="module")
 def plate():
-    """(points [N, 3], viewmat, K, surface, ignored) in float64: N is no multiple of a vector, more than two units."""
+    """(points [N, 3], viewmat, K, surface, ignored) in float64; N is no multiple of a SIMD vector and exceeds two
+    chunks."""
     rng = np.random.default_rng(3)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     viewmat = np.eye(4)
@@ -46,7 +47,7 @@ def plate():
     surface = np.stack([rng.uniform(2, 3, (HEIGHT, WIDTH)), *rng.uniform(0, 1, (2, HEIGHT, WIDTH))], -1)
     ignored = rng.uniform(0, 1, (HEIGHT, WIDTH, 1)) * (rng.uniform(size=(HEIGHT, WIDTH, 1)) > 0.7)
     local = rng.uniform([-4, -2, -1], [4, 2, 4], (10007, 3))
-    # Half of them about where the surface is, seen or just hidden.
+    # Half of the points are near the surface, visible or just hidden.
     near = np.arange(0, 10007, 2)
     pixels = rng.uniform([-3, -3], [WIDTH + 3, HEIGHT + 3], (len(near), 2))
     z = rng.uniform(1.9, 3.1, len(near))
@@ -65,10 +66,10 @@ def test_it_is_what_float64_says(plate, with_ignored):
     ignored = ignored if with_ignored else np.zeros_like(ignored)
     given = single(points, viewmat, K, surface, ignored)
     given = given if with_ignored else [*given[:-1], None]
-    # Rounded to float32 first: what is tested is the arithmetic.
+    # Inputs are rounded to float32 first, so that only the arithmetic is tested.
     rounded = [np.asarray(v, np.float32).astype(float) for v in (points, viewmat, K, surface, ignored)]
     found, expected = visible_pixels(*given, TOLERANCE, SOFT), reference(*rounded)
-    clear = np.abs(expected[1]) > 1e-3  # where the camera's plane is, rounding decides what is in front
+    clear = np.abs(expected[1]) > 1e-3  # near the camera's plane, rounding decides which points are in front
     assert (expected[2] > 0.5).sum() > 100 and (expected[1] < 0).sum() > 500
     for name, mine, theirs in zip(("depth", "moving", "explained"), (found.depth, found.moving, found.explained),
                                   (expected[1], expected[3], expected[4]), strict=True):  # fmt: skip
