@@ -37,7 +37,7 @@ class Fillers:
     residuals: list[Tensor]
     """[H, W, 3] float16, as `SourceViews.residual`."""
     most: float
-    """The largest value in any of the plates; at least the display's largest value."""
+    """The largest value in any of the plates, and at least `Display.most`."""
 
 
 @dataclass
@@ -97,7 +97,7 @@ def _uneasy(motion: Tensor, doubt: Tensor) -> Tensor:
 def _agreed(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, chosen: list[int], moved: list[Tensor]
 ) -> list[Tensor]:
-    """[h, w] in 0..1 per plate: 1 where the plate and plate t* show the surface alike, or one of them does not show it."""
+    """[h, w] in 0..1 per plate: 1 where it and plate t* show the surface alike, or one of them does not show it."""
     h, w = target.depth.shape
     if target.t not in chosen:
         return [torch.ones_like(target.depth) for _ in chosen]

@@ -101,9 +101,10 @@ def primary_matte(
 
 
 def _unseen(source_views: SourceViews, target: TargetView, moving: Tensor, usable: list[int]) -> Tensor:
-    """[h, w] in 0..1: share of moving surfaces (`moving`) that no plate near t* shows. Plates further from t* count less.
+    """[h, w] in 0..1: share of moving surfaces (`moving`) that no plate near t* shows.
 
-    The support of the Gaussians cannot be used: movers that were never opened to motion count as seen at all times.
+    Plates further from t* count less. The support of the Gaussians cannot be used: movers that were never
+    opened to motion count as seen at all times.
     """
     seconds = {frame: float(source_views.scene.seconds[source_views.index[frame]]) for frame in usable}
     if not seconds:
