@@ -1,4 +1,4 @@
-// Where a plate shows world points, and how: projection, surface there, and whether that is it, in one pass.
+// Visibility of world points in a plate: projection, surface look-up and comparison of depths in one pass.
 
 // points: [count][3]; camera: rows 0 to 2 of the view matrix, fx, fy, cx, cy; surface: [height][width][3], median depth,
 // motion, explained; ignored: [height][width] or null; pixels: [count][2]; depth, visible, moving, explained: [count].
