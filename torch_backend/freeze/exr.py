@@ -44,7 +44,7 @@ HALF_MAX = 65504.0
 EXR_VERSION = 1
 """Version of the `splannequin:` attributes."""
 COLOR_SPACE = "lin_{}_scene"
-"""Format of the scene-linear colour space of given primaries (ASWF colour interop ID, stored as `colorInteropID`)."""
+"""Format string of the name of a scene-linear colour space (ASWF colour interop ID, stored as `colorInteropID`)."""
 
 _STORAGE = {"half": oiio.HALF, "float": oiio.FLOAT}
 _FORMATS, _GRAIN_FORMATS, _DETAIL_FORMATS = (
@@ -163,11 +163,15 @@ def write_frozen_exr(
 
     Colours are converted from Rec.709 to the primaries `metadata.light`.
 
-    Attributes: `chromaticities` and `colorInteropID` of these primaries, and `splannequin:probe` (see `contract.PROBE`)
-    if they are not Rec.709; `worldToCamera`, the OpenEXR standard matrix, in the renderer axes of Blender and Nuke (x
-    right, y up, looking along -z) for Imath's row vectors (p_camera = p_world @ M, translation in the last row);
-    `splannequin:viewmat` and `splannequin:K`, row-major as in `FrameMetadata`; `splannequin:frame`, `:tStarFrame`,
-    `:depthUnits`, `:version`, `:key`. Half channels are clamped to +-65504.
+    Attributes:
+    - `chromaticities` and `colorInteropID` of these primaries, and `splannequin:probe` (see `contract.PROBE`) if they
+      are not Rec.709.
+    - `worldToCamera`, the OpenEXR standard matrix, in the renderer axes of Blender and Nuke (x right, y up, looking
+      along -z). It is for Imath's row vectors: p_camera = p_world @ M, translation in the last row.
+    - `splannequin:viewmat` and `splannequin:K`, row-major as in `FrameMetadata`.
+    - `splannequin:frame`, `:tStarFrame`, `:depthUnits`, `:version`, `:key`.
+
+    Half channels are clamped to +-65504.
 
     With a `margin` the arrays are the data window. The display window is the frame inside of it, and K counts in its
     pixels. Blender 4.2 to 5.2 reads the whole data window and centres it in the render, wherever the display window is;

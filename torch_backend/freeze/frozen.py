@@ -19,10 +19,10 @@ from ..train.model import DynamicModel, render
 from .bands import bands
 
 _ENDS = 0.08
-"""Distance to an end of the clip, as a share of the trained frames, below which instants are ranked lower. Plates on
-one side only determine depth poorly: hands and heads came out worse there."""
+"""Distance to an end of the clip, as a share of the trained frames, below which instants are ranked lower. With plates
+on only one side, depth is poorly determined: hands and heads came out worse there."""
 SUPPORT_SECONDS = 2.0
-"""Seconds from the nearest time at which a moving Gaussian was seen, at which its support falls to 1/e."""
+"""The support of a moving Gaussian falls to 1/e this many seconds from the nearest time at which it was seen."""
 
 
 @dataclass

@@ -108,7 +108,7 @@ def _add_camera(camera: Any, vectors: Any, path: CameraPath, where: Similarity, 
     lenses = [lens_of(frame.K, path.width, path.height) for frame in path.frames]
     is_fixed = all(lens == lenses[0] for lens in lenses)
     for frame, matrix, lens in zip(path.frames, to_world, lenses, strict=True):
-        turns.Set(vectors.Matrix4d(*matrix.T.ravel().tolist()), frame.frame)  # USD multiplies rows
+        turns.Set(vectors.Matrix4d(*matrix.T.ravel().tolist()), frame.frame)  # USD uses row vectors
         if is_fixed and frame is not path.frames[0]:
             continue
         values = {

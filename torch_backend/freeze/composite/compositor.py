@@ -12,7 +12,7 @@ after the model has moved the point from t* to m. The residual I_m - R_m adds wh
 light. Plate t* is trusted even where the model does not explain it, because it shows the frozen instant. Other plates
 are trusted where nothing moves or where they agree with the model. b fades to the splats alone where no plate is
 trusted. Residuals are added in display space, in which splats blend and highlights have a shoulder. A mixes
-scene-linear light, so that the same mix with an artist's plate gives the frame.
+scene-linear light, so that artists can repeat the mix with their own plate.
 
 Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023, "DynIBaR"; figures: docs/benchmarks.md.
 """
@@ -70,7 +70,7 @@ class CompositeFrame:
     """[H, W] in 0..1: share of the pixel that moves in the clip, from the plates where they show it. On the clip's own
     poses it is also 1 where the frame's own plate shows a mover and is rejected. Where it is 0, that plate is valid."""
     primary: int
-    """Frame number of the plate that `st` looks into."""
+    """Frame number of the primary plate, to which `st` refers."""
     st: Tensor
     """[H, W, 2] s to the right, t up, 0..1 over the undistorted plate `primary`, pixel centres at (i + 0.5) / size."""
     matte: Tensor
@@ -86,7 +86,7 @@ class CompositeFrame:
 
     @property
     def color(self) -> Tensor:
-        """[H, W, 3] `linear` on its display, not clipped. Computed on every access, because few callers need it."""
+        """[H, W, 3] `linear` on its display, not clipped. It is not cached, because few callers need it."""
         out = torch.empty_like(self.linear)
         for rows in bands(*self.alpha.shape):
             out[rows] = to_display(self.linear[rows], self.display)
@@ -114,7 +114,7 @@ class Compositor:
         self.config = config or CompositeConfig()
         self._moving, self._bars = moving, bars
         self.seen = SourceViews(run, scene, plates, moving, self.config.source_views)
-        """The plates compared with the current scene: the run's, or a developed instant's."""
+        """The plates compared with the current model, which is the run or a developed instant."""
 
     @torch.no_grad()
     def frame(
@@ -166,7 +166,7 @@ class Compositor:
     # ------------------------------------------------------------------------------------------------- the frame
 
     def _turn_to(self, frozen: FrozenGaussians, t_star: float) -> None:
-        """Recreates `seen` if `frozen` is another developed scene; frames of one instant follow each other."""
+        """Recreates `seen` when the developed instant changes; frames of one instant are rendered in sequence."""
         developed = frozen if frozen.descent is not None else None
         if developed is not self.seen.stage.developed:
             config = self.config.source_views

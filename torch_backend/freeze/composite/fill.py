@@ -181,8 +181,8 @@ def _take_instant(
 ) -> None:  # fmt: skip
     """Uses plate t*'s own pixels in a filling where it shows movers from nearly the same side.
 
-    Movers are learnt from plate t* alone, so their splats are only right from that camera. From elsewhere a face may
-    fall apart although its depth is still right, and a residual cannot repair that.
+    Movers are learnt from plate t* alone, so their splats are only right from that camera. Seen from elsewhere, a
+    face may fall apart although its depth is right, and a residual cannot repair that.
 
     Args:
         points: [P, 3] visible surface points, in scene units.

@@ -119,7 +119,7 @@ def draw(grain: Grain, frame: int, rgba: NDArray[Any], size: tuple[int, int]) ->
 
     Args:
         grain: statistics of the plate's grain.
-        frame: frame number, used as the seed: the grain of a frame is reproducible and differs from other frames.
+        frame: frame number, used as the seed. The grain is reproducible and differs between frames.
         rgba: [H, W, 4] the frozen frame, display-referred, premultiplied.
         size: width and height of the plate in pixels. Grain is drawn at that size, then resized to the frame.
 

@@ -26,7 +26,7 @@ Array = NDArray[Any]
 _UNKNOWN = 1.0
 """Relative standard deviation above which a depth map's value is ignored; `_instant` fills holes with such values."""
 _AROUND = 15
-"""Side in pixels of the window whose mean correction is used for a mover's pixels without one, at its outline."""
+"""Side in pixels of a window. Pixels at a mover's outline without a correction take the mean correction in it."""
 
 
 @dataclass
@@ -69,7 +69,7 @@ class InstantDepth:
 
 
 class MeasuredDepths:
-    """The artist's depth maps of a run's instants, loaded one instant at a time."""
+    """The artist's depth maps for a run's instants. The last instant is cached."""
 
     def __init__(self, run: LoadedRun, scene: Scene, config: SurfaceDepthConfig | None = None) -> None:
         """JobError (TRAIN) if the run's maps are damaged."""

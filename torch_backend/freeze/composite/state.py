@@ -36,9 +36,9 @@ class StateWeights:
     change: float = 1.82
     """Weight of the difference between the plate and the frozen render."""
     gain: float = 2.26
-    """Weight of the model's error at the plate's own time, subtracted from the frozen render's error."""
+    """Weight of the frozen render's error minus the model's error at the plate's own time."""
     contradiction: float = 1.73
-    """Weight of the difference between the plate and every colour that reprojected plate t* shows nearby."""
+    """Weight of the difference between the plate and the range of colours that reprojected plate t* shows nearby."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ the depth behind them. The depth of static surfaces is therefore measured, once 
 
 1. Key views, spread over the clip, start from the inverse depth of the static splats.
 2. Each key view's plate is compared with the plates of the key views around it. Gauss-Newton steps in inverse depth
-   minimise their difference (Lucas and Kanade 1981, along epipolar lines). Moving pixels of the mattes are left out.
+   minimise their difference (Lucas and Kanade 1981, along epipolar lines). Pixels in motion mattes are left out.
    The noise of each pair of plates is measured around each pixel and gives the variance of the inverse depth.
 3. After each step, planes are fitted to inverse depth in windows of two sizes, weighted by 1 / variance. The inverse
    depth of a plane is affine in the image, so planes stay planes. Each pixel averages the planes of the windows around
@@ -41,8 +41,8 @@ from ..views.working_plates import MEASURED_WIDTH, VIEWS
 from .planes import Array, Planes, fit_planes, grid_of, smoothed, window_means
 
 LEAST_INVERSE = 1e-4
-"""Least inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so what is farther than
-10,000 of them has no parallax."""
+"""Smallest inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so surfaces farther
+than 10,000 units have no parallax."""
 TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation for Gaussian errors."""
 SAME = 3.0
@@ -50,7 +50,7 @@ SAME = 3.0
 _QUANTUM = 1.0 / 255.0
 """Least standard deviation of a plate's brightness: a step of 8 bits."""
 _SURE = 2.0
-"""Slope below which 8-bit quantisation may be the cause, in standard deviations of the slope of quantisation noise."""
+"""Slope, in standard deviations of the slope of 8-bit quantisation noise, below which it may be only noise."""
 _SLOPE_NOISE = 12.0**0.5 / 8.0
 """Ratio of the standard deviation of `_slope` to that of the picture, for independent pixel noise."""
 
@@ -64,8 +64,8 @@ class SurfaceDepthConfig:
     keys: int = VIEWS
     """Number of key views, spread evenly over the clip."""
     around: int = 6
-    """Number of key views before and after a key view with which it is compared, and from which a frame takes its
-    depth."""
+    """Number of key views on either side with which a key view is compared. Also the number of nearest key views from
+    which a frame takes its depth."""
     steps: int = 4
     """Number of Gauss-Newton steps."""
     radii: tuple[int, ...] = (3, 8)
@@ -81,8 +81,8 @@ class SurfaceDepthConfig:
     uneven: float = 0.1
     """Scale of a window's mean squared residual, in units of variance, at which its weight falls off."""
     outlier: float = 1e-6
-    """Probability that a pixel's splats belong to another surface than the pixel. Where colours differ more surely than
-    that, depth edges follow the picture."""
+    """Probability that a pixel's splats belong to another surface than the pixel. Where a colour difference is less
+    likely than this, depth edges follow the picture."""
     color: float = 0.1
     """Sigma of the colour difference between a pixel and a window, display-referred, in the bilateral filter."""
 

@@ -9,8 +9,10 @@ reproduced exactly.
 
 The filter is bilinear, on coordinates rounded to 1/256 of a pixel, so that a pixel's centre gives that pixel bit for
 bit. Without the rounding, float32 coordinates of a wide plate are off by about 1e-4 pixels, which is visible next to a
-highlight of 50. Of the filters of Blender's Map UV node, only Nearest exists in all of 4.2 to 5.2 and keeps the
-identity, if coordinates point a quarter of a pixel past its corner (in 4.3 the centre already gives the next pixel).
+highlight of 50.
+
+Of the filters of Blender's Map UV node, only Nearest exists in all versions from 4.2 to 5.2 and keeps the identity. Its
+coordinates must point a quarter of a pixel past the pixel's corner, because in 4.3 the centre gives the next pixel.
 Bilinear exists since 5.0 and has the float32 error. Anisotropic blurs the identity in 4.2, 4.3 and 5.2; Bicubic always
 does. The add-on's node group therefore blends four Nearest look-ups, and agrees with `sample` to 1e-4 relative.
 

@@ -3,8 +3,8 @@
 The deformation field has to explain a whole clip; a freeze needs one instant of it. The frozen Gaussians therefore
 become free parameters. Still pixels are learnt from all trained frames, with movers placed by the run's scene flow.
 Movers at t* are learnt from plate t* alone. Plate t* does not train Gaussians that it sees from much farther away than
-other frames do: a face six pixels wide fits it wherever the eyes are. The pictures are larger than those of a preview
-run, so the frozen scene becomes sharper than the run.
+other frames do: a face that is six pixels wide matches the plate with its eyes in any position. The training pictures
+are larger than those of a preview run, so the frozen scene becomes sharper than the run.
 
 A run that is as sharp as its pictures gains nothing on still pixels, and these are then left unchanged. Its movers may
 still be blurred. They are then trained alone, and blended between their states before and after training. The blend
@@ -61,8 +61,8 @@ class DevelopConfig:
     """Largest number of trained frames that are left out, to measure whether developing helps."""
     gain: float = 0.2
     """Gain in dB that the still pixels of the frames left out must reach. Below it, movers are trained alone, on plate
-    t*. With smaller gains at the run's width, the frozen ground truth lost half a dB that frames of the clip did not
-    reveal, because movers are elsewhere in them."""
+    t*. With a smaller gain at the run's own width, instants lost half a dB against frozen ground truth. Frames of the
+    clip did not show this loss, because movers are elsewhere in them."""
     worth: float = 3.0
     """Movers trained alone are kept if the gain of plate t* exceeds this factor times the loss of the neighbouring
     trained frames, in mean squared error."""
@@ -121,7 +121,7 @@ class _FineTuning:
         known = len(run.model.gaussians)
         self.afar = torch.zeros_like(self.mover)
         self.afar[:known] = undersampled(run, scene, frozen.state["means"][:known], t_star, config.afar).float()
-        # If such a Gaussian moves in other frames, they show it at other times, so it is not trained at all.
+        # An undersampled Gaussian that moves in other frames is not trained, because they show it at other times.
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in self.probes or self.instants])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
         opened[known:] = 1.0

@@ -28,8 +28,8 @@ FOLDER = DEVELOPED_FOLDER
 VERSION = 28
 """Version of developed instants. Raise it when older ones must not be used any more."""
 MOST = 6
-"""Largest number of instants of a take for which instants are developed. A take with more instants develops none, so
-that the look does not change in the middle of a speed ramp."""
+"""Largest number of instants in a take that are developed. A take with more instants develops none of them, so that the
+look does not change in the middle of a speed ramp."""
 
 
 class Instants:
@@ -45,7 +45,7 @@ class Instants:
         to_develop = distinct if on and len(distinct) <= MOST else []
         self.config = config_for(run)
         self.keys = {t: developed_key(shot, run, int(t), self.config, query) for t in to_develop if t in trained}
-        """t* -> key of the developed instants. Only trained frames are developed: the run knows their plates."""
+        """t* -> key of the developed instants. Only frames whose plates the run was trained on are developed."""
         self._held: dict[float, FrozenGaussians] = {}
         self._at: tuple[float, FrozenGaussians] | None = None
 
@@ -55,7 +55,7 @@ class Instants:
         return sorted(int(t) for t in self.keys)
 
     def is_kept(self, t_star: float) -> bool:
-        """True if an instant is stored in the run's folder, developed."""
+        """True if the developed instant is stored in the run's folder."""
         return t_star not in self._held and self._kept(t_star) is not None
 
     def prepare(self, t_stars: Iterable[float], report: Reporter) -> None:

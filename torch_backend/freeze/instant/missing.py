@@ -101,7 +101,7 @@ def missing_pixels(
         image: the frozen scene from plate t*'s camera, scene units.
         behind: the frozen scene without movers, from the same camera.
         matte: [h, w] in 0..1, motion matte of plate t*.
-        unit: pixels per pixel at width 640.
+        unit: pixels of the plate per pixel at width 640.
         config: tolerances.
     """
     sigma, reach = 2.0 * config.margin * unit, max(1, round(2.0 * config.margin * unit))

@@ -5,17 +5,18 @@ supervised it: at t*, from all other poses. For example, the field may fade the 
 
 The static baseline has the same Gaussians as the frozen scene, but its open Gaussians are at the mean of the times at
 which they were seen. Both are compared with plate t*, and with the still pixels of other plates across the clip. A
-Gaussian is closed (made static) if its motion costs the other plates more than plate t* gains. If the mattes show no
-motion at t* and the Gaussian only sways, a third of that cost is enough. Neighbours are decided together, because
-errors are noisy and objects move as a whole. A Gaussian without a measurable cost stays open.
+Gaussian is closed (made static) if its motion raises the error of the other plates by more than it lowers the error of
+plate t*. If the mattes show no motion at t* and the Gaussian only sways, a third of that increase is enough. Neighbours
+are decided together, because errors are noisy and objects move as a whole. A Gaussian whose motion raises no error
+stays open.
 
 Mattes miss swaying objects and sometimes whole arms, and count their pixels as still. The mean state always fits such
 pixels better, although the plate shows another time than t*. For a Gaussian that moves farther than a sway, the
-advantage of the run at the plate's own time over the baseline is therefore subtracted from the cost.
+advantage of the run at the plate's own time over the baseline is therefore subtracted from the error increase.
 
-Plate t* cannot judge objects that it sees from far away: a face six pixels wide fits it wherever the eyes are. For such
-objects, plates that see them from near are compared on all pixels, moving or not, and the run's advantage is always
-subtracted.
+Plate t* cannot judge objects that it sees from far away: a face that is six pixels wide matches the plate with its eyes
+in any position. Such objects are compared on all pixels of plates that see them from near, moving or not, and the run's
+advantage is always subtracted.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class StaticBaselineConfig:
     swaying. The advantage of the run over the baseline at that plate's time is then subtracted. People who hold still
     sway by less, and their mean is as good."""
     nearer: float = 1.0 / AFAR
-    """Largest distance of a plate that sees a Gaussian from near, relative to the distance at t*."""
+    """Distance of a plate's camera, relative to that of t*'s, up to which the plate sees a Gaussian from near."""
 
 
 def apply_static_baseline(
@@ -121,7 +122,7 @@ class _Pair:
         self.marks = torch.stack([torch.zeros_like(movers).index_fill(0, rows, 1.0), movers], dim=1)
 
     def worse(self, frames: list[int], near: Tensor, still: bool = True) -> Tensor:
-        """[M]: squared error of the scene minus that of the baseline, summed over pixels, mean over frames that see it.
+        """[M] per Gaussian: squared error of the scene minus that of the baseline over its pixels, mean over frames.
 
         A pixel's difference is divided among the Gaussians that contribute to it in either scene. Each Gaussian then
         gets the mean of its neighbours `near` [M, K].
@@ -138,7 +139,7 @@ class _Pair:
         return sums / counts.clamp_min(1.0)
 
     def _blamed(self, frame: int, still: bool) -> Tensor:
-        """[M, 2] per row: error of the scene minus that of the baseline in a frame, and visible pixels."""
+        """[M, 2] per row, in a frame: squared error of the scene minus that of the baseline, and visible pixels."""
         camera, plate = self.plates.camera(frame), self.plates.picture(frame)
         ignored = self.plates.ignored(frame)
         whole = torch.ones(plate.shape[:2], device=plate.device) > 0 if ignored is None else ~ignored

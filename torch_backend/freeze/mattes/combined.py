@@ -1,8 +1,9 @@
-"""Combines several instants in one take: objects under a matte come from another take, or keep moving (live plate).
+"""Combines several instants in one take: objects under a matte come from a source take, or from the live plate.
 
-Where an object is in either take, the pixels of the other take are used. The object is then shown at that take's
-instant, and the background that it hid at the base's instant is visible. Around objects both takes have the same
-pixels, because nothing moves there, so the border may be a few pixels away from the object.
+Wherever an object is in the base take or in its source take, the pixels of the source take are used. The object is then
+shown at the source take's instant, and the background that it hid at the base's instant is visible. Around objects,
+both takes have the same pixels, because nothing moves there. The border may therefore be a few pixels away from the
+object.
 """
 
 from __future__ import annotations

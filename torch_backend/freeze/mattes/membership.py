@@ -18,8 +18,8 @@ SEEN = 0.05
 
 THICK = 0.1
 """Depth behind the visible surface, as a share of the surface's depth, above which a Gaussian is hidden: 0.3 m, a body,
-at 3 m. With 0.03, the depth error, an object's own Gaussians counted as hidden, and small objects lost the parts that
-the lassoed frame hides (docs/benchmarks.md, "Mattes by pointing")."""
+at 3 m. With the depth error of 0.03 as threshold, an object's own Gaussians counted as hidden, and small objects
+lost the parts that the lassoed frame hides (docs/benchmarks.md, "Mattes by pointing")."""
 
 RIM = 0.25
 """Distance to the members, as a share of the object's diagonal, within which Gaussians that no lassoed frame shows may
@@ -55,7 +55,8 @@ def in_front(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, depth: Tensor)
 def membership(votes: Tensor) -> Tensor:
     """[N, 2]: share of each Gaussian that belongs to the object (0 if unknown), and 1 if it is known, else 0.
 
-    `votes` [N, 2] are the Gaussian's pixels inside mattes, and all its pixels. It is known with over `SEEN` pixels.
+    `votes` [N, 2] are the Gaussian's pixels inside mattes, and all its pixels. Gaussians with more than `SEEN` pixels
+    are known.
     """
     within, whole = votes.unbind(1)
     known = whole > SEEN

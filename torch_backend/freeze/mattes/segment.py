@@ -97,7 +97,7 @@ def _cut(
     picture: Picture, depth: NDArray[np.float32], prior: NDArray[np.float32], never: NDArray[np.bool_],
     config: SegmentConfig,
 ) -> Matte:  # fmt: skip
-    """The matte from the log-odds of outline, colour and depth; 0 where `never`. See the module docstring."""
+    """The matte from log-odds of outline, colour and depth (see the module docstring); 0 where `never` is True."""
     width = prior.shape[1]
     rows, columns = _crop(~never, round(config.around * width))
     part, start = picture[rows, columns], prior[rows, columns]

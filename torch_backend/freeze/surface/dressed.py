@@ -50,8 +50,8 @@ def dress(
         triangles: [T, 3] indices of vertices.
         views: frozen frames.
         cut: [V] distance to a view's depth above which the view shows another surface than the vertex.
-        part: share of all triangles below which a separate piece is noise, unless most views confirm it. A fifth of it
-            limits islands of people in the room, and of the room in people.
+        part: share of all triangles below which a separate piece is noise, unless most views confirm it. Below a fifth
+            of it, islands of people in the room, and of the room in people, are removed.
     """
     triangles = triangles[_is_kept(vertices, triangles, views, cut, part)]
     kept, flat = np.unique(triangles, return_inverse=True)

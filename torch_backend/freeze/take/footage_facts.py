@@ -18,13 +18,16 @@ from ...shot import Shot, content_key
 def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     """Location and interpretation of the footage, for take.json; {} if the footage is missing.
 
-    file: the video, or the first picture of the sequence. beside: the same path, relative to the shot folder. size:
-    width and height of its pictures. first, last: frame numbers in the files; those of a video start at 1. shift:
-    offset from these to the shot's frame numbers; absent if 0. probe: linear Rec.709 light of `contract.PROBE` in the
-    footage's colour space. space: name of that colour space. map: ST map in the take's folder that undistorts the lens,
-    written by this function; empty without a lens. unlike: a clause that says why other programs would show the files
-    differently from the plates; empty if they would not. orientation: rotation in the video's header as an EXIF code;
-    1: none.
+    file: the video, or the first picture of the sequence.
+    beside: the same path, relative to the shot folder.
+    size: width and height of its pictures.
+    first, last: frame numbers in the files; those of a video start at 1.
+    shift: offset from these to the shot's frame numbers; absent if 0.
+    probe: linear Rec.709 light of `contract.PROBE` in the footage's colour space.
+    space: name of that colour space.
+    map: ST map in the take's folder that undistorts the lens, written by this function; empty without a lens.
+    unlike: clause that states why other programs would show the files differently from the plates; empty otherwise.
+    orientation: rotation in the video's header as an EXIF code; 1: none.
 
     JobError (DISK) or OSError if the map cannot be written.
     """

@@ -1,6 +1,6 @@
 """Renders the frames of a take in several processes where cores and memory allow it.
 
-One process uses about two cores, however many there are, because each frame is decided in one thread. Each process
+One process uses only about two cores, because the decisions about a frame run in one thread. Each process
 renders consecutive frames, which share source plates. Frames that a process does not finish, because it was killed or
 could not start, are rendered by the process that started it.
 """

@@ -27,8 +27,8 @@ class TakeLimits:
     fair_invented: float = 0.2
     """Largest share of the picture that may be a guess in a fair take, mean over frames."""
     lost: float = 0.6
-    """Share of a grid cell of the picture above which the cell counts as a guess. It allows for a person in part of the
-    cell. The clips have 0.12 to 0.53 in the worst cell of the worst frame."""
+    """Share of a cell of the picture's grid that may be a guess before the whole cell counts as one. It allows for a
+    person in part of the cell. The clips have 0.12 to 0.53 in the worst cell of the worst frame."""
     steady: float = 0.6
     """Share of the frames above which a cell counts as a guess throughout the take."""
     named: float = 0.1

@@ -99,9 +99,9 @@ class VisibilityConfig:
     depth_tolerance: float = 0.03
     """Relative depth difference up to which a point belongs to the surface that a plate shows."""
     margin: int = MARGIN
-    """Radius by which motion mattes are dilated. Sigma of the low-pass, once or doubled, under which pictures are
-    compared, because splats are soft. Differences are dilated by twice this radius, because partly rejected movers
-    would leave outlines."""
+    """Radius by which motion mattes are dilated. Pictures are compared under a low-pass with this sigma or twice this
+    sigma, because splats are soft. Differences are dilated by twice this radius, because partly rejected movers would
+    leave outlines."""
     unexplained: float = 0.1
     """Low-passed difference, display-referred, at which the trust in a plate falls to 1/e."""
 
