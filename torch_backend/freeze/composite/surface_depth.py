@@ -69,8 +69,8 @@ class SurfaceDepthConfig:
     steps: int = 4
     """Number of Gauss-Newton steps."""
     radii: tuple[int, ...] = (3, 8)
-    """Radii in pixels of the windows in which planes are fitted in key views. In a frame only the first is used: for
-    the windows, and for the spacing of the nine windows that each pixel averages."""
+    """Radii in pixels of the windows in which planes are fitted in key views. In a frame only the first is used; it is
+    also the spacing of the nine windows that each pixel averages."""
     small: int = 2
     """Radius in pixels of the windows in which the noise of plates is measured, and a frame's splats are smoothed."""
     detail: float = 1.5

@@ -15,8 +15,8 @@ pixels better, although the plate shows another time than t*. For a Gaussian tha
 advantage of the run at the plate's own time over the baseline is therefore subtracted from the error increase.
 
 Plate t* cannot judge objects that it sees from far away: a face that is six pixels wide matches the plate with its eyes
-in any position. Such objects are compared on all pixels of plates that see them from near, moving or not, and the run's
-advantage is always subtracted.
+in any position. For such objects, plates that see them from near are compared on all pixels, including moving ones. The
+run's advantage is then always subtracted.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def deep_samples(
         K: [3, 3] intrinsics of the frame in pixels, overscan included.
         beyond: pixels of overscan on the left and right, and above and below.
         exposure, exposed_at: as in `render_frozen`.
-        display: display of the splats' colours.
+        display: the display in which the splats' colours are given.
         surface: [H, W] the frame's depth with overscan, scene units of the model; `NO_DEPTH` without a surface.
         config: parameters of the search.
     """

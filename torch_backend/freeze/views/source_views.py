@@ -36,7 +36,7 @@ LENGTHS_OF = 640
 MARGIN = 2
 """Possible misplacement of an outline, in pixels at width `LENGTHS_OF`: errors of flow and depth, and motion blur."""
 _VIEWS, _VIEWS_BYTES = 90, 700e6
-"""Largest number of cached plates. Up to 80 other plates are used between two uses of a plate, 16 frames apart. With a
+"""Largest number of cached plates. Between two uses of a plate, 16 frames apart, up to 80 other plates are used. With a
 smaller cache, every plate was computed three times per take."""
 _RESIDUALS_BYTES = 250e6
 _FINEST = 1280

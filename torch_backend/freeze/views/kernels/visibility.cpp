@@ -9,7 +9,7 @@ const long long N = P.count, W = P.width, H = P.height;
 const float* V = P.camera;
 const float fx = V[12], fy = V[13], cx = V[14], cy = V[15], wide = (float)W, high = (float)H;
 const float tolerance = P.settings[0], soft = 1.f / P.settings[1];
-// Not above 0: so is what is no number.
+// Clamps x to 0..most; NaN becomes 0.
 auto within = FN(float x, float most) -> float { return !(x > 0.f) ? 0.f : x < most ? x : most; };
 for (long long first; (first = take() * @POINTS@) < N;) {
     long long last = first + @POINTS@ < N ? first + @POINTS@ : N;
