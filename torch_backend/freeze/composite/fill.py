@@ -273,7 +273,7 @@ def _chosen(
     primary: int,
     usable: list[int],
 ) -> list[int]:
-    """Frame numbers of the fill plates: plate t*, the primary plate, and those that show most of the rest."""
+    """Frame numbers of the fill plates: plate t*, the primary plate, and the plates that show most of the rest."""
     h, w = target.depth.shape
     need = 1.0 - resized(matte, w, h)[::4, ::4]
     points, motion, doubt = (of[::4, ::4] for of in (target.points, target.motion, target.doubt))

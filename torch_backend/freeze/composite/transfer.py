@@ -1,4 +1,4 @@
-"""Transfer functions of a `footage.display` for tensors on any device; `Display` itself has those for NumPy arrays."""
+"""Transfer functions of a `footage.display` for tensors. `Display` has the same functions for NumPy arrays."""
 
 from __future__ import annotations
 

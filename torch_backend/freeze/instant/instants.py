@@ -175,7 +175,7 @@ def load_developed(
 
 
 def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
-    """True if names, types and shapes of a file's tensors are valid for the run: the file is untrusted input."""
+    """True if names, types, shapes and values of a file's tensors are valid for the run: the file is untrusted."""
     names = [f"{part}.{name}" for part in ("base", "state") for name in PARAM_NAMES]
     closed, origin, known = tensors.get("closed"), tensors.get("origin"), len(frozen.support)
     if closed is None or closed.dtype != torch.long or closed.dim() != 1 or not all(n in tensors for n in names):

@@ -1,4 +1,4 @@
-"""The verdict on a take: which share comes from plates, which is a guess, where it is unreliable, and what to do.
+"""The verdict on a take: shares of plate and guess, frames and places that are unreliable, and advice.
 
 A take is no better than its run. No other plate shows a walking person where they stood at t*, and the model has
 another shape of them at every instant. The take's verdict therefore repeats the faults in the run's verdict.
