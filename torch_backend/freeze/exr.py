@@ -273,8 +273,8 @@ def read_layers(
 ) -> tuple[oiio.ImageSpec, list[str], _Facts, NDArray[np.float32]]:
     """(spec, names of the channels, metadata, pixels [H, W, C] float32) of an EXR that has at least `channels`.
 
-    `what` describes a file without these channels in the message ("not a frozen frame"). FileNotFoundError if there is
-    no file; ValueError if it cannot be read or lacks a channel, or if `metadata` raises it.
+    `what` is the message for a file without these channels ("not a frozen frame"). FileNotFoundError if there is no
+    file; ValueError if it cannot be read or lacks a channel, or if `metadata` raises it.
     """
     if not path.is_file():
         raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))

@@ -257,7 +257,7 @@ class _FineTuning:
         return learnt if ignored is None else learnt & ~ignored
 
     def _optimizer(self) -> FusedAdam:
-        """Optimiser with the learning rates of mid-training; means are nearly right and get the rate of the end."""
+        """Optimiser with the learning rates of mid-training. Means are nearly converged and use the final rate."""
         c, p = _TRAINING, self.params
         rates = {
             "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities, "sh0": c.lr_sh0,
