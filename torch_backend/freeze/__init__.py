@@ -1,4 +1,4 @@
-"""A run, an instant t* and a camera path into frozen frames: EXR, mattes, previews, video, PLY."""
+"""Renders frozen frames from a run, an instant t* and a camera path: EXR, mattes, previews, video, PLY."""
 
 from .frozen import FrozenGaussians, freeze_at
 from .take.job import freeze_shot

@@ -1,4 +1,4 @@
-"""Frozen frames as deep OpenEXR: a list of samples in each pixel, for compositors that merge by depth."""
+"""Writes frozen frames as deep OpenEXR, with several samples per pixel, for compositors that merge by depth."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from .exr import HALF_MAX, ROWS, FrameMetadata, frame_spec, set_margin, write_beside
 
 DEEP_CHANNELS = ("R", "G", "B", "A", "Z")
-"""Point samples: without ZBack a sample is a surface, not a volume."""
+"""Channels of a deep frame. Without ZBack, a sample is a surface, not a volume."""
 _FORMATS = (oiio.HALF, oiio.HALF, oiio.HALF, oiio.HALF, oiio.FLOAT)
 
 Samples = Callable[[slice], tuple[NDArray[np.float32], NDArray[np.float32]]]
-"""Rows -> ([S, h, W, 4] colour in the file's light, premultiplied by its own alpha; [S, h, W] depth), front to back; a
-sample is there where alpha is above 0."""
+"""Rows -> ([S, h, W, 4] colour in the file's primaries, premultiplied by the sample's alpha; [S, h, W] depth), front to
+back. A sample with alpha 0 does not exist."""
 
 
 def write_deep_exr(
@@ -29,18 +29,18 @@ def write_deep_exr(
     """Writes one frame of deep samples atomically: half colour and alpha, float32 depth along the camera's axis, ZIPS.
 
     Args:
-        path: the file.
+        path: output file.
         size: (height, width) with overscan.
-        samples: makes the samples, some rows at a time.
-        metadata: as in `write_frozen_exr`, but in the axes and units that `depth_units` says.
-        margin: as there.
+        samples: returns the samples of some rows.
+        metadata: as in `write_frozen_exr`, but in the axes and units that `depth_units` states.
+        margin: as in `write_frozen_exr`.
 
     Raises:
         OSError: as `write_frozen_exr`.
     """
     height, width = size
     spec = frame_spec(width, height, DEEP_CHANNELS, _FORMATS, metadata)
-    spec.attribute("compression", "zips")  # all that deep files can have
+    spec.attribute("compression", "zips")  # deep files support no stronger compression
     spec.deep = True
     set_margin(spec, margin)
 
@@ -53,7 +53,7 @@ def write_deep_exr(
 
 
 def _deep_data(rgba: NDArray[np.float32], depth: NDArray[np.float32]) -> oiio.DeepData:
-    """OpenImageIO's own of samples as `Samples` gives them. It takes one number at a time: mapped, half as slow."""
+    """OpenImageIO's `DeepData` of samples. It accepts one value per call; `map` takes half the time of a loop."""
     values = np.concatenate([rgba.clip(-HALF_MAX, HALF_MAX), depth[..., None]], axis=-1).reshape(
         len(rgba), -1, len(DEEP_CHANNELS)
     )

@@ -1,12 +1,14 @@
-"""Frozen frames as OpenEXR: colour, depth, mattes and what the frame was made of, in one single-part file.
+"""Reads and writes frozen frames as single-part OpenEXR: colour, depth, mattes and sources of the pixels.
 
-Channel names were chosen by experiment with the bpy wheels 4.2.23, 4.5.15, 5.0.1 and 5.2.3. With `CHANNELS`, Blender
-loads the file as MULTILAYER, "Linear Rec.709", and the compositor's Image node shows the sockets Combined, Alpha,
-Depth, Motion and Support in all four versions, values bit-exact; R G B A Z are plain, so Nuke and other readers show
-`rgba` and `depth` at once and find `Support` and `Motion` as further layers. With `GRAIN_CHANNELS` a socket Grain, a
-colour, joins them; with `DETAIL_CHANNELS` Splat, a colour, and Plate and Source, values. Rejected:
-`Frozen.Combined.R ...` (same sockets, but no plain RGBA elsewhere); plain RGBA with `Frozen.Support.V` (a second layer,
-so the mattes are not on the same node); a lone `.R` or `.A` in a matte (aborts 5.2.3 with corrupted memory).
+Channel names are the result of tests with the bpy wheels 4.2.23, 4.5.15, 5.0.1 and 5.2.3. With `CHANNELS`, Blender
+loads the file as MULTILAYER, "Linear Rec.709". In all four versions, the compositor's Image node has the sockets
+Combined, Alpha, Depth, Motion and Support, with bit-exact values. R G B A Z have no prefix, so Nuke and other readers
+show `rgba` and `depth` directly, and `Support` and `Motion` as layers. `GRAIN_CHANNELS` add a colour socket Grain.
+`DETAIL_CHANNELS` add a colour socket Splat and value sockets Plate and Source.
+
+Rejected: `Frozen.Combined.R ...` (the same sockets, but no plain RGBA in other programs); plain RGBA with
+`Frozen.Support.V` (a second layer, so the mattes are not on the same node); a single `.R` or `.A` in a matte (crashes
+5.2.3 with corrupted memory).
 """
 
 from __future__ import annotations
@@ -34,15 +36,15 @@ from ..shot import atomic_path
 CHANNELS = channels_of("")
 """Channel names in the order of the arrays: colour, depth, support matte, motion matte."""
 GRAIN_CHANNELS = channels_of("grain")
-"""Channel names of the grain, which a frame may lack."""
+"""Channel names of the grain; optional in a frame."""
 DETAIL_CHANNELS = channels_of("detail")
-"""Channel names of `DetailLayers`, which a frame of splats alone lacks."""
+"""Channel names of `DetailLayers`; missing in a frame of splats alone."""
 HALF_MAX = 65504.0
 """Largest finite half float; brighter colour is clamped to it."""
 EXR_VERSION = 1
 """Version of the `splannequin:` attributes."""
 COLOR_SPACE = "lin_{}_scene"
-"""Scene-linear of some primaries (ASWF colour interop id, written as `colorInteropID`)."""
+"""Format string of the name of a scene-linear colour space (ASWF colour interop ID, stored as `colorInteropID`)."""
 
 _STORAGE = {"half": oiio.HALF, "float": oiio.FLOAT}
 _FORMATS, _GRAIN_FORMATS, _DETAIL_FORMATS = (
@@ -50,23 +52,23 @@ _FORMATS, _GRAIN_FORMATS, _DETAIL_FORMATS = (
     for part in ("", "grain", "detail")
 )
 _PARTS = ("", "grain", "detail")
-"""Parts whose layers have arguments of their own here; layers of any other go by the table alone (`more`)."""
+"""Parts whose layers are separate arguments of `write_frozen_exr`; all other layers are passed in `more`."""
 _MORE = {layer.name: layer for layer in FRAME_LAYERS if layer.part not in _PARTS}
 _CHANNELS_OF = {"rgba": (4,), "splat": (4,), "grain": (3,)}
 ROWS = 64
-"""Rows of a picture that are made and written at a time."""
+"""Number of rows that are computed and written at a time."""
 _PLATE_STEPS = 256.0
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class FrameMetadata:
-    """What a frozen frame says about itself, stored as EXR attributes."""
+    """Metadata of a frozen frame, stored as EXR attributes."""
 
     frame: int
     """Frame number in the clip's own numbering."""
     t_star_frame: float
-    """Instant at which time stands still, as a (fractional) frame number of the clip."""
+    """Frozen instant, as a (fractional) frame number of the clip."""
     viewmat: NDArray[np.float32]
     """[4,4] world-to-camera, OpenCV axes, column vectors (p_camera = viewmat @ p_world)."""
     K: NDArray[np.float32]
@@ -80,11 +82,11 @@ class FrameMetadata:
     key: str = ""
     """Key of the inputs of the frame, to detect a stale one; empty in frames of versions that did not store it."""
     light: str = LIGHTS[0]
-    """Primaries of the light in the file, one of `LIGHTS`. Arrays here are Rec.709's, whatever it is."""
+    """Primaries of the light in the file, one of `LIGHTS`. Arrays in memory are always Rec.709."""
 
 
 class Rows(Protocol):
-    """A layer [H,W,...] of which some rows can be had: an array, or `Made`."""
+    """A layer [H,W,...] that can be sliced by rows: an array or `Made`."""
 
     @property
     def shape(self) -> tuple[int, ...]: ...
@@ -94,12 +96,12 @@ class Rows(Protocol):
 
 @dataclass(frozen=True)
 class Made:
-    """A layer that is made when it is written, a few rows at a time: as a whole it would take up memory."""
+    """A layer that is computed while it is written, some rows at a time, to save memory."""
 
     shape: tuple[int, ...]
     """[H,W] or [H,W,C]."""
     rows: Callable[[slice], NDArray[Any]]
-    """Those rows of it, any float; asked for once each, from the top."""
+    """Function that returns the requested rows, any float dtype. It is called once per slice, from the top."""
 
     def __getitem__(self, rows: slice, /) -> NDArray[Any]:
         return self.rows(rows)
@@ -107,37 +109,37 @@ class Made:
 
 @dataclass(frozen=True, eq=False)
 class DetailLayers:
-    """Where the pixels of a frame come from that is made of plates as well as of splats."""
+    """Sources of the pixels of a frame that is composited from plates and splats."""
 
     splat: ArrayLike | Made
-    """[H,W,4] scene-linear, premultiplied: the frame as the splats alone show it."""
+    """[H,W,4] scene-linear, premultiplied: the frame rendered from splats alone."""
     plate: ArrayLike
-    """[H,W] in 0..1: share of the pixel that is plate; 0 where splats invented it."""
+    """[H,W] in 0..1: share of the pixel that comes from plates. 0: all of it comes from splats."""
     source: ArrayLike
-    """[H,W] number of the frame whose plate gives most of the pixel; 0 where `plate` is 0."""
+    """[H,W] frame number of the plate with the largest share; 0 where `plate` is 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrozenFrame:
-    """One frozen frame as read back."""
+    """One frozen frame as read from a file."""
 
     rgba: NDArray[np.float32]
     """[H,W,4] scene-linear, premultiplied."""
     depth: NDArray[np.float32]
     """[H,W] planar depth along the camera's axis, in `metadata.depth_units`; 1e10 where alpha is 0."""
     support: NDArray[np.float32]
-    """[H,W] in 0..1: how well the pixel was seen at t*."""
+    """[H,W] in 0..1. 1: the surface is static, or a frame near t* shows it. 0: no frame shows its state at t*."""
     motion: NDArray[np.float32]
-    """[H,W] in 0..1: how much of the pixel belongs to what moves in the clip."""
+    """[H,W] in 0..1: share of the pixel that moves in the clip."""
     metadata: FrameMetadata
     margin: tuple[int, int] = (0, 0)
-    """Pixels beyond the frame on the left and right, and above and below; the arrays hold them."""
+    """Pixels of overscan (left and right, above and below), included in the arrays."""
     grain: NDArray[np.float32] | None = None
-    """[H,W,3] scene-linear, premultiplied: what added to `rgba` gives it the plate's grain. None: not in the file."""
+    """[H,W,3] scene-linear, premultiplied: the plate's grain, to be added to `rgba`. None: not in the file."""
     detail: DetailLayers | None = None
-    """float32. None: the frame is of splats alone."""
+    """Sources of the pixels, float32. None: the frame is of splats alone."""
     more: Mapping[str, NDArray[np.float32]] = field(default_factory=dict[str, NDArray[np.float32]])
-    """Further layers of the table that are in the file, by name: [H,W], or [H,W,4] of a colour."""
+    """Other layers of `FRAME_LAYERS` in the file, by name: [H,W], or [H,W,C] for several channels."""
 
 
 def write_frozen_exr(
@@ -154,25 +156,30 @@ def write_frozen_exr(
 ) -> Path:
     """Writes one frame atomically: half colour and mattes, float32 depth and `source`, ZIP. Arrays as in `FrozenFrame`.
 
-    Grain is noise, which does not compress: it keeps 2 bits of its mantissa and is off by an eighth of itself at most,
-    which takes a third off what it adds to the file (0.74 instead of 1.25 MB at 640 x 480). `splat` keeps 8 bits, four
-    times finer than 8-bit sRGB, and `plate` steps of 1/256: with `source` they add 0.95 MB instead of 1.29.
+    Grain is noise, which does not compress. It is therefore stored with 2 bits of mantissa and a relative error of at
+    most 1/8, and adds a third less to the file (0.74 instead of 1.25 MB at 640 x 480). `splat` is stored with 8 bits of
+    mantissa, four times finer than 8-bit sRGB, and `plate` in steps of 1/256. With `source` they add 0.95 MB instead of
+    1.29 MB.
 
-    Colours are converted from Rec.709 to the light that `metadata` names.
+    Colours are converted from Rec.709 to the primaries `metadata.light`.
 
-    Attributes: `chromaticities` and `colorInteropID` of that light, and `splannequin:probe` (see `contract.PROBE`) if
-    it is not Rec.709's; `worldToCamera`, the OpenEXR standard matrix, in the renderer axes of Blender and Nuke (x
-    right, y up, looking along -z) for Imath's row vectors (p_camera = p_world @ M, translation in the last row);
-    `splannequin:viewmat` and `splannequin:K`, row-major as in `FrameMetadata`; `splannequin:frame`, `:tStarFrame`,
-    `:depthUnits`, `:version`, `:key`. Half channels are clamped to +-65504.
+    Attributes:
+    - `chromaticities` and `colorInteropID` of these primaries, and `splannequin:probe` (see `contract.PROBE`) if they
+      are not Rec.709.
+    - `worldToCamera`, the OpenEXR standard matrix, in the renderer axes of Blender and Nuke (x right, y up, looking
+      along -z). It is for Imath's row vectors: p_camera = p_world @ M, translation in the last row.
+    - `splannequin:viewmat` and `splannequin:K`, row-major as in `FrameMetadata`.
+    - `splannequin:frame`, `:tStarFrame`, `:depthUnits`, `:version`, `:key`.
 
-    With a `margin` the arrays are the data window, and the display window, in whose pixels K counts, is the frame
-    inside of them. Blender 4.2 to 5.2 reads the whole data window and puts its middle in the middle of the render,
-    wherever the display window lies; so margins are the same on opposite sides.
+    Half channels are clamped to +-65504.
 
-    `more` are layers of the table of another part, by name. KeyError if the table has none that is called so.
+    With a `margin` the arrays are the data window. The display window is the frame inside of it, and K counts in its
+    pixels. Blender 4.2 to 5.2 reads the whole data window and centres it in the render, wherever the display window is;
+    margins are therefore equal on opposite sides.
 
-    Layers that are `Made` are made while they are written. ValueError names the layer whose shape is wrong or that
+    `more` holds other layers of `FRAME_LAYERS`, by name. KeyError if the table has no layer of that name.
+
+    Layers of type `Made` are computed while they are written. ValueError names the layer whose shape is wrong or that
     holds NaN or infinity; OSError if the file cannot be written (errno ENOSPC when the disk is full).
     """
     path = Path(path)
@@ -196,9 +203,9 @@ def write_frozen_exr(
 
 
 def set_margin(spec: oiio.ImageSpec, margin: tuple[int, int]) -> None:
-    """Makes the middle of a picture its frame, with `margin` pixels left and right, and above and below, beyond it.
+    """Sets the display window of `spec` to the picture without `margin` pixels (left and right, above and below).
 
-    ValueError if they leave nothing.
+    ValueError if the display window would be empty.
     """
     across, down = margin
     if not (0 <= 2 * across < spec.width and 0 <= 2 * down < spec.height):
@@ -209,10 +216,10 @@ def set_margin(spec: oiio.ImageSpec, margin: tuple[int, int]) -> None:
 
 
 def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[Rows]) -> Path:
-    """Writes layers [H,W,c] or [H,W], whose channels are those of `spec` one after the other, whole or not at all.
+    """Writes layers [H,W,c] or [H,W], whose channels are those of `spec` in order, atomically.
 
-    What is stored as half is clamped to +-65504. A few rows at a time: a 4K frame of all layers has half a gigabyte.
-    OSError with the system's reason, as `write_frozen_exr`.
+    Half channels are clamped to +-65504. Rows are written in bands, because all layers of a 4K frame have half a
+    gigabyte. OSError with the system's reason, as `write_frozen_exr`.
     """
     kinds = [spec.channelformat(channel).basetype for channel in range(spec.nchannels)]
     most = np.array([HALF_MAX if kind == oiio.HALF else np.inf for kind in kinds], np.float32)
@@ -227,7 +234,7 @@ def write_exr(path: Path, spec: oiio.ImageSpec, parts: Sequence[Rows]) -> Path:
 
 
 def write_beside(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bool]) -> Path:
-    """Writes a picture whole or not at all. `rows` writes `ROWS` of it from a given one, False if it cannot.
+    """Writes a picture atomically. `rows(output, top)` writes `ROWS` rows from row `top` and returns False on failure.
 
     OSError with the system's reason, as `write_frozen_exr`.
     """
@@ -240,7 +247,7 @@ def write_beside(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bo
             for top in range(0, spec.height, ROWS) if good else ():
                 good = good and rows(output, top)
         except BaseException:
-            output.close()  # a file that is open cannot be removed everywhere
+            output.close()  # Windows cannot remove an open file
             raise
         if not (good and output.close()):
             raise write_error(output.geterror(), path, spec.height * spec.width * 4 * spec.nchannels)
@@ -248,13 +255,13 @@ def write_beside(path: Path, spec: oiio.ImageSpec, rows: Callable[[Any, int], bo
 
 
 def _rows_of(parts: Sequence[Rows], rows: slice, width: int) -> NDArray[np.float32]:
-    """[h,W,C] float32: some rows of all layers."""
+    """[h,W,C] float32: some rows of all layers, concatenated along channels."""
     height = rows.stop - rows.start
     return np.concatenate([part[rows].reshape(height, width, -1) for part in parts], axis=2, dtype=np.float32)
 
 
 def channel_names(spec: oiio.ImageSpec) -> list[str]:
-    """Names of a file's channels, in its order."""
+    """Names of a file's channels, in file order."""
     return list(cast(Any, spec).channelnames)
 
 
@@ -264,9 +271,10 @@ _Facts = TypeVar("_Facts")
 def read_layers(
     path: Path, channels: Sequence[str], what: str, metadata: Callable[[oiio.ImageSpec, Path], _Facts]
 ) -> tuple[oiio.ImageSpec, list[str], _Facts, NDArray[np.float32]]:
-    """(spec, names of the channels, metadata, pixels [H, W, C] float32) of an EXR of ours with `channels`, at least.
+    """(spec, names of the channels, metadata, pixels [H, W, C] float32) of an EXR that has at least `channels`.
 
-    FileNotFoundError without a file; ValueError if it cannot be read or is not `what`, or as `metadata` raises it.
+    `what` is the message for a file without these channels ("not a frozen frame"). FileNotFoundError if there is no
+    file; ValueError if it cannot be read or lacks a channel, or if `metadata` raises it.
     """
     if not path.is_file():
         raise FileNotFoundError(errno.ENOENT, "no such EXR", str(path))
@@ -289,9 +297,9 @@ def read_layers(
 
 
 def read_frozen_exr(path: str | Path) -> FrozenFrame:
-    """Reads a file of `write_frozen_exr`; everything float32.
+    """Reads a file of `write_frozen_exr`; all arrays are float32.
 
-    FileNotFoundError without a file; ValueError if it cannot be read, is not a frozen frame, or is from a newer
+    FileNotFoundError if there is no file; ValueError if it cannot be read, is not a frozen frame, or is from a newer
     version.
     """
     spec, names, metadata, pixels = read_layers(Path(path), CHANNELS, "not a frozen frame", _metadata)
@@ -320,13 +328,13 @@ def read_frozen_exr(path: str | Path) -> FrozenFrame:
 
 
 def read_key(path: str | Path) -> str | None:
-    """`FrameMetadata.key` of a frame, from its header alone; None if the file cannot be read as one."""
+    """`FrameMetadata.key` of a file, from its header; None if the file cannot be read."""
     try:
         image = oiio.ImageInput.open(regular_file(path))
     except (OSError, ValueError):
         return None
     if image is None:
-        oiio.geterror()  # clears the error, which the next caller would get
+        oiio.geterror()  # clears the error, so that the next caller does not get it
         return None
     try:
         return str(image.spec().getattribute("splannequin:key") or "")
@@ -335,15 +343,15 @@ def read_key(path: str | Path) -> str | None:
 
 
 def _coarse(grain: NDArray[Any]) -> NDArray[np.float16]:
-    """Grain [h,W,3] as half floats whose eight lowest bits are 0, and an alpha of 0: [h,W,4]."""
+    """Grain [h,W,3] as half floats whose eight lowest bits are 0, plus an alpha of 0: [h,W,4]."""
     half = np.clip(grain, -HALF_MAX, HALF_MAX).astype(np.float16)
-    # Rounded to the nearest: cut off, it would lose a tenth of its strength.
+    # Rounded to nearest, because truncation would reduce the grain by a tenth.
     half = ((half.view(np.uint16) + np.uint16(0x80)) & np.uint16(0xFF00)).view(np.float16)
     return np.concatenate([half, np.zeros((*half.shape[:2], 1), np.float16)], axis=2)
 
 
 def _eight_bits(values: NDArray[np.float32]) -> NDArray[np.float16]:
-    """Values as half floats with 8 bits of mantissa, rounded to the nearest."""
+    """Values as half floats with 8 bits of mantissa, rounded to nearest."""
     bits = np.clip(values, -HALF_MAX, HALF_MAX).view(np.uint32)
     return ((bits + np.uint32(0x4000)) & np.uint32(0xFFFF8000)).view(np.float32).clip(-HALF_MAX, HALF_MAX).astype("f2")
 
@@ -357,11 +365,11 @@ _STORED: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
     "splat": _eight_bits,
     "plate": _in_steps,
 }
-"""What becomes of a layer's rows as they are written."""
+"""Name of a layer -> rounding of its rows before they are written."""
 
 
 def _stored(name: str, layer: Rows, matrix: NDArray[np.float32] | None) -> Rows:
-    """A layer as its file has it: colours in the file's light, rounded as the layer's kind is."""
+    """A layer as stored in the file: colours converted by `matrix` to the file's primaries, then rounded."""
     change = _STORED.get(name, lambda rows: rows)
     if matrix is not None and len(layer.shape) == 3 and (name not in _MORE or _MORE[name].is_colour):
         return Made(layer.shape, lambda rows: change(in_light(layer[rows], matrix)))
@@ -369,9 +377,9 @@ def _stored(name: str, layer: Rows, matrix: NDArray[np.float32] | None) -> Rows:
 
 
 def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
-    """`rgba` and layers like it as float32, those that are `Made` checked when they are. ValueError names a wrong one.
+    """The layers as float32, after checks of shape and finite values. ValueError names a bad layer.
 
-    Each has the size of `rgba`.
+    All layers must have the size of `rgba`. Values of `Made` layers are checked when they are computed.
     """
     with np.errstate(over="ignore"):
         found: dict[str, Rows] = {
@@ -394,7 +402,7 @@ def _checked(layers: dict[str, ArrayLike | Made]) -> dict[str, Rows]:
 
 
 def _made(name: str, layer: Made, rows: slice) -> NDArray[np.float32]:
-    """Some rows of a layer, float32. ValueError if they are not finite."""
+    """Some rows of a layer, float32. ValueError if a value is not finite."""
     with np.errstate(over="ignore"):
         made = np.asarray(layer[rows], dtype=np.float32)
     check_finite(name, made, rows.start)
@@ -402,7 +410,7 @@ def _made(name: str, layer: Made, rows: slice) -> NDArray[np.float32]:
 
 
 def check_finite(name: str, layer: NDArray[np.float32], top: int = 0) -> None:
-    """ValueError names a layer [H,W,...] with NaN or infinity in it, and the first place; it begins in row `top`."""
+    """Raises ValueError if a layer [H,W,...] has NaN or infinity. `top`: row of the picture in which it starts."""
     finite = np.isfinite(layer)
     if not finite.all():
         y, x, *_ = np.argwhere(~finite)[0]
@@ -413,7 +421,7 @@ def check_finite(name: str, layer: NDArray[np.float32], top: int = 0) -> None:
 def frame_spec(
     width: int, height: int, names: tuple[str, ...], formats: tuple[oiio.BASETYPE, ...], metadata: FrameMetadata
 ) -> oiio.ImageSpec:
-    """What the EXR of a frame begins with, ZIP-compressed. ValueError on matrices or an instant that are none."""
+    """Header of a frame's EXR, ZIP-compressed. ValueError if a matrix is invalid or the instant is not finite."""
     viewmat = np.asarray(metadata.viewmat, dtype=np.float32)
     intrinsics = np.asarray(metadata.K, dtype=np.float32)
     for name, matrix, shape in (("viewmat", viewmat, (4, 4)), ("K", intrinsics, (3, 3))):
@@ -439,13 +447,13 @@ def frame_spec(
 def linear_spec(
     width: int, height: int, names: tuple[str, ...], formats: tuple[oiio.BASETYPE, ...], light: str = LIGHTS[0]
 ) -> oiio.ImageSpec:
-    """What a ZIP-compressed EXR of scene-linear light, one of `LIGHTS`, with these channels begins with."""
+    """Header of a ZIP-compressed EXR with these channels, scene-linear with the primaries `light`, one of `LIGHTS`."""
     spec = oiio.ImageSpec(width, height, len(names), formats[0])
     spec.channelnames = names
-    if len(set(formats)) > 1:  # else the writer passes over them
+    if len(set(formats)) > 1:  # the writer ignores them otherwise
         spec.channelformats = formats
     spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")  # else the writer puts the hour there: a frame is the same whenever it was made
+    spec.attribute("DateTime", "")  # otherwise the writer stores the current time, and files would differ
     spec.attribute("oiio:ColorSpace", COLOR_SPACE.format(light))
     spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), PRIMARIES[light][1])
     if light != LIGHTS[0]:
@@ -454,7 +462,7 @@ def linear_spec(
 
 
 def read_light(spec: oiio.ImageSpec) -> str:
-    """Which of `LIGHTS` a file of `linear_spec` holds."""
+    """Primaries of a file of `linear_spec`, one of `LIGHTS`."""
     return light_of_chromaticities(cast(Any, spec).getattribute("chromaticities"))
 
 
@@ -484,7 +492,8 @@ def _metadata(spec: oiio.ImageSpec, path: Path) -> FrameMetadata:
 
 
 def write_error(message: str, path: Path, byte_count: int) -> OSError:
-    """OSError with the system's reason, which libraries pass on only in words, if at all. `byte_count`: of the file."""
+    """OSError with an errno derived from a library's `message` and the free disk space, because libraries return only
+    text. `byte_count`: size of the file."""
     code = next((c for c in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) if os.strerror(c) in message), None)
     if code is None:
         code = errno.ENOSPC if shutil.disk_usage(path.parent).free < byte_count else errno.EIO

@@ -1,4 +1,4 @@
-"""Time stands still: every Gaussian is asked once, at t* or as near to it as somebody saw it."""
+"""Freezes a dynamic model: evaluates every Gaussian once, at t* or at the nearest time at which a frame saw it."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from ..train.model import DynamicModel, render
 from .bands import bands
 
 _ENDS = 0.08
-"""An instant this near to an end of the clip, as a share of the trained frames, has plates on one side only to tell how
-far away things are: hands and heads came out worse there."""
+"""Distance to an end of the clip, as a share of the trained frames, below which instants are ranked lower. With plates
+on only one side, depth is poorly determined: hands and heads came out worse there."""
 SUPPORT_SECONDS = 2.0
-"""The support matte of a moving Gaussian falls to 1/e at this distance from the nearest time it was seen."""
+"""The support of a moving Gaussian falls to 1/e this many seconds from the nearest time at which it was seen."""
 
 
 @dataclass
@@ -34,20 +34,20 @@ class FrozenGaussians:
     sh_degree: int
     """SH degree in use."""
     support: Tensor
-    """[N] in 0..1: how well each Gaussian is known at the instant."""
+    """[N] in 0..1: certainty of each Gaussian's state at the instant."""
     motion: Tensor
     """[N] in 0..1: 1 for Gaussians that move in the clip."""
     descent: FrozenGaussians | None = None
-    """A developed instant as it was before, row by row: the run's Gaussians at t*, which still move as the run moves
-    them. None if it was not developed."""
+    """The same rows before they were developed: the Gaussians at t*, which follow the run's scene flow. None if the
+    instant was not developed."""
     origin: Tensor | None = None
-    """[N] uint8: 0 for a row that is the run's own, else the number of the repair that changed it last, counted from 1
-    in the order of `instant.repairs.repairs`. None: no repair was asked."""
+    """[N] uint8: 0 for a row unchanged from the run, else the number of the repair that changed it last, counted from 1
+    in the order of `instant.repairs.repairs`. None: no repair was applied."""
 
 
 @dataclass
 class FrozenImage:
-    """One frozen frame, display-referred, nothing behind it."""
+    """One frozen frame, without a background."""
 
     color: Tensor
     """[H, W, 3] premultiplied, display-referred."""
@@ -56,14 +56,14 @@ class FrozenImage:
     depth: Tensor
     """[H, W] median depth along the camera's axis in scene units; 1e10 where alpha is 0."""
     support: Tensor
-    """[H, W] in 0..1: how much of what is seen was seen at the instant."""
+    """[H, W] in 0..1: mean support of the visible Gaussians."""
     motion: Tensor
-    """[H, W] in 0..1: how much of what is seen moves in the clip."""
+    """[H, W] in 0..1: share of the pixel that moves in the clip."""
     depth_sigma: Tensor | None = None
-    """[H, W] standard deviation of `depth` in scene units; None: not known, `depth` is the splats' own."""
+    """[H, W] standard deviation of `depth` in scene units; None: unknown, `depth` is that of the splats."""
 
     def cpu(self) -> FrozenImage:
-        """The same on the CPU, where files are written."""
+        """A copy on the CPU, for writing files."""
         return replace(self, **{name: value.cpu() for name, value in vars(self).items() if value is not None})
 
 
@@ -72,7 +72,7 @@ class OutputFrame:
     """One frame to render."""
 
     frame: int
-    """Number in the clip."""
+    """Frame number in the clip."""
     viewmat: Tensor
     """[4, 4] world-to-camera, scene units."""
     K: Tensor
@@ -80,7 +80,7 @@ class OutputFrame:
     t_star: float
     """Frame number at which time stands still."""
     exposed_like: float
-    """Frame number whose exposure the camera has: its own on the clip's poses, t* on a path of its own."""
+    """Frame number whose exposure is applied: `frame` on the clip's poses, t* on a new camera path."""
 
 
 def span_of(scene: Scene, run: LoadedRun) -> float:
@@ -91,13 +91,13 @@ def span_of(scene: Scene, run: LoadedRun) -> float:
 
 @torch.no_grad()
 def freeze_at(model: DynamicModel, time: float, seconds: float, query: str = "nearest") -> FrozenGaussians:
-    """Freezes a model at a normalised time. The field is evaluated once; views then cost only rasterisation.
+    """Freezes a model at a normalised time. The field is evaluated once; views then only need rasterisation.
 
     Args:
         time: t* in [0, 1].
-        seconds: length of the trained range, for the support's decay.
-        query: nearest: a moving Gaussian is asked at its supported bin nearest to t*, so that nobody is shown in a
-            state that no frame has constrained; plain: at t* itself (the published method). ValueError otherwise.
+        seconds: length of the trained range in seconds, for the decay of support.
+        query: "nearest" evaluates a moving Gaussian at its supported time bin nearest to t*, so that every state shown
+            is constrained by a frame. "plain" evaluates it at t* (the published method). ValueError otherwise.
     """
     if query not in ("nearest", "plain"):
         raise UserError(f"query is {query!r}: it should be nearest or plain")
@@ -124,11 +124,11 @@ def render_frozen(
     exposed_at: float = 0.0,
     overscan: tuple[float, float] = (0.0, 0.0),
 ) -> FrozenImage:
-    """One view of a frozen scene, brought to the CPU: viewmat [4, 4] in scene units, K [3, 3] in pixels.
+    """Renders one view of a frozen scene, on the CPU: viewmat [4, 4] in scene units, K [3, 3] in pixels.
 
-    Time stands still for the world, not for the camera: `exposure` at the normalised time `exposed_at` is applied, so
-    that a frozen frame matches the plate it is mixed with. None: colours as the Gaussians have them. `overscan`: pixels
-    around the camera's own frame, which then looks as it does without them.
+    `exposure` at the normalised time `exposed_at` is applied, so that the frame matches the plate it is mixed with.
+    Time is frozen for the scene, not for the camera's exposure. None: colours of the Gaussians. `overscan`: pixels
+    (left and right, above and below) around the camera's frame; the frame itself looks the same with and without them.
     """
     mattes = torch.stack([frozen.support, frozen.motion], dim=1)
     out = render(
@@ -146,7 +146,7 @@ def render_frozen(
     if out.depth_median is None:
         raise RuntimeError("the rasteriser returned no depth")
     colors, alphas, depth = out.colors[0], out.alphas[0], out.depth_median[0]
-    del out  # the mean depth is not needed, and 4K takes its room
+    del out  # frees the mean depth, which is large at 4K
     parts = bands(height, width)
     if len(parts) == 1:
         color, alpha, support, motion = _shown(colors, alphas, exposure, exposed_at)
@@ -166,7 +166,7 @@ def render_frozen(
 
 
 def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
-    """A frozen scene whose Gaussians have the share `kept` [N] of their opacity left."""
+    """A frozen scene whose opacities are multiplied by `kept` [N]."""
     logits = frozen.state["opacity_logits"]
     kept = kept.to(logits)
     less = torch.logit((torch.sigmoid(logits) * kept).clamp(1e-6, 1.0 - 1e-6))
@@ -177,9 +177,9 @@ def fade(frozen: FrozenGaussians, kept: Tensor) -> FrozenGaussians:
 def _shown(
     colors: Tensor, alphas: Tensor, exposure: Exposure | None, exposed_at: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(color [h, w, 3], alpha, support, motion [h, w]) of rows as rasterised: colors [h, w, 5], alphas [h, w]."""
+    """(color [h, w, 3], alpha, support, motion [h, w]) from rasterised rows: colors [h, w, 5], alphas [h, w]."""
     alpha = alphas.clamp(0.0, 1.0)
-    # Mattes are shares of what is seen: undo the premultiplication, keep nothing where nothing is.
+    # Mattes are not premultiplied: divide by alpha, and set them to 0 where alpha is 0.
     covered = alpha.clamp_min(1e-4)
     mattes = torch.where(alpha[..., None] > 1e-3, colors[..., 3:] / covered[..., None], 0.0).clamp(0.0, 1.0)
     color = colors[..., :3]
@@ -190,20 +190,20 @@ def _shown(
 
 @dataclass
 class CandidateInstant:
-    """A trained frame as a place for time to stand still."""
+    """A trained frame as a candidate for t*."""
 
     index: int
     """Index into the trained frames."""
     score: float
-    """Higher is better; comparable within one ranking."""
+    """Score of the frame: higher is better. Only comparable within one ranking."""
     seen: float
-    """Share of what moves that this frame saw, 0 to 1; 1 where nothing moves."""
+    """Share of the moving Gaussians seen in this frame, weighted by travel, 0 to 1; 1 if nothing moves."""
     sharpness: float
-    """Share of the trained frames whose plates are not sharper, 0 to 1."""
+    """Rank of the plate's sharpness among the trained frames, 0 (softest) to 1 (sharpest)."""
 
 
 def best_instants(instants: list[CandidateInstant], count: int = 5, apart: float = 0.08) -> list[CandidateInstant]:
-    """Up to `count` of a ranking, best first, at least `apart` of the trained frames from each other."""
+    """Up to `count` of a ranking, best first, at least the share `apart` of the trained frames from each other."""
     chosen: list[CandidateInstant] = []
     for instant in sorted(instants, key=lambda i: -i.score):
         if all(abs(instant.index - other.index) >= apart * len(instants) for other in chosen):
@@ -213,14 +213,14 @@ def best_instants(instants: list[CandidateInstant], count: int = 5, apart: float
 
 @torch.no_grad()
 def rank_instants(model: DynamicModel, times: np.ndarray, sharpness: np.ndarray) -> list[CandidateInstant]:
-    """Every trained frame as an instant to freeze: one that saw most of what moves and whose plate is sharp is good.
+    """Scores every trained frame as a candidate for t*: good frames show most movers and have a sharp plate.
 
-    Gaussians count by how far they travel, so that people weigh more than a flickering lamp. Between two that are as
-    good the one that is not at an end of the clip wins.
+    Gaussians are weighted by their travel, so that people count more than a flickering lamp. Frames near an end of the
+    clip get a slightly lower score.
 
     Args:
         times: [S] normalised times of the trained frames.
-        sharpness: [S] of their plates; any scale.
+        sharpness: [S] sharpness of their plates, on any scale.
     """
     rows = model.open_rows()
     rank = np.argsort(np.argsort(sharpness)) / max(1, len(sharpness) - 1)

@@ -1,4 +1,4 @@
-"""Gaussians in the axes and units of a scene: means, rotations, sizes and spherical harmonics moved together."""
+"""Transforms Gaussians to the axes and units of a scene: means, rotations, scales and spherical harmonics."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from ..raster.reference import sh_basis
 from ..torch_types import from_numpy
 
 _DIRECTIONS = 64
-"""Directions in which a band's rotation is solved for: some times more than the 7 functions of the third."""
+"""Number of sample directions for a band's rotation: several times the 7 functions of the third band."""
 _CHUNK = 1 << 16
-"""Gaussians whose harmonics are rotated at a time: float64 copies of them take 25 MB."""
+"""Number of Gaussians whose harmonics are rotated at once: their float64 copies take 25 MB."""
 
 
 def placed(gaussians: PlyGaussians, where: Similarity) -> PlyGaussians:
-    """The same Gaussians after the world was turned, scaled and moved: they look the same from the moved camera.
+    """Gaussians transformed by a similarity: they look the same from an equally transformed camera.
 
     Args:
         gaussians: as stored, float32.
-        where: from their space to the new one.
+        where: similarity from the Gaussians' space to the new space.
 
     Returns:
-        float32; quaternions wxyz of the lengths they had, harmonics of the degree they had.
+        float32 Gaussians; lengths of quaternions (wxyz) and the degree of harmonics are unchanged.
     """
     turn = rotation_to_quat(where.rotation)
     sh = gaussians.sh
@@ -45,9 +45,10 @@ def placed(gaussians: PlyGaussians, where: Similarity) -> PlyGaussians:
 
 
 def rotated_harmonics(sh: NDArray[np.float32], rotation: NDArray[Any]) -> NDArray[np.float32]:
-    """Coefficients [N, K, 3] of the same radiance after the world was turned by a rotation [3, 3]; K as it was.
+    """Coefficients [N, K, 3] after the world is rotated by `rotation` [3, 3].
 
-    What had a colour c(d) in direction d has c(rotation^T d) now. Constants stay; each further band is mixed in itself.
+    A colour c(d) in direction d becomes c(rotation^T d). The constant band is unchanged. Every other band is multiplied
+    by its own matrix.
     """
     result = sh.copy()
     degree = math.isqrt(sh.shape[1]) - 1
@@ -61,11 +62,10 @@ def rotated_harmonics(sh: NDArray[np.float32], rotation: NDArray[Any]) -> NDArra
 
 
 def band_rotations(rotation: NDArray[Any], degree: int) -> list[NDArray[np.float64]]:
-    """Matrices [2l+1, 2l+1] of the bands l = 1 to `degree`: coefficients before to those after the world was turned.
+    """Matrices [2l+1, 2l+1] of the bands l = 1 to `degree` that map coefficients to those of the rotated world.
 
-    Each is the least-squares solution of Y(D) M = Y(rotation^T D) over evenly spread directions D. A band is closed
-    under rotation, so the residual is rounding alone; and M has the signs and the order of the rasteriser's own basis,
-    whatever these are.
+    Each is the least-squares solution of Y(D) M = Y(rotation^T D) over evenly distributed directions D. A band is
+    closed under rotation, so the residual is only rounding. Signs and order of M follow the rasteriser's basis.
     """
     directions = _fibonacci_sphere(_DIRECTIONS)
     before = _basis(directions @ np.asarray(rotation, np.float64), degree)  # rows d: (rotation^T d)^T = d^T rotation
@@ -81,7 +81,7 @@ def _basis(directions: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
 
 
 def _fibonacci_sphere(count: int) -> NDArray[np.float64]:
-    """Unit vectors [count, 3], evenly spread: heights evenly, turned by the golden angle."""
+    """Unit vectors [count, 3], evenly distributed: equal steps in height, rotated by the golden angle."""
     heights = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     angles = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
     radii = np.sqrt(1.0 - heights**2)
@@ -89,7 +89,7 @@ def _fibonacci_sphere(count: int) -> NDArray[np.float64]:
 
 
 def _product(turn: NDArray[np.float64], quats: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Hamilton products of one quaternion [4] and many [N, 4], wxyz: first `quats`, then `turn`."""
+    """Hamilton products turn * quats of one quaternion [4] and many [N, 4], wxyz: `quats` rotates first."""
     w, v = turn[0], turn[1:]
     scalars, vectors = quats[:, :1], quats[:, 1:]
     return np.concatenate(

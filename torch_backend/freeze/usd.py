@@ -1,8 +1,8 @@
-"""Splats and the animated camera as one USD stage, for Houdini, Solaris, Nuke, Omniverse and Blender.
+"""Writes splats and the animated camera as one USD stage, for Houdini, Solaris, Nuke, Omniverse and Blender.
 
 The splats are a `ParticleField3DGaussianSplat` (OpenUSD 26.03; https://openusd.org/release/user_guides/schemas/usdVol/):
-scales are linear, opacities between 0 and 1, harmonics grouped by particle, in the order and signs of 3DGS. Z is up;
-lengths are the scene's, and the stage says how many metres one is.
+scales are linear, opacities between 0 and 1, harmonics grouped by particle, in the order and signs of 3DGS. Z is up.
+Lengths are in units of the scene; the stage's `metersPerUnit` states their size.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from .exr import write_error
 ROOT, SPLATS, CAMERA = "/frozen", "/frozen/splats", "/frozen/camera"
 """Paths of the prims."""
 REACH = 3.0
-"""Standard deviations of a Gaussian that the stage's extent counts in: 0.3 % of it lie beyond."""
+"""Radius of a Gaussian in the stage's extent, in standard deviations; 0.3 % of a Gaussian lies outside."""
 
 
 class NoUsdError(RuntimeError):
-    """The backend's environment has no usd-core: it was set up by an earlier version."""
+    """Raised if the backend's environment has no usd-core, because an earlier version set it up."""
 
 
 def write_usd(
@@ -38,14 +38,14 @@ def write_usd(
     metres_per_unit: float,
     fps: float,
 ) -> Path:
-    """Writes a stage (.usdc, .usda) beside its place, then renames it.
+    """Writes a stage (.usdc, .usda) atomically.
 
     Args:
-        path: file.
-        gaussians: in the scene's axes and units already; None: the camera alone.
-        cameras: the animated camera in solve units; its frame numbers are the stage's time codes.
-        where: from solve units to the scene.
-        metres_per_unit: length in metres of a unit of the scene.
+        path: output file.
+        gaussians: splats in the scene's axes and units; None: only the camera is written.
+        cameras: the animated camera in solve units; its frame numbers become time codes of the stage.
+        where: similarity from solve units to the scene.
+        metres_per_unit: length of a scene unit in metres.
         fps: frames per second.
 
     Returns:
@@ -55,7 +55,7 @@ def write_usd(
         NoUsdError: usd-core is not installed.
         OSError: the file cannot be written.
     """
-    # Through importlib: usd-core has no types, so everything of it is Any.
+    # importlib is used because usd-core has no type stubs; all its names become Any.
     try:
         Gf, Sdf, Tf, Usd, UsdGeom, UsdVol, Vt = (
             importlib.import_module(f"pxr.{name}") for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdVol", "Vt")
@@ -80,7 +80,7 @@ def write_usd(
 
 
 def _size_of(gaussians: PlyGaussians | None) -> int:
-    """Bytes that a stage takes at least, about; one block of a disk more."""
+    """Approximate lower bound of a stage's size in bytes, plus one disk block."""
     return 4096 + (0 if gaussians is None else gaussians.means.nbytes + gaussians.sh.nbytes)
 
 
@@ -94,7 +94,7 @@ def _describe(stage: Any, geometry: Any, cameras: CameraPath, metres_per_unit: f
 
 
 def _add_camera(camera: Any, vectors: Any, path: CameraPath, where: Similarity, metres_per_unit: float) -> None:
-    """Keys a camera on every frame of the path. Film backs of USD are in tenths of a stage unit, whatever it is."""
+    """Adds keys for every frame of the path to a camera. USD film backs are in tenths of a stage unit."""
     per_mm = 0.01 / metres_per_unit
     to_world = camera_to_world(where.viewmats(path_viewmats(path)))
     turns = camera.AddTransformOp()
@@ -108,7 +108,7 @@ def _add_camera(camera: Any, vectors: Any, path: CameraPath, where: Similarity, 
     lenses = [lens_of(frame.K, path.width, path.height) for frame in path.frames]
     is_fixed = all(lens == lenses[0] for lens in lenses)
     for frame, matrix, lens in zip(path.frames, to_world, lenses, strict=True):
-        turns.Set(vectors.Matrix4d(*matrix.T.ravel().tolist()), frame.frame)  # USD multiplies rows
+        turns.Set(vectors.Matrix4d(*matrix.T.ravel().tolist()), frame.frame)  # USD uses row vectors
         if is_fixed and frame is not path.frames[0]:
             continue
         values = {
@@ -122,13 +122,13 @@ def _add_camera(camera: Any, vectors: Any, path: CameraPath, where: Similarity, 
 
 
 def _add_splats(field: Any, arrays: Any, gaussians: PlyGaussians) -> None:
-    """Fills a particle field."""
+    """Writes Gaussians to a particle field."""
     count, bases = gaussians.sh.shape[:2]
     scales = np.exp(gaussians.log_scales)
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     opacities = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     field.CreatePositionsAttr(arrays.Vec3fArray.FromNumpy(_packed(gaussians.means)))
-    field.CreateOrientationsAttr(arrays.QuatfArray.FromNumpy(_packed(quats[:, [1, 2, 3, 0]])))  # in memory xyzw
+    field.CreateOrientationsAttr(arrays.QuatfArray.FromNumpy(_packed(quats[:, [1, 2, 3, 0]])))  # USD stores xyzw
     field.CreateScalesAttr(arrays.Vec3fArray.FromNumpy(_packed(scales)))
     field.CreateOpacitiesAttr(arrays.FloatArray.FromNumpy(_packed(opacities)))
     field.CreateRadianceSphericalHarmonicsDegreeAttr(round(bases**0.5) - 1)

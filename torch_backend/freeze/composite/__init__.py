@@ -1,1 +1,1 @@
-"""One frozen frame: which source gives each pixel, and what fills the rest."""
+"""Composites one frozen frame: chooses the source of each pixel, and fills the rest."""

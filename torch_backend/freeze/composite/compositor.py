@@ -1,18 +1,18 @@
-"""Frozen frames made of the plates: splats give geometry, motion and occlusion, plates give the pixels.
+"""Frozen frames composited from the plates: splats give geometry, motion and occlusion; plates give the pixels.
 
-For a camera and an instant t*, with C the frozen render, I_m plate m and R_m the model's own render of plate m (its
-camera, its time, its exposure), a pixel x is
+C is the frozen render of a camera at the instant t*. I_m is plate m. R_m is the model's render with the camera, time
+and exposure of plate m. A pixel x of the frozen frame is
 
     out(x) = A(x) I_n(p_n(x)) + (1 - A(x)) (C(x) + b(x) sum_m w_m(x) (I_m - R_m)(p_m(x)) / sum_m w_m(x))
 
-n is the primary plate: the frame's own on the clip's poses, the nearest in pose on others. A, its matte, is 1 wherever
-nothing that moves is seen, at t* or in the plate; so a still world is the plate itself, bit for bit. The rest is
-filled: what the model missed in other plates (texture, edges, light) is carried along the surface point that x shows
-to where plate m shows the same point, moved from t* to m as the model moves it. Plate t* is trusted even where the
-model cannot explain it, because what it shows is the truth of the frozen instant; others where nothing moves, or where
-they agree with the model. b fades to the splats alone where no plate can be believed. Residuals are carried in display
-space, in which splats blend and highlights have a shoulder; A mixes scene-linear light, so that the same mix of an
-artist's plate gives the frame.
+n is the primary plate: the frame's own plate on the clip's poses, the plate nearest in pose on others. A is the matte
+of the primary plate. It is 1 where neither t* nor the plate shows anything moving, so a static scene reproduces the
+plate bit for bit. The remaining pixels are filled. p_m(x) is the pixel where plate m shows the surface point of x,
+after the model has moved the point from t* to m. The residual I_m - R_m adds what the model missed: texture, edges and
+light. Plate t* is trusted even where the model does not explain it, because it shows the frozen instant. Other plates
+are trusted where nothing moves or where they agree with the model. b fades to the splats alone where no plate is
+trusted. Residuals are added in display space, in which splats blend and highlights have a shoulder. A mixes
+scene-linear light, so that artists can repeat the mix with their own plate.
 
 Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering"; Li et al. 2023, "DynIBaR"; figures: docs/benchmarks.md.
 """
@@ -43,51 +43,50 @@ from .transfer import to_display, to_linear
 from .warp import sample
 
 _NOTHING = 0.5 / 1024.0
-"""Matte up to which it rounds to nothing."""
+"""Largest matte that rounds to 0 in steps of 1/1024."""
 
 
 @dataclass
 class CompositeFrame:
-    """One frozen frame made of plates, on the CPU, with overscan if the render had it."""
+    """One frozen frame composited from plates, on the CPU, with the overscan of the render."""
 
     linear: Tensor
     """[H, W, 3] premultiplied, scene-linear: matte * plate(st) + fill."""
     alpha: Tensor
     """[H, W] in 0..1."""
     splat: Tensor
-    """[H, W, 3] premultiplied, on `display`: the splats alone."""
+    """[H, W, 3] the splats alone, premultiplied, in the colours of `display`."""
     splat_alpha: Tensor
-    """[H, W] in 0..1: how much of the pixel they cover."""
+    """[H, W] in 0..1: alpha of `splat`."""
     plate: Tensor
-    """[H, W] in 0..1: share of the pixel that is plate; 0: invented by splats."""
+    """[H, W] in 0..1: share of the pixel that comes from plates. 0: all of it comes from splats."""
     source: Tensor
-    """[H, W] float32: number of the frame whose plate gives most; 0 where `plate` is 0."""
+    """[H, W] float32: frame number of the plate with the largest share; 0 where `plate` is 0."""
     depth: Tensor
     """[H, W] as in `FrozenImage`."""
     support: Tensor
-    """[H, W] in 0..1: 1: the surface stands still, or a frame near t* shows it; 0: no frame shows how it looked at
-    t*."""
+    """[H, W] in 0..1. 1: the surface is static, or a frame near t* shows it. 0: no frame shows its state at t*."""
     motion: Tensor
-    """[H, W] in 0..1: how much of what is seen moves in the clip, by the plates where they tell. On the clip's own
-    poses 1 also where the frame's own plate shows what moves and is let go of: where it is 0 that plate may stand."""
+    """[H, W] in 0..1: share of the pixel that moves in the clip, from the plates where they show it. On the clip's own
+    poses it is also 1 where the frame's own plate shows a mover and is rejected. Where it is 0, that plate is valid."""
     primary: int
-    """Frame number of the plate that `st` looks into."""
+    """Frame number of the primary plate, to which `st` refers."""
     st: Tensor
     """[H, W, 2] s to the right, t up, 0..1 over the undistorted plate `primary`, pixel centres at (i + 0.5) / size."""
     matte: Tensor
-    """[H, W] in 0..1: how much of the pixel the primary plate gives."""
+    """[H, W] in 0..1: share of the pixel that comes from the primary plate."""
     fill: Tensor
     """[H, W, 3] scene-linear, premultiplied by 1 - matte: the rest of the pixel."""
     display: Display = PLAIN
-    """What `splat` and `color` are shown on."""
+    """Display of the colours in `splat` and `color`."""
     depth_sigma: Tensor | None = None
     """As in `FrozenImage`."""
     terms: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
-    """Name -> [h, w] at the size of decisions: what decided where each pixel comes from (`--debug-terms`)."""
+    """Name -> [h, w] at decision resolution: evidence that chose the source of each pixel (`--debug-terms`)."""
 
     @property
     def color(self) -> Tensor:
-        """[H, W, 3] `linear` on its display, uncut; made anew each time, because few need it whole."""
+        """[H, W, 3] `linear` on its display, not clipped. It is not cached, because few callers need it."""
         out = torch.empty_like(self.linear)
         for rows in bands(*self.alpha.shape):
             out[rows] = to_display(self.linear[rows], self.display)
@@ -95,11 +94,11 @@ class CompositeFrame:
 
 
 BarsOf = Callable[[int], "NDArray[np.bool_] | None"]
-"""Frame number -> [H, W], what of its plate is a bar beside the picture and no part of the scene; None: nothing."""
+"""Frame number -> bool [H, W], True on black bars around the picture of its plate; None: no bars."""
 
 
 class Compositor:
-    """Makes frozen frames of one run out of plates. Results per plate are cached for all frames that use it."""
+    """Composites frozen frames of one run from plates. Results per plate are cached for all frames that use it."""
 
     def __init__(
         self,
@@ -115,7 +114,7 @@ class Compositor:
         self.config = config or CompositeConfig()
         self._moving, self._bars = moving, bars
         self.seen = SourceViews(run, scene, plates, moving, self.config.source_views)
-        """The plates as the scene at hand has them: the run's, or that of a developed instant."""
+        """The plates compared with the current model, which is the run or a developed instant."""
 
     @torch.no_grad()
     def frame(
@@ -130,11 +129,11 @@ class Compositor:
         """One frozen frame.
 
         Args:
-            output: its camera and instant.
+            output: camera and instant of the frame.
             frozen: the scene frozen at `output.t_star`.
-            image: the splats' render of it, which may show more around the frame: overscan.
+            image: the splats' render of the frame, overscan included.
             width, height: pixels of the frame without overscan.
-            withheld: frames whose plates are not to be used.
+            withheld: frames whose plates must not be used.
         """
         self._turn_to(frozen, output.t_star)
         target = target_view(self.seen, output, frozen, image, width, height)
@@ -148,12 +147,12 @@ class Compositor:
         )
         fillers = fillers_of(self.seen, self.config, target, primary_part.matte, primary, usable)
         made = self._mix_frame(target, primary, primary_part, fillers)
-        if bars is not None:  # they are shown as they are, at every instant
+        if bars is not None:  # bars look the same at every instant
             made.support[bars], made.motion[bars] = 1.0, 0.0
         return made
 
     def _keep_bars(self, matte: Tensor, frame: int) -> Tensor | None:
-        """Has a frame's own plate give the bars beside its picture: `matte` [H, W] becomes 1 there."""
+        """Sets `matte` [H, W] to 1 on the bars of a frame's own plate. Returns the bars, bool [H, W], or None."""
         found = None if self._bars is None else self._bars(frame)
         if found is None:
             return None
@@ -167,7 +166,7 @@ class Compositor:
     # ------------------------------------------------------------------------------------------------- the frame
 
     def _turn_to(self, frozen: FrozenGaussians, t_star: float) -> None:
-        """Looks at the plates as a scene has them; frames of one instant come one after another."""
+        """Recreates `seen` when the developed instant changes; frames of one instant are rendered in sequence."""
         developed = frozen if frozen.descent is not None else None
         if developed is not self.seen.stage.developed:
             config = self.config.source_views
@@ -207,7 +206,7 @@ class Compositor:
         return made
 
     def _placed(self, frame: int, rows: int, columns: int, band: slice) -> Tensor:
-        """[h, columns, 3] scene-linear: some rows of a plate in the middle of `rows` x `columns`, 0 around it."""
+        """[h, columns, 3] scene-linear: rows `band` of a plate centred in `rows` x `columns` pixels, 0 around it."""
         height, width = self.plates.height, self.plates.width
         if (height, width) == (rows, columns):
             return self.plates.linear(frame, band)
@@ -220,9 +219,9 @@ class Compositor:
         return out
 
     def _mix_rows(self, made: CompositeFrame, filling: Filling | None, lead: Tensor | None, rows: slice) -> None:
-        """Fills some rows of a frame whose `matte` is settled and whose `alpha` is the splats'.
+        """Mixes some rows of a frame. Its `matte` is final, and its `alpha` is that of the splats.
 
-        `lead` [h, W, 3] are the primary plate's pixels there, scene-linear; None where it gives nothing.
+        `lead` [h, W, 3] holds the primary plate's pixels of these rows, scene-linear. None: the plate is not used.
         """
         matte, alpha, fill = made.matte[rows], made.alpha[rows], made.fill[rows]
         share = matte.clone()
@@ -234,7 +233,7 @@ class Compositor:
             covered = torch.maximum(alpha, matte)[at].clamp_min(1e-4)[:, None]
             color = filling.color if self.plates.deep else filling.color.clamp(0.0, 1.0)
             color = color / covered
-            if made.display.bends:  # what is carried a little too far would be many times as bright
+            if made.display.bends:  # on the shoulder a small error is many times as large in linear light
                 color = color.clamp_max(filling.most)
             fill[at] = left[:, None] * covered * to_linear(color, made.display)
             share[at] += left * filling.share
@@ -246,7 +245,7 @@ class Compositor:
 
 
 def _terms(target: TargetView, fillers: Fillers | None) -> dict[str, Tensor]:
-    """What a frame knows of its pixels, and which plates may fill them: see `CompositeFrame.terms`."""
+    """Maps of a target view, and visibility and agreement per fill plate: see `CompositeFrame.terms`."""
     terms = {name: getattr(target, name) for name in ("motion", "doubt", "moved", "unseen")}
     if fillers is not None:
         for n, frame in enumerate(fillers.chosen):

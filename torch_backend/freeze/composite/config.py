@@ -1,4 +1,4 @@
-"""Every number of plate detail: how plates are chosen, weighed and mixed."""
+"""Configuration of the compositor."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ class CompositeConfig:
     """How plates are chosen, weighed and mixed. Lengths are in pixels of pictures 640 wide."""
 
     sources: int = 5
-    """Plates that a frame is made of, at most: its own and that of t* among them. For what the own one hides as many
-    are examined on either side, each twice as many frames away as the one before: 1 to 16."""
+    """Largest number of plates per frame, including its own plate and plate t*. The others are chosen from this many
+    candidates on either side of the primary plate, at distances of 1, 2, 4, 8 and 16 frames."""
     depth_error: float = 0.15
-    """Share of the depth by which surfaces may be wrong: with the baseline, an error in pixels, at 1 of which a plate
-    is trusted by half. A cautious figure: near plates are right where far ones only look so."""
+    """Assumed relative depth error. The baseline to a plate turns it into an error in pixels; at 1 pixel the plate's
+    weight is halved. The value is cautious, because distant plates can look consistent and still be misplaced."""
     doubt: float = 0.05
-    """Sum of weights at which a pixel is half plate, half splats: what plates say is trusted in part, as it is wrong
-    in part. On truth the best share of a single plate's residual in what moves is 0.4 to 0.65."""
+    """Sum of weights at which half of the plates' residual is applied, as residuals are partly wrong. Against ground
+    truth, the best share of a single plate's residual on movers is 0.4 to 0.65."""
     sway: float = 3.0
-    """Travel in pixels from t* to a plate at which what moves in it is trusted 1/e: longer ones are known less."""
+    """Scene flow in pixels from t* to a plate at which the plate's weight on movers falls to 1/e: long flow is less
+    certain."""
     sway_trust: float = 0.15
-    """How far a plate of another time is trusted in what moves, where the model explains it. Depths that are off by a
-    pixel carry plate t* to a wrong place far away in pose; the own plate's residual is at its place, at another time:
-    either alone is worse than both."""
+    """Weight of a plate of another time on movers that the model explains. A depth error of one pixel misplaces plate
+    t* in views far away in pose. The residual of the frame's own plate is in place, but of another time. Using both is
+    better than either alone."""
     beside: float = 20.0
-    """Angle in degrees between the frame's and plate t*'s view of a surface from which on that plate's own pixels are
-    not believed of what moves; up to half of it they are."""
+    """Angle in degrees between the frame's and plate t*'s viewing rays of a mover, above which plate t*'s own pixels
+    are not used. Their weight is full up to half of this angle."""
     state: StateConfig = field(default_factory=StateConfig)
-    """How the posterior of a plate's state is computed."""
+    """Parameters of the posterior of a plate's state."""
     source_views: VisibilityConfig = field(default_factory=VisibilityConfig)
-    """How plates are compared with the model."""
+    """Parameters of the comparison of plates with the model."""

@@ -1,4 +1,4 @@
-"""Fills a frozen frame where its primary source is not used: splats, and what they missed of other plates."""
+"""Fills a frozen frame where its primary source is not used, with splats and the residuals of other plates."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from ..views.visibility import Visibility
 from .config import CompositeConfig
 
 WHOLE = 1.0 - 0.5 / 1024.0
-"""Matte from which on the primary plate gives the whole pixel: it is rounded to 1024 steps, this one to 1."""
+"""Matte above which rounding to 1024 steps gives 1, so that the pixel comes from the primary plate alone."""
 _ROUGH = 1
-"""Pixels of decisions around a place that a plate has to show, too, to fill it where something moves: depth is rough
-there, so what a plate is seen to show changes from pixel to pixel, and single ones would stand out."""
+"""Radius, in pixels at decision resolution, of the surroundings that a plate must also show to fill a pixel near a
+mover. Depth is rough near movers, so visibility changes from pixel to pixel, and single pixels would stand out."""
 
 
 @dataclass
 class Fillers:
-    """The plates that fill what the primary one does not give."""
+    """The plates that fill the pixels not covered by the primary plate; lists have one item per plate."""
 
     chosen: list[int]
-    """Their frame numbers."""
+    """Frame numbers of the plates."""
     moved: list[Tensor]
-    """[h, w, 3] each: scene units from t* to that plate of what is seen, at the size of decisions."""
+    """[h, w, 3] scene flow of the visible surface from t* to the plate, scene units, at decision resolution."""
     shown: list[Tensor]
-    """[h, w] in 0..1 each: that plate shows it, and what is around it."""
+    """[h, w] in 0..1: the plate shows the surface and its surroundings."""
     agreed: list[Tensor]
-    """[h, w] in 0..1 each: it does not contradict plate t* about what is seen."""
+    """[h, w] in 0..1: the plate and plate t* show the surface alike."""
     residuals: list[Tensor]
-    """[H, W, 3] float16 each, as `SourceViews.residual`."""
+    """[H, W, 3] float16, as `SourceViews.residual`."""
     most: float
-    """The largest number in any of them, or in a working frame if that is more."""
+    """The largest value in any of the plates, and at least `Display.most`."""
 
 
 @dataclass
 class Filling:
-    """Pixels of some rows that the primary plate does not give, P of them."""
+    """The P pixels of some rows that are not covered by the primary plate."""
 
     y: Tensor
-    """[P] int64 row, from the first of these rows."""
+    """[P] int64 row, counted from the first of these rows."""
     x: Tensor
     """[P] int64 column."""
     color: Tensor
     """[P, 3] premultiplied, display-referred."""
     share: Tensor
-    """[P] in 0..1: how much of it is plate."""
+    """[P] in 0..1: share of the pixel that comes from plates."""
     source: Tensor
-    """[P] number of the frame that gives most."""
+    """[P] frame number of the plate with the largest weight."""
     most: float = 1.0
     """As in `Fillers`."""
 
@@ -66,7 +66,7 @@ def fillers_of(
     primary: int,
     usable: list[int],
 ) -> Fillers | None:
-    """The plates for what the primary one does not give; None if it gives everything."""
+    """The plates that fill the pixels not covered by the primary plate; None if it covers all pixels."""
     if not bool((matte < WHOLE).any()):
         return None
     chosen = _chosen(source_views, config, target, matte, primary, usable)
@@ -79,9 +79,8 @@ def fillers_of(
 
 
 def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], moved: list[Tensor]) -> list[Tensor]:
-    """[h, w] in 0..1 for each plate: where it shows the surface of the pixel and its surroundings. Used near movers
-    only."""
-    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 4 * _ROUGH + 1)  # as far as what follows reaches
+    """[h, w] in 0..1 per plate: visibility of the pixel's surface and its surroundings. Only used near movers."""
+    near = dilate(_uneasy(target.motion, target.doubt) > 0.0, 4 * _ROUGH + 1)  # radius of the erosion and blur below
     points, out = target.points[near], list[Tensor]()
     for frame, way in zip(chosen, moved, strict=True):
         visible = torch.ones_like(target.depth)
@@ -91,14 +90,14 @@ def _shown(source_views: SourceViews, target: TargetView, chosen: list[int], mov
 
 
 def _uneasy(motion: Tensor, doubt: Tensor) -> Tensor:
-    """[...] in 0..1: how far edges of what moves may be near."""
+    """[...] in 0..1: possibility that the edge of a mover is near."""
     return torch.maximum(motion, doubt).clamp(0.0, 1.0)
 
 
 def _agreed(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, chosen: list[int], moved: list[Tensor]
 ) -> list[Tensor]:
-    """[h, w] in 0..1 for each plate: 1 where plate t* does not see what is seen, or sees it alike."""
+    """[h, w] in 0..1 per plate: 1 where it and plate t* show the surface alike, or one of them does not show it."""
     h, w = target.depth.shape
     if target.t not in chosen:
         return [torch.ones_like(target.depth) for _ in chosen]
@@ -121,7 +120,7 @@ def _agreed(
 def fill(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, fillers: Fillers, matte: Tensor, rows: slice
 ) -> Filling:
-    """What the primary plate does not give of some rows: the splats, with what they missed from other plates."""
+    """Fills the pixels of some rows that the primary plate does not cover: splats plus weighted residuals of plates."""
     at = (matte[rows] < WHOLE).nonzero()
     y, x = at[:, 0], at[:, 1]
     count = len(at)
@@ -142,7 +141,7 @@ def fill(
     weights, places = list[Tensor](), list[Tensor]()
     same_state, untold = torch.zeros(count, device="cpu"), torch.ones(count, device="cpu")
     truth = source_views.seen(target.t, points) if target.t in fillers.chosen else None
-    if truth is not None:  # the better plate t* shows it, the less another time is needed
+    if truth is not None:  # the better plate t* shows a pixel, the less other times are needed
         untold = 1.0 - _near(source_views, config, target, target.t, truth)
     for n, frame in enumerate(fillers.chosen):
         if truth is not None and frame == target.t:
@@ -169,7 +168,7 @@ def fill(
     filling.color += carried * filling.share[:, None]
     if truth is not None:
         at = fillers.chosen.index(target.t)
-        # A plate near in pose that shows the same, a little swayed, has it at its place; plate t* may be a pixel off.
+        # A plate near in pose that shows nearly the same state has no reprojection error; plate t* may be a pixel off.
         around = truth.visible * look_up(fillers.shown[at], small) * (1.0 - same_state)
         _take_instant(source_views, config, target, filling, points, small, around, places[at])
     filling.most = fillers.most
@@ -180,16 +179,16 @@ def _take_instant(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, filling: Filling, points: Tensor,
     small: Tensor, visible: Tensor, places: Tensor,
 ) -> None:  # fmt: skip
-    """Puts plate t*'s own pixels into a filling where it shows what moves, from nearly the same side.
+    """Uses plate t*'s own pixels in a filling where it shows movers from nearly the same side.
 
-    What moves is learnt from plate t* alone. Its splats are right from that camera; from elsewhere a face may fall
-    apart while its depth still holds, and a residual cannot mend that.
+    Movers are learnt from plate t* alone, so their splats are only right from that camera. Seen from elsewhere, a
+    face may fall apart although its depth is right, and a residual cannot repair that.
 
     Args:
-        points: [P, 3] that are seen, in scene units.
-        small: [P, 2] where the frame shows them, in pixels of decisions.
-        visible: [P] in 0..1 how surely plate t* shows each and what is around it.
-        places: [P, 2] where it shows them, in pixels of the plate.
+        points: [P, 3] visible surface points, in scene units.
+        small: [P, 2] their pixels in the frame, at decision resolution.
+        visible: [P] in 0..1 visibility of each point and its surroundings in plate t*.
+        places: [P, 2] their pixels in plate t*, at the plate's size.
     """
     h, w = target.depth.shape
     moves = above(look_up(resized(target.image.motion, w, h), small), 0.5)
@@ -203,7 +202,7 @@ def _take_instant(
 
 
 def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetView, points: Tensor) -> Tensor:
-    """[...] in 0..1: how nearly plate t* sees points [..., 3] from the frame's side."""
+    """[...] in 0..1: similarity of the viewing directions of plate t* and the frame at points [..., 3]."""
     a, b = points - source_views.centres[source_views.index[target.t]], points - target.centre
     cosine = (a * b).sum(-1) / (norm(a, -1) * norm(b, -1)).clamp_min(1e-9)
     angle = torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0)))
@@ -211,7 +210,7 @@ def _facing(source_views: SourceViews, config: CompositeConfig, target: TargetVi
 
 
 def _exposed(source_views: SourceViews, target: TargetView, frame: int) -> tuple[Tensor, Tensor]:
-    """(gain [3], offset [3]) from the exposure of a plate to that of the frame that is made."""
+    """(gain [3], offset [3]) that convert the exposure of a plate to the exposure of the target frame."""
     exposure = source_views.run.model.exposure
     if not exposure.config.on:
         return torch.ones(3, device="cpu"), torch.zeros(3, device="cpu")
@@ -221,14 +220,14 @@ def _exposed(source_views: SourceViews, target: TargetView, frame: int) -> tuple
 
 
 def _doubted(visibility: Visibility, doubt: Tensor) -> Visibility:
-    """The visibility, with what it shows of points in doubt [...] taken for moving where the model says otherwise."""
+    """The visibility with `moving` raised to `doubt` [...] where the model does not explain the plate."""
     return replace(visibility, moving=torch.maximum(visibility.moving, doubt * (1.0 - visibility.explained)))
 
 
 def _unmoved(
     source_views: SourceViews, config: CompositeConfig, frame: int, points: Tensor, visibility: Visibility
 ) -> Tensor:
-    """[...] in 0..1: what moves is in plate `frame` nearly as at t*: the model agrees, and moved it little."""
+    """[...] in 0..1: similarity of movers in plate `frame` to t*: high if the model explains them and flow is short."""
     view = source_views.view(frame)
     travel = norm(project(points, view.viewmat, view.K)[0] - visibility.pixels, -1)
     trust = torch.exp(-travel / (config.sway * source_views.unit))
@@ -238,7 +237,7 @@ def _unmoved(
 def _near(
     source_views: SourceViews, config: CompositeConfig, target: TargetView, frame: int, visibility: Visibility
 ) -> Tensor:
-    """[...] in 0..1: how surely a plate shows points where the depth says."""
+    """[...] in 0..1: visibility of points in a plate, reduced by the parallax of a depth error."""
     return visibility.visible / (1.0 + parallax(source_views, target, frame, visibility.depth, config.depth_error))
 
 
@@ -252,8 +251,13 @@ def _weight(
     sway: Tensor,
     still: Tensor | float = 1.0,
 ) -> Tensor:
-    """[...] how far a plate is trusted at points, `motion` of which belongs to what moves at t*; what stands still in
-    it by `still` at most."""
+    """[...] weight of a plate at points.
+
+    Args:
+        motion: [...] in 0..1, share of the point that moves at t*.
+        sway: [...] weight on movers.
+        still: largest weight on static surfaces.
+    """
     near = _near(source_views, config, target, frame, visibility)
     if frame == target.t:
         return near
@@ -269,7 +273,7 @@ def _chosen(
     primary: int,
     usable: list[int],
 ) -> list[int]:
-    """The plates to fill with: that of t*, the own one for what sways, and those that see most of the rest."""
+    """Frame numbers of the fill plates: plate t*, the primary plate, and the plates that show most of the rest."""
     h, w = target.depth.shape
     need = 1.0 - resized(matte, w, h)[::4, ::4]
     points, motion, doubt = (of[::4, ::4] for of in (target.points, target.motion, target.doubt))
@@ -289,7 +293,7 @@ def _chosen(
     for frame in chosen:
         have = have + gains[frame]
     while len(chosen) < min(config.sources, len(gains)):
-        # Diminishing returns: a second plate of the same wall helps less than a first one of another.
+        # Square root: a second plate of the same wall helps less than a first plate of another wall.
         left = {frame: gain for frame, gain in gains.items() if frame not in chosen}
         worth = {frame: float(((have + gain).sqrt() - have.sqrt()).sum()) for frame, gain in left.items()}
         candidates = sorted(worth, key=lambda candidate: abs(candidate - primary))

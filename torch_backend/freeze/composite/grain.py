@@ -1,13 +1,13 @@
-"""Grain: how much the plate has, and the same for frozen frames, which have none and look like a still beside it.
+"""Measures the plate's grain and draws the same grain on frozen frames, which would look like stills without it.
 
-Measured on the plate as it is mixed with (undistorted working frames), display-referred, per channel and brightness:
-a block of the picture minus the parabola that fits it is grain where the block shows something flat. Which blocks are
-flat is found from below: the least deviating ones tell how much grain there is at least, and blocks join as long as
-grain alone could explain them. The fit also takes grain away, more of a soft one than of a sharp one; since the
-projection is known, so is how much, and what is told is corrected for it.
+Grain is measured on undistorted working frames, display-referred, per channel and brightness. A quadratic polynomial
+is fitted to each block of the picture. Where a block shows a flat surface, the fit's residual is grain. Flat blocks are
+found iteratively: the blocks that vary least give a first estimate of the grain, and blocks are added as long as grain
+alone explains their variance. The fit also removes some grain, more of soft grain than of sharp grain. The projection
+gives the removed share, and the measured deviation is corrected for it.
 
-Drawn as Gaussian noise with that deviation at every pixel's own brightness, that softness, and that agreement between
-the channels; the frame's number is the seed.
+Grain is drawn as Gaussian noise with the measured softness and correlation between channels. Its deviation depends on
+each pixel's brightness. The frame number is the seed.
 """
 
 from __future__ import annotations
@@ -27,40 +27,40 @@ from ...footage.images import read_frame
 from ...scene import evenly_spaced
 
 BINS = 8
-"""Brightness levels that grain is measured at."""
+"""Number of brightness levels at which grain is measured."""
 SAMPLED = 8
-"""Frames of a clip that are measured."""
+"""Number of frames of a clip that are measured."""
 _BLOCK = 16
 _FEWEST = 12
-"""Blocks that a level or a channel needs to be trusted."""
+"""Number of flat blocks below which a level or a channel is not trusted."""
 _LEAST = 0.05
-"""Share of the blocks of a level, the least varying ones, that are taken for grain to begin with."""
+"""Share of a level's blocks, those with the lowest variance, that start the search for flat blocks."""
 _STANDS_OUT = 3.0
-"""Standard deviations from which on a block, and times the deviation of most from which on a level, show no grain but
-what is in the picture."""
+"""Outlier threshold. A block's variance may exceed the mean by this many standard deviations, and a level's deviation
+may be this many times the median of all levels. Beyond that, the picture's texture is taken to be the cause."""
 _MOST = 0.08
-"""So does one with this deviation, whatever the others have."""
+"""Deviation, display-referred, above which a level is always rejected as texture."""
 _SOFTNESS = np.arange(0.0, 2.01, 0.05)
 
 
 @dataclass(frozen=True, eq=False)
 class Grain:
-    """What a plate's grain looks like. Brightness and deviations are display-referred, 0 to 1."""
+    """Statistics of a plate's grain. Brightness and deviations are display-referred, 0 to 1."""
 
     deviation: NDArray[np.float32]
     """[3, BINS] standard deviation per channel at the middles of `BINS` equal levels of that channel's brightness."""
     softness: float
-    """Deviation in pixels of the Gaussian that white noise is blurred with to look like it; 0: none."""
+    """Sigma in pixels of the Gaussian blur that makes white noise look like the grain; 0: no blur."""
     correlation: NDArray[np.float32]
-    """[3, 3] between the channels; 1 on the diagonal."""
+    """[3, 3] correlation between the channels; 1 on the diagonal."""
 
     @classmethod
     def none(cls) -> Grain:
-        """That of a clean plate."""
+        """Grain of a clean plate: zero."""
         return cls(np.zeros((3, BINS), np.float32), 0.0, np.eye(3, dtype=np.float32))
 
     def to_json(self) -> dict[str, Any]:
-        """For take.json; deviations in 8-bit steps, which people know."""
+        """Values for take.json; deviations are in 8-bit steps, which artists know."""
         return {
             "deviation_8bit": np.round(self.deviation * 255.0, 3).tolist(),
             "softness_px": round(self.softness, 2),
@@ -69,10 +69,10 @@ class Grain:
 
 
 def measure_plate(files: Sequence[Path], display: Display) -> Grain:
-    """Grain of a plate from up to `SAMPLED` of its PNG frames, spread over it. JobError if one cannot be read.
+    """Grain of a plate from up to `SAMPLED` evenly spaced PNG frames. JobError if a frame cannot be read.
 
-    Measured on sRGB, cut at white, whatever `display` they are in: on a shoulder the same grain is next to nothing, and
-    what is guessed from darker levels would be many times too much.
+    Frames of every `display` are converted to sRGB and clipped at white. A shoulder compresses grain to almost nothing,
+    and grain extrapolated there from darker levels would be many times too strong.
     """
     picked = evenly_spaced(len(files), SAMPLED)
     frames = [read_frame(files[i]) for i in picked]
@@ -80,17 +80,17 @@ def measure_plate(files: Sequence[Path], display: Display) -> Grain:
 
 
 def measure(frames: Sequence[NDArray[Any]]) -> Grain:
-    """Grain of frames [H, W, 3], uint8 or uint16, display-referred. None where nothing flat is to be seen."""
+    """Grain of frames [H, W, 3], uint8 or uint16, display-referred. `Grain.none()` if no block is flat."""
     found = [_blocks(frame) for frame in frames if min(frame.shape[:2]) >= _BLOCK]
     if not found:
         return Grain.none()
     residual, mean, usable = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    # Quantisation noise is not the plate's grain: the frozen frame gets its own when it is rounded.
+    # Quantisation noise is not part of the grain, because writing the frozen frame adds it again.
     step = 1.0 / (255.0 if frames[0].dtype == np.uint8 else 65535.0)
     variance = np.einsum("nci,nci->nc", residual, residual) / _BLOCK**2
     level = np.minimum((mean * BINS).astype(int), BINS - 1)
     softness, flat = 0.0, np.zeros_like(usable)
-    for _ in range(2):  # which blocks are flat depends on the softness a little, and the other way round
+    for _ in range(2):  # flat blocks and softness depend on each other a little
         flat = np.zeros_like(usable)
         for c in range(3):
             for k in range(BINS):
@@ -115,23 +115,23 @@ def measure(frames: Sequence[NDArray[Any]]) -> Grain:
 
 
 def draw(grain: Grain, frame: int, rgba: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float32]:
-    """The grain of the plate, to be added to a frozen frame.
+    """Grain to add to a frozen frame.
 
     Args:
-        grain: the plate's.
-        frame: frame number, the seed: the same grain whenever it is drawn, another one on every frame.
-        rgba: [H, W, 4] display-referred, premultiplied, as splats blend.
-        size: width and height of the plate in pixels: grain is drawn there and brought to the frame's size with it.
+        grain: statistics of the plate's grain.
+        frame: frame number, used as the seed. The grain is reproducible and differs between frames.
+        rgba: [H, W, 4] the frozen frame, display-referred, premultiplied.
+        size: width and height of the plate in pixels. Grain is drawn at that size, then resized to the frame.
 
     Returns:
-        [H, W, 3] scene-linear, premultiplied like the picture; its mean is 0 but for what black and white cut off.
+        [H, W, 3] scene-linear, premultiplied by the frame's alpha. Its mean is 0 except where black or white clips it.
     """
     brush = Brush(grain, frame, rgba.shape[:2], size)
     return brush.rows(slice(0, len(rgba)), rgba)
 
 
 class Brush:
-    """`draw` for some rows at a time: of a picture that would be large as a whole."""
+    """`draw` for some rows at a time, to save memory on large pictures."""
 
     def __init__(self, grain: Grain, frame: int, shape: tuple[int, ...], size: tuple[int, int]) -> None:
         """`shape` is [H, W] of the whole picture; the rest as for `draw`."""
@@ -141,7 +141,7 @@ class Brush:
             self._noise = _resized(self._noise, 0, self._height)
 
     def rows(self, rows: slice, rgba: NDArray[Any]) -> NDArray[np.float32]:
-        """[h, W, 3] as `draw`, of `rgba` [h, W, 4]: these rows of the picture."""
+        """[h, W, 3] grain as from `draw`, for `rgba` [h, W, 4], which are these rows of the picture."""
         if self._noise is None:
             return np.zeros((*rgba.shape[:2], 3), np.float32)
         noise = _resized(self._noise, 0, self._height, rows)
@@ -157,7 +157,7 @@ class Brush:
 
 
 def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float32]:
-    """[height, width, 3] of unit deviation, as soft and as alike between channels as the grain."""
+    """[height, width, 3] noise of unit deviation with the softness and channel correlation of the grain."""
     width, height = size
     kernel = _kernel(grain.softness)
     reach = len(kernel) // 2
@@ -171,7 +171,7 @@ def _noise(grain: Grain, frame: int, size: tuple[int, int]) -> NDArray[np.float3
 
 
 def _resized(noise: NDArray[np.float32], axis: int, length: int, part: slice = slice(None)) -> NDArray[np.float32]:
-    """`noise` with `length` pixels along an axis, or a part: averaged where it shrinks, blended where it grows."""
+    """`noise` resized to `length` pixels along an axis, or a `part` of that: averaged if smaller, else interpolated."""
     before = noise.shape[axis]
     along = [-1 if n == axis else 1 for n in range(3)]
     if before == length:
@@ -183,7 +183,7 @@ def _resized(noise: NDArray[np.float32], axis: int, length: int, part: slice = s
         share = (at - low).reshape(along).astype(np.float32)
         blended = noise.take(low, axis) * (1.0 - share) + noise.take(np.minimum(low + 1, before - 1), axis) * share
         return np.asarray(blended, np.float32)
-    # Integral along the axis, read at the edges of the new pixels: exact means over them.
+    # Differences of the integral at the edges of the new pixels are exact means.
     total = np.concatenate([np.zeros_like(noise.take([0], axis)), np.cumsum(noise, axis, dtype=np.float64)], axis)
     at = np.asarray(np.linspace(0.0, before, length + 1), np.float64)
     low = np.minimum(at.astype(int), before - 1)
@@ -194,7 +194,7 @@ def _resized(noise: NDArray[np.float32], axis: int, length: int, part: slice = s
 
 
 def _kernel(softness: float) -> NDArray[np.float32]:
-    """Blur along one axis that keeps the deviation of white noise; a single 1 for softness 0."""
+    """Blur kernel along one axis that keeps the deviation of white noise; a single 1 for softness 0."""
     reach = int(np.ceil(3.0 * softness))
     x = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (x / softness) ** 2) if softness > 0.0 else np.ones(1)
@@ -203,14 +203,14 @@ def _kernel(softness: float) -> NDArray[np.float32]:
 
 @functools.lru_cache(maxsize=1)
 def _basis() -> NDArray[np.float64]:
-    """[block pixels, 6] orthonormal: what a parabola over a block can be."""
+    """[block pixels, 6] orthonormal basis of the quadratic polynomials over a block."""
     y, x = np.mgrid[-1.0 : 1.0 : _BLOCK * 1j, -1.0 : 1.0 : _BLOCK * 1j]
     columns = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1).reshape(-1, 6)
     return np.linalg.qr(columns)[0]
 
 
 def _blocks(frame: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Of every block: residual [n, 3, pixels], mean [n, 3], and whether none of it is clipped [n, 3]."""
+    """Per block: residual [n, 3, pixels], mean [n, 3], and bool [n, 3], True if no pixel is clipped."""
     rows, columns = frame.shape[0] // _BLOCK, frame.shape[1] // _BLOCK
     values = frame[: rows * _BLOCK, : columns * _BLOCK].astype(np.float32)
     values /= 255.0 if frame.dtype == np.uint8 else 65535.0
@@ -223,7 +223,8 @@ def _blocks(frame: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float3
 
 @functools.lru_cache(maxsize=64)
 def _kept(softness: float) -> tuple[float, float, tuple[float, ...]]:
-    """What the fit leaves of grain of deviation 1: (variance, degrees of freedom, correlation at `_LAGS`)."""
+    """Statistics of the fit's residual for grain of deviation 1: (variance, degrees of freedom, correlation at
+    `_LAGS`)."""
     kernel = _kernel(softness).astype(np.float64)
     full = np.convolve(kernel, kernel[::-1])
     along = np.zeros(2 * _BLOCK - 1)
@@ -250,15 +251,15 @@ def _lag_mean(covariance: NDArray[Any], dy: int, dx: int) -> float:
 
 
 def _median_ratio(softness: float) -> float:
-    """Median over mean of the variance of a block of grain: that of chi squared (Wilson and Hilferty)."""
+    """Median over mean of a grain block's variance, which is chi-squared distributed (Wilson and Hilferty)."""
     return float((1.0 - 2.0 / (9.0 * _kept(softness)[1])) ** 3)
 
 
 def _only_grain(variance: NDArray[Any], softness: float) -> NDArray[np.bool_]:
-    """Which blocks of one level vary no more than grain does, found from the least varying upwards."""
+    """bool [n]: blocks of one level whose variance [n] grain alone explains, grown from those of lowest variance."""
     if len(variance) < _FEWEST:
         return np.zeros(len(variance), bool)
-    most = 1.0 + _STANDS_OUT * np.sqrt(2.0 / _kept(softness)[1])  # in units of their mean, which their median is near
+    most = 1.0 + _STANDS_OUT * np.sqrt(2.0 / _kept(softness)[1])  # relative to the mean, approximated by the median
     chosen = variance <= np.quantile(variance, _LEAST)
     while True:
         more = variance <= most * float(np.median(variance[chosen]))
@@ -268,13 +269,13 @@ def _only_grain(variance: NDArray[Any], softness: float) -> NDArray[np.bool_]:
 
 
 def _softness(residual: NDArray[np.float32], flat: NDArray[np.bool_]) -> float:
-    """Which of `_SOFTNESS` explains how flat blocks agree with themselves a pixel or two away."""
-    # The channel that is seen best: chroma is softer in most footage, but the eye reads grain from green.
+    """The value of `_SOFTNESS` that best explains the autocorrelation of flat blocks at `_LAGS`."""
+    # Only green is used, the most visible channel: chroma is softer in most footage.
     chosen = residual[flat[:, 1], 1].reshape(-1, _BLOCK, _BLOCK)
     if len(chosen) < _FEWEST:
         return 0.0
     power = np.mean(chosen**2, axis=(1, 2))
-    like = power < _STANDS_OUT**2 * np.median(power)  # levels without anything flat
+    like = power < _STANDS_OUT**2 * np.median(power)  # rejects levels without flat blocks
     chosen, power = chosen[like], power[like]
     seen: list[float] = []
     for dy, dx in _LAGS:
@@ -285,9 +286,9 @@ def _softness(residual: NDArray[np.float32], flat: NDArray[np.bool_]) -> float:
 
 
 def _whole_curve(deviation: NDArray[Any]) -> NDArray[np.float32]:
-    """[3, BINS] with NaN where too little was seen: filled from neighbours, and freed of single levels that stand out.
+    """[3, BINS] deviation with NaN (too few blocks) interpolated and outlier levels replaced.
 
-    A level at which the clip shows nothing flat is told too much; grain follows brightness smoothly.
+    A level at which the clip shows no flat surface is measured too high; grain varies smoothly with brightness.
     """
     typical = np.nanmedian(deviation) if not np.isnan(deviation).all() else 0.0
     known = deviation <= min(_MOST, _STANDS_OUT * typical)
@@ -302,7 +303,7 @@ def _whole_curve(deviation: NDArray[Any]) -> NDArray[np.float32]:
             curve[c] = np.nan
     if np.isnan(curve).all():
         return np.zeros((3, BINS), np.float32)
-    # A channel of which nothing was seen (all black, say) has what the others have.
+    # A channel without measurements (all black, for example) takes the mean of the others.
     return np.where(np.isnan(curve), np.nanmean(curve, axis=0), curve).astype(np.float32)
 
 

@@ -1,8 +1,9 @@
-"""Depth of what moves in a frozen instant, by the artist's depth map of plate t*.
+"""Depth of movers in a frozen instant, from the artist's depth map of plate t*.
 
-Only one plate shows a mover at t*, so no parallax gives its depth; a depth map does. Where the splats of a frozen frame
-are those that plate t* shows, their inverse depth and the map's are averaged, each weighted by its variance. The map's
-variance is that of its fit. The splats' variance is that of their difference from the map, less the map's variance.
+Only one plate shows a mover at t*, so its depth cannot be triangulated; a depth map supplies it. Where a frozen frame
+shows the same splats as plate t*, their inverse depth and the map's are averaged, weighted by 1 / variance. The map's
+variance comes from its fit. The splats' variance is the variance of their difference from the map, minus the map's
+variance.
 """
 
 from __future__ import annotations
@@ -21,32 +22,32 @@ from ..frozen import FrozenGaussians, render_frozen
 from .surface_depth import LEAST_INVERSE, SAME, TO_SIGMA, KeyView, SurfaceDepthConfig, rays_of, seen_in
 
 Array = NDArray[Any]
-"""float32 unless it says otherwise."""
+"""Array of float32, if not stated otherwise."""
 _UNKNOWN = 1.0
-"""Relative standard deviation from which on a map counts as knowing nothing: so holes are filled, see `_instant`."""
+"""Relative standard deviation above which a depth map's value is ignored; `_instant` fills holes with such values."""
 _AROUND = 15
-"""Side in pixels of the windows whose mean correction a mover's pixel takes that has none of its own: its outline."""
+"""Side in pixels of a window. Pixels at a mover's outline without a correction take the mean correction in it."""
 
 
 @dataclass
 class InstantDepth:
-    """What the depth map of plate t* says of one frozen instant."""
+    """Depth map of plate t*, for one frozen instant."""
 
     splats: KeyView
     """Plate t*'s camera, with the inverse depth of the instant's splats."""
     measured: KeyView
-    """The same camera with the map's inverse depth, and its standard deviation."""
+    """Plate t*'s camera, with the map's inverse depth and its standard deviation."""
     splat_noise: float
-    """Standard deviation of the inverse depth of splats that move, as a share of it."""
+    """Relative standard deviation of the inverse depth of moving splats."""
     noise: float
-    """That of splats that stand still."""
+    """Relative standard deviation of the inverse depth of static splats."""
 
     def correction(self, view: KeyView, moving: Array) -> tuple[Array, Array]:
-        """(factor of the inverse depth of a frame's splats, their relative standard deviation after it), [h, w] each.
+        """(factor for the inverse depth of a frame's splats, relative standard deviation of the result), [h, w] each.
 
         Args:
             view: the frame's camera with its splats' inverse depth [h, w].
-            moving: bool [h, w] where these move; elsewhere the factor is 1.
+            moving: bool [h, w], True where the splats move; elsewhere the factor is 1.
         """
         rays, inverse = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
         shown, _ = seen_in(self.splats, view, rays, inverse)
@@ -68,7 +69,7 @@ class InstantDepth:
 
 
 class MeasuredDepths:
-    """What the artist's depth maps say of a run's instants; nothing for a run without maps."""
+    """The artist's depth maps for a run's instants. The last instant is cached."""
 
     def __init__(self, run: LoadedRun, scene: Scene, config: SurfaceDepthConfig | None = None) -> None:
         """JobError (TRAIN) if the run's maps are damaged."""
@@ -77,7 +78,7 @@ class MeasuredDepths:
         self._at: tuple[float, InstantDepth | None] | None = None
 
     def at(self, t_star: float, frozen: FrozenGaussians) -> InstantDepth | None:
-        """Of the instant at frame t*, frozen; None without a map of that frame, or where nothing moves in it."""
+        """Depth of the instant at frame t*. None if that frame has no map, or if nothing moves in it."""
         if self._maps is None:
             return None
         if self._at is None or self._at[0] != t_star:
@@ -103,7 +104,7 @@ class MeasuredDepths:
         apart = TO_SIGMA * float(np.median(np.abs(inverse[moving] / splats[moving] - 1.0)))
         splat_noise = float(np.sqrt(max(apart**2 - own**2, self.config.noise**2)))
         pose = scene.viewmats[i].double().numpy(), K.double().numpy()
-        # Where the map knows nothing it agrees with the splats, and is not sure of it.
+        # Holes of the map get the splats' depth with a standard deviation above `_UNKNOWN`.
         measured = np.where(has_depth, inverse, splats), np.where(has_depth, sigma, 10.0 * splats)
         none = np.zeros_like(splats)
         return InstantDepth(

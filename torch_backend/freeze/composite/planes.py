@@ -1,6 +1,6 @@
-"""Inverse depth as planes: weighted least squares in a window around each pixel.
+"""Fits planes to inverse depth: weighted least squares in a window around each pixel.
 
-Inverse depth of a plane is affine in the image, so planes of the scene stay planes here.
+The inverse depth of a plane is affine in the image, so planes of the scene stay planes in these maps.
 """
 
 from __future__ import annotations
@@ -12,32 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-"""float32 unless it says otherwise."""
+"""Array of float32, if not stated otherwise."""
 
 
 class Planes(NamedTuple):
     """Inverse depth around each pixel as a plane: value + along * (x - its column) + down * (y - its row)."""
 
     value: Array
-    """[h, w] at the window's middle."""
+    """[h, w] inverse depth at the window's centre."""
     along: Array
     """[h, w] change per pixel to the right."""
     down: Array
     """[h, w] change per pixel downwards."""
     chi: Array
-    """[h, w] mean square of what the window's values are off the plane, in their variances."""
+    """[h, w] mean squared residual of the window's values, in units of their variance."""
     information: Array
-    """[h, w] 1 / variance of the value, if the window's values are a plane."""
+    """[h, w] 1 / variance of `value`, if the window's values lie on a plane."""
 
     def fits(self, uneven: float) -> Array:
-        """[h, w] in 0..1: how well a window is a plane; `uneven` is a `chi` that is no fault."""
+        """[h, w] in 0..1: how planar a window is; `uneven` is the scale of `chi` at which planarity falls off."""
         return np.square(np.square(uneven / (uneven + self.chi)))
 
 
 def smoothed(values: Array, weight: Array, radii: Sequence[int], uneven: float) -> tuple[Array, Array]:
-    """(inverse depth [h, w], variance [h, w]) of the planes of all windows that hold a pixel, those that fit.
+    """(inverse depth [h, w], its variance [h, w]): per pixel the mean plane of all windows that contain it.
 
-    `values` [h, w] is inverse depth, `weight` [h, w] 1 / its variance.
+    Planes are weighted by how well they fit. `values` [h, w] is inverse depth, `weight` [h, w] 1 / its variance.
     """
     rows, columns = grid_of(values.shape)
 
@@ -53,7 +53,10 @@ def smoothed(values: Array, weight: Array, radii: Sequence[int], uneven: float) 
 
 
 def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
-    """The planes that fit `values` [h, w], weighted by 1 / their variance [h, w], in the windows around all pixels."""
+    """Weighted least-squares planes of `values` [h, w] in the windows around all pixels.
+
+    `weight` [h, w] is 1 / variance of the values. `radius` of the windows is in pixels.
+    """
     rows, columns = grid_of(values.shape)
     near = weight.astype(np.float64)
     terms = [near * f for f in (1.0, columns, rows, columns**2, columns * rows, rows**2)]
@@ -61,7 +64,7 @@ def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
     total, *moments = window_means(terms, radius)
     total = np.maximum(total, 1e-12)
     x, y, xx, xy, yy, v, vx, vy, vv = (moment / total for moment in moments)
-    least = 1.0 / 12.0  # the variance within a pixel: slopes stay finite where all the weight lies in one
+    least = 1.0 / 12.0  # variance of positions within a pixel: keeps slopes finite if one pixel has all the weight
     xx, xy, yy = xx - x * x + least, xy - x * y, yy - y * y + least
     vx, vy, vv = vx - v * x, vy - v * y, vv - v * v
     determinant = xx * yy - xy * xy
@@ -72,13 +75,13 @@ def fit_planes(values: Array, weight: Array, radius: int) -> Planes:
 
 
 def grid_of(size: tuple[int, ...]) -> tuple[Array, Array]:
-    """([h, 1] rows, [1, w] columns), counted from the middle."""
+    """([h, 1] row, [1, w] column) coordinates relative to the image centre."""
     height, width = size
     return np.arange(height)[:, None] - 0.5 * height, np.arange(width)[None] - 0.5 * width
 
 
 def window_means(terms: Sequence[Array], radius: int) -> list[Array]:
-    """Each [h, w] averaged over windows; what is beyond the picture counts as 0."""
+    """Means of each [h, w] over square windows of `radius` pixels; values outside the picture count as 0."""
     import cv2
 
     side = 2 * radius + 1, 2 * radius + 1

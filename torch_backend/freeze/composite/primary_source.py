@@ -1,5 +1,4 @@
-"""Chooses the primary source: the plate that gives a frozen frame most of its pixels, and the matte where it is
-used."""
+"""Chooses the primary source, the plate that most pixels of a frozen frame come from, and its matte."""
 
 from __future__ import annotations
 
@@ -23,22 +22,23 @@ from .warp import snap
 
 @dataclass
 class PrimaryMatte:
-    """Share of each pixel that the primary plate gives, and the evidence for it."""
+    """Share of each pixel that comes from the primary plate, and the evidence for it."""
 
     matte: Tensor
     """[H, W] in 0..1."""
     st: Tensor
     """[H, W, 2] coordinates in the primary plate, as in `CompositeFrame.st`."""
     is_identity: bool
-    """True if `st` is the identity: the frame is one of the clip's own."""
+    """True if `st` is the identity, because the frame has a pose of the clip."""
     terms: Evidence = field(default_factory=dict[str, Tensor])
     """The evidence and its log-odds, [h, w] each. Empty if the plate shows t* itself."""
 
 
 def primary_plate(source_views: SourceViews, output: OutputFrame, target: TargetView, usable: list[int]) -> int:
-    """The frame's own plate, else the usable one nearest in pose: distance over depth, and viewing direction.
+    """Frame number of the primary plate: the frame's own plate, or else the usable plate nearest in pose.
 
-    Among equal poses (a tripod) the nearest in frame number.
+    The pose distance is the camera's distance divided by the depth, plus the difference in viewing direction. Of equal
+    poses (a tripod) the nearest in frame number is chosen.
     """
     if target.own and output.frame in usable:
         return output.frame
@@ -60,11 +60,11 @@ def primary_matte(
     usable: list[int],
     size: tuple[int, int],
 ) -> PrimaryMatte:
-    """The primary plate's matte.
+    """The primary plate's matte. Also sets four maps of `target`.
 
-    Also settles `target.motion`: by the mattes of plate t* where that sees the point, else by the model's;
-    `target.doubt`: what the primary plate shows wrongly others may, too, though their mattes do not say so;
-    `target.moved` and `target.unseen`.
+    `motion` comes from the mattes of plate t* where it shows the point, and from the model's matte elsewhere. `doubt`
+    is 1 where the primary plate is rejected: other plates may be wrong there, too, even if their mattes are still. The
+    other two are `moved` and `unseen`.
     """
     rows, columns = target.image.alpha.shape
     lead = source_views.seen(primary, target.points)
@@ -101,9 +101,10 @@ def primary_matte(
 
 
 def _unseen(source_views: SourceViews, target: TargetView, moving: Tensor, usable: list[int]) -> Tensor:
-    """[h, w] in 0..1: how little of what moves (`moving`) plates near t* show; the further from t*, the less they know.
+    """[h, w] in 0..1: share of moving surfaces (`moving`) that no plate near t* shows.
 
-    Gaussians that moved but were never opened are seen all along, so their own support does not say it.
+    Plates further from t* count less. The support of the Gaussians cannot be used: movers that were never
+    opened to motion count as seen at all times.
     """
     seconds = {frame: float(source_views.scene.seconds[source_views.index[frame]]) for frame in usable}
     if not seconds:
@@ -123,7 +124,7 @@ def _unseen(source_views: SourceViews, target: TargetView, moving: Tensor, usabl
 
 
 def _free(source_views: SourceViews, target: TargetView, frame: int) -> Tensor | None:
-    """[h, w] in 0..1: what of a frame's own plate is part of the scene; None: all of it."""
+    """[h, w] in 0..1: 0 on ignored pixels of a frame's own plate, else 1. None: no pixel is ignored."""
     ignored = source_views.view(frame).ignored
     if ignored is None:
         return None
@@ -135,7 +136,10 @@ def _free(source_views: SourceViews, target: TargetView, frame: int) -> Tensor |
 def _places(
     source_views: SourceViews, target: TargetView, primary: int, own: bool, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """(ST [H, W, 2] into the primary plate, [H, W] 1 within it): the identity on the clip's own poses."""
+    """(ST [H, W, 2] into the primary plate, [H, W] 1 inside the plate and 0 outside).
+
+    ST is the identity if `own`, that is, on the clip's own poses.
+    """
     rows, columns = target.image.alpha.shape
     if own:
         x = (torch.arange(columns, device="cpu") + 0.5 - (columns - size[0]) // 2) / size[0]
@@ -156,7 +160,7 @@ def _places(
 
 
 def _middle(inner: Tensor, outer: Tensor) -> tuple[slice, slice]:
-    """(rows, columns) of a picture [h, w, ...] that lies in the middle of a larger one."""
+    """(rows, columns) of a picture [h, w, ...] centred in a larger one."""
     (rows, columns), (h, w) = outer.shape[:2], inner.shape[:2]
     top, left = (rows - h) // 2, (columns - w) // 2
     return slice(top, top + h), slice(left, left + w)

@@ -1,10 +1,9 @@
-"""Which pixels of a plate show another state of the scene than the instant t*.
+"""Posterior probability that a pixel of a plate shows another state of the scene than the instant t*.
 
-Every pixel has a posterior probability. Its log-odds are a weighted sum of evidence (logistic regression): motion
-mattes, the model's scene flow, and differences between the plate, the frozen render and plate t*, in units of noise.
-The weights are fitted on synthetic scenes with truth by `python -m benchmarks.fit_state`, to two things: the squared
-error that the plate's pixel costs against what would fill it, and whether the plate differs from the truth at all. No
-weight is set by eye.
+The log-odds of each pixel are a weighted sum of evidence (logistic regression): motion mattes, the model's scene flow,
+and differences between the plate, the frozen render and plate t*, in units of noise.
+`python -m benchmarks.fit_state` fits all weights on synthetic scenes with ground truth. Its objective has two terms:
+the squared error of the plate's pixel compared with that of the fill, and whether the plate differs from ground truth.
 
 Related: Granados et al. 2012, "Background Inpainting for Videos with Dynamic Objects and a Free-moving Camera", also
 choose between plates by an expected error.
@@ -29,33 +28,34 @@ class StateWeights:
     """Weight of each piece of evidence in the log-odds that a plate shows another state; see `evidence` for units."""
 
     bias: float = -6.39
-    """Log-odds where no evidence says anything."""
+    """Log-odds where all evidence is 0."""
     plate_matte: float = 4.3
     """Weight of the plate's own motion matte."""
     scene_flow: float = 5.05
-    """Weight of how far the model moves the surface from t* to the plate."""
+    """Weight of the model's scene flow from t* to the plate."""
     change: float = 1.82
     """Weight of the difference between the plate and the frozen render."""
     gain: float = 2.26
-    """Weight of how much better the model explains the plate at its own time than the frozen render does."""
+    """Weight of the frozen render's error minus the model's error at the plate's own time."""
     contradiction: float = 1.73
-    """Weight of the difference between the plate and all that plate t*, carried to it, shows nearby."""
+    """Weight of the difference between the plate and the range of colours that reprojected plate t* shows nearby."""
 
 
 @dataclass(frozen=True)
 class StateConfig:
-    """How evidence is scaled, and how log-odds become a matte."""
+    """Scaling of the evidence, and mapping of log-odds to a matte."""
 
     noise: float = 0.01
-    """Standard deviation of a low-passed difference between two plates of one surface, display-referred. That between a
-    plate and a render is larger by what the model leaves unexplained of plate t*."""
+    """Standard deviation of the low-passed difference between two plates of one surface, display-referred. For a plate
+    and a render, the model's residual in plate t* is added."""
     travel: float = 0.5
-    """Scene flow in pixels of 640 at which its evidence is log(2): below it flow is mostly the field's noise."""
+    """Scene flow, in pixels at width 640, at which its evidence is log(2). Smaller flow is mostly noise of the
+    deformation field."""
     smoothing: float = 8.0
-    """Sigma of the low-pass of the log-odds, in pixels of 640: states belong to surfaces. On tuning scenes 4 and 8
-    are equally good, 1 and 2 are worse."""
+    """Sigma of the low-pass of the log-odds, in pixels at width 640, because states belong to whole surfaces. On tuning
+    scenes 4 and 8 are equally good, 1 and 2 are worse."""
     softness: float = 2.0
-    """Log-odds on either side of even odds between which a pixel is mixed; beyond them it is wholly one source."""
+    """Absolute log-odds up to which a pixel is mixed; beyond that it comes entirely from one source."""
     weights: StateWeights = field(default_factory=StateWeights)
     """The fitted weights."""
 
@@ -72,11 +72,11 @@ def evidence(
     instant: Visibility | None,
     config: StateConfig,
 ) -> Evidence:
-    """Evidence that plate `frame` shows another state than t*, at the resolution of decisions.
+    """Evidence that plate `frame` shows another state than t*, at decision resolution.
 
     Args:
-        seen: how the plate sees the target view's points.
-        instant: how plate t* sees them; None if it may not be used.
+        seen: visibility of the target view's points in the plate.
+        instant: visibility of the target view's points in plate t*; None if plate t* must not be used.
     """
     h, w = target.depth.shape
     view, unit = source_views.view(frame), source_views.unit
@@ -90,7 +90,7 @@ def evidence(
         noise += _unexplained(source_views, target.t, instant, config.smoothing * unit)
         carried = look_up(source_views.view(target.t).picture.float(), instant.pixels)
         ours, theirs = (blurred(each * instant.visible[..., None], unit) for each in (plate, carried))
-        reach = max(1, round(MARGIN * unit))  # pixels by which an error of depth may misplace plate t*
+        reach = max(1, round(MARGIN * unit))  # pixels by which a depth error may misplace plate t*
         contradiction = torch.maximum(beyond(ours, theirs, reach), beyond(theirs, ours, reach))
     gain = change - misfit
     return {
@@ -103,21 +103,21 @@ def evidence(
 
 
 def log_odds(of: Evidence, config: StateConfig, unit: float) -> Tensor:
-    """[h, w] log-odds that a plate shows another state. `unit`: pixels of decisions to one of 640."""
+    """[h, w] log-odds that a plate shows another state than t*. `unit`: as `SourceViews.unit`."""
     weights = {f.name: float(getattr(config.weights, f.name)) for f in fields(StateWeights)}
     total = sum((weights[name] * value for name, value in of.items()), torch.tensor(weights["bias"], device="cpu"))
     return blurred(total, config.smoothing * unit)
 
 
 def let_go(odds: Tensor, config: StateConfig) -> Tensor:
-    """[h, w] in 0..1: the share of each pixel that the plate does not give, of log-odds [h, w]."""
+    """[h, w] in 0..1: share of each pixel that is not taken from the plate, given log-odds [h, w]."""
     return (0.5 + 0.5 * odds / config.softness).clamp(0.0, 1.0)
 
 
 def _unexplained(source_views: SourceViews, t_star: int, instant: Visibility, sigma: float) -> Tensor:
-    """[h, w] what the model leaves unexplained of plate t* around each pixel, display-referred: how noisy it is.
+    """[h, w] local mean of the model's residual in plate t*, display-referred, as a measure of noise.
 
-    Where plate t* sees nothing it is the mean of what it sees.
+    Where plate t* does not show the surface, this is the mean over the visible pixels.
     """
     missed = look_up(source_views.view(t_star).missed.float()[..., None], instant.pixels)[..., 0] * instant.visible
     seen, least = blurred(instant.visible, sigma), 1e-3
@@ -126,9 +126,9 @@ def _unexplained(source_views: SourceViews, t_star: int, instant: Visibility, si
 
 
 def _travel(source_views: SourceViews, target: TargetView, frame: int) -> Tensor:
-    """[h, w] pixels of 640 by which the model moves what is seen from t* to a plate, as that plate sees it."""
+    """[h, w] scene flow of the target's points from t* to a plate, in that plate's image, in pixels at width 640."""
     h, w = target.depth.shape
-    size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: Gaussians of what moves are larger than its pixels
+    size = (w + 1) // 2, (h + 1) // 2  # a quarter of the work: moving Gaussians are larger than these pixels
     moved, points = displacements(source_views, target, [frame], size)[0], target.points[::2, ::2]
     view = source_views.view(frame)
     ends = project(points + moved, view.viewmat, view.K)[0]

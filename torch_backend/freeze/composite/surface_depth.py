@@ -1,19 +1,19 @@
-"""Depth of frozen frames that a compositor can use: smooth on surfaces, with the edges of the frame's own picture.
+"""Depth of frozen frames that a compositor can use: smooth on surfaces, with the edges of the frame's picture.
 
-The median depth of splats is that of single Gaussians: a plane looks like shingles, and where Gaussians are translucent
-the depth behind them is taken. The depth of still surfaces is therefore measured, once for all frames of a run:
+The median depth of splats is the depth of single Gaussians. A plane looks like shingles, and translucent Gaussians give
+the depth behind them. The depth of static surfaces is therefore measured, once for all frames of a run:
 
-1. Key views, spread over the clip, start from the splats' inverse depth of what stands still.
-2. Each plate is compared with the plates of the key views around it. Inverse depth takes Gauss-Newton steps that make
-   them agree (Lucas and Kanade 1981, along epipolar lines). What mattes call moving takes no part. The noise of two
-   plates is measured around each pixel, so that its inverse depth has a variance.
-3. After each step planes are fitted to inverse depth in windows of two sizes, weighted by 1 / variance. Inverse depth
-   of a plane is affine in the image, so planes stay planes. A pixel takes the planes of those windows around it whose
-   deviations their variances explain: a window that reaches over an edge is no plane (Kuwahara et al. 1976).
+1. Key views, spread over the clip, start from the inverse depth of the static splats.
+2. Each key view's plate is compared with the plates of the key views around it. Gauss-Newton steps in inverse depth
+   minimise their difference (Lucas and Kanade 1981, along epipolar lines). Pixels in motion mattes are left out.
+   The noise of each pair of plates is measured around each pixel and gives the variance of the inverse depth.
+3. After each step, planes are fitted to inverse depth in windows of two sizes, weighted by 1 / variance. The inverse
+   depth of a plane is affine in the image, so planes stay planes. Each pixel averages the planes of the windows around
+   it whose residuals their variance explains: a window across an edge is not planar (Kuwahara et al. 1976).
 
-A frame takes depth from the key views nearest to it: the value on which most of them and the splats agree. Moving
-pixels, and pixels that no key view shows, keep the splats' depth. Planes are fitted once more in small windows, and
-each pixel takes those of its neighbours that are about as deep as the splats there and have its colour in the frame's
+A frame takes its depth from the nearest key views: the value on which most of them and the splats agree. Moving
+pixels, and pixels that no key view shows, keep the splats' depth. Planes are then fitted again in small windows. Each
+pixel averages the planes of its neighbours that have a depth near the splats' and a similar colour in the frame's
 picture: a joint bilateral filter of planes.
 """
 
@@ -41,75 +41,75 @@ from ..views.working_plates import MEASURED_WIDTH, VIEWS
 from .planes import Array, Planes, fit_planes, grid_of, smoothed, window_means
 
 LEAST_INVERSE = 1e-4
-"""Least inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so what is farther than
-10,000 of them has no parallax."""
+"""Smallest inverse depth, in 1 / scene units. A clip's cameras extend over about one scene unit, so surfaces farther
+than 10,000 units have no parallax."""
 TO_SIGMA = 1.4826
-"""Standard deviation over median deviation, of Gaussian errors."""
+"""Ratio of standard deviation to median absolute deviation for Gaussian errors."""
 SAME = 3.0
-"""Standard deviations within which two depths, or two plates' brightness, are those of one surface."""
+"""Number of standard deviations within which two depths, or the brightness of two plates, belong to one surface."""
 _QUANTUM = 1.0 / 255.0
 """Least standard deviation of a plate's brightness: a step of 8 bits."""
 _SURE = 2.0
-"""Deviations of the slopes that steps of 8 bits make from which on a slope is the picture's."""
+"""Slope, in standard deviations of the slope of 8-bit quantisation noise, below which it may be only noise."""
 _SLOPE_NOISE = 12.0**0.5 / 8.0
-"""Standard deviation of `_slope` over that of the picture, if the noise of its pixels is independent."""
+"""Ratio of the standard deviation of `_slope` to that of the picture, for independent pixel noise."""
 
 
 @dataclass(frozen=True)
 class SurfaceDepthConfig:
-    """How the depth of surfaces is found. Pixels are those of pictures `width` wide."""
+    """Parameters of the surface depth. Lengths are in pixels of pictures `width` wide."""
 
     width: int = MEASURED_WIDTH
-    """Width in pixels at which surfaces are measured; less for smaller plates."""
+    """Width in pixels at which surfaces are measured; at most that of the working frames."""
     keys: int = VIEWS
     """Number of key views, spread evenly over the clip."""
     around: int = 6
-    """Number of key views before and after a key view with which it is compared, and from which a frame takes its
-    depth."""
+    """Number of key views on either side with which a key view is compared. Also the number of nearest key views from
+    which a frame takes its depth."""
     steps: int = 4
     """Number of Gauss-Newton steps."""
     radii: tuple[int, ...] = (3, 8)
-    """Radii in pixels of the windows in which planes are fitted to what the plates show. In a frame they have the
-    first, and each pixel takes those of nine windows that lie as far apart."""
+    """Radii in pixels of the windows in which planes are fitted in key views. In a frame only the first is used; it is
+    also the spacing of the nine windows that each pixel averages."""
     small: int = 2
-    """Radius in pixels of the windows in which the noise of plates is measured, and splats of a frame are smoothed."""
+    """Radius in pixels of the windows in which the noise of plates is measured, and a frame's splats are smoothed."""
     detail: float = 1.5
     """Standard deviation in pixels of the blur that is subtracted from plates, so that light and exposure cancel."""
     noise: float = 0.03
-    """Standard deviation of the splats' inverse depth, as a share of it: their median error is 1.2 to 1.8 % on the
-    tuning scenes arm-000 and arm-001."""
+    """Relative standard deviation of the splats' inverse depth: their median error is 1.2 to 1.8 % on the tuning
+    scenes arm-000 and arm-001."""
     uneven: float = 0.1
-    """Mean square deviation of a window from its plane, in variances, from which on it counts less."""
+    """Scale of a window's mean squared residual, in units of variance, at which its weight falls off."""
     outlier: float = 1e-6
-    """Chance that a pixel's splats belong to another surface than the pixel: where the picture's colour is that surely
-    another one, edges are the picture's."""
+    """Probability that a pixel's splats belong to another surface than the pixel. Where a colour difference is less
+    likely than this, depth edges follow the picture."""
     color: float = 0.1
-    """Difference of colours in the frame's picture, display-referred, between a pixel and the window it takes."""
+    """Sigma of the colour difference between a pixel and a window, display-referred, in the bilateral filter."""
 
 
 @dataclass
 class KeyView:
-    """A clip's frame at which still surfaces are measured, at the size of measuring."""
+    """A frame of the clip at which static surfaces are measured, at `SurfaceDepthConfig.width`."""
 
     viewmat: NDArray[np.float64]
     """[4, 4] world-to-camera, scene units."""
     K: NDArray[np.float64]
     """[3, 3] pixels."""
     picture: Array
-    """[h, w] brightness of its plate without what is smooth."""
+    """[h, w] high-passed brightness of its plate."""
     still: Array
-    """[h, w] 1 where its plate shows what stands still, else 0."""
+    """[h, w] 1 where its plate shows a static surface, else 0."""
     inverse: Array
-    """[h, w] inverse depth of what stands still, in 1 / scene units."""
+    """[h, w] inverse depth of the static surfaces, in 1 / scene units."""
     sigma: Array
-    """[h, w] its standard deviation."""
+    """[h, w] standard deviation of `inverse`."""
 
 
 class StillSurfaces:
-    """Inverse depth of what stands still at the key views of a clip. Making it takes seconds."""
+    """Inverse depth of static surfaces at the key views of a clip. Construction takes seconds."""
 
     def __init__(self, keys: list[KeyView], config: SurfaceDepthConfig | None = None) -> None:
-        """`keys` in the clip's order, with the splats' inverse depth; they are refined here, in place."""
+        """`keys` are in the clip's order and hold the splats' inverse depth, which is refined in place."""
         self.config, self.keys = config or SurfaceDepthConfig(), keys
         found: list[tuple[Array, Array]] = []
         for i, key in enumerate(keys):
@@ -119,7 +119,7 @@ class StillSurfaces:
             key.inverse, key.sigma = inverse, sigma
 
     def near(self, viewmat: NDArray[np.float64]) -> list[KeyView]:
-        """The key views whose cameras are nearest to a world-to-camera [4, 4], nearest first."""
+        """The key views whose cameras are nearest to a camera (world-to-camera [4, 4]), nearest first."""
         centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
 
         def away(key: KeyView) -> float:
@@ -130,7 +130,7 @@ class StillSurfaces:
 
 
 def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
-    """[h, w] brightness of a plate [h, w, 3] without what is smooth."""
+    """[h, w] high-passed brightness of a plate [h, w, 3]."""
     import cv2
 
     grey = plate.mean(2, dtype=np.float32)
@@ -138,15 +138,15 @@ def key_picture(plate: Array, config: SurfaceDepthConfig) -> Array:
 
 
 def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig) -> tuple[Array, Array]:
-    """Inverse depth [h, w] of a key view at which plates agree, and its standard deviation [h, w]."""
+    """(inverse depth [h, w] of a key view at which plates agree, its standard deviation [h, w])."""
     start, inverse = key.inverse, key.inverse.copy()
-    prior = 1.0 / np.square(start)  # off by as much as it is: splats count only where plates say nothing
+    prior = 1.0 / np.square(start)  # relative error of 100 %: splats only count where plates have no texture
     variance = 1.0 / prior
     for _ in range(config.steps if others else 1):
         information, pull, parallax = gauss_newton(key, others, inverse, config)
         weight = information + prior
         step = (pull + prior * (start - inverse)) / weight
-        pixel = 1.0 / np.maximum(parallax, 1e-3)  # a linear step is not believed beyond that
+        pixel = 1.0 / np.maximum(parallax, 1e-3)  # a step of one pixel: the linearisation holds no further
         inverse, variance = smoothed(inverse + np.clip(step, -pixel, pixel), weight, config.radii, config.uneven)
         inverse = np.maximum(inverse, LEAST_INVERSE).astype(np.float32)
     return inverse, np.sqrt(variance).astype(np.float32)
@@ -155,8 +155,11 @@ def refined(key: KeyView, others: Sequence[KeyView], config: SurfaceDepthConfig)
 def gauss_newton(
     key: KeyView, others: Sequence[KeyView], inverse: Array, config: SurfaceDepthConfig
 ) -> tuple[Array, Array, Array]:
-    """What the plates of `others` say of a key view's inverse depth, [h, w] each: 1 / its variance, that times the step
-    by which they would agree, and the pixels by which a point moves in any of them with inverse depth."""
+    """(information, pull, parallax) of a key view's inverse depth from the plates of `others`, [h, w] each.
+
+    Information is 1 / variance. Pull is information times the Gauss-Newton step. Parallax is the largest image motion
+    in any of the plates, in pixels per unit of inverse depth.
+    """
     information, pull, parallax = np.zeros_like(inverse), np.zeros_like(inverse), np.zeros_like(inverse)
     rays = rays_of(key.K, inverse.shape)
     for other in others:
@@ -170,9 +173,9 @@ def gauss_newton(
             continue
         count, square = window_means([weight, weight * np.square(shift)], config.small)
         noise = np.sqrt(np.maximum(square / np.maximum(count, 1e-6), _QUANTUM**2))
-        # Number of standard deviations from which on two plates show different points.
+        # Robust weight: beyond SAME standard deviations two plates show different points.
         weight /= np.square(noise * (1.0 + np.square(shift / (SAME * noise))))
-        # A slope that steps of 8 bits may have made says nothing of depth.
+        # A slope within 8-bit quantisation noise carries no information on depth.
         steps = np.square(_SURE * _SLOPE_NOISE * _QUANTUM) * (np.square(place.dx) + np.square(place.dy))
         weight *= np.maximum(1.0 - steps / np.maximum(np.square(slope), 1e-20), 0.0)
         information += weight * slope * slope
@@ -183,22 +186,22 @@ def gauss_newton(
 
 @dataclass
 class Place:
-    """Where the points of one view are in another."""
+    """Projection of the points of one view into another."""
 
     x: Array
-    """[h, w] pixel of the other view, centres at whole numbers."""
+    """[h, w] column in the other view, pixel centres at whole numbers."""
     y: Array
-    """[h, w]."""
+    """[h, w] row in the other view, pixel centres at whole numbers."""
     dx: Array
-    """[h, w] pixels by which x changes with inverse depth."""
+    """[h, w] derivative of x with respect to inverse depth, in pixels."""
     dy: Array
-    """[h, w]."""
+    """[h, w] derivative of y with respect to inverse depth, in pixels."""
     inverse: Array
-    """[h, w] inverse depth in the other view; 0 behind it."""
+    """[h, w] inverse depth in the other view; 0 behind its camera."""
 
     @classmethod
     def of(cls, view: KeyView, other: KeyView, rays: Array, inverse: Array) -> Place:
-        """Of the points of `view` at `inverse` [h, w] along `rays` [h, w, 3]."""
+        """Projection of the points of `view` at inverse depth `inverse` [h, w] along `rays` [h, w, 3]."""
         turn, shift = between(view.viewmat, other.viewmat)
         points = rays @ turn.T + inverse[..., None] * shift
         in_front = points[..., 2] > 1e-3
@@ -211,7 +214,7 @@ class Place:
         return cls(*(a.astype(np.float32) for a in places))
 
     def look(self, picture: Array) -> Array:
-        """[h, w] a picture of the other view at these places, 0 outside of it."""
+        """[h, w] a picture of the other view sampled at these points, 0 outside of it."""
         import cv2
 
         return cv2.remap(picture, self.x, self.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
@@ -245,31 +248,31 @@ class Splats:
     K: NDArray[np.float64]
     """[3, 3] pixels of the picture, overscan included."""
     inverse: Array
-    """[H, W] inverse of the median depth, 0 where nothing is."""
+    """[H, W] inverse of the median depth, 0 where there is no splat."""
     moving: Array
-    """[H, W] in 0..1: how much of what is seen moves in the clip."""
+    """[H, W] in 0..1: share of the pixel that moves in the clip."""
 
 
 class Correction(Protocol):
-    """Another measurement of what moves (`measured_depth.InstantDepth`)."""
+    """Another measurement of the depth of movers (`measured_depth.InstantDepth`)."""
 
     def correction(self, view: KeyView, moving: Array) -> tuple[Array, Array]:
-        """(factor of the splats' inverse depth in a view, their relative standard deviation after it), [h, w] each."""
+        """(factor for the splats' inverse depth in a view, relative standard deviation of the result), [h, w] each."""
         ...
 
 
 def frame_depth(
     surfaces: StillSurfaces, splats: Splats, picture: Array, measured: Correction | None = None
 ) -> tuple[Array, Array]:
-    """Inverse depth [H, W] of a frame, and its standard deviation [H, W], in 1 / scene units; 0 where nothing is.
+    """(inverse depth [H, W] of a frame, its standard deviation [H, W]), in 1 / scene units; 0 without a splat.
 
-    `picture` [H, W, 3] is the finished frame, display-referred. `measured` corrects the splats of what moves.
+    `picture` [H, W, 3] is the finished frame, display-referred. `measured` corrects the depth of moving splats.
     """
     import cv2
 
     config = surfaces.config
     height, width = splats.inverse.shape
-    # Pixels of the key views' size, whatever of the scene the frame shows around its middle: overscan changes nothing.
+    # The focal length is that of the key views, so that overscan does not change the pixels of the frame.
     focal = float(surfaces.keys[0].K[0, 0]) if surfaces.keys else splats.K[0, 0] * config.width / width
     w = max(min(64, width), min(width, round(width * float(focal / splats.K[0, 0]))))
     h = max(8, round(height * w / width))
@@ -286,9 +289,9 @@ def frame_depth(
         factor = np.asarray(cv2.resize(factor, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
         whole = np.where(splats.moving > 0.5, whole * factor, whole)
     sigma = noise * np.maximum(inverse, LEAST_INVERSE)
-    inverse, _ = smoothed(inverse, 1.0 / np.square(sigma), (config.small,), config.uneven)  # single splats jut out
+    inverse, _ = smoothed(inverse, 1.0 / np.square(sigma), (config.small,), config.uneven)  # single splats stick out
     values, sigma = combined(surfaces, KeyView(splats.viewmat, K, inverse, still, inverse, sigma))
-    # A mover and a still surface stay separate surfaces, however near they are.
+    # Movers and static surfaces are fitted separately, so that planes never span both.
     weight = 1.0 / np.square(np.maximum(sigma, LEAST_INVERSE * config.noise))
     still, moved = (fit_planes(values, weight * (of + 1e-9), config.radii[0]) for of in (~mover, mover))
     planes = Planes(*(np.where(mover, *each) for each in zip(moved, still, strict=True)))
@@ -299,15 +302,15 @@ def frame_depth(
 
 
 def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
-    """(inverse depth, its standard deviation), [h, w] each: that on which most of the key views and the splats agree.
+    """(inverse depth, its standard deviation), [h, w] each: the value on which most key views and the splats agree.
 
-    `view` has the splats' inverse depth and its standard deviation. Splats say alone what moves.
+    `view` has the splats' inverse depth and its standard deviation. Only splats are used for movers.
     """
     rays, splats = rays_of(view.K, view.inverse.shape), np.maximum(view.inverse, LEAST_INVERSE).astype(np.float32)
     seen = [(splats, view.sigma), *(seen_in(key, view, rays, splats) for key in surfaces.near(view.viewmat))]
     values, sigmas = (np.stack(each) for each in zip(*seen, strict=True))
     votes = (sigmas > 0).astype(np.float32)
-    votes[1:] *= (view.still > 0) / max(len(values) - 1, 1)  # key views share plates: all together count as one
+    votes[1:] *= (view.still > 0) / max(len(values) - 1, 1)  # key views share plates: together they have one vote
     all_votes = np.maximum(votes.sum(0), 1e-12)
     variances = np.square(np.maximum(sigmas, 1e-4 * splats))
     densities, means, spreads = (np.zeros_like(values) for _ in range(3))
@@ -318,11 +321,11 @@ def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
         weight = agree / variances
         total = np.maximum(weight.sum(0), 1e-12)
         means[i] = (weight * values).sum(0) / total
-        # Those that disagree may be right: as likely as they have votes.
+        # The values that disagree may be right, with a probability of their share of the votes.
         doubt = agree * weight / total + (votes - agree) / all_votes
         spreads[i] = 1.0 / total + (doubt * np.square(values - means[i])).sum(0)
-    # The densest of all values: one that knows little agrees with everything, and shall not win by that. A high
-    # power instead of the largest alone, so that rounding decides nothing.
+    # The value of highest density wins. Density is divided by sigma, because an uncertain value agrees with all others.
+    # A high power replaces the maximum, so that rounding cannot switch the winner.
     share = (densities / np.maximum(densities.max(0), 1e-12)) ** 8
     share /= np.maximum(share.sum(0), 1e-12)
     mean = (share * means).sum(0)
@@ -331,9 +334,10 @@ def combined(surfaces: StillSurfaces, view: KeyView) -> tuple[Array, Array]:
 
 
 def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[Array, Array]:
-    """Inverse depth [h, w] of a view's points as a key view has them, and its standard deviation, 0 where it has none.
+    """(inverse depth of a view's points, from a key view, its standard deviation), [h, w] each.
 
-    `inverse` [h, w] is where to begin. A point's place in the key view hangs on its depth; two rounds settle it.
+    The standard deviation is 0 where the key view has no depth. `inverse` [h, w] is the initial guess. A point's pixel
+    in the key view depends on its depth, so two fixed-point iterations are made.
     """
     turn, shift = between(view.viewmat, key.viewmat)
     along_axis = (rays @ turn.T)[..., 2]
@@ -351,11 +355,13 @@ def seen_in(key: KeyView, view: KeyView, rays: Array, inverse: Array) -> tuple[A
 def selected(
     planes: Planes, sigma: Array, small: Array, splats: Array, picture: Array, config: SurfaceDepthConfig
 ) -> tuple[Array, Array]:
-    """Inverse depth [H, W] of a picture and its standard deviation: each pixel's from the planes around it.
+    """(inverse depth [H, W] of a picture, its standard deviation [H, W]): per pixel from the planes around it.
 
     Args:
-        planes: [h, w], fitted to a smaller picture `small` [h, w, C] of the frame; `sigma` [h, w] that of their values.
-        splats: [H, W] the splats' inverse depth, 0 where nothing is.
+        planes: [h, w], fitted at a lower resolution.
+        sigma: [h, w] standard deviation of the planes' values.
+        small: [h, w, C] the frame's picture at the resolution of the planes.
+        splats: [H, W] the splats' inverse depth, 0 where there is no splat.
         picture: [H, W, C] the frame.
     """
     import cv2
@@ -379,10 +385,13 @@ def _from_windows(
     windows: list[Array], rough: Array, colors: list[Array], top: int, size: tuple[int, int, int],
     config: SurfaceDepthConfig,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Some rows of `selected`, from row `top` on: `rough` and `colors` [b, W] of the picture's channels.
+    """Some rows of `selected`, starting at row `top`.
 
-    `windows` are level, slopes, fit, variance and the channels of the smaller picture, [h, w] with a border of the
-    farthest tap; `size` is (h, w) without it, and the picture's height.
+    Args:
+        windows: level, slopes, fit, variance and channels of the smaller picture, [h, w] plus a border of `radii[0]`.
+        rough: [b, W] the splats' inverse depth of these rows, median-filtered.
+        colors: [b, W] per channel of the picture.
+        size: (h, w) without the border, and the picture's height.
     """
     import cv2
 
@@ -405,7 +414,7 @@ def _from_windows(
             off = np.zeros_like(rough)
             for one, other in zip(window_colors, colors, strict=True):
                 off += np.square((one - other) * np.float32(1.0 / config.color))
-            # Splats have the last word among windows of one colour, and none where the picture's colour denies them.
+            # Splats choose among windows of one colour; windows of another colour are rejected, whatever their depth.
             weight = fit * np.exp(-0.5 * off) * (np.exp(-0.5 * np.square(guess * near)) + config.outlier)
             total += weight
             mean += weight * guess
@@ -418,7 +427,7 @@ def _from_windows(
 
 
 class FrameDepths:
-    """Makes depth of a run's frozen frames that a compositor can use. Still surfaces are measured for the first."""
+    """Makes compositor-ready depth of a run's frozen frames. Static surfaces are measured at the first frame."""
 
     def __init__(self, run: LoadedRun, scene: Scene, config: SurfaceDepthConfig | None = None) -> None:
         self.run, self.scene, self.config = run, scene, config or SurfaceDepthConfig()
@@ -426,7 +435,7 @@ class FrameDepths:
 
     @property
     def surfaces(self) -> StillSurfaces:
-        """Those of the run. They hang on no instant, so that a frame is the same whichever was made before it."""
+        """The run's static surfaces. They do not depend on t*, so that the order of frames changes nothing."""
         if self._surfaces is None:
             frozen = freeze_at(self.run.model, 0.5, span_of(self.scene, self.run))
             still = fade(frozen, (frozen.motion < 0.5).float())
@@ -441,13 +450,15 @@ class FrameDepths:
         self, viewmat: Tensor, K: Tensor, depth: Tensor, motion: Tensor, picture: Tensor,
         measured: Correction | None = None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """(depth, its standard deviation) of a frozen frame, [H, W] each in scene units; 1e10 and 0 where nothing is.
+        """(depth, its standard deviation) of a frozen frame, [H, W] each in scene units; 1e10 and 0 without a splat.
 
         Args:
-            viewmat: [4, 4] world-to-camera, scene units. `K`: [3, 3] pixels of the picture, overscan included.
-            depth: [H, W] the splats' median depth. `motion`: [H, W] in 0..1, how much of it moves in the clip.
+            viewmat: [4, 4] world-to-camera, scene units.
+            K: [3, 3] pixels of the picture, overscan included.
+            depth: [H, W] the splats' median depth.
+            motion: [H, W] in 0..1, share of the pixel that moves in the clip.
             picture: [H, W, 3] the finished frame, display-referred.
-            measured: what the artist's depth maps say of the instant, if anything.
+            measured: correction by the artist's depth map of the instant; None without a map.
         """
         has_depth = depth < NO_DEPTH
         inverse = torch.where(has_depth, 1.0 / depth.clamp(1.0 / 1e4, 1.0 / LEAST_INVERSE), 0.0)

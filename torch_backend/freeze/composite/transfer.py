@@ -1,4 +1,4 @@
-"""A `footage.display` on tensors: there on the host for files, here where the pictures are."""
+"""Transfer functions of a `footage.display` for tensors. `Display` has the same functions for NumPy arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ...footage.display import Display
 
 
 def to_linear(shown: Tensor, display: Display) -> Tensor:
-    """Numbers of a display to scene-linear, any shape: `Display.to_light`."""
+    """Scene-linear light from display values of any shape, like `Display.to_light`."""
     encoded = shown
     if display.bends:
         above = (shown - SHOULDER_FROM).clamp_min(0.0)
@@ -22,7 +22,7 @@ def to_linear(shown: Tensor, display: Display) -> Tensor:
 
 
 def to_display(linear: Tensor, display: Display) -> Tensor:
-    """Scene-linear to numbers of a display, any shape: `Display.from_light`."""
+    """Display values from scene-linear light of any shape, like `Display.from_light`."""
     size = linear.abs()
     curve = size.clamp_min(float(LINEAR_KNEE)).pow(1.0 / 2.4) * 1.055 - 0.055
     encoded = torch.where(size <= float(LINEAR_KNEE), linear * 12.92, torch.copysign(curve, linear))

@@ -1,21 +1,24 @@
-"""The freeze as a warp: what turns the artist's own plate into the frozen frame, frame by frame, in one EXR each.
+"""The freeze as a warp of the artist's own plate, one EXR per frame.
 
     frozen = matte * plate(ST) + fill        scene-linear, premultiplied
 
-`ST` is a picture of coordinates as in `lens/stmap.py` (s to the right, t up, pixel centres at (i + 0.5) / size) over
-the undistorted plate, `matte` how much of a pixel that plate gives, `fill` the rest: other plates and splats. Where
-nothing moves ST is the identity, matte 1 and fill 0, so the plate leaves as it came, whatever was done to it before.
+`ST` is an image of coordinates as in `lens/stmap.py` (s to the right, t up, pixel centres at (i + 0.5) / size) over
+the undistorted plate. `matte` is the share of a pixel that comes from that plate. `fill` is the rest, from other plates
+and splats. Where nothing moves, ST is the identity, matte is 1 and fill is 0. The plate, graded or not, is then
+reproduced exactly.
 
-The filter is bilinear, on coordinates in steps of 1/256 of a pixel: what lies on a pixel's centre is that pixel, bit
-for bit, though float32 coordinates of a wide plate are off by some 1e-4 pixels, which beside a highlight of 50 shows.
-Of the filters of Blender's Map UV node only Nearest is there from 4.2 to 5.2 and keeps the identity, a quarter into
-a pixel (in 4.3 a pixel's centre is the next one's already). Bilinear is there from 5.0 on and has that error;
-Anisotropic blurs the identity in 4.2, 4.3 and 5.2, Bicubic wherever it is. So the add-on's group blends four nearest
-look-ups by the fraction, and agrees with `sample` to 1e-4 relative.
+The filter is bilinear, on coordinates rounded to 1/256 of a pixel, so that a pixel's centre gives that pixel bit for
+bit. Without the rounding, float32 coordinates of a wide plate are off by about 1e-4 pixels, which is visible next to a
+highlight of 50.
 
-Channels, by experiment with the bpy wheels 4.2.23, 4.5.15, 5.0.1 and 5.2.3: `CHANNELS` are sockets Combined (the fill),
-Alpha, ST and Matte of one Image node. Rejected: `forward.u` and `forward.v` (4.2 and 5.2 read two channels wrongly) and
-`ST.R` (taken for a colour, and converted where the scene's colours are not Rec.709).
+Of the filters of Blender's Map UV node, only Nearest exists in all versions from 4.2 to 5.2 and keeps the identity. Its
+coordinates must point a quarter of a pixel past the pixel's corner, because in 4.3 the centre gives the next pixel.
+Bilinear exists since 5.0 and has the float32 error. Anisotropic blurs the identity in 4.2, 4.3 and 5.2; Bicubic always
+does. The add-on's node group therefore blends four Nearest look-ups, and agrees with `sample` to 1e-4 relative.
+
+The channel names are the result of tests with the bpy wheels 4.2.23, 4.5.15, 5.0.1 and 5.2.3: `CHANNELS` become the
+sockets Combined (the fill), Alpha, ST and Matte of one Image node. Rejected: `forward.u` and `forward.v` (4.2 and 5.2
+read two channels wrongly), and `ST.R` (read as a colour, and converted if the scene's colours are not Rec.709).
 """
 
 from __future__ import annotations
@@ -36,11 +39,11 @@ from ...torch_types import from_numpy
 from ..exr import check_finite, linear_spec, read_layers, read_light, set_margin, write_exr
 
 CHANNELS = ("R", "G", "B", "A", "ST.X", "ST.Y", "ST.Z", "Matte.V")
-"""Fill and alpha of the whole frame; s, t and 1; matte."""
+"""Channels of the fill, the frame's alpha, ST (s, t and 1) and the matte."""
 WARP_VERSION = 1
 """Version of the `splannequin:` attributes of a warp."""
 STEPS = 256
-"""Coordinates are multiples of one pixel over this."""
+"""Number of coordinate steps per pixel."""
 
 _FORMATS = (oiio.HALF,) * 4 + (oiio.FLOAT,) * 3 + (oiio.HALF,)
 _ROWS = 256
@@ -48,29 +51,29 @@ _ROWS = 256
 
 @dataclass(frozen=True)
 class WarpMetadata:
-    """What a warp says about itself, stored as EXR attributes."""
+    """Metadata of a warp, stored as EXR attributes."""
 
     frame: int
     """Frame number in the clip's own numbering."""
     primary: int
-    """Number of the plate that ST looks into: `frame` on the clip's poses, else the nearest in pose."""
+    """Frame number of the plate that ST refers to: `frame` on the clip's poses, else the plate nearest in pose."""
     t_star_frame: float
-    """Instant at which time stands still, as a (fractional) frame number of the clip."""
+    """Frozen instant, as a (fractional) frame number of the clip."""
     plate_width: int
-    """Width of the plate in pixels, whose pixels ST counts in."""
+    """Width in pixels of the plate that ST refers to."""
     plate_height: int
-    """Its height."""
+    """Height in pixels of the plate that ST refers to."""
     key: str = ""
-    """What it was made from, to tell a stale one: the frame's."""
+    """Key of the frame's inputs, to detect a stale warp."""
     light: str = LIGHTS[0]
-    """Primaries of the light in the file, one of `LIGHTS`. The fill here is Rec.709's, whatever it is."""
+    """Primaries of the light in the file, one of `LIGHTS`. `Warp.fill` is always in Rec.709."""
     version: int = WARP_VERSION
     """Version of these attributes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """One warp as read back; tensors float32 on the CPU."""
+    """One warp as read from a file; tensors are float32 on the CPU."""
 
     st: Tensor
     """[H,W,2] s and t, 0..1 over the plate."""
@@ -82,11 +85,11 @@ class Warp:
     """[H,W] in 0..1: how opaque the frozen frame is."""
     metadata: WarpMetadata
     margin: tuple[int, int] = (0, 0)
-    """Pixels beyond the frame on the left and right, and above and below; the tensors hold them."""
+    """Pixels of overscan (left and right, above and below), included in the tensors."""
 
 
 def snap(st: Tensor, plate_size: tuple[int, int]) -> Tensor:
-    """ST [H,W,2] over a plate of (width, height), with coordinates on multiples of 1/`STEPS` of a pixel; float32."""
+    """ST [H,W,2] over a plate of (width, height), rounded to multiples of 1/`STEPS` of a pixel; float32."""
     size = torch.tensor(plate_size, dtype=torch.float64, device=st.device)
     out = torch.empty(st.shape, dtype=torch.float32, device=st.device)
     for top in range(0, st.shape[0], _ROWS):
@@ -96,7 +99,7 @@ def snap(st: Tensor, plate_size: tuple[int, int]) -> Tensor:
 
 
 def sample(plate: Tensor, st: Tensor) -> Tensor:
-    """[H,W,C] float32: a plate [h,w,C] seen through ST [H,W,2], bilinear; beyond its border it goes on as it ends."""
+    """[H,W,C] float32: a plate [h,w,C] sampled bilinearly at ST [H,W,2]; its border pixels are repeated outside."""
     height, width = plate.shape[:2]
     flat = plate.reshape(height * width, -1)
     out = torch.empty((*st.shape[:2], flat.shape[1]), dtype=torch.float32, device=plate.device)
@@ -113,7 +116,7 @@ def sample(plate: Tensor, st: Tensor) -> Tensor:
 
 
 def _between(share: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Two neighbouring pixels of a row of `size`, [H,W] int64, and [H,W,1] float32 how far towards the second."""
+    """Indices [H,W] int64 of two neighbouring pixels on an axis of `size`, and the second one's weight [H,W,1]."""
     at = (((share * size - 0.5) * STEPS).round() / STEPS).clamp(0.0, size - 1.0)
     first = at.floor()
     return first.long(), (first.long() + 1).clamp(max=size - 1), (at - first).float()[..., None]
@@ -122,7 +125,7 @@ def _between(share: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
 def apply_warp(plate_linear: Tensor, warp: Warp) -> Tensor:
     """[H,W,3] the frozen frame, scene-linear, premultiplied, of a plate [h,w,3]: matte * plate(ST) + fill.
 
-    ValueError if the plate has not the size that the warp was made for.
+    ValueError if the plate's size differs from the size that the warp was made for.
     """
     metadata = warp.metadata
     if plate_linear.shape != (metadata.plate_height, metadata.plate_width, 3):
@@ -144,9 +147,9 @@ def write_warp(
 ) -> Path:
     """Writes one warp atomically: float32 ST, the rest half, ZIP. Arrays as in `Warp`, ST from `snap`.
 
-    Mattes in steps of 1/1024 are exact in half floats, and the fill is off by 5e-4 of itself at most: that is little of
-    the frame, too, for a fill that adds light to what the plate gives, instead of taking some away. With a `margin`
-    the arrays are the data window, as in `write_frozen_exr`.
+    Half floats store mattes in steps of 1/1024 exactly, and the fill with a relative error of at most 5e-4. The frame's
+    error is as small, because the fill only adds light to the plate's share. With a `margin` the arrays are the data
+    window, as in `write_frozen_exr`.
 
     ValueError names the layer whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be
     written (errno ENOSPC when the disk is full).
@@ -174,7 +177,7 @@ def write_warp(
 def read_warp(path: str | Path) -> Warp:
     """Reads a file of `write_warp`.
 
-    FileNotFoundError without a file; ValueError if it cannot be read, is no warp, or is from a newer version.
+    FileNotFoundError if there is no file; ValueError if it cannot be read, is not a warp, or is from a newer version.
     """
     spec, names, metadata, pixels = read_layers(Path(path), CHANNELS, "no warp", _metadata)
     found = from_numpy(pixels)

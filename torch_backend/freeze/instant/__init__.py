@@ -1,1 +1,1 @@
-"""The scene at t*: the run frozen, held against a static baseline, fine-tuned, and kept."""
+"""The scene at t*: the frozen run, compared with a static baseline, fine-tuned, and stored."""

@@ -1,16 +1,18 @@
-"""Develop: a frozen instant is trained on as the static scene that it is, until it shows what plate t* shows.
+"""Develop: fine-tunes a frozen instant as a static scene, so that it matches plate t*.
 
-The field has to explain a whole clip; a freeze needs one instant of it. So the frozen Gaussians become
-parameters of their own. Still pixels are learnt from all trained
-frames, in each of which what moves stands where the field has it; what moves at t* is learnt from plate t* alone. Of
-what that sees from much farther than others do, it teaches nothing: a face of six pixels is right from there with its
-eyes anywhere. The pictures are larger than those of a preview run, so the frozen scene becomes sharper than the run.
+The deformation field has to explain a whole clip; a freeze needs one instant of it. The frozen Gaussians therefore
+become free parameters. Still pixels are learnt from all trained frames, with movers placed by the run's scene flow.
+Movers at t* are learnt from plate t* alone. Plate t* does not train Gaussians that it sees from much farther away than
+other frames do: a face that is six pixels wide matches the plate with its eyes in any position. The training pictures
+are larger than those of a preview run, so the frozen scene becomes sharper than the run.
 
-A run as sharp as its pictures has nothing to gain where nothing moves, and is left alone there. What moves it may show
-blurred all the same. That is trained alone then, and goes part of the way to what plate t* made of it: as far as its
-neighbours in time bear, in which what one plate got wrong would stand in the wrong place.
+A run that is as sharp as its pictures gains nothing on still pixels, and these are then left unchanged. Its movers may
+still be blurred. They are then trained alone, and blended between their states before and after training. The blend
+factor is chosen so that trained frames near t* do not get much worse, because errors of one plate would be misplaced
+there.
 
-Their number stays: growing was tried, and lost 0.3 dB on held-out frames (docs/decisions.md, "Developing an instant").
+The number of Gaussians does not change: densification lost 0.3 dB on held-out frames (docs/decisions.md, "Developing an
+instant").
 """
 
 from __future__ import annotations
@@ -37,40 +39,40 @@ from ..views.working_plates import WorkingPlates, showing, spread
 from .undersampled import AFAR, undersampled
 
 _TRAINING = TrainConfig()
-"""Loss, weights and rates of a training of 3000 steps: those of an instant are derived from them."""
+"""Loss, weights and learning rates of a training of 3000 steps, from which those of an instant are derived."""
 _BESIDE = 2
-"""Number of trained frames on either side of t* that are asked whether what moves may be taken over."""
+"""Number of trained frames on either side of t* that judge movers trained alone."""
 _PARTS = (0.0, 0.5, 1.0)
 """Blend factors between movers before and after fine-tuning; the best of them is kept."""
 Check = Callable[[int, int], None]
-"""Called with (steps done, steps in all); raises to cancel."""
+"""Called with (steps done, steps in total); raises to cancel."""
 
 
 @dataclass(frozen=True)
 class DevelopConfig:
-    """How an instant is developed. Loss, weights and rates are those of a training: see `_TRAINING`."""
+    """Parameters to develop an instant. Loss, weights and learning rates are those of a training: see `_TRAINING`."""
 
     steps: int = 120
-    """Training steps, of one frame each. Of 75 to 300 the delivered frames differ by 0.06 dB at most on three clips."""
+    """Number of training steps, of one frame each. Between 75 and 300 steps, the delivered frames differ by at most
+    0.06 dB on three clips."""
     width: int = LENGTHS_OF
-    """Pixels of the pictures that are trained on, at most; never above the working frames'."""
+    """Largest width in pixels of the training pictures; at most that of the working frames."""
     probes: int = 6
-    """Trained frames that are left out, at most, to see whether developing helped."""
+    """Largest number of trained frames that are left out, to measure whether developing helps."""
     gain: float = 0.2
-    """dB that the still pixels of the frames left out must gain: by less, at the size of the run, frozen truth lost
-    half a dB where frames of the clip, in which movers stand elsewhere, saw nothing of it. Where they gain less, what
-    moves is trained alone, on plate t*."""
+    """Gain in dB that the still pixels of the frames left out must reach. Below it, movers are trained alone, on plate
+    t*. With a smaller gain at the run's own width, instants lost half a dB against frozen ground truth. Frames of the
+    clip did not show this loss, because movers are elsewhere in them."""
     worth: float = 3.0
-    """Movers trained alone are kept where plate t* gains more than this many times what the neighbouring trained frames
-    lose, in mean squared error."""
+    """Movers trained alone are kept if the gain of plate t* exceeds this factor times the loss of the neighbouring
+    trained frames, in mean squared error."""
     instant_share: float = 0.25
-    """Share of the steps that are taken on plate t* itself, or on its neighbours where it was held out of training: 30
-    steps, as plate t* alone shows what moves."""
+    """Share of the steps on plate t* itself, or on its neighbours if it was held out of training. It gives 30 steps to
+    plate t*, which alone shows the movers at t*."""
     afar: float = AFAR
-    """Plate t* does not train Gaussians that it sees from more than this many times as far as some trained frame
-    does."""
+    """Ratio of distances above which plate t* does not train a Gaussian, as in `undersampled`."""
     seed: int = 0
-    """Of the order of frames."""
+    """Seed of the order of frames."""
 
 
 def develop(
@@ -82,23 +84,23 @@ def develop(
     config: DevelopConfig | None = None,
     check: Check | None = None,
 ) -> FrozenGaussians:
-    """Trains a frozen scene on as the static scene that it is.
+    """Fine-tunes a frozen scene as a static scene.
 
-    Returns what became of it. If frames that were left out gained nothing where nothing moves, or plate t* lost, that
-    stays as it was; and what moves does, or goes as far as t*'s neighbours bear.
+    Returns the fine-tuned scene. If the frames left out gain less than `DevelopConfig.gain` on still pixels, or plate
+    t* loses, only movers are changed, as far as the trained frames near t* allow.
 
     Args:
-        frozen: the run's scene at t*, and behind its Gaussians those of what it lacks (`missing.py`).
-        t_star: frame number. If it is none of the run's trained frames its plate is not looked at: what moves is learnt
-            from the nearest trained frame on either side, in which it stands where the field has it.
-        moving: what moves in the clip's frames.
-        check: reports progress, and cancels.
+        frozen: the run's scene at t*, followed by the Gaussians of missing movers (`missing.py`).
+        t_star: frame number. If it was not trained on, its plate is not used. Movers are then learnt from the nearest
+            trained frame on either side, where scene flow places them.
+        moving: motion mattes of the clip's frames.
+        check: callback that reports progress and raises to cancel.
     """
     return _FineTuning(run, scene, frozen, t_star, moving, config or DevelopConfig()).run(check)
 
 
 class _FineTuning:
-    """One development."""
+    """State of one fine-tuning."""
 
     def __init__(
         self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int, moving: MovingOf,
@@ -119,7 +121,7 @@ class _FineTuning:
         known = len(run.model.gaussians)
         self.afar = torch.zeros_like(self.mover)
         self.afar[:known] = undersampled(run, scene, frozen.state["means"][:known], t_star, config.afar).float()
-        # Frames that show such a thing where it moves show it at other times: then nothing of it is learnt.
+        # An undersampled Gaussian that moves in other frames is not trained, because they show it at other times.
         moves = torch.stack([self.plates.moving_share(frozen, frame) for frame in self.probes or self.instants])
         opened = torch.zeros_like(self.mover).index_fill(0, run.model.open_rows(), 1.0)
         opened[known:] = 1.0
@@ -128,7 +130,7 @@ class _FineTuning:
         """Rows of movers that lie on moving pixels of plate t*."""
 
     def run(self, check: Check | None) -> FrozenGaussians:
-        """Runs all steps, then keeps what made the judged frames better."""
+        """Runs all steps, and keeps the changes that improve the judged frames."""
         steps, before = self.config.steps, self._judged()
 
         def checked(done: int) -> None:
@@ -144,7 +146,7 @@ class _FineTuning:
         return FrozenGaussians(state, was.sh_degree, was.support, was.motion, was)
 
     def _train(self, steps: int, instant_share: float, check: Callable[[int], None]) -> None:
-        """Runs a number of steps, a share of them on plate t*; `check` is called with how many are done."""
+        """Runs `steps` steps, a share of them on plate t*; `check` is called with the number of finished steps."""
         order: list[int] = []
         mean = ParameterMean()
         for n in range(steps):
@@ -162,8 +164,10 @@ class _FineTuning:
         mean.put_into(self.params)
 
     def _movers_alone(self, check: Callable[[int], None]) -> dict[str, Tensor]:
-        """The scene as it was, but for what moves at t*: that is trained on plate t*, and goes as far towards it as
-        t*'s neighbours bear, which may be not at all."""
+        """The state before training, except for movers, which are trained on plate t* alone.
+
+        Movers get the blend of `_PARTS` that gains most on plate t*, minus `worth` times the loss of frames near t*.
+        """
         was, rows, near = self.frozen.state, self.alone, self._near()
         kept = dict(was)
         if not len(rows) or not near:
@@ -190,20 +194,20 @@ class _FineTuning:
             self.params[name].data = value.clone()
 
     def _near(self) -> list[int]:
-        """The trained frames nearest to those that show t*, on either side, without them."""
+        """The trained frames nearest to t* on either side, without those that show t* itself."""
         before = [frame for frame in self.trained.train_frames if frame < min(self.instants)]
         after = [frame for frame in self.trained.train_frames if frame > max(self.instants)]
         return [*before[-_BESIDE:], *after[:_BESIDE]]
 
     def _judged(self) -> tuple[float, float]:
-        """(PSNR in dB of the still pixels of the probes, of plate t* or its neighbours)."""
+        """(PSNR in dB of the still pixels of the probes, PSNR in dB of plate t* or its neighbours)."""
         still, instants = (-10.0 * math.log10(max(self._error(of), 1e-12)) for of in (self.probes, self.instants))
         return still, instants
 
     @torch.no_grad()
     def _error(self, frames: list[int], movers: bool = False) -> float:
-        """Mean squared error of frames, display-referred, over the pixels that show the frozen scene or (`movers`) over
-        their moving pixels. 0 without such pixels."""
+        """Mean squared error of frames, display-referred, over the pixels of `_learnt` or, with `movers`, over moving
+        pixels. 0 without such pixels."""
         sums = torch.zeros(2, dtype=torch.float64, device=self.device)
         for frame in frames:
             shown, pixels = self._shown(frame)
@@ -218,7 +222,7 @@ class _FineTuning:
         shown, learnt = self._shown(frame, torch.rand(3, generator=self.generator, device="cpu").to(self.device))
         target = torch.where(learnt[..., None], self.plates.picture(frame), shown.detach())
         loss = photometric(shown, target, _TRAINING.dssim)
-        # What may be taught by no frame would only fade.
+        # Gaussians that plate t* does not train get no opacity penalty, which would only fade them.
         shares = torch.sigmoid(self.params["opacity_logits"]) * (1.0 - self.afar)
         total = loss + _TRAINING.opacity_weight * shares.mean()
         self.optimizer.zero_grad(set_to_none=True)
@@ -229,7 +233,7 @@ class _FineTuning:
         self.optimizer.step(guard=[total])
 
     def _shown(self, frame: int, background: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """A frame as the scene has it, [H, W, 3], and bool [H, W]: what it says of the frozen scene.
+        """(render [H, W, 3] of the scene moved to a frame, pixels [H, W] bool as from `_learnt`).
 
         The background colour changes at every step, so that a hole cannot pass for a grey wall.
         """
@@ -245,7 +249,7 @@ class _FineTuning:
         return shown, self._learnt(frame, *out.colors[0, ..., 3:].detach().unbind(-1))
 
     def _learnt(self, frame: int, mover: Tensor, afar: Tensor) -> Tensor:
-        """bool [H, W]: which pixels of a frame say what the frozen scene should show there."""
+        """bool [H, W]: pixels of a frame that are valid training data for the frozen scene."""
         matte, ignored = self.plates.matte(frame), self.plates.ignored(frame)
         learnt = (matte < 0.5) & (mover < 0.5)
         if frame in self.instants:
@@ -253,7 +257,7 @@ class _FineTuning:
         return learnt if ignored is None else learnt & ~ignored
 
     def _optimizer(self) -> FusedAdam:
-        """At the rates of the middle of a training, or for means, which are nearly right, of its end."""
+        """Optimiser with the learning rates of mid-training. Means are nearly converged and use the final rate."""
         c, p = _TRAINING, self.params
         rates = {
             "quats": c.lr_quats, "log_scales": c.lr_scales, "opacity_logits": c.lr_opacities, "sh0": c.lr_sh0,

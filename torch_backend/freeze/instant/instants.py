@@ -1,4 +1,4 @@
-"""Instants of a run, developed once and kept in its folder: one safetensors file each, known by what made it."""
+"""Stores developed instants in the run's folder: one safetensors file each, with a key of its inputs."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from .develop import DevelopConfig
 from .repairs import Moment, repaired, repairs
 
 FOLDER = DEVELOPED_FOLDER
-"""Of developed instants, in a run's folder."""
+"""Folder of developed instants in a run's folder."""
 VERSION = 28
-"""Rises when instants developed before are not to be used any more."""
+"""Version of developed instants. Raise it when older ones must not be used any more."""
 MOST = 6
-"""Instants of a take that are developed at most; takes of more show them all as the run has them, so that no frame
-jumps to another make in the middle of a ramp."""
+"""Largest number of instants in a take that are developed. A take with more instants develops none of them, so that the
+look does not change in the middle of a speed ramp."""
 
 
 class Instants:
-    """The scenes of a take: the run at each of its instants, developed where that is wanted and can be done."""
+    """The scenes of a take: the run at each of its instants, developed if requested and possible."""
 
     def __init__(
         self, shot: Shot, run: LoadedRun, scene: Scene, query: str, t_stars: Iterable[float], on: bool = True
     ) -> None:
-        """`query` as in `FreezeParams`; `t_stars`: all instants of the take, as frame numbers; `on` False: none is
-        developed. The shot's motion mattes must have been found (`find_motion`): keys tell them apart."""
+        """`query`: as in `FreezeParams`. `t_stars`: frame numbers of all instants of the take. `on` False: no instant
+        is developed. The shot's motion mattes must exist (`find_motion`), because the keys depend on them."""
         self.shot, self.run, self.scene, self.query = shot, run, scene, query
         distinct, trained = sorted(set(t_stars)), set(run.train_frames)
         to_develop = distinct if on and len(distinct) <= MOST else []
         self.config = config_for(run)
         self.keys = {t: developed_key(shot, run, int(t), self.config, query) for t in to_develop if t in trained}
-        """t* -> key, of those that are developed: of trained frames, whose plates the run knows."""
+        """t* -> key of the developed instants. Only frames whose plates the run was trained on are developed."""
         self._held: dict[float, FrozenGaussians] = {}
         self._at: tuple[float, FrozenGaussians] | None = None
 
@@ -55,21 +55,21 @@ class Instants:
         return sorted(int(t) for t in self.keys)
 
     def is_kept(self, t_star: float) -> bool:
-        """True if an instant lies developed in the run's folder."""
+        """True if the developed instant is stored in the run's folder."""
         return t_star not in self._held and self._kept(t_star) is not None
 
     def prepare(self, t_stars: Iterable[float], report: Reporter) -> None:
-        """Develops those of `t_stars` that are to be and are not there yet. `Cancelled` leaves no half of one."""
+        """Develops the instants of `t_stars` in `keys` that are not stored yet. `Cancelled` leaves no partial file."""
         missing = [t for t in dict.fromkeys(t_stars) if t in self.keys and self._kept(t) is None]
         for n, t_star in enumerate(missing):
-            self._at = None  # before the next takes its room
+            self._at = None  # frees memory for the next instant
             self._develop(t_star, report, n, len(missing))
 
     def at(self, t_star: float, report: Reporter) -> FrozenGaussians:
-        """The scene at an instant; developed now if it is to be and is not."""
+        """The scene at an instant. It is developed now if it is in `keys` and not stored yet."""
         if self._at is not None and self._at[0] == t_star:
             return self._at[1]
-        self._at = None  # before the next takes its room
+        self._at = None  # frees memory for the next instant
         if t_star in self.keys:
             made = self._kept(t_star) or self._develop(t_star, report)
         else:
@@ -91,14 +91,14 @@ class Instants:
 
         def check(done: int, steps: int) -> None:
             report.check_cancelled()
-            if done not in warned:  # before the first step it is asked often
+            if done not in warned:  # training of movers alone calls this with the same `done` at every step
                 warned.add(done)
                 text = f"t* {int(t_star)}, step {done} of {steps}"
                 report.progress("developing", n * steps + done, count * steps, text)
 
         frozen = self._field(t_star)
         made = _make(self.shot, self.run, self.scene, int(t_star), frozen, self.config, check)
-        # Another job may have developed it meanwhile, and others may be at work with that one: the first stays.
+        # Another job may have stored the same instant meanwhile. Jobs may be using that file, so it is not replaced.
         stored = self._kept(t_star)
         made = made if stored is None else stored
         self._at = t_star, made
@@ -119,7 +119,7 @@ class Instants:
 
 
 def config_for(run: LoadedRun) -> DevelopConfig:
-    """How instants of a run are developed: as large as it was trained, at least `DevelopConfig.width`."""
+    """Configuration to develop instants of a run, at the run's training width or `DevelopConfig.width`, if larger."""
     usual = DevelopConfig()
     larger = max(1.0, run.width / usual.width)
     return dataclasses.replace(usual, width=max(usual.width, run.width), steps=round(usual.steps * larger))
@@ -128,7 +128,7 @@ def config_for(run: LoadedRun) -> DevelopConfig:
 def developed_key(
     shot: Shot, run: LoadedRun, t_star: int, config: DevelopConfig | None = None, query: str = "nearest"
 ) -> str:
-    """Identifies what a developed instant is made from and how; `query` as in `FreezeParams`."""
+    """Key of a developed instant's inputs and configuration; `query` as in `FreezeParams`."""
     return _key(shot, run, t_star, config, query, run.stamp)
 
 
@@ -140,7 +140,7 @@ def _key(
 
 
 def developed_path(run: LoadedRun, t_star: int) -> Path:
-    """Where a run's instant is kept once it is developed."""
+    """Path of a developed instant in the run's folder."""
     return run.folder / FOLDER / frame_file(t_star, ".safetensors")
 
 
@@ -148,13 +148,13 @@ def load_developed(
     shot: Shot, run: LoadedRun, t_star: int, frozen: FrozenGaussians, config: DevelopConfig | None = None,
     query: str = "nearest",
 ) -> FrozenGaussians | None:  # fmt: skip
-    """The instant as it was developed before; None if it was not, or from something else, or its file is damaged.
+    """The stored developed instant; None if there is none, its key differs, or its file is damaged.
 
-    `frozen` is the run's scene at t*, asked as `query` says.
+    `frozen` is the run's scene at t*, evaluated with `query`.
     """
     path = developed_path(run, t_star)
     try:
-        # An instant of an earlier version is known by the time of its run's checkpoint.
+        # Keys of earlier versions contain the modification time of the run's checkpoint.
         keys = [_key(shot, run, t_star, config, query, stamp) for stamp in (run.stamp, run.former_stamp)]
         if not path.is_file() or read_meta(path).get("key") not in keys:
             return None
@@ -175,7 +175,7 @@ def load_developed(
 
 
 def _whole(tensors: dict[str, Tensor], frozen: FrozenGaussians) -> bool:
-    """True if tensors of a file fit each other and the run: it may come from anywhere."""
+    """True if names, types, shapes and values of a file's tensors are valid for the run: the file is untrusted."""
     names = [f"{part}.{name}" for part in ("base", "state") for name in PARAM_NAMES]
     closed, origin, known = tensors.get("closed"), tensors.get("origin"), len(frozen.support)
     if closed is None or closed.dtype != torch.long or closed.dim() != 1 or not all(n in tensors for n in names):
@@ -194,11 +194,11 @@ def developed(
     shot: Shot, run: LoadedRun, scene: Scene, t_star: int, frozen: FrozenGaussians,
     config: DevelopConfig | None = None, keep: bool = True,
 ) -> FrozenGaussians:  # fmt: skip
-    """The scene frozen at frame `t_star`, developed: from the run's folder if it is there, else made now and kept.
+    """The developed scene at frame `t_star`, read from the run's folder or else developed now and stored.
 
     Args:
-        frozen: the run's scene at t*, asked at the nearest time at which it was seen.
-        keep: write it into the run's folder. OSError or JobError if that cannot be done.
+        frozen: the run's scene at t*, evaluated with the query "nearest".
+        keep: store the instant in the run's folder. OSError or JobError if that fails.
     """
     config = config or config_for(run)
     made = load_developed(shot, run, t_star, frozen, config)
@@ -220,16 +220,16 @@ def _make(
 def _save(
     shot: Shot, run: LoadedRun, t_star: int, field: FrozenGaussians, made: FrozenGaussians, key: str
 ) -> None:  # fmt: skip
-    """Writes an instant of the run's `field`; those of other trainings of the run go.
+    """Writes a developed instant, and deletes instants of other trainings of the run.
 
-    OSError, or JobError where a link leads elsewhere.
+    `field` is the run's scene at t* before repairs. OSError, or JobError if a link leads out of the shot.
     """
     assert made.descent is not None and made.origin is not None
     path = developed_path(run, t_star)
     folder = shot.own(path.parent)
     closed = torch.nonzero(made.descent.motion[: len(field.motion)] < field.motion).flatten()
     tensors = {"closed": closed, "origin": made.origin}
-    # An instant that stayed as it was shares its tensors with what it descends from, which the file may not.
+    # An unchanged instant shares tensors with its `descent`, but tensors in a safetensors file must not share memory.
     tensors |= {f"state.{name}": made.state[name].clone() for name in PARAM_NAMES}
     tensors |= {f"base.{name}": made.descent.state[name] for name in PARAM_NAMES}
     sweep_half_written(folder)
@@ -237,6 +237,6 @@ def _save(
     save_checkpoint(path, tensors, meta)
     stamps = run.stamp, run.former_stamp
     for other in folder.glob("*.safetensors"):
-        with contextlib.suppress(OSError):  # known by its key, it does no harm but take room
+        with contextlib.suppress(OSError):  # a file that stays only takes space: its key does not match
             if frame_number(other.stem) is not None and other != path and read_meta(other).get("run") not in stamps:
                 other.unlink()

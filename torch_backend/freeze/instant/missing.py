@@ -1,9 +1,10 @@
-"""Adds Gaussians for what plate t* shows moving and the frozen scene lacks: a waving hand, an arm raised for a moment.
+"""Adds Gaussians for movers that plate t* shows and the frozen scene lacks, such as a waving hand.
 
-The field learns from all frames. Objects that only a few frames show are in no state of the field, and developing would
-paint them onto the surfaces behind. Plate t* shows it, but not its depth. So it gets the depth of what it is attached
-to: the median over the pixels beside it at which the scene is nearer than where the thing is missing. Floaters of the
-field, which the plate contradicts, are hidden first. A thing that is attached to nothing is left to developing.
+The deformation field learns from all frames, so it has no state with an object that only a few frames show. Developing
+would paint the object onto the surfaces behind it. Plate t* shows the object, but not its depth. The object therefore
+gets the depth of the surface to which it is attached. This is the median over adjacent pixels at which the scene is
+nearer than at the missing object. Floaters of the field that the plate contradicts are hidden first. An object that is
+attached to nothing is left to developing.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from ..views.working_plates import SEEN, WorkingPlates
 
 @dataclass(frozen=True)
 class MissingConfig:
-    """How missing movers are found, and how large their Gaussians are."""
+    """Parameters to find missing movers, and the size of their Gaussians."""
 
     plates: VisibilityConfig = field(default_factory=VisibilityConfig)
     """Tolerances for comparing pictures and depths."""
     sigma: float = 0.6
-    """Standard deviation of a Gaussian in pixels of plate t*, which gets one per pixel: small enough to keep outlines,
-    large enough that neighbours blend."""
+    """Standard deviation of an added Gaussian, in pixels of plate t*; one is added per missing pixel. The value is
+    small enough to keep outlines and large enough for neighbours to blend."""
 
 
 @torch.no_grad()
@@ -49,7 +50,7 @@ def with_missing(
     Args:
         frozen: the run's scene at t*.
         t_star: frame number. If it was not trained on, the scene is returned unchanged.
-        moving: what moves in the clip's frames.
+        moving: motion mattes of the clip's frames.
     """
     config = config or MissingConfig()
     if t_star not in run.train_frames:
@@ -63,8 +64,8 @@ def with_missing(
     def shown(scene: FrozenGaussians) -> FrozenImage:
         return render_frozen(scene, viewmat, K, width, height, run.model.exposure, time)
 
-    # A moving Gaussian is a floater if plate t* contradicts most of what is seen of it. Left in, it would be taken for
-    # what a hand is attached to, and hold the hand too near.
+    # A moving Gaussian is a floater if plate t* contradicts most of its visible contribution. It could be mistaken for
+    # the surface that a hand is attached to, and the hand would be placed too near.
     wrong = matte * mismatch(picture, shown(frozen).color, unit, config.plates)
     weights = torch.stack([wrong, torch.ones_like(wrong)], dim=-1).to(moves.device)
     inside, whole = gathered(frozen.state, viewmat.to(moves.device), K.to(moves.device), width, height, weights).T
@@ -93,20 +94,22 @@ def with_missing(
 def missing_pixels(
     picture: Tensor, image: FrozenImage, behind: FrozenImage, matte: Tensor, unit: float, config: VisibilityConfig
 ) -> tuple[Tensor, Tensor]:
-    """([h, w] in 0..1 share of each pixel that is missing and attached to something, [h, w] its inverse depth).
+    """([h, w] in 0..1 share of each pixel that is missing and attached to a surface, [h, w] its inverse depth).
 
     Args:
         picture: [h, w, 3] plate t*, display-referred.
-        image: the frozen scene as its camera sees it, scene units; behind: the same without what moves.
-        matte: [h, w] in 0..1, what moves.
-        unit: pixels to one of 640.
+        image: the frozen scene from plate t*'s camera, scene units.
+        behind: the frozen scene without movers, from the same camera.
+        matte: [h, w] in 0..1, motion matte of plate t*.
+        unit: pixels of the plate per pixel at width 640.
+        config: tolerances.
     """
     sigma, reach = 2.0 * config.margin * unit, max(1, round(2.0 * config.margin * unit))
 
     def unlike(shown: FrozenImage) -> Tensor:
         return _sure((picture - shown.color).abs().amax(-1), config)
 
-    # Where the plate matches the background, the scene shows something in excess there, and lacks nothing.
+    # Where the plate matches the background, nothing is missing: the scene shows a mover too many.
     absent, other = (mismatch(picture, each.color, unit, config) for each in (image, behind))
     gone = matte * torch.minimum(absent, other)
     outline = torch.minimum(unlike(image), unlike(behind))
@@ -119,8 +122,11 @@ def missing_pixels(
 
 
 def mismatch(picture: Tensor, shown: Tensor, unit: float, config: VisibilityConfig) -> Tensor:
-    """[h, w] in 0..1: confidence that a plate shows colours that a render has nowhere nearby, [h, w, 3] each,
-    display-referred. Blur and misplacement within the margin do not count, because splats have both."""
+    """[h, w] in 0..1: confidence that a plate's colour does not occur in a render nearby.
+
+    `picture` and `shown` are [h, w, 3], display-referred. Blur and misplacement within the margin do not count, because
+    splats have both.
+    """
     margin = config.margin * unit
     return _sure(beyond(blurred(picture, margin), blurred(shown, margin), max(1, round(2.0 * margin))), config)
 
@@ -130,14 +136,16 @@ def _sure(difference: Tensor, config: VisibilityConfig) -> Tensor:
 
 
 def _hiding(frozen: FrozenGaussians, hidden: Tensor) -> FrozenGaussians:
-    """The scene with the rows `hidden`, bool [N], made invisible."""
+    """The scene with the Gaussians `hidden`, bool [N], made invisible."""
     opacity = torch.where(hidden, HIDDEN, frozen.state["opacity_logits"])
     return replace(frozen, state={**frozen.state, "opacity_logits": opacity})
 
 
 def _depths(around: Tensor, gone: Tensor, holds: Tensor, inverse: Tensor, least: float) -> Tensor:
-    """[h, w] inverse depth of each connected region of `around`, bool: the median weighted by `holds`. 0 where a region
-    is attached to nothing, or has less than `least` missing pixels: the area of the low-pass that found it."""
+    """[h, w] inverse depth of each connected region of `around` (bool): the median weighted by `holds`.
+
+    It is 0 where a region is attached to nothing or has fewer than `least` missing pixels (`gone`).
+    """
     count, labels = cv2.connectedComponents(around.byte().numpy())
     regions = np.asarray(labels, np.int32)
     weights, values, amounts = (each.numpy() for each in (holds, inverse, gone))
@@ -151,7 +159,7 @@ def _depths(around: Tensor, gone: Tensor, holds: Tensor, inverse: Tensor, least:
 
 
 def weighted_median(values: NDArray[np.float32], weights: NDArray[np.float32]) -> float:
-    """Of values [N] with weights [N]: half of the weight lies on either side."""
+    """The median of values [N] with weights [N]."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])

@@ -1,12 +1,11 @@
-"""The scene at t*: the run's field at that instant, and what is repaired of it, in this order.
+"""The scene at t*: the run's deformation field evaluated at that instant, then repaired in three steps.
 
-1. Static baseline: what the field harms stands as it is on average.
-2. Missing movers: what plate t* shows and the scene lacks is set where it stood.
-3. Develop: the scene is fine-tuned as the static scene that it is.
+1. Static baseline: Gaussians whose motion does harm get their mean state.
+2. Missing movers: Gaussians are added for movers that plate t* shows and the scene lacks.
+3. Develop: the scene is fine-tuned as a static scene.
 
-A repair takes a scene and returns a scene of the same rows, with new ones behind them if it adds any; it writes into
-neither. The first and the last ask: does plate t* gain, and do the other plates not lose? What that does not answer
-with yes is left as it was.
+A repair returns a new scene with the same rows, followed by the rows that it adds. It does not change its input. The
+first and the last repair only keep changes that improve plate t* without making the other plates worse.
 """
 
 from __future__ import annotations
@@ -28,18 +27,18 @@ from .static_baseline import StaticBaselineConfig, apply_static_baseline
 
 @dataclass(frozen=True)
 class Moment:
-    """The instant that is made, and what there is to make it of."""
+    """The instant to repair, and the data to repair it with."""
 
     run: LoadedRun
     """The trained run."""
     scene: Scene
     """The shot's cameras and frames."""
     t_star: int
-    """Frame number at which time stands still."""
+    """Frame number of the frozen instant."""
     moving: MovingOf
-    """What moves in the clip's frames."""
+    """Motion mattes of the clip's frames."""
     check: Check | None = None
-    """Reports progress, and cancels."""
+    """Callback that reports progress and raises to cancel."""
 
 
 class Repair(Protocol):
@@ -51,35 +50,35 @@ class Repair(Protocol):
         ...
 
     def apply(self, frozen: FrozenGaussians, moment: Moment) -> FrozenGaussians:
-        """The repaired scene, of the same rows and those that it adds; `frozen` is not changed."""
+        """The repaired scene: the same rows, followed by added ones. `frozen` is not changed."""
         ...
 
 
 @dataclass(frozen=True)
 class StaticBaseline:
-    """Closes what the field harms: see `static_baseline.py`."""
+    """Closes Gaussians whose motion does harm: see `static_baseline.py`."""
 
     config: StaticBaselineConfig = field(default_factory=StaticBaselineConfig)
-    """How scene and baseline are compared."""
+    """Parameters of the comparison of scene and baseline."""
     name: str = "static baseline"
     """As in `Repair`."""
 
     def apply(self, frozen: FrozenGaussians, moment: Moment) -> FrozenGaussians:
-        """The scene with what harms it standing still."""
+        """The scene in which Gaussians whose motion does harm are closed."""
         return apply_static_baseline(moment.run, moment.scene, frozen, moment.t_star, moment.moving, self.config)
 
 
 @dataclass(frozen=True)
 class Missing:
-    """Adds what plate t* shows moving and the scene lacks: see `missing.py`."""
+    """Adds movers that plate t* shows and the scene lacks: see `missing.py`."""
 
     config: MissingConfig = field(default_factory=MissingConfig)
-    """How it is found and made."""
+    """Parameters to find missing movers, and the size of their Gaussians."""
     name: str = "missing movers"
     """As in `Repair`."""
 
     def apply(self, frozen: FrozenGaussians, moment: Moment) -> FrozenGaussians:
-        """The scene with what it lacks behind its rows."""
+        """The scene with Gaussians of missing movers appended after its rows."""
         return with_missing(moment.run, moment.scene, frozen, moment.t_star, moment.moving, self.config)
 
 
@@ -88,22 +87,22 @@ class Develop:
     """Fine-tunes the scene on the plates: see `develop.py`."""
 
     config: DevelopConfig = field(default_factory=DevelopConfig)
-    """How it is trained."""
+    """Parameters of the fine-tuning."""
     name: str = "develop"
     """As in `Repair`."""
 
     def apply(self, frozen: FrozenGaussians, moment: Moment) -> FrozenGaussians:
-        """The fine-tuned scene, which descends from `frozen`."""
+        """The fine-tuned scene; its `descent` is `frozen`."""
         return develop(moment.run, moment.scene, frozen, moment.t_star, moment.moving, self.config, moment.check)
 
 
 def repairs(config: DevelopConfig) -> tuple[Repair, ...]:
-    """All repairs, in their order."""
+    """All repairs, in the order in which they are applied."""
     return StaticBaseline(), Missing(), Develop(config)
 
 
 def repaired(frozen: FrozenGaussians, moment: Moment, steps: Sequence[Repair]) -> FrozenGaussians:
-    """The run's scene at t* after all steps; its `origin` says which of them changed each row last."""
+    """The run's scene at t* after all steps; its `origin` holds the number of the step that changed each row last."""
     origin = torch.zeros(len(frozen.support), dtype=torch.uint8, device=frozen.support.device)
     for n, step in enumerate(steps):
         after = step.apply(frozen, moment)

@@ -1,18 +1,22 @@
-"""No worse than a static model: what the field harms in a frozen scene is closed before the instant is developed.
+"""Static baseline: closes Gaussians whose motion makes the frozen scene worse than a static scene.
 
-A field is trained to explain every frame at its own time. A frozen shot evaluates it where no loss supervised it: at
-t*, from all other poses. An example is the wall behind a person, which the field may let fade while she stands there.
-The static twin of a frozen scene has the same Gaussians, the open ones at the mean of the times at which they were
-seen. Scene and twin are held against plates: that of t*, and the still pixels of others, all over the clip. A Gaussian
-is closed where the others are worse for it by more than plate t* gains; where the mattes see nothing move at t* and it
-only sways, by more than a third of that. It is asked of neighbours together: errors are noisy, and things move in
-pieces. Where it makes no difference it stays open: mattes miss what sways, and to such pixels, which they call still, a
-mean is always nearer. They miss whole arms, too. So of what went farther than a sway, what the run shows at a plate's
-own time better than the twin counts against the twin: that plate says nothing of t*.
+A deformation field is trained to explain every frame at its own time. A frozen shot evaluates it where no loss
+supervised it: at t*, from all other poses. For example, the field may fade the wall behind a person while she hides it.
 
-Of what t* sees from afar its plate cannot say how it looks: a face of six pixels fits it with its eyes anywhere. Plates
-that see such a thing from near are asked with all of its pixels, whether they move or not; and there, where they do
-move, what the run shows better at the plate's own time counts against the twin even of a sway.
+The static baseline has the same Gaussians as the frozen scene, but its open Gaussians are at the mean of the times at
+which they were seen. Both are compared with plate t*, and with the still pixels of other plates across the clip. A
+Gaussian is closed (made static) if its motion raises the error of the other plates by more than it lowers the error of
+plate t*. If the mattes show no motion at t* and the Gaussian only sways, a third of that increase is enough. Neighbours
+are decided together, because errors are noisy and objects move as a whole. A Gaussian whose motion raises no error
+stays open.
+
+Mattes miss swaying objects and sometimes whole arms, and count their pixels as still. The mean state always fits such
+pixels better, although the plate shows another time than t*. For a Gaussian that moves farther than a sway, the
+advantage of the run at the plate's own time over the baseline is therefore subtracted from the error increase.
+
+Plate t* cannot judge objects that it sees from far away: a face that is six pixels wide matches the plate with its eyes
+in any position. For such objects, plates that see them from near are compared on all pixels, including moving ones. The
+run's advantage is then always subtracted.
 """
 
 from __future__ import annotations
@@ -38,36 +42,35 @@ from .undersampled import AFAR
 
 @dataclass(frozen=True)
 class StaticBaselineConfig:
-    """How a frozen scene is compared with its static twin."""
+    """Parameters of the comparison of a frozen scene with its static baseline."""
 
     width: int = MEASURED_WIDTH
-    """Pixels of the pictures that are compared, at most; never above the working frames'."""
+    """Largest width in pixels of the compared pictures; at most that of the working frames."""
     plates: int = VIEWS
-    """Trained frames that are examined beside t*, at most, evenly over the clip."""
+    """Largest number of evenly spaced trained frames that are compared in addition to t*."""
     neighbours: int = 16
     """Number of nearest open Gaussians that are decided together."""
     doubted: float = 3.0
     """Factor by which the gain of plate t* must exceed the loss of the others for a Gaussian that only sways where the
-    mattes are still at t*. A field also bends to an error of that one plate's camera, at the edge of a desk for
-    instance."""
+    mattes are still at t*. The field also bends to an error of plate t*'s camera, for example at the edge of a desk."""
     sways: float = 4.0
-    """Distance in pixels of pictures 640 wide, from t* to a plate, above which a Gaussian counts as moving and not as
-    swaying. The advantage of the run over the twin at that plate's time is then subtracted. People who hold still sway
-    by less, and their mean is as good."""
+    """Scene flow in pixels at width 640, from t* to a plate, above which a Gaussian counts as moving and not as
+    swaying. The advantage of the run over the baseline at that plate's time is then subtracted. People who hold still
+    sway by less, and their mean is as good."""
     nearer: float = 1.0 / AFAR
-    """Largest distance of a plate that sees a Gaussian from near, relative to the distance at t*."""
+    """Distance of a plate's camera, relative to that of t*'s, up to which the plate sees a Gaussian from near."""
 
 
 def apply_static_baseline(
     run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int, moving: MovingOf,
     config: StaticBaselineConfig | None = None,
 ) -> FrozenGaussians:  # fmt: skip
-    """A run's scene at t*, in which what only does harm there stands still: `closed`.
+    """A run's scene at t* in which Gaussians whose motion only does harm are closed.
 
     Args:
-        frozen: the run's own Gaussians at t*, nothing behind them.
-        t_star: frame number; one that the run was not trained on is judged by the trained plates beside it.
-        moving: what moves in the clip's frames.
+        frozen: the run's own Gaussians at t*, without appended ones.
+        t_star: frame number. If it was not trained on, the nearest trained plates on either side replace plate t*.
+        moving: motion mattes of the clip's frames.
     """
     config = config or StaticBaselineConfig()
     rows = run.model.open_rows()
@@ -90,7 +93,7 @@ def apply_static_baseline(
 
 @torch.no_grad()
 def with_still_means(run: LoadedRun, frozen: FrozenGaussians, rows: Tensor) -> FrozenGaussians:
-    """A frozen scene in which `rows` [M] int64 of the run's Gaussians are what they are on average, and do not move."""
+    """A frozen scene in which `rows` [M] int64 of the run's Gaussians have their mean state and do not move."""
     mean, state = mean_of(run.model, rows), dict(frozen.state)
     for name, value in state.items():
         state[name] = value.index_copy(0, rows, mean[name])
@@ -99,29 +102,34 @@ def with_still_means(run: LoadedRun, frozen: FrozenGaussians, rows: Tensor) -> F
 
 
 class _Pair:
-    """A frozen scene and its twin, which differ by `rows` [M]; `movers` [N] is 1 for what moves in plate t*."""
+    """A frozen scene and its static baseline, which differ in `rows` [M].
+
+    `movers` [N] is 1 for Gaussians on moving pixels of plate t*.
+    """
 
     def __init__(
         self, run: LoadedRun, plates: WorkingPlates, frozen: FrozenGaussians, twin: FrozenGaussians, rows: Tensor,
         movers: Tensor, t_star: int, config: StaticBaselineConfig,
     ) -> None:  # fmt: skip
         self.sways = config.sways * plates.width / 640
-        """Pixels of the plates."""
+        """`StaticBaselineConfig.sways` in pixels of the compared plates."""
         places = frozen.state["means"][rows]
         self.from_near = config.nearer * norm(places - plates.centre(t_star), -1)
-        """[M] distance up to which a plate sees each of the rows from near."""
+        """[M] distance in scene units up to which a plate sees each of the rows from near."""
         self.run, self.plates, self.rows, self.scenes = run, plates, rows, (frozen, twin)
         self.went = torch.zeros(len(rows), dtype=torch.bool, device=movers.device)
-        """[M] True for what some plate that was asked saw farther from its place at t* than a sway."""
+        """bool [M]: True for Gaussians that move farther than a sway between t* and some compared plate."""
         self.marks = torch.stack([torch.zeros_like(movers).index_fill(0, rows, 1.0), movers], dim=1)
 
     def worse(self, frames: list[int], near: Tensor, still: bool = True) -> Tensor:
-        """[M]: squared error of the scene over that of its twin, in pixels, for the mean frame that sees a Gaussian.
+        """[M] per Gaussian: squared error of the scene minus that of the baseline over its pixels, mean over frames.
 
-        A pixel's difference is shared by the Gaussians that paint it in either; each is given the mean of those `near`
-        [M, K] it. With `still` only pixels that do not move, neither there nor in plate t*, unless the plate sees the
-        Gaussian from near; and what the twin's error there exceeds that of the run at the frame's own time by is
-        subtracted for what went farther than a sway, and for what is seen from near.
+        A pixel's difference is divided among the Gaussians that contribute to it in either scene. Each Gaussian then
+        gets the mean of its neighbours `near` [M, K].
+
+        With `still`, only pixels that move neither in the frame nor in plate t* count, unless the frame sees the
+        Gaussian from near. The run's advantage over the baseline at the frame's own time is subtracted for Gaussians
+        that move farther than a sway or are seen from near.
         """
         sums, counts = torch.zeros(2, len(self.rows), device=self.marks.device)
         for frame in frames:
@@ -131,7 +139,7 @@ class _Pair:
         return sums / counts.clamp_min(1.0)
 
     def _blamed(self, frame: int, still: bool) -> Tensor:
-        """[M, 2]: how much worse a frame is for each of the rows, and how many pixels it sees of it."""
+        """[M, 2] per row, in a frame: squared error of the scene minus that of the baseline, and visible pixels."""
         camera, plate = self.plates.camera(frame), self.plates.picture(frame)
         ignored = self.plates.ignored(frame)
         whole = torch.ones(plate.shape[:2], device=plate.device) > 0 if ignored is None else ~ignored
@@ -164,7 +172,7 @@ class _Pair:
         return sums[:, :2]
 
     def _travel(self, then: FrozenGaussians, frame: int) -> Tensor:
-        """[M] pixels by which the rows move from t* to a frame's own time, as that frame sees it."""
+        """[M] image motion of the rows from t* to a frame's own time, in pixels of that frame."""
         viewmat, K, _, _ = self.plates.camera(frame)
         pixels_now, pixels_then = (
             project(scene.state["means"][self.rows], viewmat, K)[0] for scene in (self.scenes[0], then)
@@ -173,7 +181,7 @@ class _Pair:
 
     @torch.no_grad()
     def _shown(self, scene: FrozenGaussians, frame: int) -> tuple[Tensor, Tensor]:
-        """(picture [H, W, 3] in 0..1, marks [H, W, 2]) of a scene from the camera of a frame, over grey."""
+        """(picture [H, W, 3] in 0..1, marks [H, W, 2]) of a scene from the camera of a frame, on a grey background."""
         grey = torch.tensor([0.5, 0.5, 0.5, 0.0, 0.0], device=self.marks.device)
         out = render(
             scene.state, scene.sh_degree, *self.plates.camera(frame), background=grey, colors=self.marks,
@@ -184,7 +192,7 @@ class _Pair:
 
 
 def _nearest(means: Tensor, count: int) -> Tensor:
-    """[M, K] int64: the nearest of means [M, 3] to each, itself among them."""
+    """[M, K] int64: indices of the `count` nearest of means [M, 3] to each, including itself."""
     count = min(count, len(means))
     places = means.cpu().numpy()
     found = nearest(places, places, count)[1]

@@ -1,4 +1,4 @@
-"""Undersampled Gaussians: those that plate t* sees from so far away that nearer frames show them better."""
+"""Undersampled Gaussians: plate t* sees them from far away, and other frames show them from nearer."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from ...torch_types import norm
 from ...train import LoadedRun
 
 AFAR = 2.0
-"""Times the distance of another frame from which on a frame sees a thing from afar."""
+"""Ratio of plate t*'s distance to the nearest frame's distance above which a Gaussian is undersampled."""
 
 
 @torch.no_grad()
 def undersampled(run: LoadedRun, scene: Scene, means: Tensor, t_star: float, times: float) -> Tensor:
-    """bool [M]: which of the run's first M Gaussians are more than `times` as far from t*'s camera as from the nearest
-    one that a trained frame saw them with.
+    """bool [M]: True for each of the run's first M Gaussians that is undersampled at t*.
 
-    means [M, 3] is where they are at t*, a frame number; what was never seen is not among them.
+    Such a Gaussian is more than `times` as far from t*'s camera as from the nearest trained camera that saw it. One
+    that was never seen is not undersampled. `means` [M, 3] are positions at t*, in scene units; `t_star` is a frame
+    number.
     """
     model, trained = run.model, [scene.frames.index(frame) for frame in run.train_frames]
     centres = scene.camera_centres()

@@ -1,4 +1,4 @@
-"""The job that renders the light of a take's frozen scene at a point: takes/NAME/panorama/KEY.exr and KEY.json."""
+"""The light job: renders a take's frozen scene from a point to takes/NAME/panorama/KEY.exr and KEY.json."""
 
 from __future__ import annotations
 
@@ -41,41 +41,41 @@ from ..take.frames import scene_linear
 from . import sphere
 
 LIGHT_VERSION = 1
-"""Rises when panoramas rendered before must not pass for new ones."""
+"""Version of panoramas. Raise it when older ones must not be used any more."""
 _CHANNELS = ("R", "G", "B")
 
 
 @dataclass
 class LightConfig:
-    """How the panorama is made."""
+    """Parameters of the panorama."""
 
     width: int = 1024
-    """Width in pixels; half as high, which must be 32 or a power of two above. A pixel is a third of a degree: visible
-    in mirrors, not on matt surfaces."""
+    """Width in pixels. The height is half of it and must be 32 times a power of two. A pixel is a third of a degree,
+    which is visible in mirrors but not on matt surfaces."""
     near: float = 0.02
-    """Splats nearer to the point than this share of the median distance are left out, up to twice that they fade in:
-    in front of the point one of them would cover a large part of the sphere."""
+    """Distance to the point, as a share of the median distance, below which splats are left out. They fade in up to
+    twice that distance. Such a splat would cover a large part of the sphere."""
     inside: float = 3.0
-    """Splats within this many standard deviations of the point are left out: a projection that is linear about their
-    centre would smear them across a whole face."""
+    """Distance to the point, in standard deviations of a splat, below which the splat is left out. A projection that is
+    linearised at its centre would smear it across a whole face."""
     wide: float = 0.3
-    """Splats whose largest standard deviation is more than this share of their distance, 17 degrees, are left out: they
-    reach over several faces, each of which would draw another shape of them."""
+    """Largest standard deviation of a splat, as a share of its distance (17 degrees), above which it is left out. It
+    would extend over several faces and have a different shape in each."""
     cone: float = 0.34
-    """Cosine of the largest angle between a face's axis and a splat that it shows, 70 degrees: of splats beyond, the
-    linear projection is no estimate, and their middles lie in other faces."""
+    """Cosine of the largest angle between a face's axis and a splat that it shows, 70 degrees. Splats at larger angles
+    have their centres in other faces, and the linearised projection is not valid for them."""
     cameras: int = 24
-    """Most of the clip's cameras that are asked which way a splat was seen from."""
+    """Largest number of the clip's cameras that are compared to choose the viewing direction of a splat's colour."""
 
 
 def make_light(
     shot: Shot, params: LightParams, report: Reporter, config: LightConfig | None = None
 ) -> dict[str, Any]:  # fmt: skip
-    """Renders a take's frozen scene from a point into a panorama, unless it is there.
+    """Renders a take's frozen scene from a point into a panorama, unless it already exists.
 
-    Equirectangular, scene-linear Rec.709, half floats, in the scene's axes as Blender's Environment Texture reads them.
-    Returns {take, key, light: file, position: [x, y, z], filled: share of the sphere that no splat covers, made: bool}.
-    JobError in words if it cannot be made; ValueError if the position or the placement is none.
+    The panorama is equirectangular, scene-linear Rec.709, half floats, in the scene's axes, as Blender's Environment
+    Texture reads it. Returns {take, key, light: file, position: [x, y, z], filled: share of the sphere that no splat
+    covers, made: bool}. JobError if it cannot be rendered; ValueError if position or placement are invalid.
     """
     config = config or LightConfig()
     point = np.array(point_of(params.position))
@@ -109,10 +109,10 @@ def _rendered(
     report: Reporter,
     config: LightConfig,
 ) -> LightFacts:
-    """Renders, fills and writes a panorama. JobError if nothing is seen from the point, or the disk is full."""
+    """Renders, fills and writes a panorama. JobError if no splat is visible from the point, or if the disk is full."""
     report.progress("making the light", 0, len(sphere.FACES) + 1, "reading splats")
     record, scene = read_json(folder.facts), load_scene(shot)
-    left = Similarity.of(placement_of(record))  # where the splats in the file stand
+    left = Similarity.of(placement_of(record))  # placement of the splats in the file
     change = Similarity.of(placement).after(left.inverse())
     cameras = left.points(camera_to_world(path_viewmats(load_cameras(shot)))[:, :3, 3])
     kept = cameras[evenly_spaced(len(cameras), config.cameras)]
@@ -143,7 +143,7 @@ def _rendered(
 
 @dataclass
 class SeenSplats:
-    """N splats about a point, which is the origin; the unit of length is their median distance."""
+    """N splats around a point, which is the origin; the unit of length is their median distance."""
 
     means: Tensor
     """[N, 3] float32."""
@@ -160,11 +160,11 @@ class SeenSplats:
 def seen_from(
     splats: PlyGaussians, point: NDArray[np.float64], cameras: NDArray[np.float64], config: LightConfig
 ) -> SeenSplats:
-    """Splats as they are seen from a point [3], in colours that the clip's cameras, at [C, 3], saw; all of one space.
+    """Splats relative to a point [3], with the colours seen by the clip's cameras at [C, 3]; all in one space.
 
-    View-dependent colours were learnt from where the cameras were. Of directions beyond they say nothing, and may be
-    anything. So each splat has the colour that it had for the camera whose direction is nearest to the point's.
-    Those that would smear are left out, see `LightConfig`. JobError without any.
+    View-dependent colours are only learnt for the directions of the clip's cameras and are arbitrary elsewhere. Each
+    splat therefore gets its colour for the camera whose viewing direction is nearest to the point's. Splats that would
+    smear are left out, see `LightConfig`. JobError if there are no splats around the point.
     """
     means = from_numpy(splats.means).double() - from_numpy(point)
     apart = norm(means, -1)
@@ -189,8 +189,10 @@ def seen_from(
 
 
 def _colors(sh: Tensor, means: Tensor, cameras: Tensor) -> Tensor:
-    """[N, 3] colours of harmonics [N, K, 3] at means [N, 3], for the camera of [C, 3] whose direction to the mean is
-    nearest to the origin's."""
+    """[N, 3] colours of harmonics [N, K, 3] at means [N, 3], for the nearest viewing direction of `cameras` [C, 3].
+
+    The nearest direction is the one with the smallest angle to the direction from the origin to the mean.
+    """
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
     wanted = means / norm(means, -1, keepdim=True)
     best, along = torch.full((len(means),), -2.0), wanted.clone()
@@ -204,7 +206,7 @@ def _colors(sh: Tensor, means: Tensor, cameras: Tensor) -> Tensor:
 
 
 def _exposed(shot: Shot, told: dict[str, Any], scene: Scene, colors: Tensor, report: Reporter) -> Tensor:
-    """Colours [N, 3] as the clip's camera exposed them at t*; as they are if the take's run is not there any more."""
+    """Colours [N, 3] with the exposure of the clip's camera at t*; unchanged if the take's run no longer exists."""
     try:
         run = load_run(shot, str(told.get("run", "")))
     except (JobError, ValueError):
@@ -219,7 +221,7 @@ def _exposed(shot: Shot, told: dict[str, Any], scene: Scene, colors: Tensor, rep
 
 
 def exposed_as(run: LoadedRun, scene: Scene, frame: float, colors: Tensor) -> Tensor:
-    """Display-referred colours [N, 3], exposed as the camera of a run did at a frame of the clip; 0 or above."""
+    """Display-referred colours [N, 3], not negative, with the camera's exposure at a frame of the clip."""
     exposure = run.model.exposure
     if not exposure.config.on:
         return colors
@@ -234,8 +236,10 @@ def exposed_as(run: LoadedRun, scene: Scene, frame: float, colors: Tensor) -> Te
 def render_panorama(
     splats: SeenSplats, turn: NDArray[np.float64], display: Display, config: LightConfig, report: Reporter
 ) -> NDArray[np.float32]:
-    """[width / 2, width, 4], splats as a panorama: scene-linear, premultiplied by coverage, in axes that `turn` [3, 3]
-    rotates the splats' axes to."""
+    """[width / 2, width, 4] panorama of splats, scene-linear, premultiplied by coverage.
+
+    `turn` [3, 3] rotates the splats' axes to those of the panorama.
+    """
     focal, side = sphere.face_camera(config.width)
     K = torch.tensor([[focal, 0.0, side / 2.0], [0.0, focal, side / 2.0], [0.0, 0.0, 1.0]])
     apart = norm(splats.means, -1)
@@ -268,6 +272,6 @@ def render_panorama(
 
 
 def write_panorama(path: Path, light: NDArray[np.float32]) -> Path:
-    """Writes a panorama [H, W, 3] of linear Rec.709 as half floats, whole or not at all. OSError if it cannot be."""
+    """Writes a panorama [H, W, 3] of linear Rec.709 as half floats, atomically. OSError if it cannot be written."""
     height, width = light.shape[:2]
     return write_exr(path, linear_spec(width, height, _CHANNELS, (oiio.HALF,) * 3), [light])

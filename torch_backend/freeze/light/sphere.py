@@ -1,7 +1,7 @@
-"""Pictures of all directions: equirectangular, as Blender's Environment Texture reads them, of faces and filled.
+"""Equirectangular panoramas, as Blender's Environment Texture reads them: resampled from cube faces, and filled.
 
-Column u and row v of a picture 1 wide and 1 high look along the longitude pi - 2 pi u, counted from +X over +Y, and the
-latitude pi / 2 - pi v: the middle looks along +X, the quarter from the left along +Y, the top along +Z.
+With u and v in 0..1 from the top left corner, a pixel looks along the longitude pi - 2 pi u, counted from +X towards
++Y, and the latitude pi / 2 - pi v. The centre looks along +X, the column at u = 1/4 along +Y, and the top along +Z.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 FACES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-"""Axes that the faces look along."""
+"""Viewing axes of the faces."""
 HALF_FACE = math.radians(50.0)
-"""Half the angle of a face: beyond 45 degrees neighbours overlap, and fade into each other."""
+"""Half the field of view of a face. Beyond 45 degrees, neighbouring faces overlap and are blended."""
 OVERSAMPLING = 2
-"""Pixels of the panorama that are looked up per pixel that leaves, in each direction."""
+"""Number of samples per pixel of the panorama, along each axis."""
 _COARSEST = 32
-"""Rows of the picture that the fill begins with, a row for every 6 degrees."""
+"""Rows of the coarsest level of the fill, one for every 6 degrees."""
 _SWEEPS = 24
-"""Relaxations of each size of the fill: what is left over has the wavelength of the next coarser size."""
+"""Number of relaxation sweeps per level of the fill. Coarser levels have already solved longer wavelengths."""
 
 
 def directions(width: int, height: int) -> NDArray[np.float32]:
-    """Unit vectors [height, width, 3] that the pixels of an equirectangular picture look along, z up."""
+    """Unit viewing directions [height, width, 3] of the pixels of an equirectangular picture, z up."""
     longitude = np.pi - 2.0 * np.pi * (np.arange(width) + 0.5) / width
     latitude = np.pi / 2.0 - np.pi * (np.arange(height) + 0.5) / height
     out = np.empty((height, width, 3), np.float32)
@@ -37,7 +37,7 @@ def directions(width: int, height: int) -> NDArray[np.float32]:
 
 
 def solid_angles(width: int, height: int) -> NDArray[np.float64]:
-    """[height, 1] share of the sphere that a pixel of each row has; `width` times their sum is 1."""
+    """[height, 1] share of the sphere covered by one pixel of each row; `width` times their sum is 1."""
     edges = np.sin(np.pi / 2.0 - np.pi * np.arange(height + 1) / height)
     return ((edges[:-1] - edges[1:]) / 2.0 / width)[:, None]
 
@@ -57,11 +57,11 @@ def face_camera(width: int) -> tuple[float, int]:
 
 
 def panorama(width: int, render: Callable[[NDArray[np.float64]], NDArray[np.float32]]) -> NDArray[np.float32]:
-    """[width / 2, width, 4] of six faces: linear colour, premultiplied, and coverage.
+    """[width / 2, width, 4] panorama from six faces: linear colour, premultiplied, and coverage.
 
     Args:
-        width: even, pixels.
-        render: world-to-camera rotation [3, 3] -> the face [side, side, 4] that `face_camera` says, of such colour.
+        width: width of the panorama in pixels, even.
+        render: world-to-camera rotation [3, 3] -> face [side, side, 4] for `face_camera`, linear and premultiplied.
     """
     fine = OVERSAMPLING * width
     focal, side = face_camera(width)
@@ -80,7 +80,7 @@ def panorama(width: int, render: Callable[[NDArray[np.float64]], NDArray[np.floa
 
 
 def _smaller(picture: NDArray[np.float32], rows: int) -> NDArray[np.float32]:
-    """[rows, 2 rows, C]: the means of a panorama's pixels."""
+    """[rows, 2 * rows, C] panorama, reduced in size by averaging."""
     return np.asarray(cv2.resize(picture, (2 * rows, rows), interpolation=cv2.INTER_AREA), np.float32)
 
 
@@ -91,13 +91,14 @@ def _fade(across: NDArray[np.float32], ahead: NDArray[np.float32]) -> NDArray[np
 
 
 def filled(picture: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
-    """(colour [H, W, 3], share of the sphere that was filled) of a panorama [H, W, 4], premultiplied by its coverage.
+    """(colour [H, W, 3], filled share of the sphere) of a panorama [H, W, 4] that is premultiplied by its coverage.
 
-    What is covered keeps its colour; the rest is a membrane between: each pixel is the mean of its neighbours on the
-    sphere. It is relaxed from coarse to fine; the coarsest is a mean of all that is covered, weighted by the fourth
-    power of the distance on the sphere, so that it knows no seam and no pole. W is 2 H, H 32 or a power of two above.
+    Covered pixels keep their colour. The others are filled by a membrane: each pixel is the mean of its neighbours on
+    the sphere. The membrane is relaxed from coarse to fine. The coarsest level starts from a mean of all covered
+    pixels, weighted by 1 / distance^4 on the sphere, so that there is no seam at the border or the poles. W is 2 H,
+    and H is 32 times a power of two.
 
-    ValueError if nothing is covered.
+    ValueError if no pixel is covered.
     """
     height, width = picture.shape[:2]
     alpha = np.clip(picture[..., 3:], 0.0, 1.0)
@@ -116,7 +117,7 @@ def filled(picture: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
 
 
 def _weighted(small: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[h, w, 3] of a coarse panorama [h, w, 4]: everywhere the mean of what is covered, near more than far."""
+    """[h, w, 3] mean colour of all covered pixels of a coarse panorama [h, w, 4], weighted by 1 / distance^4."""
     height, width = small.shape[:2]
     along = directions(width, height).reshape(-1, 3)
     areas = np.broadcast_to(solid_angles(width, height), (height, width)).reshape(-1, 1)
@@ -127,19 +128,19 @@ def _weighted(small: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _twice(color: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A panorama [h, w, 3] at twice the size, bilinear, round the back."""
+    """A panorama [h, w, 3] at twice the size, bilinear, wrapped around horizontally."""
     around = np.concatenate([color[:, -1:], color, color[:, :1]], axis=1)
     large = cv2.resize(around, (2 * around.shape[1], 2 * len(around)), interpolation=cv2.INTER_LINEAR)
     return np.asarray(large[:, 2:-2], np.float32)
 
 
 def _relaxed(small: NDArray[np.float32], start: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[h, w, 3]: `start` relaxed towards the membrane that a panorama [h, w, 4] holds by its coverage."""
+    """[h, w, 3]: `start` relaxed towards the membrane whose boundary is the covered part of a panorama [h, w, 4]."""
     height = len(small)
     alpha = np.clip(small[..., 3:], 0.0, 1.0)
     held = np.where(alpha > 1e-4, small[..., :3], 0.0)
     loose = np.where(alpha > 1e-4, 1.0 - alpha, 1.0)
-    # The Laplacian of the sphere on even steps of both angles: circles of latitude shrink towards the poles.
+    # Laplacian of the sphere on a regular grid of latitude and longitude: circles of latitude shrink towards the poles.
     edges = np.cos(np.pi / 2.0 - np.pi * np.arange(height + 1) / height)[:, None, None]
     middles = np.cos(np.pi / 2.0 - np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
     up, down, aside = edges[:-1] * middles, edges[1:] * middles, np.ones_like(middles)

@@ -1,1 +1,1 @@
-"""Mattes of a take: one lasso at one frame becomes a matte at every pose, and a Cryptomatte of all of them."""
+"""Mattes of a take: turns a lasso at one frame into a matte at every pose, and writes a Cryptomatte of all mattes."""

@@ -1,4 +1,4 @@
-"""Carries mattes from the frames where things were lassoed to all frames of a take."""
+"""Propagates mattes from the lassoed frames to all frames of a take."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from .membership import membership, render_members, rule_out, vote
 from .segment import Matte, Picture, SegmentConfig, refine, segment_lasso
 
 VOTE_WIDTH = 320
-"""Pixels of the pictures on which mattes vote: a vote costs as much as a step of training of that width."""
+"""Width in pixels of the pictures on which mattes vote: a vote costs as much as a training step at that width."""
 
 
 @dataclass
 class TakeFrame:
-    """A frozen frame as mattes need it. Arrays have the frame's size with its overscan."""
+    """A frozen frame for which mattes are made. Arrays include the overscan."""
 
     number: int
     """Frame number of the clip."""
     picture: Picture
-    """[H, W, 3] as displayed."""
+    """[H, W, 3] sRGB picture."""
     depth: NDArray[np.float32]
     """[H, W] along the camera's axis, scene units."""
     viewmat: Tensor
@@ -37,7 +37,7 @@ class TakeFrame:
     beyond: tuple[int, int]
     """Pixels of overscan left and right, and above and below."""
     t_star: float
-    """Frame number at which time stands still."""
+    """Frame number of the frozen instant."""
 
 
 Polygons = Mapping[str, Mapping[int, Sequence[NDArray[np.float64]]]]
@@ -45,7 +45,7 @@ Polygons = Mapping[str, Mapping[int, Sequence[NDArray[np.float64]]]]
 
 
 def in_order(polygons: Polygons, frames: Iterable[int]) -> list[int]:
-    """`frames` by their distance from the nearest one with a lasso."""
+    """`frames` sorted by their distance to the nearest lassoed frame."""
     lassoed = sorted({frame for of in polygons.values() for frame in of})
     return sorted(frames, key=lambda n: (min((abs(n - at) for at in lassoed), default=0), n))
 
@@ -56,8 +56,8 @@ def carry(
 ) -> Iterator[tuple[TakeFrame, dict[str, Matte]]]:  # fmt: skip
     """Yields frames of a take, `in_order`, each with a matte [H, W] for every name.
 
-    Every frame's mattes vote, too: so what a lassoed frame does not show of a thing is found as the camera comes to
-    see it. KeyError if `read` does not know the frame of a polygon.
+    The mattes of every frame vote, too, so that parts of an object hidden in the lassoed frame are found once the
+    camera shows them. KeyError if `read` does not know the frame of a polygon.
     """
     order = in_order(polygons, frames)
     lassoed = [number for number in order if any(number in of for of in polygons.values())]
@@ -87,20 +87,20 @@ def carry(
 
 
 def _refined(votes: Tensor, frozen: FrozenGaussians, frame: TakeFrame, config: SegmentConfig | None) -> Matte:
-    """The matte [H, W] of what votes [N, 2] are about, at a frame."""
+    """The matte [H, W] at a frame of the object with votes [N, 2]."""
     height, width = frame.depth.shape
     shown = render_members(frozen, membership(votes), frame.viewmat, frame.K, width, height, frame.beyond)
     return refine(frame.picture, frame.depth, shown[..., 0].numpy(), shown[..., 1].numpy(), config)
 
 
 def _add(votes: dict[str, Tensor], told: Mapping[str, Tensor]) -> None:
-    """Adds votes to the previous ones."""
+    """Adds the votes `told` to `votes` in place."""
     for name, more in told.items():
         votes[name] = votes[name] + more if name in votes else more
 
 
 def _votes_of(mattes: Mapping[str, Matte], frame: TakeFrame, frozen: FrozenGaussians) -> dict[str, Tensor]:
-    """Name -> votes [N, 2] of a frame's matte: pixels of each Gaussian within it, and all pixels of it."""
+    """Name -> votes [N, 2] of a frame's matte: pixels of each Gaussian inside the matte, and all its pixels."""
     if not mattes:
         return {}
     height, width = frame.depth.shape

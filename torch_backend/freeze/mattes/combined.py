@@ -1,8 +1,9 @@
-"""One picture of several instants: things under a matte come from another take, or go on living as the plate has them.
+"""Combines several instants in one take: objects under a matte come from a source take, or from the live plate.
 
-Where a thing stands in either take, the picture is the other take's: it stands as that instant has it, and what it
-hid at the base's instant is seen. Around things both takes show the same pixels, because nothing moves there, so the
-border may run a few pixels away from the thing.
+Wherever an object is in the base take or in its source take, the pixels of the source take are used. The object is then
+shown at the source take's instant, and the background that it hid at the base's instant is visible. Around objects,
+both takes have the same pixels, because nothing moves there. The border may therefore be a few pixels away from the
+object.
 """
 
 from __future__ import annotations
@@ -37,29 +38,29 @@ from ..take.video import write_video
 from .files import is_current, matte_file, read_matte
 
 VERSION = 4
-"""Rises when pictures combined before are not to be used any more."""
+"""Version of combined frames. Raise it when older ones must not be used any more."""
 GROW = 4.0
-"""Pixels of pictures 640 wide by which a matte grows: its edge is soft, and hair reaches beyond it."""
+"""Radius by which a matte is dilated, in pixels at width 640: its edge is soft, and hair extends beyond it."""
 FAR = 2.0
-"""Largest ratio of depths up to which a moving pixel belongs to a frozen thing."""
+"""Ratio of depths up to which a moving pixel can belong to a frozen object."""
 
 Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Source:
-    """A finished take that gives pixels."""
+    """A finished take whose pixels are used."""
 
     name: str
-    """Its name."""
+    """Name of the take."""
     folder: TakeFolder
-    """Its folder."""
+    """Folder of the take."""
     facts: dict[str, Any]
-    """take.json."""
+    """Content of take.json."""
     matte_keys: dict[str, str]
     """Name of a finished matte -> key of its files."""
     matte_format: str
-    """Suffix of its single mattes."""
+    """Suffix of the take's single mattes."""
 
     @property
     def margin(self) -> tuple[int, int]:
@@ -68,7 +69,7 @@ class Source:
         return int(across), int(down)
 
     def matte(self, name: str, frame: int) -> Array:
-        """[H, W] in 0..1, with overscan. JobError if the file is missing or was made from something else."""
+        """Matte [H, W] in 0..1, with overscan. JobError if the file is missing or its key differs."""
         path = matte_file(self.folder, name, frame, self.matte_format)
         if not is_current(path, self.matte_keys[name]):
             raise JobError(
@@ -77,9 +78,9 @@ class Source:
         return read_matte(path, self.margin)
 
     def shows(self, name: str, number: int, frame: FrozenFrame, is_live: bool) -> Array:
-        """[3, H, W] in 0..1 of this take's frame `number`: a thing's matte, those of all others, and what moves.
+        """[3, H, W] in 0..1 of this take's frame `number`: an object's matte, the union of all others, and motion.
 
-        Nothing that lies `FAR` behind a standing thing moves with it, such as sky that the search took for moving.
+        For a frozen object, motion farther than `FAR` times its depth is set to 0, such as sky in the motion mattes.
         """
         matte, motion = self.matte(name, number), frame.motion
         others = [self.matte(other, number) for other in self.matte_keys if other != name]
@@ -89,9 +90,9 @@ class Source:
 
 
 def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, Any]:
-    """Writes a take whose things come from the takes that `params` name. Returns its take.json.
+    """Writes a take whose objects come from the takes that `params` name. Returns the content of its take.json.
 
-    JobError in words if it cannot be done. What is there already, made of the same, stays.
+    Frames with the same inputs that already exist are kept. JobError if the takes cannot be combined.
     """
     things = things_of(params.things)
     base = _opened(shot, params.base)
@@ -108,7 +109,7 @@ def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, An
     pixels = int(base.facts["width"]) * int(base.facts["height"])
     need_disk(folder.root, len(frames) * pixels * 50.0, "the take")
     try:
-        remove_file(folder.facts)  # until all frames are there it is no take
+        remove_file(folder.facts)  # marks the take as unfinished until all frames exist
         for done, number in enumerate(frames):
             report.progress("combining takes", done, len(frames), f"frame {number}")
             report.check_cancelled()
@@ -119,7 +120,10 @@ def combine(shot: Shot, params: CombineParams, report: Reporter) -> dict[str, An
 
 
 def things_of(text: str) -> dict[str, str]:
-    """Matte -> take that its thing comes from, of "MATTE=TAKE, ...". JobError on what is none."""
+    """Name of a matte -> name of the take that its object comes from, parsed from "MATTE=TAKE, ...".
+
+    JobError if the text is malformed.
+    """
     found: dict[str, str] = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
         matte, is_pair, take = (word.strip() for word in part.partition("="))
@@ -134,7 +138,7 @@ def things_of(text: str) -> dict[str, str]:
 
 
 def combined(base: FrozenFrame, other: FrozenFrame, mask: Array) -> FrozenFrame:
-    """`other` where `mask` [H, W] is 1, `base` where it is 0. Numbers such as depth are either the one or the other."""
+    """`other` where `mask` [H, W] is 1, `base` where it is 0. Depth, `source` and `more` are chosen, not blended."""
     is_other = mask > 0.5
 
     def mixed(a: object, b: object) -> Array:
@@ -165,17 +169,18 @@ def combined(base: FrozenFrame, other: FrozenFrame, mask: Array) -> FrozenFrame:
 
 
 def grown(matte: Array, width: int) -> Array:
-    """A matte [H, W] with a soft border `GROW` pixels of a picture 640 wide further out."""
+    """A matte [H, W] dilated by `GROW` pixels at width 640, with a soft border."""
     reach = max(1, round(GROW * width / 640))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return np.asarray(cv2.GaussianBlur(cv2.dilate(matte, kernel), (0, 0), 0.5 * reach), np.float32)
 
 
 def with_motion(matte: Array, others: Array, motion: Array) -> Array:
-    """A matte [H, W] with all that moves (`motion` [H, W]) and touches it: a hand that the matte missed, or where the
-    thing is while it lives. Moving pixels nearer to `others` [H, W], the mattes of all other things, are left to them.
+    """A matte [H, W] extended by the moving regions that touch it.
 
-    `motion` is the layer of a frozen frame: what moves at t* or in the frame's own plate.
+    Such a region is a hand that the matte missed, or the object at its place in the live plate. `motion` [H, W] is the
+    layer of a frozen frame: pixels that move at t* or in the frame's own plate. Moving pixels nearer to `others`
+    [H, W], the union of all other mattes, are left out.
     """
     in_thing, in_others = matte > 0.5, (others > 0.5) & (others > matte)
     joined = in_thing | (motion > 0.5)
@@ -187,12 +192,12 @@ def with_motion(matte: Array, others: Array, motion: Array) -> Array:
 
 
 def _distance(mask: NDArray[np.bool_]) -> Array:
-    """[H, W] pixels to the nearest one of a mask."""
+    """[H, W] distance in pixels to the nearest pixel of a mask."""
     return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
 def _opened(shot: Shot, name: str) -> Source:
-    """A finished take. JobError if there is none."""
+    """A finished take. JobError if it does not exist."""
     folder = TakeFolder(shot.own(shot.take(checked_name(name, "take"))))
     if not folder.facts.is_file():
         raise JobError(f"{shot.root.name} has no finished take {name!r}.", "Freeze it first.", ExitCode.FREEZE)
@@ -205,7 +210,7 @@ def _opened(shot: Shot, name: str) -> Source:
 
 
 def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source | None]) -> list[int]:
-    """The frames that can be combined. JobError if takes do not fit each other, or lack a matte."""
+    """The frames that can be combined. JobError if the takes are incompatible, or if a matte is missing."""
     frames = set(frames_of(base.folder))
     for matte, take in things.items():
         source = sources[take]
@@ -221,7 +226,7 @@ def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source
                     "clip's own shows the plate.", "Use a take from the clip's own poses.", ExitCode.FREEZE,
                 )  # fmt: skip
             continue
-        placed = ("placement",) if base.facts.get("passes") else ()  # in which the layer Position is
+        placed = ("placement",) if base.facts.get("passes") else ()  # the layer Position depends on it
         for name in ("width", "height", "margin", "camera_path", "shutter", *placed):
             if (source.facts.get(name) or 0) != (base.facts.get(name) or 0):
                 raise JobError(
@@ -235,7 +240,7 @@ def _check(base: Source, things: Mapping[str, str], sources: Mapping[str, Source
 
 
 def _refuse_frozen(folder: TakeFolder, params: CombineParams) -> None:
-    """JobError if the result would take the place of frozen frames."""
+    """Raises JobError if the result would overwrite frozen frames."""
     if params.take in (params.base, *things_of(params.things).values()) or (
         folder.facts.is_file() and "combined" not in read_json(folder.facts)
     ):
@@ -249,7 +254,7 @@ def _write_frame(
     folder: TakeFolder, number: int, base: Source, things: Mapping[str, str], sources: Mapping[str, Source | None],
     live: Plates | None,
 ) -> None:  # fmt: skip
-    """Writes a frame and its preview, unless they are there, made of the same."""
+    """Writes a frame and its preview, unless files with the same key exist."""
     key = content_key(
         VERSION, GROW, read_key(base.folder.frame(number)), None if live is None else live.key,
         [[matte, take, base.matte_keys, *_keys(sources[take], number)] for matte, take in things.items()],
@@ -266,7 +271,7 @@ def _write_frame(
         if source is None:
             assert live is not None
             whole, mask = grown(with_motion(*shows), width), np.zeros_like(frame.depth)
-            mask[inner] = whole[inner]  # the plate ends where the frame does
+            mask[inner] = whole[inner]  # the plate does not cover the overscan
             other = _living_frame(frame, live, number, inner)
             picture = np.asarray(live.display(number).clamp(0.0, 1.0).numpy() * 255.0, np.float32)
         else:
@@ -284,12 +289,12 @@ def _write_frame(
 
 
 def _keys(source: Source | None, number: int) -> list[Any]:
-    """What a thing's pixels come from: frame and mattes of another take; nothing more for the plate."""
+    """Inputs of an object's pixels for the key: frame and mattes of its take; empty for the live plate."""
     return [] if source is None else [read_key(source.folder.frame(number)), source.matte_keys]
 
 
 def _living_frame(base: FrozenFrame, plates: Plates, number: int, inner: tuple[slice, slice]) -> FrozenFrame:
-    """A frame of the plate, with the depth of the frozen scene: the depth of a thing that goes on living is unknown."""
+    """A frame of the live plate. It has the depth of the frozen scene, because that of a moving object is unknown."""
     rgba = np.zeros_like(base.rgba)
     rgba[inner] = np.concatenate(
         [plates.linear(number).numpy(), np.ones((*base.depth[inner].shape, 1), np.float32)], axis=2
@@ -305,7 +310,7 @@ def _living_frame(base: FrozenFrame, plates: Plates, number: int, inner: tuple[s
 def _finish(
     shot: Shot, params: CombineParams, folder: TakeFolder, base: Source, frames: list[int], report: Reporter
 ) -> dict[str, Any]:  # fmt: skip
-    """Contact sheet, video and take.json; earlier frames that are none of this take go."""
+    """Writes contact sheet, video and take.json, and removes frames that do not belong to the take."""
     for number in frames_of(folder):
         if number not in frames:
             for old in (folder.frame(number), folder.preview(number)):

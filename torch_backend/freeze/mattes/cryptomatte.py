@@ -1,9 +1,9 @@
-"""Cryptomatte: all mattes of a frame in one file, from which compositors pick by name.
+"""Writes a Cryptomatte: all mattes of a frame in one file, from which compositors select by name.
 
 Cryptomatte specification 1.2.0 (Friedman, Jones: "Fully automatic ID mattes with support for motion blur and
-transparency", SIGGRAPH 2015 posters; https://github.com/Psyop/Cryptomatte). A matte is known by the MurmurHash3 of its
-name, read as a float. Each pixel holds pairs of such an identifier and of the share of the pixel that is the matte's,
-the largest share first; two pairs are a layer of R G B A. The header's manifest says which name is which identifier.
+transparency", SIGGRAPH 2015 posters; https://github.com/Psyop/Cryptomatte). The identifier of a matte is the
+MurmurHash3 of its name, stored as a float. Each pixel holds (identifier, share) pairs, the largest share first. Two
+pairs form a layer of R G B A. The header's manifest maps names to identifiers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..exr import Made, linear_spec, set_margin, write_exr
 
 LAYERS = layers_of(CRYPTOMATTE)
 PAIRS = 2 * len(LAYERS)
-"""Mattes that a pixel can belong to; of more, those with the smallest shares are left out."""
+"""Largest number of mattes per pixel; beyond it, the mattes with the smallest shares are dropped."""
 _MASK = 0xFFFFFFFF
 
 
@@ -35,7 +35,7 @@ def murmur3(data: bytes, seed: int = 0) -> int:
         block = block * 0xCC9E2D51 & _MASK
         block = _turned(block, 15) * 0x1B873593 & _MASK
         hashed ^= block
-        if n < whole // 4:  # MurmurHash3 mixes a tail of fewer than four bytes in without this step
+        if n < whole // 4:  # MurmurHash3 omits this step for a tail of fewer than four bytes
             hashed = (_turned(hashed, 13) * 5 + 0xE6546B64) & _MASK
     hashed ^= len(data)
     hashed = (hashed ^ hashed >> 16) * 0x85EBCA6B & _MASK
@@ -44,31 +44,31 @@ def murmur3(data: bytes, seed: int = 0) -> int:
 
 
 def _turned(value: int, by: int) -> int:
-    """A word of 32 bits, rotated to the left."""
+    """A 32-bit word rotated left by `by` bits."""
     return (value << by | value >> 32 - by) & _MASK
 
 
 def identifier(name: str) -> int:
-    """Bits of the float by which a Cryptomatte knows a name: its hash, where that is neither infinite, NaN nor
-    denormal."""
+    """32-bit Cryptomatte identifier of a name: its hash, changed if the float would be infinite, NaN or denormal."""
     hashed = murmur3(name.encode())
     return hashed ^ 1 << 23 if hashed >> 23 & 255 in (0, 255) else hashed
 
 
 def as_float(bits: int) -> np.float32:
-    """The float of 32 bits."""
+    """The float32 with the given 32 bits."""
     return np.uint32(bits).view(np.float32)
 
 
 def manifest(names: Sequence[str]) -> str:
-    """JSON: name -> identifier as eight hexadecimal digits."""
+    """JSON object: name -> identifier as eight hexadecimal digits."""
     return json.dumps({name: f"{identifier(name):08x}" for name in names}, ensure_ascii=False, separators=(",", ":"))
 
 
 def ranked(mattes: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-    """[H, W, 2 * PAIRS]: identifier and share of the mattes of each pixel, the largest share first; 0 where none is.
+    """[H, W, 2 * PAIRS]: (identifier, share) pairs of each pixel's mattes, the largest share first, then 0.
 
-    Shares of a pixel that sum to more than 1 are scaled to sum to 1. ValueError without mattes, or of unlike sizes.
+    Shares of a pixel that sum to more than 1 are scaled to sum to 1. ValueError if there are no mattes, or if their
+    sizes differ.
     """
     identifiers = np.array([as_float(identifier(name)) for name in mattes], np.float32)
     shares = np.stack([np.clip(matte, 0.0, 1.0) for matte in mattes.values()], axis=-1).astype(np.float32)
@@ -84,9 +84,9 @@ def ranked(mattes: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
 def write_cryptomatte(
     path: str | Path, mattes: Mapping[str, NDArray[np.float32]], margin: tuple[int, int] = (0, 0), key: str = ""
 ) -> Path:
-    """Writes mattes [H, W] in 0..1 of a frame as a Cryptomatte, whole or not at all: float32, ZIP.
+    """Writes mattes [H, W] in 0..1 of a frame as a Cryptomatte, atomically: float32, ZIP.
 
-    `margin`: pixels of the arrays beyond the frame, as `write_frozen_exr`. OSError if the file cannot be written.
+    `margin`: pixels of overscan in the arrays, as in `write_frozen_exr`. OSError if the file cannot be written.
     """
     shape = next(iter(mattes.values())).shape
     names = tuple(channel for layer in LAYERS for channel in layer.channels)

@@ -1,4 +1,4 @@
-"""Files of mattes: single ones as EXR or 16-bit PNG, known by the key of what they were made from."""
+"""Reads and writes single mattes as EXR or 16-bit PNG, with a key of their inputs."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from ..exr import linear_spec, read_key, set_margin, write_exr
 
 
 def matte_file(folder: TakeFolder, name: str, frame: int, suffix: str) -> Path:
-    """Where a frame of a matte lies; `suffix` is one of `MATTE_FORMATS`."""
+    """Path of one frame of a matte; `suffix` is one of `MATTE_FORMATS`."""
     return folder.matte_frames(name) / frame_file(frame, f".{suffix}")
 
 
 def write_matte(path: Path, matte: NDArray[np.float32], margin: tuple[int, int], key: str) -> None:
-    """Writes a matte [H, W] in 0..1, whole or not at all.
+    """Writes a matte [H, W] in 0..1, atomically.
 
-    R, G and B of an EXR (half) or a PNG (16 bits, linear) are the matte: every program shows that as a picture. A PNG
-    has no overscan: `margin` pixels, left and right, and above and below, are cut off. OSError if it cannot be written.
+    R, G and B of an EXR (half) or a PNG (16 bits, linear) all hold the matte, so that every program shows it as a
+    picture. A PNG has no overscan: `margin` pixels (left and right, above and below) are cropped. OSError if the file
+    cannot be written.
     """
     three = np.repeat(matte[..., None], 3, axis=2)
     if path.suffix == ".png":
@@ -38,7 +39,7 @@ def write_matte(path: Path, matte: NDArray[np.float32], margin: tuple[int, int],
 
 
 def read_matte(path: Path, margin: tuple[int, int]) -> NDArray[np.float32]:
-    """[H, W] in 0..1 of a file of `write_matte`, with its overscan. ValueError if it cannot be read."""
+    """Matte [H, W] in 0..1 from a file of `write_matte`, with overscan. ValueError if the file cannot be read."""
     buffer = oiio.ImageBuf(regular_file(path))
     pixels = None if buffer.has_error else buffer.get_pixels(oiio.FLOAT)
     if pixels is None or buffer.has_error:
@@ -49,10 +50,10 @@ def read_matte(path: Path, margin: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def is_current(path: Path, key: str) -> bool:
-    """True if a file is whole and was made from what `key` identifies."""
+    """True if a file is complete and stores `key`."""
     return is_whole_picture(path) and read_key(path) == key
 
 
 def suffixes_beside(suffix: str) -> list[str]:
-    """The other formats of single mattes."""
+    """The formats in `MATTE_FORMATS` other than `suffix`."""
     return [other for other in MATTE_FORMATS if other != suffix]

@@ -1,4 +1,4 @@
-"""The job that makes the mattes of a take: lassos in, single sequences and a Cryptomatte out."""
+"""The matte job: renders the mattes of a take from lassos, as single sequences and a Cryptomatte."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ from .lassos import Lasso, json_list, lasso_of, read_lassos
 from .segment import Matte, SegmentConfig
 
 MATTES_VERSION = 1
-"""Of mattes.json."""
+"""Version of mattes.json."""
 _METHOD = 3
-"""Rises when mattes made before are not to be used any more; their lassos stay."""
+"""Version of mattes. Raise it when older ones must not be used any more; their lassos are kept."""
 
 
 @dataclass(frozen=True)
 class _Take:
-    """A finished take, as mattes need it."""
+    """A finished take for which mattes are made."""
 
     folder: TakeFolder
     facts: dict[str, Any]
-    """take.json."""
+    """Content of take.json."""
     frames: list[int]
-    """Numbers of its frames, ascending."""
+    """Numbers of the take's frames, ascending."""
 
     @property
     def margin(self) -> tuple[int, int]:
@@ -61,10 +61,10 @@ class _Take:
 
 
 def make_mattes(shot: Shot, params: MatteParams, report: Reporter) -> dict[str, Any]:
-    """Makes the mattes of a take that are missing or stale, and their Cryptomatte.
+    """Makes the missing and outdated mattes of a take, and their Cryptomatte.
 
-    Returns {take, mattes: name -> folder, cryptomatte: folder, frames, seconds of the first matte}. JobError in words
-    if it cannot be done.
+    Returns {take, frames: number of frames, mattes: name -> folder, made: names of the mattes that were made,
+    cryptomatte: folder}. JobError if the mattes cannot be made.
     """
     take = _opened(shot, params.take)
     lassos = _lassos(take, params)
@@ -89,7 +89,7 @@ def make_mattes(shot: Shot, params: MatteParams, report: Reporter) -> dict[str, 
         "mattes": [lasso.to_json() for lasso in lassos],
     }
     try:
-        write_json(take.folder.mattes_record, record)  # a job that is cancelled loses no lasso
+        write_json(take.folder.mattes_record, record)  # a cancelled job must not lose lassos
         _write(shot, take, params, wanted, stale, keys, report)
         _sweep(take, params, wanted)
         write_json(take.folder.mattes_record, {**record, "finished": True})
@@ -105,7 +105,7 @@ def make_mattes(shot: Shot, params: MatteParams, report: Reporter) -> dict[str, 
 
 
 def stored_lassos(folder: TakeFolder, width: int, height: int) -> list[Lasso]:
-    """The lassos that a take's mattes were made of; none if it has no mattes. JobError if their record is damaged."""
+    """The lassos of a take's mattes; empty if it has no mattes. JobError if their record is damaged."""
     if not folder.mattes_record.is_file():
         return []
     record = read_json(folder.mattes_record)
@@ -115,14 +115,14 @@ def stored_lassos(folder: TakeFolder, width: int, height: int) -> list[Lasso]:
 
 
 def _opened(shot: Shot, name: str) -> _Take:
-    """A take that is there. JobError if it is not."""
+    """A finished take. JobError if it does not exist, is damaged, or is combined from others."""
     folder = TakeFolder(shot.own(shot.take(name)))
     if not folder.facts.is_file():
         raise JobError(f"{shot.root.name} has no finished take {name!r}.", "Freeze it first.", ExitCode.FREEZE)
     facts = read_json(folder.facts)
     if not all(name in facts for name in ("run", "checkpoint", "width", "height", "query")):
         raise JobError(f"{folder.facts} is damaged.", "Freeze the take again.", ExitCode.FREEZE)
-    if "combined" in facts:  # a matte is carried by the frozen scene of one instant
+    if "combined" in facts:  # mattes are propagated by the frozen scene of a single instant
         raise JobError(
             f"The take {name} is combined from others: its mattes would be those of one instant alone.",
             "Make the mattes in the takes that it was combined from.", ExitCode.USAGE,
@@ -131,7 +131,7 @@ def _opened(shot: Shot, name: str) -> _Take:
 
 
 def _lassos(take: _Take, params: MatteParams) -> list[Lasso]:
-    """The lassos of before and those of the file, which take the place of those of the same name."""
+    """The stored lassos and those of the file; the file's lassos replace stored ones of the same name."""
     size = int(take.facts["width"]), int(take.facts["height"])
     lassos = stored_lassos(take.folder, *size)
     if params.remove:
@@ -170,8 +170,7 @@ def _lassos(take: _Take, params: MatteParams) -> list[Lasso]:
 
 
 def _keys(take: _Take, wanted: Mapping[str, list[Lasso]]) -> dict[str, str]:
-    """Name -> what identifies all that its matte is made from. Evidence goes from frame to frame, so every frame
-    counts."""
+    """Name -> key of the matte's inputs. All frames are included, because every frame votes on the matte."""
     shown = [[n, read_key(take.folder.frame(n))] for n in take.frames]
     how = dataclasses.asdict(SegmentConfig())
     return {
@@ -183,7 +182,7 @@ def _write(
     shot: Shot, take: _Take, params: MatteParams, wanted: Mapping[str, list[Lasso]], stale: Mapping[str, list[Lasso]],
     keys: Mapping[str, str], report: Reporter,
 ) -> None:  # fmt: skip
-    """Writes the mattes that are stale, and the Cryptomattes that hold one of them or a removed one."""
+    """Writes the outdated mattes, and the Cryptomattes that contain one of these or a removed matte."""
     if not wanted:
         return
     whole = content_key(_METHOD, {name: keys[name] for name in wanted})
@@ -208,7 +207,7 @@ def _write(
 def _carried(
     shot: Shot, take: _Take, params: MatteParams, stale: Mapping[str, list[Lasso]], report: Reporter
 ) -> Iterator[tuple[int, dict[str, Matte]]]:
-    """Frames with their mattes, the lassoed ones first."""
+    """Yields (frame number, mattes by name), starting with the lassoed frames."""
     run = load_run(shot, str(take.facts["run"]), choose_device(params.device, report, "Making mattes"))
     if run.stamp != take.facts["checkpoint"]:
         raise JobError(
@@ -226,7 +225,7 @@ def _carried(
 
     def read(number: int) -> TakeFrame:
         if number not in held:
-            held.clear()  # a frame with a lasso is requested twice in a row if it is the only one
+            held.clear()  # one frame is enough: a single lassoed frame is requested twice in a row
             held[number] = read_take_frame(take.folder, number, scene)
         return held[number]
 
@@ -238,7 +237,7 @@ def _carried(
 
 
 def read_take_frame(folder: TakeFolder, number: int, scene: Scene) -> TakeFrame:
-    """A frame of a take, from its EXR. ValueError if that cannot be read."""
+    """A frame of a take, from its EXR. ValueError if the EXR cannot be read."""
     frame = read_frozen_exr(folder.frame(number))
     viewmat = scene.from_solve(frame.metadata.viewmat.astype(np.float64)[None])[0]
     K = from_numpy(frame.metadata.K.copy())
@@ -250,7 +249,7 @@ def read_take_frame(folder: TakeFolder, number: int, scene: Scene) -> TakeFrame:
 
 
 def _sweep(take: _Take, params: MatteParams, wanted: Mapping[str, list[Lasso]]) -> None:
-    """Removes single mattes of other names and formats, and frames that the take has no more."""
+    """Removes single mattes of other names and formats, and mattes of frames that are not in the take."""
     keep = set(take.frames)
     with contextlib.suppress(FileNotFoundError):
         for old in [*take.folder.single_mattes.iterdir()]:
@@ -267,5 +266,5 @@ def _sweep(take: _Take, params: MatteParams, wanted: Mapping[str, list[Lasso]]) 
 
 
 def _is_of(file: Path, frames: set[int]) -> bool:
-    """True if a file is that of one of the frames."""
+    """True if a file belongs to one of the frames."""
     return frame_number(file.stem) in frames

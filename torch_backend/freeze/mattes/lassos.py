@@ -1,9 +1,9 @@
-"""Lassos: polygons that somebody drew around a thing at a frame of a take, as files hold them.
+"""Reads lassos, the polygons drawn around an object at a frame of a take, from JSON files.
 
     {"mattes": [{"name": "left man", "frame": 30, "polygon": [[75, 200], [95, 188], ...]}, ...]}
 
-Coordinates are pixels of the frozen frame without its overscan, from the top left corner. With "width" and "height" in
-the object of a lasso they are pixels of a picture of that size, and are scaled. A single lasso may be the whole file.
+Coordinates are pixels of the frozen frame without its overscan, from the top left corner. If a lasso has "width" and
+"height", its coordinates are pixels of a picture of that size and are scaled. A file may also be a single lasso.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from ...contract import ExitCode, JobError, checked_name, read_json
 from ...contract.files import is_json_object
 
 MOST_CORNERS = 100_000
-"""Corners of a polygon; somebody's hand draws some hundreds."""
+"""Largest number of corners of a polygon; a polygon drawn by hand has some hundreds."""
 
 
 @dataclass(frozen=True)
 class Lasso:
-    """A polygon around a thing."""
+    """A polygon around an object."""
 
     name: str
-    """What the matte is called."""
+    """Name of the matte."""
     frame: int
-    """Frame of the take at which it was drawn."""
+    """Frame number of the take at which the polygon was drawn."""
     polygon: tuple[tuple[float, float], ...]
     """Corners, in pixels of the frozen frame without its overscan."""
 
     def corners(self) -> NDArray[np.float64]:
-        """[P, 2] pixels."""
+        """Corners [P, 2] in pixels."""
         return np.array(self.polygon, np.float64)
 
     def to_json(self) -> dict[str, Any]:
-        """As `read_lassos` reads it."""
+        """JSON object of the lasso, in the format of `read_lassos`."""
         return {"name": self.name, "frame": self.frame, "polygon": [list(corner) for corner in self.polygon]}
 
 
 def read_lassos(path: str | Path, width: int, height: int) -> list[Lasso]:
-    """The lassos of a file for a take of this size.
+    """The lassos of a file, for a take with frames of `width` x `height` pixels.
 
-    JobError names the file, the lasso and what is wrong with it.
+    JobError names the file, the lasso and its error.
     """
     try:
         data = read_json(path)
@@ -62,7 +62,7 @@ _FORM = 'Write {"mattes": [{"name": "a name", "frame": 1, "polygon": [[x, y], [x
 
 
 def lasso_of(row: object, what: str, width: int, height: int) -> Lasso:
-    """One lasso from JSON; JobError, which calls it `what`."""
+    """One lasso from JSON. JobError if it is invalid; `what` is its name in the message."""
     if not is_json_object(row):
         raise JobError(f"{what} is no JSON object.", _FORM, ExitCode.USAGE)
     name, frame, polygon = row.get("name"), row.get("frame"), row.get("polygon")
@@ -85,7 +85,7 @@ def lasso_of(row: object, what: str, width: int, height: int) -> Lasso:
 
 
 def json_list(value: object) -> list[Any]:
-    """What was read from JSON if it is a list, else an empty one."""
+    """`value`, read from JSON, if it is a list, else an empty list."""
     return cast(list[Any], value) if isinstance(value, list) else []
 
 
@@ -94,6 +94,6 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 
 def _scale(row: Mapping[str, Any], name: str, size: int) -> float:
-    """Pixels of the take's frames per pixel of the picture that a lasso was drawn on."""
+    """Pixels of the take's frames per pixel of the picture on which a lasso was drawn."""
     value = row.get(name)
     return size / value if _is_number(value) and value > 0 else 1.0

@@ -1,4 +1,4 @@
-"""Which Gaussians a matte is of: mattes at some frames vote, and the vote is rendered at every pose."""
+"""Membership of Gaussians in a matte's object: mattes at some frames vote, and the votes are rendered at every pose."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from ..frozen import FrozenGaussians
 from ..views.reproject import inside, look_up, project
 
 SEEN = 0.05
-"""Pixels of a Gaussian that cameras have to see before mattes can say whether it is a member."""
+"""Smallest contribution of a Gaussian to the voting frames, in pixels, for its membership to be known."""
 
 THICK = 0.1
-"""Gaussians farther behind the surface than this share of its depth are behind the thing: 0.3 m, a body, at 3 m. At the
-3 % by which depth is off, a thing's own Gaussians counted as hidden, and small things lost what the lassoed frame hid
-(docs/benchmarks.md, "Mattes by pointing")."""
+"""Depth behind the visible surface, as a share of the surface's depth, above which a Gaussian is hidden: 0.3 m, a body,
+at 3 m. With the depth error of 0.03 as threshold, an object's own Gaussians counted as hidden, and small objects
+lost the parts that the lassoed frame hides (docs/benchmarks.md, "Mattes by pointing")."""
 
 RIM = 0.25
-"""Gaussians that no lassoed frame shows can belong to the thing within this share of its diagonal from its members: a
-back that the camera comes to see, an arm that the frame cuts off, but not the wall behind. 0.05 to 0.5 differ by 0.005
-(docs/benchmarks.md, "Mattes by pointing"). Things that are cut off farther need a second lasso."""
+"""Distance to the members, as a share of the object's diagonal, within which Gaussians that no lassoed frame shows may
+belong to the object: a back that the camera reveals later, or an arm outside the frame, but not the wall behind. Values
+from 0.05 to 0.5 differ by 0.005 (docs/benchmarks.md, "Mattes by pointing"). Longer hidden parts need a second lasso."""
 
 
 def vote(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, weights: Tensor, depth: Tensor) -> Tensor:
-    """[N, C]: of what a camera sees of each Gaussian, the pixels in each of pictures [H, W, C].
+    """[N, C]: visible pixels of each Gaussian in a camera, weighted by each of the pictures `weights` [H, W, C].
 
-    viewmat [4, 4] in scene units, K [3, 3] in pixels of the pictures. `depth` [H, W] is that of what they show, along
-    the camera's axis, scene units. A Gaussian whose centre is outside of the picture is not seen: what reaches into it
-    may be a hundredth of a large one. One that is not `in_front` is not seen either.
+    viewmat [4, 4] is in scene units, K [3, 3] in pixels of the pictures. `depth` [H, W] of the visible surface is along
+    the camera's axis, scene units. A Gaussian with its centre outside the picture gets no votes, because the picture
+    may show only a hundredth of it. A Gaussian that is not `in_front` gets none either.
     """
     device = frozen.support.device
     height, width, _ = weights.shape
@@ -43,10 +43,9 @@ def vote(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, weights: Tensor, d
 
 
 def in_front(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, depth: Tensor) -> Tensor:
-    """[N] bool: False for Gaussians behind the surface that the frame shows at their pixel; `depth` [H, W] as in
-    `vote`.
+    """[N] bool: False for Gaussians behind the visible surface at their pixel; `depth` [H, W] as in `vote`.
 
-    Splats of a person are not opaque. A wall that shines through them would become a part of them.
+    Splats of a person are not opaque. Without this test, a wall that shines through would become part of the person.
     """
     pixels, away = project(frozen.state["means"], viewmat, K)
     surface = look_up(depth.to(pixels.device), pixels, "nearest")
@@ -54,9 +53,10 @@ def in_front(frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, depth: Tensor)
 
 
 def membership(votes: Tensor) -> Tensor:
-    """[N, 2]: the share of each Gaussian that belongs to a thing, 0 if nobody saw it, and 1 if somebody did.
+    """[N, 2]: share of each Gaussian that belongs to the object (0 if unknown), and 1 if it is known, else 0.
 
-    `votes` [N, 2] are pixels within mattes, and all pixels.
+    `votes` [N, 2] are the Gaussian's pixels inside mattes, and all its pixels. Gaussians with more than `SEEN` pixels
+    are known.
     """
     within, whole = votes.unbind(1)
     known = whole > SEEN
@@ -64,9 +64,9 @@ def membership(votes: Tensor) -> Tensor:
 
 
 def rule_out(votes: Tensor, means: Tensor) -> Tensor:
-    """Votes [N, 2] with one more against every Gaussian that nobody saw and that is farther than `RIM` from the thing.
+    """Votes [N, 2] with a vote against each unknown Gaussian that is farther than `RIM` from the object's members.
 
-    `means` [N, 3] are where the Gaussians are.
+    `means` [N, 3] are the Gaussians' centres.
     """
     share, known = membership(votes).unbind(1)
     members = (share > 0.5).cpu()
@@ -74,7 +74,7 @@ def rule_out(votes: Tensor, means: Tensor) -> Tensor:
     if not bool(members.any()) or not bool(unseen.any()):
         return votes
     places = means.detach().cpu().double().numpy()
-    low, high = np.quantile(places[members.numpy()], (0.02, 0.98), axis=0)  # floaters are far from it
+    low, high = np.quantile(places[members.numpy()], (0.02, 0.98), axis=0)  # excludes floaters
     core = places[members.numpy()]
     core = core[((core >= low) & (core <= high)).all(1)]
     if not len(core):
@@ -90,9 +90,10 @@ def render_members(
     frozen: FrozenGaussians, members: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int,
     overscan: tuple[float, float] = (0.0, 0.0),
 ) -> Tensor:  # fmt: skip
-    """[H, W, 2] in 0..1, on the CPU: `members` [N, 2] as one camera sees them, as shares of what is modelled.
+    """[H, W, 2] in 0..1, on the CPU: `members` [N, 2], as returned by `membership`, rendered for one camera.
 
-    The first is a share of what is known: a pixel that is half unknown and half the thing is the thing.
+    The first channel is the object's share among known Gaussians, so a pixel that is half unknown and half object gets
+    1. The second is the share of known Gaussians.
     """
     device = frozen.support.device
     out = render(

@@ -1,10 +1,10 @@
-"""Separates a lassoed thing from what surrounds it, in one frozen frame: by its colours and its depth.
+"""Segments a lassoed object in one frozen frame by colour and depth.
 
-Log-odds of three cues are added: the outline that was drawn or rendered, colour, and depth. The last two are histograms
-of what lies inside and around, as in GrabCut (Rother, Kolmogorov, Blake, SIGGRAPH 2004). In place of a graph cut, a
-guided filter (He, Sun, Tang: "Guided image filtering", PAMI 2013) smooths them along the frame's own edges; it then
-turns the decision into soft edges. OpenCV's GrabCut takes neither a prior nor a fourth channel: it lost legs and arms
-of people 25 pixels wide.
+Log-odds of three cues are added: the outline that was drawn or rendered, colour, and depth. Colour and depth use
+histograms of the inside and the surroundings, as in GrabCut (Rother, Kolmogorov, Blake, SIGGRAPH 2004). A guided filter
+(He, Sun, Tang: "Guided image filtering", PAMI 2013) replaces the graph cut: it smooths the log-odds along the frame's
+edges, and then softens the edges of the decision. OpenCV's GrabCut accepts neither a prior nor a fourth channel, and
+lost legs and arms of people 25 pixels wide.
 """
 
 from __future__ import annotations
@@ -16,40 +16,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]
-"""[H, W, 3] as displayed."""
+"""[H, W, 3] sRGB picture."""
 Matte = NDArray[np.float32]
-"""[H, W] in 0..1: share of the pixel that belongs to the thing."""
+"""[H, W] in 0..1: share of the pixel that belongs to the object."""
 
 
 @dataclass(frozen=True)
 class SegmentConfig:
-    """How a thing is separated from what surrounds it."""
+    """Parameters of the segmentation. Lengths are shares of the frame's width."""
 
     slack: float = 0.008
-    """A lasso may miss the outline by this share of the frame's width; 0.008 is 5 pixels of 640."""
+    """Largest expected error of a lasso's outline; 5 pixels at width 640."""
     band: float = 0.008
-    """The outline that splats render may miss the picture's by this share of the frame's width; 5 pixels of 640."""
+    """Largest expected error of an outline rendered from splats; 5 pixels at width 640."""
     around: float = 0.06
-    """Share of the frame's width around the thing from which the colours of what surrounds it are learnt; 38 pixels of
-    640."""
+    """Width of the surroundings from which background colours are learnt; 38 pixels at width 640."""
     least: int = 4
-    """Least `slack` in pixels at any frame size: a lasso drawn by hand is off by about 3."""
+    """Smallest `slack` in pixels at any frame size: a lasso drawn by hand is off by about 3."""
     most: float = 3.0
-    """Log-odds of one cue at most, 20 to 1: no cue overrules two others that agree."""
+    """Largest log-odds of one cue, 20 to 1, so that no cue overrules two others that agree."""
     prior: float = 3.0
-    """Log-odds of the outline that was drawn or rendered at a distance of `slack` or `band` from it: 20 to 1."""
+    """Log-odds of the outline cue at a distance of `slack` or `band` from the outline: 20 to 1."""
     radius: float = 0.004
-    """Radius of the guided filters' window as a share of the frame's width; 2.5 pixels of 640."""
+    """Radius of the guided filters' windows; 2.5 pixels at width 640."""
     epsilon: float = 1e-3
-    """Regularisation of the guided filters on pictures in 0..1: contrast below its root, 0.03, is no edge."""
+    """Regularisation of the guided filters on pictures in 0..1: contrast below its root, 0.03, does not form an
+    edge."""
 
 
 def segment_lasso(
     picture: Picture, depth: NDArray[np.float32], polygon: NDArray[np.float64], config: SegmentConfig | None = None
 ) -> Matte:
-    """The matte of what a polygon [P, 2] (pixels, centres at +0.5) surrounds in a frame.
+    """The matte of the object inside a polygon [P, 2] (pixels, centres at +0.5) in a frame.
 
-    `depth` [H, W] is that of the frame, along the camera's axis, any unit.
+    `depth` [H, W] of the frame is along the camera's axis, in any unit.
     """
     config = config or SegmentConfig()
     inside = filled(polygon, picture.shape[:2])
@@ -61,9 +61,9 @@ def segment_lasso(
 def refine(
     picture: Picture, depth: NDArray[np.float32], rendered: Matte, known: Matte, config: SegmentConfig | None = None
 ) -> Matte:
-    """A matte as splats render it, with its edge where the frame's own picture has it.
+    """A matte rendered from splats, with its edges moved to the edges of the frame's picture.
 
-    `known` [H, W] in 0..1 is the share of each pixel that some vote was about: the picture decides about the rest.
+    `known` [H, W] in 0..1 is the share of each pixel with votes; elsewhere colour and depth decide.
     """
     config = config or SegmentConfig()
     is_known = known > 0.5
@@ -76,7 +76,7 @@ def refine(
 
 
 def signed_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """[H, W] pixels from the outline of a mask: above 0 inside, below 0 outside, halves beside the outline."""
+    """[H, W] signed distance to the outline of a mask in pixels: positive inside, +-0.5 at pixels on the outline."""
     within, beyond = (
         np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
         for mask in (inside, ~inside)
@@ -85,7 +85,7 @@ def signed_distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 
 def filled(polygon: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """bool [H, W]: pixels whose centres lie within a polygon [P, 2]."""
+    """bool [H, W]: pixels whose centres are inside a polygon [P, 2]."""
     shift = 4
     corners = np.rint((polygon - 0.5) * (1 << shift)).astype(np.int32)
     mask = np.zeros(shape, np.uint8)
@@ -97,7 +97,7 @@ def _cut(
     picture: Picture, depth: NDArray[np.float32], prior: NDArray[np.float32], never: NDArray[np.bool_],
     config: SegmentConfig,
 ) -> Matte:  # fmt: skip
-    """The matte by log-odds: those of the outline, of colour and of depth, smoothed along the picture's edges."""
+    """The matte from log-odds of outline, colour and depth (see the module docstring); 0 where `never` is True."""
     width = prior.shape[1]
     rows, columns = _crop(~never, round(config.around * width))
     part, start = picture[rows, columns], prior[rows, columns]
@@ -115,26 +115,26 @@ def _cut(
 
 
 COLOURS, DEPTHS = 12, 48
-"""Bins of each colour axis, and of depth."""
+"""Number of histogram bins per colour axis, and for depth."""
 
 
 def _colour_bins(picture: Picture) -> NDArray[np.int64]:
-    """[H, W] bin of each pixel's colour in CIE Lab, `COLOURS` a side."""
+    """[H, W] histogram bin of each pixel's CIE Lab colour, with `COLOURS` bins per axis."""
     lab = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)).astype(np.int64) * COLOURS // 256
     return (lab[..., 0] * COLOURS + lab[..., 1]) * COLOURS + lab[..., 2]
 
 
 def _depth_bins(away: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """[H, W] bin of each pixel's logarithm of depth: those of the thing's own depths lie in the middle half."""
+    """[H, W] histogram bin of each pixel's log depth; the object's depths cover the middle half of the bins."""
     low, high = np.quantile(away[inside], (0.02, 0.98)) if inside.any() else (0.0, 0.0)
     span = max(float(high - low), 0.02)
     return np.clip((away - low + 0.5 * span) / (2.0 * span) * DEPTHS, 0, DEPTHS - 1).astype(np.int64)
 
 
 def ratio(bins: NDArray[np.int64], count: int, inside: NDArray[np.bool_], most: float) -> NDArray[np.float32]:
-    """[H, W] log-ratio of how frequent each pixel's bin is inside and outside of a mask, `most` at most.
+    """[H, W] log-ratio of the frequencies of each pixel's bin inside and outside a mask, limited to +-`most`.
 
-    A bin counts as if one pixel of a thousand on either side were in it: rare ones tell nothing.
+    0.001 is added to both frequencies, so that rare bins give a ratio near 0.
     """
     shares: list[NDArray[np.float64]] = []
     for mask in (inside, ~inside):
@@ -144,16 +144,16 @@ def ratio(bins: NDArray[np.int64], count: int, inside: NDArray[np.bool_], most: 
 
 
 def guided(guide: NDArray[np.float32], values: Matte, radius: int, epsilon: float) -> Matte:
-    """`smoothed`, held in 0..1."""
+    """`smoothed`, clipped to 0..1."""
     return np.clip(smoothed(guide, values, radius, epsilon), 0.0, 1.0)
 
 
 def smoothed(
     guide: NDArray[np.float32], values: NDArray[np.float32], radius: int, epsilon: float
 ) -> NDArray[np.float32]:
-    """Guided filter with a colour guide [H, W, 3] in 0..1: `values` [H, W] with edges where the guide has them.
+    """`values` [H, W] smoothed by a guided filter with a colour guide [H, W, 3] in 0..1; edges follow the guide.
 
-    He et al. 2013, equations 19 to 21: within each window values are a linear function of the guide's colour.
+    He et al. 2013, equations 19 to 21: in each window, the result is a linear function of the guide's colour.
     """
 
     def mean(layer: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -174,7 +174,7 @@ def smoothed(
 
 
 def _crop(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
-    """Rows and columns of what is True, and `margin` pixels around it."""
+    """(rows, columns) of the bounding box of True pixels, extended by `margin` pixels."""
     found: list[slice] = []
     for axis in (1, 0):
         at = np.flatnonzero(mask.any(axis))

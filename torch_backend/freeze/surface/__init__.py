@@ -1,1 +1,1 @@
-"""The surface of a frozen scene, fused from the depth of a take's frames."""
+"""Fuses the depth of a take's frames to a mesh of the frozen scene's surface."""

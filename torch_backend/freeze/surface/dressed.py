@@ -1,4 +1,4 @@
-"""Colours, people and noise of a fused surface."""
+"""Post-processing of a fused surface: removes noise, and adds colours and the mask of people."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from ...array_types import pieces
 from .volume import SIDE, View
 
 _CONFIRMED, _VIEWS = 0.5, 3.0
-"""A small piece is kept if at least this share of the views that look there, and this many, see it at its depth. On the
-bundled clip two hands that no forearm connects have 0.6 and 0.7 of 22 and 23 views, noise at most 0.4 or 3 views."""
+"""Smallest share and smallest number of views that must confirm the depth of a small piece to keep it. On the bundled
+clip, two hands without a forearm have 0.6 and 0.7 of 22 and 23 views; noise has at most 0.4, or 3 views."""
 _SMALLEST = 2 * SIDE**2
-"""Triangles of the smallest piece that is kept: a square of twice the truncation. Smaller ones lie beside a surface."""
+"""Number of triangles of the smallest piece that is kept: a square of twice the truncation. Smaller pieces are noise
+near a surface."""
 _COLUMNS = 512
-"""Vertices are looked up in rows of this many: OpenCV takes no picture of more than 32767 rows or columns."""
+"""Number of vertices per row in look-ups, because OpenCV limits pictures to 32767 rows and columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +27,13 @@ class Surface:
     """A mesh of triangles."""
 
     vertices: NDArray[np.float32]
-    """[V, 3]."""
+    """[V, 3] positions."""
     colors: NDArray[np.uint8]
-    """[V, 3] as displayed."""
+    """[V, 3] sRGB colours."""
     triangles: NDArray[np.int32]
-    """[T, 3]."""
+    """[T, 3] indices of vertices."""
     people: NDArray[np.bool_]
-    """[T] True of what moves in the clip."""
+    """[T] True for triangles that move in the clip."""
 
 
 def dress(
@@ -42,15 +43,15 @@ def dress(
     cut: NDArray[np.float32],
     part: float,
 ) -> Surface:
-    """A surface without noise, in the colours of the views that see each vertex best.
+    """A surface without noise; each vertex has the colour of the view that shows it best.
 
     Args:
-        vertices: [V, 3].
-        triangles: [T, 3].
+        vertices: [V, 3] positions.
+        triangles: [T, 3] indices of vertices.
         views: frozen frames.
-        cut: [V] a vertex that is this far from a view's depth is another surface.
-        part: share of all triangles below which a separate piece is noise, unless most views confirm it; also a part of
-            people in the room, or of the room in people.
+        cut: [V] distance to a view's depth above which the view shows another surface than the vertex.
+        part: share of all triangles below which a separate piece is noise, unless most views confirm it. Below a fifth
+            of it, islands of people in the room, and of the room in people, are removed.
     """
     triangles = triangles[_is_kept(vertices, triangles, views, cut, part)]
     kept, flat = np.unique(triangles, return_inverse=True)
@@ -66,7 +67,7 @@ def _is_kept(
     cut: NDArray[np.float32],
     part: float,
 ) -> NDArray[np.bool_]:
-    """[T] which triangles are of a large piece, or of a small one that most views confirm."""
+    """bool [T]: True for triangles of large pieces, and of small pieces that most views confirm."""
     piece = _piece(triangles, len(vertices))
     size = np.bincount(piece[triangles[:, 0]], minlength=len(vertices))
     is_small = size < part * len(triangles)
@@ -83,7 +84,7 @@ def _is_kept(
 def _confirmations(
     vertices: NDArray[np.float32], views: Sequence[View], cut: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(number of views that know a depth at a vertex [V], number of those whose depth is the vertex's)."""
+    """(number of views with depth at each vertex [V], number of these views with the vertex's depth [V])."""
     looked, confirmed = (np.zeros(len(vertices), np.float32) for _ in range(2))
     points, edge = _in_rows(vertices), _in_rows(cut)
     for view in views:
@@ -96,7 +97,7 @@ def _confirmations(
 
 
 def _people(triangles: NDArray[np.int32], moves: NDArray[np.bool_], part: float) -> NDArray[np.bool_]:
-    """[T] which triangles are people, from the vertices [V] that move; small islands are what surrounds them."""
+    """bool [T]: True for triangles of people, from moving vertices `moves` [V]; small islands are removed."""
     alike = moves[triangles].all(1) | ~moves[triangles].any(1)
     size = _sizes(triangles[alike], len(moves))
     is_surrounded = size < 0.5 * _sizes(triangles, len(moves))  # else it is most of a separate piece
@@ -105,19 +106,19 @@ def _people(triangles: NDArray[np.int32], moves: NDArray[np.bool_], part: float)
 
 
 def _sizes(triangles: NDArray[np.int32], count: int) -> NDArray[np.int64]:
-    """[V] triangles of the piece that each of `count` vertices belongs to."""
+    """[V] number of triangles in the piece of each of `count` vertices."""
     piece = _piece(triangles, count)
     return np.bincount(piece[triangles[:, 0]], minlength=count)[piece]
 
 
 def _piece(triangles: NDArray[np.int32], count: int) -> NDArray[np.int32]:
-    """[V] number of the piece that each of `count` vertices belongs to."""
+    """[V] index of the piece of each of `count` vertices."""
     ends = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
     return pieces(ends[:, 0], ends[:, 1], count)
 
 
 def _in_rows(values: NDArray[Any]) -> NDArray[Any]:
-    """Values [N, ...] of vertices as [R, 512, ...]; the last row is filled with ones."""
+    """Values [N, ...] of vertices reshaped to [R, 512, ...]; the last row is padded with ones."""
     rows = -(-len(values) // _COLUMNS)
     filled = np.ones((rows * _COLUMNS, *values.shape[1:]), np.float32)
     filled[: len(values)] = values
@@ -125,7 +126,7 @@ def _in_rows(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _normals(vertices: NDArray[np.float32], triangles: NDArray[np.int32]) -> NDArray[np.float32]:
-    """[V, 3] unit normals, those of triangles weighted by their areas."""
+    """[V, 3] unit normals: means of the triangles' normals, weighted by area."""
     a, b, c = (vertices[triangles[:, n]] for n in range(3))
     of_face = np.cross(b - a, c - a)
     sums = [sum(np.bincount(triangles[:, n], of_face[:, axis], len(vertices)) for n in range(3)) for axis in range(3)]
@@ -136,7 +137,7 @@ def _normals(vertices: NDArray[np.float32], triangles: NDArray[np.int32]) -> NDA
 def _looked_up(
     vertices: NDArray[np.float32], normals: NDArray[np.float32], views: Sequence[View], cut: NDArray[np.float32]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """(colours [V, 3] of the view that sees a vertex best, motion [V] by all views that see it)."""
+    """(colours [V, 3] from the view that shows a vertex best, motion [V] averaged over all views that show it)."""
     count = len(vertices)
     points, edge = _in_rows(vertices), _in_rows(cut)
     best, total, moved = (np.zeros(count, np.float32) for _ in range(3))
@@ -153,7 +154,7 @@ def _looked_up(
         away = np.maximum(np.linalg.norm(to_camera, axis=1), 1e-20)
         facing = np.maximum((to_camera * normals).sum(1) / away, 0.05)  # a normal is noise where the surface is thin
         near = flat(np.where(surface > 0.0, np.exp(-np.square((surface - depth) / edge)), 0.0))[:, 0]
-        # Pixels of the view for each unit of the surface's area.
+        # Pixels of the view per unit of surface area.
         score = near * facing * np.square(view.K[0, 0] / away)
         better = score > best
         best = np.where(better, score, best)

@@ -1,4 +1,4 @@
-"""The job that fuses the frozen frames of a take to a mesh: takes/NAME/surface.ply."""
+"""The surface job: fuses the frozen frames of a take to a mesh, takes/NAME/surface.ply."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ from .volume import SurfaceConfig, View, fuse
 def make_surface(
     shot: Shot, params: SurfaceParams, report: Reporter, config: SurfaceConfig | None = None
 ) -> dict[str, Any]:
-    """Makes the surface of a take, in the axes and units in which its splats left, unless it is there.
+    """Makes the surface of a take, in the axes and units of its exported splats, unless it already exists.
 
-    Returns {take, surface: file, vertices, triangles, people: triangles that move in the clip, made: bool}. JobError in
-    words if it cannot be made.
+    Returns {take, surface: file, vertices, triangles, people: number of triangles that move in the clip, made: bool}.
+    JobError if it cannot be made.
     """
     config = config or SurfaceConfig()
     folder = TakeFolder(shot.own(shot.take(params.take)))
@@ -88,14 +88,14 @@ def make_surface(
 
 
 def _has_living(facts: dict[str, Any]) -> bool:
-    """True of a combined take in which something goes on living."""
+    """True for a combined take with an object from the live plate."""
     combined = facts.get("combined")
     things = cast("dict[str, Any]", combined).get("things") if isinstance(combined, dict) else None
     return isinstance(things, dict) and LIVE_SOURCE in cast("dict[str, Any]", things).values()
 
 
 def _fused(folder: TakeFolder, config: SurfaceConfig, report: Reporter) -> Surface:
-    """The surface of a take's frames, in solve units. JobError if they have no depth."""
+    """The surface of a take's frames, in solve units. JobError if the frames have no depth or give no surface."""
     frames = frames_of(folder)
     chosen = [frames[i] for i in evenly_spaced(len(frames), min(config.views, len(frames)))]
     views: list[View] = []
@@ -125,7 +125,7 @@ def _fused(folder: TakeFolder, config: SurfaceConfig, report: Reporter) -> Surfa
 
 
 def view_of(path: Path, config: SurfaceConfig) -> View:
-    """A frozen frame as it is fused, in solve units. ValueError if it cannot be read."""
+    """A frozen frame resized for fusing, in solve units. ValueError if the EXR cannot be read."""
     frame = read_frozen_exr(path)
     height, width = frame.depth.shape
     w = min(width, config.width)
@@ -152,7 +152,7 @@ def view_of(path: Path, config: SurfaceConfig) -> View:
 
 
 def write_surface(path: Path, header: SurfaceHeader, vertices: NDArray[np.float32], surface: Surface) -> None:
-    """Writes a surface, its vertices [V, 3] placed, beside its place, then renames it. OSError if it cannot be."""
+    """Writes a surface with placed vertices [V, 3], atomically. OSError if it cannot be written."""
     points = np.zeros(len(vertices), np.dtype(list(VERTEX_FIELDS)))
     for n, (place, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         points[place], points[color] = vertices[:, n], surface.colors[:, n]
@@ -162,13 +162,13 @@ def write_surface(path: Path, header: SurfaceHeader, vertices: NDArray[np.float3
         faces[corner] = surface.triangles[:, n]
     with atomic_path(path) as partial, open(partial, "wb") as handle:
         handle.write(header.to_bytes())
-        handle.write(points.data)  # `tofile` would not say that the disk is full
+        handle.write(points.data)  # `tofile` would not report a full disk
         handle.write(faces.data)
 
 
 def read_surface(path: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """(vertices, triangles) of a file of `write_surface`, as `VERTEX_FIELDS` and `TRIANGLE_FIELDS` say. ValueError if
-    it is none."""
+    """(vertices, triangles) of a file of `write_surface`, with `VERTEX_FIELDS` and `TRIANGLE_FIELDS`. ValueError for
+    other files."""
     with open_regular(path) as handle:
         header = read_surface_header(handle, path)
         vertices = np.frombuffer(handle.read(header.vertices * 15), np.dtype(list(VERTEX_FIELDS)))

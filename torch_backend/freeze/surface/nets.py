@@ -1,4 +1,4 @@
-"""Triangles where signed distances change their sign: surface nets (Gibson 1998), a vertex in each cell."""
+"""Extracts triangles where signed distances change sign: surface nets (Gibson 1998), one vertex per cell."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from .volume import SIDE, Volume, block_keys, blocks_of
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
 """[8, 3] corners of a cell."""
 _EDGES = [(a, b) for a, b in itertools.combinations(range(8), 2) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
-"""The 12 pairs of corners along an axis."""
+"""The 12 edges of a cell, as pairs of corners."""
 
 
 def extract(volume: Volume) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """(vertices [V, 3] in the views' units, triangles [T, 3]) of the surface.
 
-    Triangles turn counter-clockwise seen from the side of positive distances. Cells with a corner of which nothing is
-    known have no vertex: there the surface ends.
+    Triangles are counter-clockwise as seen from the side of positive distances. Cells with an unknown corner have no
+    vertex, and the surface ends there.
     """
     cells, values = _crossed(volume)
     order = np.argsort(block_keys(cells), kind="stable")
@@ -49,20 +49,20 @@ def extract(volume: Volume) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
 
 
 def _find(keys: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of each cell [N, 3] among ascending keys, -1 where it is not there."""
+    """Index of each cell [N, 3] in the ascending `keys`; -1 for missing cells."""
     wanted = block_keys(cells)
     at = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
     return np.where(keys[at] == wanted, at, -1) if len(keys) else np.full(len(cells), -1)
 
 
 def _crossed(volume: Volume) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Cells [C, 3] that the surface crosses, counted in voxels, and the distances [C, 8] at their corners."""
+    """(cells [C, 3] that the surface crosses, in voxel indices, signed distances [C, 8] at their corners)."""
     cells: list[NDArray[Any]] = []
     values: list[NDArray[Any]] = []
     blocks = blocks_of(volume.keys)
     for first in range(0, len(blocks), 4096):
         part = blocks[first : first + 4096]
-        whole = np.full((len(part), *[SIDE + 1] * 3), np.nan, np.float32)  # with the first voxels of the next blocks
+        whole = np.full((len(part), *[SIDE + 1] * 3), np.nan, np.float32)  # plus the first voxels of the next blocks
         for corner in _CORNERS:
             at = _find(volume.keys, part + corner)
             rows = np.flatnonzero(at >= 0)

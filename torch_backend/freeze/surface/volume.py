@@ -1,9 +1,9 @@
-"""Truncated signed distances of a frozen scene, averaged over the depth of many views.
+"""Truncated signed distance function (TSDF) of a frozen scene, averaged over the depth of many views.
 
-The method of Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images" (SIGGRAPH 1996), on
-blocks of voxels near surfaces alone, as Nießner et al. keep them (2013). Pixels show less and depth errs more the
-farther away a surface is, so voxels grow with the distance from the cameras: they are even in a space that is
-contracted beyond what is near (as in Barron et al., "Mip-NeRF 360", 2022, with a logarithm).
+The method is that of Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images" (SIGGRAPH
+1996). Only blocks of voxels near surfaces are stored (Nießner et al. 2013). Pixels resolve less and depth errors grow
+with the distance of a surface, so voxels grow with the distance from the cameras. They are uniform in a contracted
+space (as in Barron et al., "Mip-NeRF 360", 2022, with a logarithm).
 """
 
 from __future__ import annotations
@@ -18,56 +18,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIDE = 8
-"""Voxels along each edge of a block."""
+"""Number of voxels along each edge of a block."""
 _BITS = 20
-"""Bits of each coordinate in a block's key: a million blocks along each axis."""
+"""Number of bits per coordinate in a block's key: a million blocks along each axis."""
 _CHUNK = 2048
-"""Blocks that are worked on at once: 4 MB for each number of a voxel."""
+"""Number of blocks that are processed at once: 4 MB per float of a voxel."""
 
 
 @dataclass(frozen=True)
 class SurfaceConfig:
-    """How a surface is fused."""
+    """Parameters of the fusion of a surface."""
 
     width: int = 320
     """Largest width in pixels at which depth is fused: that of `SurfaceDepthConfig`, at which it is measured."""
     views: int = 24
-    """Largest number of a take's frames that are fused, spread evenly: each takes 1 s of one core."""
+    """Largest number of evenly spaced frames of a take that are fused: each takes 1 s of one core."""
     truncation: float = 4.0
-    """Distance in voxels from the surface at which signed distances are cut: 1.5 to 3 % of the distance from the
-    cameras, so that views that differ by the 1 to 2 % by which splats err make one surface."""
+    """Distance from the surface, in voxels, at which signed distances are truncated. It is 1.5 to 3 % of the distance
+    from the cameras, so that views with the splats' depth error of 1 to 2 % give one surface."""
     near: float = 0.1
-    """Quantile of the distance from the cameras up to which voxels are the same size; beyond, they grow with it."""
+    """Quantile of depth up to which voxels have the same size; beyond, they grow with the distance from the cameras."""
     far: float = 0.995
     """Quantile of depth beyond which nothing is fused, so that stray pixels do not stretch the volume."""
     voxels: int = 3_000_000
-    """Largest number of voxels; voxels grow until they are no more. 8 bytes each, and about 12 while a surface is
-    extracted."""
+    """Largest number of voxels. Voxels are enlarged until there are no more than this. Each takes 8 bytes, and about 12
+    while a surface is extracted."""
     part: float = 0.005
     """Share of all triangles below which a separate piece is dropped as noise, unless most views confirm it."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One frozen frame, at the size of fusing."""
+    """One frozen frame, at the resolution at which it is fused."""
 
     viewmat: NDArray[np.float64]
     """[4, 4] world-to-camera, OpenCV axes."""
     K: NDArray[np.float64]
     """[3, 3] pixels, centres at +0.5."""
     depth: NDArray[np.float32]
-    """[h, w] along the camera's axis; 0 where it is not known."""
+    """[h, w] depth along the camera's axis; 0 if unknown."""
     sigma: NDArray[np.float32]
-    """[h, w] its standard deviation, in its units."""
+    """[h, w] standard deviation of `depth`, in the same units."""
     color: NDArray[np.uint8]
-    """[h, w, 3] as displayed."""
+    """[h, w, 3] sRGB picture."""
     motion: NDArray[np.float32]
-    """[h, w] in 0..1: how much of the pixel moves in the clip."""
+    """[h, w] in 0..1: share of the pixel that moves in the clip."""
 
     def seen(self, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
         """(column, row, depth) of points [N, M, 3] in this view, float32 [N, M]; pixel centres at whole numbers.
 
-        What is behind the camera is at column -2.
+        Points behind the camera get column and row -2.
         """
         moved = points @ self.viewmat[:3, :3].T.astype(points.dtype) + self.viewmat[:3, 3].astype(points.dtype)
         depth = moved[..., 2]
@@ -78,14 +78,14 @@ class View:
         return x.astype(np.float32), y.astype(np.float32), depth.astype(np.float32)
 
     def look(self, picture: NDArray[Any], x: NDArray[Any], y: NDArray[Any], nearest: bool = False) -> NDArray[Any]:
-        """A picture of the view at pixels [N, M], N below 32768; 0 outside of it."""
+        """A picture of the view sampled at pixels [N, M], N below 32768; 0 outside of it."""
         how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         return cv2.remap(picture, x, y, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
     def depth_at(self, x: NDArray[Any], y: NDArray[Any], edge: NDArray[Any]) -> NDArray[Any]:
-        """[N, M] depth at pixels, 0 where it is not known: between pixels on a surface, the nearest pixel's at an edge.
+        """[N, M] depth at pixels, 0 if unknown: interpolated on a surface, that of the nearest pixel at an edge.
 
-        `edge` [N, M] is the difference of depth from which on two pixels show two surfaces.
+        `edge` [N, M] is the difference in depth above which two pixels show two surfaces.
         """
         known = np.where(self.depth > 0, self.depth, np.float32(np.nan))
         between = cv2.remap(known, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
@@ -95,15 +95,15 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """A space in which what is farther than `radius` from a centre lies at the logarithm of its distance."""
+    """A space in which distances from a centre beyond `radius` are replaced by their logarithm."""
 
     centre: NDArray[np.float64]
-    """[3] the middle of the cameras."""
+    """[3] mean of the camera centres."""
     radius: float
-    """Distance up to which the space is as it is."""
+    """Distance up to which the space is not contracted."""
 
     def scale(self, points: NDArray[Any]) -> NDArray[Any]:
-        """[...] how much larger voxels are along the ray at points [..., 3]; 1 within the radius."""
+        """[...] size of voxels along the ray at points [..., 3], relative to voxels within the radius."""
         off = points - self.centre.astype(points.dtype)
         return np.maximum(np.sqrt((off * off).sum(-1)) / self.radius, 1.0).astype(points.dtype)
 
@@ -121,34 +121,34 @@ class Contraction:
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Signed distances near surfaces, in shares of `cut`: above 0 in front of a surface, below 0 behind it."""
+    """Signed distances near surfaces, relative to `cut`: positive in front of a surface, negative behind it."""
 
     keys: NDArray[np.int64]
-    """[B] blocks, ascending; see `block_keys`."""
+    """[B] keys of the blocks, ascending; see `block_keys`."""
     distance: NDArray[np.float32]
-    """[B, 8, 8, 8] by x, y, z; NaN where no view says anything."""
+    """[B, 8, 8, 8] signed distances, indexed by x, y, z; NaN if unknown."""
     voxel: float
-    """Edge of a voxel in the contracted space; the middle of voxel (0, 0, 0) of block (0, 0, 0) is the origin."""
+    """Edge of a voxel in the contracted space; the centre of voxel (0, 0, 0) of block (0, 0, 0) is the origin."""
     cut: float
-    """Distance from the surface at which signed distances are cut, in the contracted space."""
+    """Distance from the surface at which signed distances are truncated, in the contracted space."""
     space: Contraction
-    """The space in which voxels are even."""
+    """The space in which voxels are uniform."""
 
 
 def block_keys(blocks: NDArray[Any]) -> NDArray[np.int64]:
-    """One number for each block [..., 3] of whole numbers, in their order."""
+    """[...] int64 key of each block [..., 3] (integers); keys sort like the blocks' coordinates."""
     x, y, z = np.moveaxis(blocks.astype(np.int64) + (1 << _BITS - 1), -1, 0)
     return (x << 2 * _BITS) + (y << _BITS) + z
 
 
 def blocks_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """[B, 3] inverse of `block_keys`."""
+    """[B, 3] blocks of keys [B]: the inverse of `block_keys`."""
     mask = (1 << _BITS) - 1
     return np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], -1) - (1 << _BITS - 1)
 
 
 def contraction(views: Sequence[View], config: SurfaceConfig) -> Contraction:
-    """The space for what views show. ValueError if no view has any depth."""
+    """The contracted space for the surfaces in views. ValueError if no view has depth."""
     seen = [v.depth[v.depth > 0] for v in views if (v.depth > 0).any()]
     if not seen:
         raise ValueError("no view has any depth")
@@ -157,7 +157,7 @@ def contraction(views: Sequence[View], config: SurfaceConfig) -> Contraction:
 
 
 def resolved(views: Sequence[View], space: Contraction) -> float:
-    """Width of a pixel of the views in the contracted space, the median: what depth resolves."""
+    """Median width of a pixel of the views in the contracted space: the resolution of depth."""
     widths: list[NDArray[Any]] = []
     for view in views:
         points, rows, columns = unprojected(view)
@@ -169,13 +169,13 @@ def fuse(
     views: Sequence[View], config: SurfaceConfig | None = None, voxel: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Volume:  # fmt: skip
-    """Fuses the depth of views. ValueError if no view has any.
+    """Fuses the depth of views. ValueError if no view has depth.
 
     Args:
-        views: of one static scene.
-        config: how.
-        voxel: edge of a voxel at least; None: the width of a pixel.
-        progress: called with the share that is done.
+        views: views of one static scene.
+        config: parameters of the fusion.
+        voxel: smallest edge of a voxel in the contracted space; None: the width of a pixel.
+        progress: called with the finished share in 0..1.
     """
     config = config or SurfaceConfig()
     space = contraction(views, config)
@@ -202,7 +202,7 @@ def fuse(
 
 
 def unprojected(view: View, off: NDArray[Any] | float = 0.0) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """(points [N, 3] that a view shows, their rows, their columns); `off` [N] is added to their depth."""
+    """(points [N, 3] of a view's pixels with depth, their rows, their columns); `off` [N] is added to the depth."""
     rows, columns = np.nonzero(view.depth > 0)
     depth = view.depth[rows, columns].astype(np.float64)
     rays = np.stack(
@@ -217,20 +217,20 @@ def unprojected(view: View, off: NDArray[Any] | float = 0.0) -> tuple[NDArray[An
 
 
 def _near_surfaces(views: Sequence[View], voxel: float, cut: float, space: Contraction) -> NDArray[np.int64]:
-    """Keys of the blocks that a view's rays cross within `cut` of their surfaces."""
+    """Keys of the blocks that the views' rays cross within `cut` of the surface."""
     found: list[NDArray[np.int64]] = []
-    steps = np.linspace(-cut, cut, 1 + 2 * math.ceil(2 * cut / (SIDE * voxel)))  # half a block at most
+    steps = np.linspace(-cut, cut, 1 + 2 * math.ceil(2 * cut / (SIDE * voxel)))  # steps of at most half a block
     for view in views:
         scale = space.scale(unprojected(view)[0])
         for off in steps:
             points = space.into(unprojected(view, off * scale)[0])
-            # Half a voxel: the middles of a block's first voxels lie on its edge.
+            # Half a voxel is added, because the centres of a block's first voxels are on its border.
             found.append(np.unique(block_keys(np.floor((points / voxel + 0.5) / SIDE))))
     return np.unique(np.concatenate(found))
 
 
 def _add(total: NDArray[Any], weight: NDArray[Any], view: View, points: NDArray[Any], cuts: NDArray[Any]) -> None:
-    """Adds what a view says of voxels [B, 512] whose middles are `points` [B, 512, 3], cut at distances of `cuts`."""
+    """Adds a view's signed distances at voxel centres `points` [B, 512, 3], truncated at `cuts` [B, 512]."""
     x, y, depth = view.seen(points)
     height, width = view.depth.shape
     rows = np.flatnonzero(((x > -1) & (x < width) & (y > -1) & (y < height)).any(1))

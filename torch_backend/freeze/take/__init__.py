@@ -1,1 +1,1 @@
-"""A take on disk: its plan, its frames as files, its parts on a farm, its verdict."""
+"""Takes: planning, rendering and writing of frozen frames, rendering in parts on a farm, and the take's verdict."""

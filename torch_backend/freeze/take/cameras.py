@@ -1,4 +1,4 @@
-"""The cameras that a take is seen through: the clip's, those between where it lacks frames, or a path of Blender's."""
+"""The cameras of a take: the clip's own, with interpolated ones for missing frames, or a camera path from Blender."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ...torch_types import from_numpy
 from ..frozen import OutputFrame
 
 LONGEST_GAP = 2.0
-"""Seconds without a frame of the footage over which cameras are still interpolated: no hand moves on a line."""
+"""Longest gap in the footage, in seconds, across which cameras are interpolated: handheld motion is not linear."""
 
 
 def output_size(shot: Shot, scene: Scene, params: FreezeParams) -> tuple[int, int]:
-    """(width, height) of the frozen frames: as wide as the footage unless asked otherwise, shaped like clip or path."""
+    """(width, height) of the frozen frames: `params.width` or the plates' width, with the aspect of clip or path."""
     plates = Plates(shot)
     if not params.camera_path and params.width in (0, plates.width):
         return plates.width, plates.height
@@ -31,9 +31,9 @@ def output_size(shot: Shot, scene: Scene, params: FreezeParams) -> tuple[int, in
 
 
 def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: int) -> list[OutputFrame]:
-    """All frames that a take can have: the clip's own poses, those between that the clip lacks, or a camera path.
+    """All possible frames of a take: the clip's poses with gaps interpolated, or the poses of a camera path.
 
-    JobError if one of `params.t_star_per_frame` lies outside of the clip.
+    JobError if one of `params.t_star_per_frame` lies outside the clip.
     """
     if params.camera_path:
         viewmats, Ks, numbers = _path_cameras(scene, CameraPath.load(params.camera_path), width, height)
@@ -55,7 +55,7 @@ def plan(scene: Scene, params: FreezeParams, t_star: int, width: int, height: in
 
 
 def _without_gaps(scene: Scene, Ks: Tensor) -> tuple[Tensor, Tensor, list[int]]:
-    """The clip's cameras, and interpolated ones for frames that the footage lacks; no gap of over `LONGEST_GAP`."""
+    """(viewmats, Ks, frame numbers) of the clip, with gaps of up to `LONGEST_GAP` filled by interpolation."""
     viewmats, intrinsic, numbers = [scene.viewmats[0]], [Ks[0]], [scene.frames[0]]
     for i, (before, after) in enumerate(pairwise(scene.frames)):
         lacking = range(before + 1, after) if scene.seconds[i + 1] - scene.seconds[i] <= LONGEST_GAP else range(0)
@@ -73,7 +73,7 @@ def _without_gaps(scene: Scene, Ks: Tensor) -> tuple[Tensor, Tensor, list[int]]:
 
 
 def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFrame]:
-    """Those of ascending frames that are requested now: first, last and step. JobError if there is none."""
+    """The frames selected by `params.first`, `last` and `step`; `frames` ascend. JobError if no frame is selected."""
     numbers = [f.frame for f in frames]
     first = numbers[0] if params.first is None else params.first
     last = numbers[-1] if params.last is None else params.last
@@ -88,12 +88,12 @@ def in_range(frames: list[OutputFrame], params: FreezeParams) -> list[OutputFram
 
 
 def intrinsics(frames: list[OutputFrame]) -> np.ndarray:
-    """[F, 4]: fx, fy, cx, cy of the frames, pixels of the output size."""
+    """[F, 4]: fx, fy, cx, cy of the frames, in pixels of the output size."""
     return np.array([[f.K[0, 0], f.K[1, 1], f.K[0, 2], f.K[1, 2]] for f in frames], np.float64)
 
 
 def _path_cameras(scene: Scene, path: CameraPath, width: int, height: int) -> tuple[Tensor, Tensor, list[int]]:
-    """A Blender path, in solve units and its own resolution, as scene cameras of the output size."""
+    """(viewmats, Ks, frame numbers) of a Blender path, converted from solve units to scene units and output size."""
     if not path.frames:
         raise JobError("The camera path has no frames.", "Send at least one pose.", ExitCode.FREEZE)
     viewmats = np.array([f.viewmat for f in path.frames], dtype=np.float64).reshape(-1, 4, 4)

@@ -1,4 +1,4 @@
-"""The contact sheet of a take: plates above, frozen frames below, so that one look tells whether time stands still."""
+"""The contact sheet of a take: plates above, frozen frames below, to check a freeze at a glance."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ...footage.images import read_png, resize, write_png
 
 COLUMNS = 8
-"""Most frames shown."""
+"""Largest number of frames shown."""
 CELL = 256
-"""Longest side of a picture on the sheet, pixels."""
+"""Longest side of a picture on the sheet, in pixels."""
 
 _MARGIN, _GAP, _FRAME = 32, 12, 3
 _TITLE_SIZE, _LABEL_SIZE = 28, 18
@@ -22,7 +22,7 @@ _GROUND = (30, 30, 30)
 _TEXT, _QUIET, _ACCENT = (0.93, 0.93, 0.93), (0.62, 0.62, 0.62), (0.98, 0.76, 0.30)
 _ALARM = (226, 74, 51)
 _FLAG = 22
-"""Side of the corner that is cut off a frozen frame which will not hold, pixels."""
+"""Side in pixels of the corner that marks a frame whose freeze is unreliable."""
 _FONT, _BOLD = "DroidSans", "DroidSans-Bold"
 
 
@@ -40,10 +40,10 @@ def write_contact_sheet(
 ) -> Path:
     """Writes the sheet as 8-bit PNG, atomically.
 
-    `plates` and `frozen` are display-referred PNGs, one per number in `frames`; `plates` None (a camera path of its
-    own has none) leaves that row out. At most `columns` frames are shown, evenly over the clip, with the first and
-    the last. `mark`, the frame number of t*, is always among them if it is in `frames`, and is outlined. `note` stands
-    under the title; frozen frames whose numbers are in `unsure` lose a corner to a red mark.
+    `plates` and `frozen` are display-referred PNGs, one per number in `frames`. `plates` None (as for a new camera
+    path) omits that row. At most `columns` evenly spaced frames are shown, including the first and the last. `mark`,
+    the frame number of t*, is always shown if it is in `frames`, and is outlined. `note` is printed under the title.
+    Frozen frames whose numbers are in `unsure` get a red corner.
 
     ValueError if the lists differ in length or are empty; FileNotFoundError or ValueError for a picture that is
     missing or damaged; OSError if the sheet cannot be written.
@@ -70,13 +70,13 @@ def write_contact_sheet(
 
 
 def pick_columns(frames: Sequence[int], columns: int = COLUMNS, mark: int | None = None) -> list[int]:
-    """Indices into `frames` of at most `columns` frames spread evenly, first and last among them, and `mark`'s."""
+    """Indices of at most `columns` evenly spaced `frames`, including the first, the last and `mark`."""
     if columns < 1:
         raise ValueError(f"columns should be at least 1, got {columns}")
     picked = [round(x) for x in np.linspace(0, len(frames) - 1, min(columns, len(frames)))]
     if mark is not None and mark in frames:
         at = list(frames).index(mark)
-        # The ends stay where they are if a middle column can give way.
+        # A middle column is replaced, if possible, so that first and last stay.
         inner = (
             range(1, len(picked) - 1) if len(picked) > 2 and at not in (picked[0], picked[-1]) else range(len(picked))
         )
@@ -85,7 +85,7 @@ def pick_columns(frames: Sequence[int], columns: int = COLUMNS, mark: int | None
 
 
 def _thumbnails(paths: Sequence[Path]) -> list[NDArray[np.uint8]]:
-    """Pictures [h,w,3] uint8 scaled so that the longest side is `CELL`."""
+    """Pictures [h,w,3] uint8 with a longest side of `CELL` pixels."""
     thumbnails: list[NDArray[np.uint8]] = []
     for path in paths:
         picture = read_png(path)
@@ -105,7 +105,7 @@ def _compose(
     title: str,
     note: str,
 ) -> NDArray[np.uint8]:
-    """The sheet [H,W,3] uint8: title, note, one row per entry of `cells`, frame numbers under the last."""
+    """The sheet [H,W,3] uint8: title, note, one row per entry of `cells`, and frame numbers under the last row."""
     width, height = size
     left = _MARGIN + max(oiio.ImageBufAlgo.text_size(name, _LABEL_SIZE, _FONT).xend for name in cells) + 2 * _GAP
     columns = len(labels)
@@ -139,7 +139,7 @@ def _compose(
 
 
 def _wrapped(text: str, width: int) -> list[str]:
-    """Words in lines of at most this many pixels; a longer word has a line of its own."""
+    """`text` wrapped into lines of at most `width` pixels; a longer word gets its own line."""
     lines: list[str] = []
     for word in text.split():
         longer = f"{lines[-1]} {word}" if lines else word
@@ -151,7 +151,7 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def _flag(picture: NDArray[np.uint8]) -> None:
-    """Marks a picture [h,w,3], in place, in its upper right corner."""
+    """Marks the upper right corner of a picture [h,w,3] in place."""
     height, width = picture.shape[:2]
     rows, columns = np.mgrid[0:height, 0:width]
     picture[columns - rows >= width - _FLAG] = _ALARM
@@ -172,6 +172,6 @@ def _write(
     across: str,
     down: str,
 ) -> None:
-    """Draws one line of text with a font that OpenImageIO brings along."""
+    """Draws one line of text with a font that ships with OpenImageIO."""
     if not oiio.ImageBufAlgo.render_text(image, x, y, text, size, font, colour, alignx=across, aligny=down):
         raise OSError(f"cannot draw text on the contact sheet: {image.geterror()}")

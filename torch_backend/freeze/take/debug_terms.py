@@ -1,4 +1,4 @@
-"""The terms behind the decisions of each frame, as pictures: what `--debug-terms DIR` writes."""
+"""Writes the terms behind the compositor's decisions as pictures, for `--debug-terms DIR`."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ def origin_terms(
     frozen: FrozenGaussians, viewmat: Tensor, K: Tensor, whole: tuple[int, int], beyond: tuple[int, int],
     size: tuple[int, int],
 ) -> dict[str, Tensor]:  # fmt: skip
-    """{"origin." and a repair's name: [h, w] share of each pixel painted by Gaussians that it changed last}.
+    """{"origin.NAME": [h, w]} per repair NAME: share of each pixel from Gaussians that the repair changed last.
 
     Args:
-        viewmat, K: the frame's camera, as `render_frozen` takes it.
-        whole, beyond: width and height of the frame in pixels, and how many of them on each side are overscan.
+        viewmat, K: the frame's camera, as for `render_frozen`.
+        whole: width and height of the frame in pixels, with overscan.
+        beyond: pixels of overscan (left and right, above and below).
         size: (w, h) of the terms.
     """
     if frozen.origin is None:
@@ -43,12 +44,12 @@ def origin_terms(
 
 
 def write_terms(folder: Path, frame: int, terms: Mapping[str, Tensor]) -> Path | None:
-    """Writes one half-float EXR with a channel for each term; returns its path, None for a frame without terms.
+    """Writes one half-float EXR with a channel per term. Returns its path, or None for a frame without terms.
 
     Args:
-        folder: made if it is not there.
-        frame: frame number, the file's name.
-        terms: `CompositeFrame.terms`, [h, w] each; channels bear their names.
+        folder: output folder, created if missing.
+        frame: frame number, used as the file name.
+        terms: `CompositeFrame.terms`, [h, w] each; their names become the channel names.
 
     OSError with the system's reason if the file cannot be written.
     """

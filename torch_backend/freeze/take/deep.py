@@ -1,12 +1,12 @@
-"""Deep samples of a frozen frame: where its depth steps, the surface before the step and the one behind it.
+"""Deep samples of a frozen frame: at depth steps, one sample of the near surface and one of the far surface.
 
-The frame's depth says which two surfaces meet around a pixel. The splats say how much of the pixel each of them is:
-they are rendered in slabs of depth, front to back, each once, and over each other the slabs are the picture of all
-splats. The frame says how the pixel looks: the samples are scaled so that over each other they are the frame.
+The frame's depth gives the two surfaces that meet around a pixel. The splats give the share of each surface in the
+pixel: they are rendered in slabs of depth, front to back, and each splat is in one slab. The slabs composited over each
+other give the render of all splats. The samples are scaled so that, composited over each other, they give the frame.
 
-Splats of one surface lie some percent of their depth apart. So depth of theirs only tells which of the two surfaces
-they belong to, and a pixel away from steps has one sample. Where every depth of a splat was a sample of its own, 94 %
-of the pixels of a preview training had two or three, and CG behind a wall showed through it.
+Splats of one surface are spread over some percent of their depth. Their depth is therefore only used to assign them to
+one of the two surfaces, and a pixel away from depth steps has one sample. With one sample per splat depth, 94 % of the
+pixels of a preview run had two or three samples, and CG behind a wall showed through it.
 """
 
 from __future__ import annotations
@@ -28,53 +28,53 @@ from ..frozen import FrozenGaussians, OutputFrame, render_frozen
 
 @dataclass(frozen=True)
 class DeepConfig:
-    """How the surfaces of a pixel are found."""
+    """Parameters of the search for a pixel's surfaces."""
 
     slabs: int = 16
-    """Slabs of depth between the nearest and the farthest hundredth of a frame; two more hold what is beyond."""
+    """Number of depth slabs between the 1st and 99th percentile of a frame's depth; two more hold what is outside."""
     step: float = 0.05
-    """Share by which depth rises from one pixel to the next where two surfaces meet; within it, one is sloped."""
+    """Relative rise of depth between neighbouring pixels above which they show two surfaces, not one sloped surface."""
 
 
 _LEAST = float(np.finfo(np.float16).eps)
-"""Share of a pixel below which a surface has no sample: less is none beside 1 in a half float."""
+"""Share of a pixel below which a surface gets no sample: a half float cannot tell 1 from 1 minus a smaller share."""
 
 
 @dataclass(frozen=True)
 class DeepSamples:
-    """Two samples of each pixel, the near and the far surface. Float32, on the CPU."""
+    """Two samples per pixel, of the near and the far surface. Float32, on the CPU."""
 
     weight: Tensor
-    """[2, H, W] share of the pixel that the splats of each give."""
+    """[2, H, W] share of the pixel covered by the splats of each surface."""
     light: Tensor
-    """[2, H, W, 3] scene-linear, their colour times that share."""
+    """[2, H, W, 3] scene-linear colour of these splats, multiplied by `weight`."""
     depth: Tensor
-    """[2, H, W] along the camera's axis, scene units of the model."""
+    """[2, H, W] depth along the camera's axis, scene units of the model."""
 
     def rows(self, rows: slice, rgba: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Some rows of the samples as a deep file has them.
+        """Some rows of the samples, as stored in a deep file.
 
         Args:
-            rows: which rows.
-            rgba: [h, W, 4] those rows of the frame, scene-linear, premultiplied.
+            rows: the rows to return.
+            rgba: [h, W, 4] these rows of the frame, scene-linear, premultiplied.
 
         Returns:
-            ([2, h, W, 4] scene-linear and premultiplied by their own alpha, [2, h, W] depth). The near over the far
-            one is `rgba`. A sample that is not there has alpha 0.
+            ([2, h, W, 4] scene-linear, premultiplied by the sample's alpha; [2, h, W] depth). The near sample
+            composited over the far one gives `rgba`. A missing sample has alpha 0.
         """
         weight = self.weight[:, rows].numpy()
         share = weight[0] / np.maximum(weight.sum(0), 1e-8)
-        share[weight.sum(0) <= 0.0] = 1.0  # plate where no splat is
+        share[weight.sum(0) <= 0.0] = 1.0  # pixels from plates without splats have one sample
         share[share < _LEAST] = 0.0
         share[share > 1.0 - _LEAST] = 1.0
         alpha = rgba[..., 3]
         own = np.stack([share * alpha, (1.0 - share) * alpha / np.maximum(1.0 - share * alpha, 1e-8)])
-        own[1, share < 1.0] = np.where(alpha == 1.0, 1.0, own[1])[share < 1.0]  # to the last bit
+        own[1, share < 1.0] = np.where(alpha == 1.0, 1.0, own[1])[share < 1.0]  # exactly opaque, without rounding
         colour = self.light[:, rows].numpy() / np.maximum(weight, 1e-8)[..., None]
         target = rgba[..., :3] / np.maximum(alpha, 1e-8)[..., None]
         shown = share[..., None] * colour[0] + (1.0 - share[..., None]) * colour[1]
         gain = np.maximum(target, 0.0) / np.maximum(shown, 1e-8)
-        colour = gain * colour + (target - gain * shown)  # the remainder: splats are black, or the frame is negative
+        colour = gain * colour + (target - gain * shown)  # offset for black splats and negative pixels
         samples = np.concatenate([colour * own[..., None], own[..., None]], axis=-1)
         return samples.astype(np.float32), self.depth[:, rows].numpy()
 
@@ -85,17 +85,17 @@ def deep_samples(
     exposure: Exposure | None, exposed_at: float, display: Display, surface: Tensor,
     config: DeepConfig | None = None,
 ) -> DeepSamples:  # fmt: skip
-    """The surfaces of each pixel of a frame.
+    """The deep samples of a frame.
 
     Args:
-        frozen: the scene.
-        output: the camera.
-        K: [3, 3] its pixels, overscan included.
+        frozen: the scene at t*.
+        output: camera and instant of the frame.
+        K: [3, 3] intrinsics of the frame in pixels, overscan included.
         beyond: pixels of overscan on the left and right, and above and below.
         exposure, exposed_at: as in `render_frozen`.
-        display: what the splats' colours are shown on.
-        surface: [H, W] the frame's depth with overscan, scene units of the model; `NO_DEPTH` where nothing is.
-        config: see there.
+        display: the display in which the splats' colours are given.
+        surface: [H, W] the frame's depth with overscan, scene units of the model; `NO_DEPTH` without a surface.
+        config: parameters of the search.
     """
     config, (height, width) = config or DeepConfig(), surface.shape
     between, depth = _surfaces(surface, config.step)
@@ -115,16 +115,16 @@ def deep_samples(
         left *= 1.0 - image.alpha
     total = weight.sum(0)
     share = torch.where(total > 0.0, weight[0] / total.clamp_min(1e-8), 1.0)
-    # A pixel that keeps one sample is as deep as the frame, though a neighbour is nearer or farther.
+    # A pixel with a single sample gets the frame's depth, although a neighbour is nearer or farther.
     depth[0] = torch.where(share > 1.0 - _LEAST, surface, depth[0])
     depth[1] = torch.where(share < _LEAST, surface, depth[1])
     return DeepSamples(weight, light, depth)
 
 
 def _surfaces(surface: Tensor, step: float) -> tuple[Tensor, Tensor]:
-    """([H, W] depth that parts a pixel's surfaces, infinite where it has one; [2, H, W] depth of both) of a frame's.
+    """([H, W] depth that separates a pixel's two surfaces, infinite for one surface; [2, H, W] depth of both).
 
-    Where depth steps within a 3 x 3 neighbourhood, the pixel holds its nearest and its farthest surface.
+    If depth steps within a 3 x 3 neighbourhood, the pixel has the nearest and the farthest surface in it.
     """
     solid = surface < NO_DEPTH
     nearest = -_highest(torch.where(solid, -surface, -NO_DEPTH))
@@ -135,12 +135,12 @@ def _surfaces(surface: Tensor, step: float) -> tuple[Tensor, Tensor]:
 
 
 def _highest(values: Tensor) -> Tensor:
-    """[H, W] the highest of each pixel and its eight neighbours."""
+    """[H, W] maximum over 3 x 3 pixels."""
     return torch.nn.functional.max_pool2d(values[None, None], 3, 1, 1)[0, 0]
 
 
 def _bounds(depth: Tensor, count: int) -> list[float]:
-    """Depths between which the slabs lie, ascending: equal ratios within what most of a picture shows."""
+    """Ascending depths of the slabs' borders, with equal ratios between the 1st and 99th percentile of depth."""
     solid = depth[depth < NO_DEPTH].numpy()
     if not solid.size:
         return [0.0, float("inf")]
@@ -149,7 +149,7 @@ def _bounds(depth: Tensor, count: int) -> list[float]:
 
 
 def _part(frozen: FrozenGaussians, chosen: Tensor) -> FrozenGaussians:
-    """Some of the Gaussians of a scene; `chosen` [N]."""
+    """The Gaussians of a scene selected by `chosen`, bool [N]."""
     state = {name: value[chosen] for name, value in frozen.state.items()}
     return replace(
         frozen, state=state, support=frozen.support[chosen], motion=frozen.motion[chosen], descent=None, origin=None

@@ -1,4 +1,4 @@
-"""The folder of a take: which of its frames are right, and how new ones take the place of the previous ones."""
+"""The folder of a take: finds frames that are up to date, and replaces outdated frames by new ones."""
 
 from __future__ import annotations
 
@@ -27,24 +27,25 @@ from .plan import FrameSpec, PlannedTake
 
 @dataclass(frozen=True)
 class Place:
-    """Where a take's frames are rendered to."""
+    """The folder to which a take's frames are rendered, and the frames that are up to date."""
 
     folder: TakeFolder
-    """The take's own; or `beside`."""
+    """Folder for new frames: the take's own, or `beside`."""
     beside: TakeFolder | None
-    """A folder in it, as long as another take of that name stands there whole: that one stays until this is done."""
+    """Subfolder for new frames if the take's folder holds a complete take of other inputs. That take is kept until the
+    new one is complete. None: new frames go to the take's own folder."""
     right_here: set[int]
-    """Frames in the take's own folder that are as they would be rendered now."""
+    """Up-to-date frames in the take's own folder."""
     right_beside: set[int]
-    """Those in `beside`: it was begun before."""
+    """Up-to-date frames in `beside`, from an interrupted freeze."""
     of_before: bool = False
-    """There are frames of an earlier version, whose files do not say which belong together: they are made anew."""
+    """True if there are frames of an earlier version, whose files have no keys; they are rendered again."""
 
 
 def place_of(take: PlannedTake, params: FreezeParams) -> Place:
-    """Makes the folder that the take is rendered to, and finds the frames that are right.
+    """Creates the folder to which the take is rendered, and finds the frames that are up to date.
 
-    One that is not asked for now is among them: a part of the range does not undo the rest of the take.
+    Frames outside the requested range are included, so that freezing a part of the range keeps the rest of the take.
     """
     folder, spec = take.folder, take.spec
     make_folders(folder, spec)
@@ -59,7 +60,7 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
     stands = folder.facts.is_file() and bool(set(frames_of(folder)) - right)
     if not stands:
         place = Place(folder, next_folder, right, right_in_next)
-        if next_folder.root.is_dir():  # killed while it took over
+        if next_folder.root.is_dir():  # the last freeze was killed in `take_over`
             take_over(take, place)
         return Place(folder, None, right | right_in_next, set(), of_before)
     _prepare(next_folder, spec)
@@ -67,24 +68,24 @@ def place_of(take: PlannedTake, params: FreezeParams) -> Place:
 
 
 def right_frames(take: PlannedTake, keys: dict[int, str | None]) -> set[int]:
-    """The frames that are as they would be rendered now, of `stored_keys`."""
+    """The up-to-date frames, given `keys` from `stored_keys`."""
     return {n for n, key in keys.items() if key is not None and key == take.keys.get(n)}
 
 
 def stored_keys(folder: TakeFolder, spec: FrameSpec) -> dict[int, str | None]:
-    """Frame -> `stored_key`, of all frames of a take's folder."""
+    """Frame number -> `stored_key` for all frames in a take's folder."""
     return {n: stored_key(folder, n, spec) for n in frames_of(folder)}
 
 
 def stored_key(folder: TakeFolder, frame: int, spec: FrameSpec) -> str | None:
-    """The key that all files of a frame carry. Empty if one carries none: an earlier version wrote it.
+    """The key that all files of a frame share. Empty if a file has no key, because an earlier version wrote it.
 
-    None if one lacks, is cut off, or is of another frame or take than the rest: a process was killed between them.
+    None if a file is missing, truncated, or has another key than the rest, because a process was killed.
     """
     files = [folder.frame(frame), folder.preview(frame)]
     files += [folder.warp(frame)] if spec.has_warps else []
     files += [folder.deep(frame)] if spec.deep is not None else []
-    if not all(map(is_whole_picture, files)):  # a copy may have been cut off
+    if not all(map(is_whole_picture, files)):  # a copied file may be truncated
         return None
     keys = {read_key(file) for file in files}
     if None in keys:
@@ -93,7 +94,7 @@ def stored_key(folder: TakeFolder, frame: int, spec: FrameSpec) -> str | None:
 
 
 def made_before(take: str) -> tuple[str, str]:
-    """Warning about a take with frames of an earlier version, with the reason."""
+    """(warning, hint) about a take with frames of an earlier version."""
     return (
         f"Frames of the take {take} were made by an earlier version, whose files do not say which belong together: "
         "they are made again.",
@@ -102,8 +103,10 @@ def made_before(take: str) -> tuple[str, str]:
 
 
 def outdated(take: PlannedTake, kept: Set[int]) -> tuple[str, str] | None:
-    """A warning that frames of the take, other than those `kept`, are removed and not rendered again, because they
-    show something else. None if there are none."""
+    """(warning, hint) that outdated frames of the take, not in `kept`, are removed and not rendered again.
+
+    None if there are no such frames.
+    """
     gone = set(frames_of(take.folder)) - kept
     if not gone:
         return None
@@ -115,7 +118,7 @@ def outdated(take: PlannedTake, kept: Set[int]) -> tuple[str, str] | None:
 
 
 def clear(take: PlannedTake, done: Set[int]) -> None:
-    """Removes all earlier frames except those in `done`, so that none of them passes for a frame of this take."""
+    """Removes all earlier frames except those in `done`, so that no outdated frame remains in the take."""
     folder = take.folder
     stale = set(_numbers(folder)) - done
     for old in [folder.facts, *(file for n in stale for file in files_of(folder, n))] if stale else ():
@@ -124,24 +127,23 @@ def clear(take: PlannedTake, done: Set[int]) -> None:
 
 
 def take_over(take: PlannedTake, place: Place) -> None:
-    """Moves the frames that were rendered next to an earlier take into its place. If it is killed, the next freeze
-    continues."""
+    """Replaces an earlier take by the frames rendered to `place.beside`. After a kill, the next freeze continues."""
     assert place.beside is not None
     clear(take, place.right_here)
     for n in frames_of(place.beside):
         for file, target in zip(reversed(files_of(place.beside, n)), reversed(files_of(take.folder, n)), strict=True):
-            if file.is_file():  # the EXR last: a frame that has one has the others
+            if file.is_file():  # the EXR is moved last: if it exists, so do the other files
                 replace_file(file, target)
     shutil.rmtree(place.beside.root, ignore_errors=True)
 
 
 def files_of(folder: TakeFolder, frame: int) -> list[Path]:
-    """All files that a frame of a take has: EXR, deep EXR, warp, preview."""
+    """Paths of all files of a frame: EXR, deep EXR, warp, preview."""
     return [folder.frame(frame), folder.deep(frame), folder.warp(frame), folder.preview(frame)]
 
 
 def make_folders(folder: TakeFolder, spec: FrameSpec) -> None:
-    """Makes a take's folder. JobError if it holds frames of someone else's."""
+    """Creates a take's folder. JobError if it contains numbered pictures from elsewhere."""
     if not folder.state.is_file() and _numbers(folder):
         raise JobError(
             f"{folder.root} holds numbered pictures that were not made here.",
@@ -152,7 +154,7 @@ def make_folders(folder: TakeFolder, spec: FrameSpec) -> None:
 
 
 def _prepare(folder: TakeFolder, spec: FrameSpec) -> None:
-    """Makes the folders of a take's frames, and removes what was half written to them."""
+    """Creates the folders of a take's frames, and removes partially written files from them."""
     warps, deeps = [folder.warps] if spec.has_warps else [], [folder.deeps] if spec.deep is not None else []
     for used in (folder.root, folder.previews, *warps, *deeps):
         make_folder(used)
@@ -160,17 +162,17 @@ def _prepare(folder: TakeFolder, spec: FrameSpec) -> None:
 
 
 def frames_of(folder: TakeFolder) -> list[int]:
-    """Numbers of the frames that a take's folder has, ascending."""
+    """Numbers of the frames in a take's folder, ascending."""
     return _frames_in(folder.root.glob("*" + LAYERS))
 
 
 def _numbers(folder: TakeFolder) -> list[int]:
-    """Those of all files of frames."""
+    """Numbers of all frames of which any file exists, ascending."""
     folders = folder.root, folder.warps, folder.deeps
     files = [folder.previews.glob("*" + PICTURE), *(each.glob("*" + LAYERS) for each in folders)]
     return sorted({n for found in files for n in _frames_in(found)})
 
 
 def _frames_in(paths: Iterable[Path]) -> list[int]:
-    """Numbers of those files that are frames, ascending."""
+    """Frame numbers of the files that are named like frames, ascending."""
     return sorted(n for p in paths if (n := frame_number(p.stem)) is not None)

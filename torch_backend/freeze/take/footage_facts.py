@@ -1,4 +1,4 @@
-"""What a take says of the footage that it was frozen from, so that a compositor can show the original itself."""
+"""Facts about the footage for take.json, with which a compositor can load the original files."""
 
 from __future__ import annotations
 
@@ -16,17 +16,20 @@ from ...shot import Shot, content_key
 
 
 def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
-    """For take.json: where the footage lies and how its files are shown; {} where it is not there any more.
+    """Location and interpretation of the footage, for take.json; {} if the footage is missing.
 
-    file: the video, or the first picture of the sequence. beside: the same, seen from the shot folder. size: of its
-    pictures. first, last: its frames' own numbers; those of a video count from 1. shift: what is added to them to get
-    the shot's numbers; absent if they are the same. probe: linear Rec.709 light that
-    `contract.PROBE` means in it. space: the name of its colour space. map: the ST map in the take's folder that takes
-    the lens away, which this writes; empty if there is no lens. unlike: why a program that shows the files would not
-    show what the freeze was made from, a clause; empty if it would. orientation: how its header says that a video is
-    turned, as EXIF counts it; 1: not at all.
+    file: the video, or the first picture of the sequence.
+    beside: the same path, relative to the shot folder.
+    size: width and height of its pictures.
+    first, last: frame numbers in the files; those of a video start at 1.
+    shift: offset from these to the shot's frame numbers; absent if 0.
+    probe: linear Rec.709 light of `contract.PROBE` in the footage's colour space.
+    space: name of that colour space.
+    map: ST map in the take's folder that undistorts the lens, written by this function; empty without a lens.
+    unlike: clause that states why other programs would show the files differently from the plates; empty otherwise.
+    orientation: rotation in the video's header as an EXIF code; 1: none.
 
-    JobError (DISK), OSError if the map cannot be written.
+    JobError (DISK) or OSError if the map cannot be written.
     """
     plates = Plates(shot)
     info, lens = plates.original(), plates.lens()
@@ -55,14 +58,14 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
 
 
 def footage_light(shot: Shot) -> str:
-    """Which of `LIGHTS` the footage holds, and frozen frames leave in; Rec.709's for all that is none of them."""
+    """Primaries of the footage and its frozen frames, one of `LIGHTS`; Rec.709 if the footage has others."""
     reading: dict[str, Any] = load_frames(shot).get("reading") or {}
     light = str(reading.get("light", ""))
     return light if light in LIGHTS else LIGHTS[0]
 
 
 def _unsteady(shot: Shot, fps: float) -> str:
-    """Why programs that count time instead of pictures would show other frames; empty if they would not."""
+    """Reason why programs that seek by time would show other frames; empty for a constant frame rate."""
     rows = load_frames(shot)["frames"]
     off = [float(row["seconds"]) - (int(row["frame"]) - int(rows[0]["frame"])) / fps for row in rows]
     return "its rate varies" if max(off) - min(off) > 0.5 / fps else ""

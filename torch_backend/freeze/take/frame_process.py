@@ -1,16 +1,16 @@
-"""One of the processes of `side_by_side.py`: `python -m torch_backend.freeze.take.frame_process`.
+"""Worker process of `side_by_side.py`: `python -m torch_backend.freeze.take.frame_process`.
 
 Reads one message (`contract.read_message`) from standard input. Its header is the request: `shot`, `params` of the
 freeze, `t_star`, `keys` of the whole take, `folder` for the frames, and `frames`, the numbers to render. The input
 stays open as long as the starter lives. Writes these messages to standard output:
 
-| kind | with |
+| kind | content |
 |---|---|
-| `progress` | `done` frames of this process, `message` of that at work |
-| `share` | `frame`, `size` [h, w]; the body: float32, the frame's share of plate, as `render_frames` returns it |
+| `progress` | `done`: number of finished frames of this process; `message`: the current frame |
+| `share` | `frame`, `size` [h, w]; body: float32, the frame's share of plate, as `render_frames` returns it |
 | `error` | `message`, `hint`, `exit_code` of a `JobError` |
 
-If the take differs from the starter's, because the run was trained meanwhile, it exits without a message.
+If the take differs from the starter's, because the run was trained meanwhile, the process exits without a message.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from ...contract import (
 
 
 class _FrameReporter(Reporter):
-    """Sends the progress of the frames; warnings were given by the starter."""
+    """Sends the progress of the frames. Warnings are dropped, because the starter has already reported them."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        """Sends the progress of the stage `freezing`, and of no other."""
+        """Sends the progress of the stage `freezing` only."""
         if stage == "freezing" and done < total:
             write_message(self._stream, {"kind": "progress", "done": int(done), "message": message})
 
 
 def main() -> int:
-    """Runs the request; an `ExitCode`."""
+    """Runs the request and returns an `ExitCode`."""
     with os.fdopen(0, "rb", buffering=0, closefd=False) as stdin:
         message = read_message(stdin)
     end_with_starter()
     stream = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # keep what libraries print out of the messages
+    os.dup2(2, 1)  # libraries print to stderr instead of the message stream
     if message is None:
         return ExitCode.CANCELLED
     try:
@@ -73,7 +73,7 @@ def main() -> int:
 
 
 def _render(request: dict[str, Any], stream: BinaryIO) -> None:
-    from ...shot import Shot  # torch takes seconds, in which the input must be watched already
+    from ...shot import Shot  # importing torch takes seconds, during which stdin must already be watched
     from .frames import render_frames
     from .plan import planned
 

@@ -1,4 +1,4 @@
-"""The frames of a take: rendered one by one, and written with their layers, warps and previews."""
+"""Renders the frames of a take one by one, and writes them with their layers, warps and previews."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from .write_beside import WriteBeside
 
 
 def make_ready(take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter) -> None:
-    """Develops the instants of those of `frames` that are not done. JobError if the disk has no room for the frames."""
+    """Develops the instants of the `frames` that are not in `done`. JobError if the disk has no room for the frames."""
     spec, missing = take.spec, [f for f in frames if f.frame not in done]
     each = (
         spec.whole[0]
@@ -59,10 +59,10 @@ def render_frames(
     take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter,
     before_each: Callable[[], None] | None = None,
 ) -> dict[int, Tensor]:  # fmt: skip
-    """Renders and writes those of `frames` that are not done, if the disk has room for them. What `before_each` raises
-    before a frame is written ends it.
+    """Renders and writes the `frames` that are not in `done`, if the disk has room for them.
 
-    Returns frame number -> [h, w] share of plate, small, of those rendered. JobError if the disk is full.
+    `before_each` is called before each frame is written; its exceptions end rendering. Returns frame number -> [h, w]
+    share of plate (see `small_share`) of the rendered frames. JobError if the disk is full.
     """
     make_ready(take, frames, done, report)
     try:
@@ -76,7 +76,7 @@ def _render_all(
     before_each: Callable[[], None] | None,
 ) -> dict[int, Tensor]:  # fmt: skip
     folder, scene, spec, keys = take.folder, take.scene, take.spec, take.keys
-    done = done if spec.debug_terms is None else set()  # of frames that are there, nobody kept the terms
+    done = done if spec.debug_terms is None else set()  # debug terms of existing frames are not stored
     shares: dict[int, Tensor] = {}
     with WriteBeside() as out:
         for n, output in enumerate(frames):
@@ -92,13 +92,13 @@ def _render_all(
                 before_each()
             write = functools.partial(_write, folder, output, image, deep, scene, spec, keys[output.frame])
             out.write(write, sum(value.nbytes for value in vars(image).values() if isinstance(value, Tensor)))
-            del image, deep, write  # at 4K the next frame needs their gigabyte
+            del image, deep, write  # frees 1 GB at 4K for the next frame
     report.progress("freezing", len(frames), len(frames), f"{len(frames)} frames")
     return shares
 
 
 def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter) -> FrozenImage | CompositeFrame:
-    """A frame of the take, of splats or of plates; layers but colour and alpha are those of the shutter's middle."""
+    """A frame of the take, from splats or plates. With motion blur, only colour and alpha are blurred."""
     frozen = spec.instants.at(output.t_star, report)
     K = whole_camera(output, spec)
     image, made = _composited(output, frozen, scene, spec)
@@ -116,7 +116,7 @@ def _render(output: OutputFrame, scene: Scene, spec: FrameSpec, report: Reporter
 def _composited(
     output: OutputFrame, frozen: FrozenGaussians, scene: Scene, spec: FrameSpec
 ) -> tuple[FrozenImage, FrozenImage | CompositeFrame]:  # fmt: skip
-    """(the splats' render, the frame) of one camera; without detail both are the same."""
+    """(the splats' render, the frame) of one camera; both are the same without plate detail."""
     exposed_at, K = scene.time_of_frame(output.exposed_like), whole_camera(output, spec)
     image = render_frozen(frozen, output.viewmat, K, *spec.whole, spec.run.model.exposure, exposed_at, spec.beyond)
     return image, image if spec.detail is None else spec.detail.frame(output, frozen, image, *spec.size)
@@ -126,7 +126,7 @@ def _blur(
     made: FrozenImage | CompositeFrame, cameras: list[OutputFrame], frozen: FrozenGaussians, scene: Scene,
     spec: FrameSpec, report: Reporter,
 ) -> None:  # fmt: skip
-    """Makes colours and alphas of a frame the mean, in scene-linear light, of it and of what other cameras see."""
+    """Replaces colours and alphas of a frame with the scene-linear mean of its own and those of other `cameras`."""
     if not cameras:
         return
     sums = _lights(made, scene.display)
@@ -143,7 +143,7 @@ def _blur(
 
 
 def _lights(image: FrozenImage | CompositeFrame, display: Display) -> list[Tensor]:
-    """[H, W, 4] each, scene-linear, premultiplied: a frame's picture, and of plates that of its splats."""
+    """[H, W, 4] each, scene-linear, premultiplied: the frame, and for a `CompositeFrame` also its splats."""
     if isinstance(image, CompositeFrame):
         splat = scene_linear(image.splat.numpy(), image.splat_alpha.numpy(), display)
         return [torch.cat([image.linear, image.alpha[..., None]], dim=2), from_numpy(splat)]
@@ -151,14 +151,14 @@ def _lights(image: FrozenImage | CompositeFrame, display: Display) -> list[Tenso
 
 
 def _shown(light: Tensor, display: Display) -> Tensor:
-    """[H, W, 3] premultiplied, on the display, of [H, W, 4] as `scene_linear` makes it."""
+    """[H, W, 3] premultiplied, display-referred, from scene-linear [H, W, 4]: the inverse of `scene_linear`."""
     alpha = light[..., 3:]
     straight = torch.where(alpha > 0.0, light[..., :3] / alpha.clamp_min(1e-8), 0.0)
     return to_display(straight, display) * alpha
 
 
 def whole_camera(output: OutputFrame, spec: FrameSpec) -> Tensor:
-    """[3, 3] a frame's camera in pixels of its picture with overscan."""
+    """[3, 3] intrinsics of a frame in pixels of its picture with overscan."""
     K = output.K.clone()
     K[:2, 2] += torch.tensor(spec.beyond, dtype=K.dtype, device="cpu")
     return K
@@ -173,8 +173,8 @@ def _write(
     spec: FrameSpec,
     key: str,
 ) -> None:
-    """All files of a frame. Each carries the frame's key, by which `take_folder.stored_key` tells a whole frame from
-    files of two; the EXR comes last, so that readers who look for it alone find the others."""
+    """Writes all files of a frame. Each stores the frame's key, with which `folder.stored_key` checks that the files
+    belong together. The EXR is written last, so that all other files exist once it does."""
     if isinstance(image, CompositeFrame):
         if spec.debug_terms is not None:
             write_terms(spec.debug_terms, output.frame, image.terms)
@@ -193,7 +193,7 @@ def _write_frame(
     spec: FrameSpec,
     key: str,
 ) -> None:
-    """Preview and EXR. The inputs of the layers are in memory; the layers are computed some rows at a time."""
+    """Writes preview and EXR. The layers are computed some rows at a time, to save memory."""
     write_png(folder.preview(output.frame), _preview(image, spec), key)
     size = tuple(image.alpha.shape)
 
@@ -243,7 +243,7 @@ def _rgba(image: FrozenImage | CompositeFrame, scene: Scene, rows: slice) -> NDA
 def _deep(
     output: OutputFrame, image: FrozenImage | CompositeFrame, scene: Scene, spec: FrameSpec, report: Reporter
 ) -> DeepSamples:  # fmt: skip
-    """The deep samples of a frame whose depth is settled."""
+    """The deep samples of a frame with final depth."""
     exposure, exposed_at = spec.run.model.exposure, scene.time_of_frame(output.exposed_like)
     frozen, K = spec.instants.at(output.t_star, report), whole_camera(output, spec)
     return deep_samples(frozen, output, K, spec.beyond, exposure, exposed_at, scene.display, image.depth)
@@ -253,7 +253,7 @@ def _write_deep(
     folder: TakeFolder, output: OutputFrame, image: FrozenImage | CompositeFrame, deep: DeepSamples, scene: Scene,
     spec: FrameSpec, key: str,
 ) -> None:  # fmt: skip
-    """The deep EXR of a frame, in the axes and units of the scene."""
+    """Writes the deep EXR of a frame, in the axes and units of Blender's scene."""
     assert spec.deep is not None
     matrix, units = light_matrix(spec.light), spec.deep.scale / scene.scale
 
@@ -275,7 +275,7 @@ def _write_deep(
 
 
 def _solve_viewmat(output: OutputFrame, scene: Scene) -> Tensor:
-    """[4, 4] a frame's world-to-camera in the units of the solve, float64."""
+    """[4, 4] world-to-camera of a frame in solve units, float64."""
     viewmat = output.viewmat.double().clone()
     viewmat[:3, 3] = viewmat[:3, 3] / scene.scale - viewmat[:3, :3] @ from_numpy(scene.centre)
     return viewmat
@@ -284,8 +284,8 @@ def _solve_viewmat(output: OutputFrame, scene: Scene) -> Tensor:
 def _grain(
     grain: Grain, output: OutputFrame, image: FrozenImage | CompositeFrame, spec: FrameSpec, display: Display
 ) -> Made:  # fmt: skip
-    """The layer of a frame's grain, [H, W, 3] scene-linear, premultiplied. It was measured on sRGB, whatever `display`
-    the frame's splats are shown on."""
+    """The grain layer of a frame, [H, W, 3] scene-linear, premultiplied. Grain is measured on sRGB, so colours of other
+    displays are converted first."""
     brush = Brush(grain, output.frame, image.alpha.shape, spec.whole_grain_size)
     K, softness = whole_camera(output, spec), grain.softness * spec.whole[0] / spec.whole_grain_size[0]
     blur: MotionBlur | None = None if spec.blur is None or spec.blur.is_still(output) else spec.blur
@@ -296,9 +296,9 @@ def _grain(
         if display.bends and not isinstance(image, CompositeFrame):
             shown = on_straight_colour(shown, lambda x: display.straightened(np.asarray(x, np.float32)))
         made = brush.rows(rows, shown)
-        if isinstance(image, CompositeFrame):  # plates have theirs
+        if isinstance(image, CompositeFrame):  # plates already have grain
             lacking = 1.0 - image.plate[rows]
-            if blur is not None:  # which has averaged theirs away in part; deviations add up by their squares
+            if blur is not None:  # motion blur averages part of the plates' grain away; variances add up
                 lengths = blur.lengths(output, K, image.depth[rows], rows.start)
                 lacking = (1.0 - kept_grain(lengths, softness).float() * (1.0 - lacking.square())).sqrt()
             made = made * lacking.numpy()[..., None]
@@ -308,12 +308,12 @@ def _grain(
 
 
 def _display(image: FrozenImage | CompositeFrame, rows: slice) -> Tensor:
-    """[h, W, 3] some rows of a frame, premultiplied, on the scene's display."""
+    """[h, W, 3] some rows of a frame, premultiplied, in the scene's display."""
     return to_display(image.linear[rows], image.display) if isinstance(image, CompositeFrame) else image.color[rows]
 
 
 def _preview(image: FrozenImage | CompositeFrame, spec: FrameSpec) -> np.ndarray:
-    """[H, W, 3] uint8 the frame without overscan as it stands over the plate; so contact sheet and video show it."""
+    """[H, W, 3] uint8 the frame without overscan on a grey background, for contact sheet and video."""
     (width, height), (left, top) = spec.size, spec.beyond
     out = np.empty((height, width, 3), np.uint8)
     for part in bands(height, width):
@@ -339,9 +339,9 @@ def _write_warp(folder: TakeFolder, output: OutputFrame, made: CompositeFrame, s
 
 
 def small_share(plate: Tensor, support: Tensor) -> Tensor:
-    """[H, W] share of plate, averaged to a picture about 160 pixels wide, for figures.
+    """[h, w] share of plate [H, W], averaged to a picture at most 160 pixels wide, for statistics.
 
-    A plate counts by at most `support` [H, W]: where no frame near t* shows the surface, it does not show the instant.
+    The share is limited by `support` [H, W]: without support, plates show the surface but not its state at t*.
     """
     plate = torch.minimum(plate, support)
     height, width = plate.shape
@@ -350,11 +350,11 @@ def small_share(plate: Tensor, support: Tensor) -> Tensor:
 
 
 def scene_linear(color: np.ndarray, alpha: np.ndarray, display: Display) -> np.ndarray:
-    """Premultiplied colour [H, W, 3] of a display and alpha [H, W] -> premultiplied scene-linear RGBA [H, W, 4].
+    """Premultiplied scene-linear RGBA [H, W, 4] from premultiplied display colour [H, W, 3] and alpha [H, W].
 
-    Splats blend in display space; the conversion acts on the colour that is seen, so it goes through straight alpha.
+    Splats blend in display space. The colour is therefore divided by alpha before the conversion.
     """
-    # Beyond what any frame of the clip shows there was nothing to match in training: overshoot is noise, which at the
-    # end of a shoulder would be many times as bright.
+    # Colour above the brightest value of the clip was not supervised in training. It is noise, which the shoulder's
+    # inverse would amplify many times.
     capped = np.clip(color, 0.0, alpha[..., None] * np.float32(display.most))
     return display.premultiplied_to_light(np.concatenate([capped, alpha[..., None]], axis=2))

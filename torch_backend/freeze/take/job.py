@@ -1,4 +1,4 @@
-"""The freeze station: makes a take, and writes what leaves for Blender and for the artist's eyes."""
+"""The freeze job: renders a take and writes all its files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from .video import write_video
 def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
     """Renders a take of a run and writes EXRs, previews, contact sheet, video and splats into takes/<name>.
 
-    Returns the take's figures (also in take.json). JobError in words if it cannot be done.
+    Returns the content of take.json. JobError if the take cannot be rendered.
     """
     take = planned(shot, params, report)
     frames = in_range(take.whole, params)
@@ -54,7 +54,7 @@ def freeze_shot(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
     if (warning := outdated(take, place.right_here | {f.frame for f in frames})) is not None:
         report.warning(*warning)
     done = place.right_here | place.right_beside
-    make_ready(take, frames, done, report)  # what can fail, or be cancelled, before anything of before goes
+    make_ready(take, frames, done, report)  # may fail or be cancelled, so it runs before old frames are removed
     if place.beside is None:
         clear(take, done)
     shares = render_side_by_side(shot, params, dataclasses.replace(take, folder=place.folder), frames, done, report)
@@ -74,9 +74,9 @@ def finish(
     shot: Shot, params: FreezeParams, take: PlannedTake, frames: list[OutputFrame], shares: dict[int, Tensor],
     report: Reporter,
 ) -> dict[str, Any]:  # fmt: skip
-    """Contact sheet, video, splats and take.json of all frames that the take has by now; they are on disk.
+    """Writes contact sheet, video, splats and take.json for `frames`, which are all frames of the take on disk.
 
-    Returns what take.json holds. `shares` as `render_frames` gives them. JobError if the disk is full.
+    Returns the content of take.json. `shares` is as returned by `render_frames`. JobError if the disk is full.
     """
     try:
         return _finish(shot, params, take, frames, shares, report)
@@ -167,8 +167,10 @@ def _facts(shot: Shot, params: FreezeParams, take: PlannedTake) -> dict[str, Any
 
 @contextlib.contextmanager
 def missable(what: str, report: Reporter) -> Generator[None]:
-    """Writes a file that a take can do without: on Windows that of before cannot be replaced while a player has it
-    open. A full disk is none of these."""
+    """Context manager that turns an OSError of writing an optional file into a warning.
+
+    On Windows, a file that a player has open cannot be replaced. A full disk and unknown errors are raised.
+    """
     try:
         yield
     except OSError as error:
@@ -179,7 +181,7 @@ def missable(what: str, report: Reporter) -> Generator[None]:
 
 
 def _made_of(folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: dict[int, Tensor]) -> dict[str, Any]:
-    """What take.json says of plate detail; {} without it. `shares` are of the frames that this job rendered."""
+    """Facts on plate detail for take.json; {} without plate detail. `shares` are those of the rendered frames."""
     if spec.detail is None:
         return {}
     for n in (n for n in numbers if n not in shares):
@@ -193,7 +195,11 @@ def _made_of(folder: TakeFolder, numbers: list[int], spec: FrameSpec, shares: di
 def _redistort(
     shot: Shot, folder: TakeFolder, size: tuple[int, int], beyond: tuple[int, int], Ks: np.ndarray, report: Reporter
 ) -> Path | None:
-    """The map back through the lens over overscanned frames; None where the shot's own map fits, or none does."""
+    """Writes the ST map that adds lens distortion to overscanned frames.
+
+    Returns None without overscan, because the shot's own map then fits. If no map can be made, it warns and returns
+    None.
+    """
     remove_file(folder.redistort)
     if not any(beyond):
         return None
@@ -210,7 +216,7 @@ def _contact_sheet(
     shot: Shot, params: FreezeParams, numbers: list[int], previews: list[Path], title: str, t_star: int,
     verdict: Verdict | None,
 ) -> None:  # fmt: skip
-    seen = [i for i, n in enumerate(numbers) if shot.plate(n).is_file()]  # all but those that the footage lacks
+    seen = [i for i, n in enumerate(numbers) if shot.plate(n).is_file()]  # frames missing in the footage have no plate
     own_poses = not params.camera_path and bool(seen)
     if own_poses:
         previews, numbers = [previews[i] for i in seen], [numbers[i] for i in seen]
@@ -223,10 +229,10 @@ def _contact_sheet(
 
 
 def detail_facts(shares: dict[int, Tensor]) -> dict[str, Any]:
-    """What a take's frames are made of, for take.json: means over frames, and each frame with a grid of regions.
+    """Statistics of a take's sources for take.json: means over frames, and the values of each frame.
 
-    `plate_share` is the mean share of plate; `invented_share` the share of pixels of which splats invented more than
-    half; `regions` the same on a grid of 4 x 4, rows from the top.
+    `plate_share` is the mean share of plate. `invented_share` is the share of pixels with less than half plate.
+    `regions` is `invented_share` on a grid of 4 x 4 cells, rows from the top.
     """
     rows: list[dict[str, Any]] = []
     for frame, share in sorted(shares.items()):

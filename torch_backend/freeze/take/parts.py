@@ -1,12 +1,12 @@
-"""A take in parts, for many computers at once: opened once, frozen in parts, finished once.
+"""Renders a take in parts on several computers: opened once, frozen in parts, finished once.
 
-    open_take      what all parts share: the instant is chosen and developed, and what the take shows is written down
-    freeze_part    frames of a range; any number of parts at once, in any order, on any computer
-    finish_take    contact sheet, video, splats and take.json, when all frames are there
+    open_take      chooses and develops the instant, and records the key of the take for all parts
+    freeze_part    renders the frames of a range; parts may run at once, in any order, on any computer
+    finish_take    writes contact sheet, video, splats and take.json, once all frames exist
 
-Each may run twice, also at once, and after it was killed: nothing that is right is removed, every file is renamed into
-its place whole, and two who make the same frame write the same bytes. Nobody holds the shot's lock: parts of different
-takes, and of one, do not wait for each other.
+Each step may run twice, also concurrently, and again after it was killed. Valid files are not removed, every file is
+written under a temporary name and then renamed, and two processes that render the same frame write the same bytes. No
+step holds the shot's lock, so parts of one take or of several takes run concurrently.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from .plan import PlannedTake, planned
 
 
 def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
-    """Begins a take: chooses its instant, develops it if that is wanted, and writes state.json.
+    """Opens a take: chooses its instant, develops it if requested, and writes state.json.
 
-    Returns {t_star, first, last, frames}: what parts are to be made of. JobError in words if it cannot be done.
+    Returns {t_star, first, last, frames} for splitting into parts. JobError if the take cannot be opened.
     """
     take = planned(shot, params, report)
     make_folders(take.folder, take.spec)
@@ -45,17 +45,17 @@ def open_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, A
     if "" in keys.values():
         report.warning(*made_before(params.take))
     if set(keys) - right_frames(take, keys):
-        remove_file(take.folder.facts)  # what it tells of goes, frame by frame
+        remove_file(take.folder.facts)  # its frames will be replaced one by one
     state = {"version": 1, "key": take.key, "t_star": take.t_star, "frames": take.all_keys}
     write_json(take.folder.state, state)
     return {"t_star": take.t_star, "first": chosen[0].frame, "last": chosen[-1].frame, "frames": len(chosen)}
 
 
 def freeze_part(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
-    """Renders those frames of `params.first` to `params.last` that an opened take lacks.
+    """Renders the frames from `params.first` to `params.last` that an opened take lacks.
 
-    A range without a frame is no error: the last part of a take may be empty. Returns {frames, rendered}. JobError if
-    the take was not opened, or not as this computer sees it.
+    A range without frames is valid, because the last part of a take may be empty. Returns {frames, rendered}. JobError
+    if the take was not opened, or was opened with other inputs than this computer sees.
     """
     take = _opened(shot, params, report)
     _refuse_undeveloped(take)
@@ -73,10 +73,9 @@ def freeze_part(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
 
 
 def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str, Any]:
-    """Completes an opened take whose frames from `params.first` to `params.last` are all there.
+    """Completes an opened take whose frames from `params.first` to `params.last` all exist.
 
-    Earlier frames that are not right any more are removed. Returns what take.json holds. JobError names frames that
-    lack.
+    Outdated frames are removed. Returns the content of take.json. JobError names the first missing frame.
     """
     take = _opened(shot, params, report)
     wanted = in_range(take.whole, params)
@@ -99,12 +98,12 @@ def finish_take(shot: Shot, params: FreezeParams, report: Reporter) -> dict[str,
 
 
 def _right_of(take: PlannedTake, frames: list[OutputFrame]) -> set[int]:
-    """Those of some frames that are on disk as they would be rendered now."""
+    """Numbers of the given frames whose files on disk are up to date."""
     return right_frames(take, {f.frame: stored_key(take.folder, f.frame, take.spec) for f in frames})
 
 
 def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
-    """The take as `open_take` settled it. JobError if it did not, or if this computer would render something else."""
+    """The plan of an opened take. JobError if it is not open, or if its key differs on this computer."""
     try:
         state = read_json(TakeFolder(shot.take(params.take)).state)
         t_star = int(state["t_star"])
@@ -124,7 +123,7 @@ def _opened(shot: Shot, params: FreezeParams, report: Reporter) -> PlannedTake:
 
 
 def _refuse_opened_anew(take: PlannedTake) -> None:
-    """JobError if the take was opened with something else since: this part's frames would replace newer ones."""
+    """Raises JobError if the take was reopened with other inputs: this part's frames would replace newer ones."""
     try:
         state = read_json(take.folder.state)
     except (OSError, ValueError):
@@ -138,8 +137,7 @@ def _refuse_opened_anew(take: PlannedTake) -> None:
 
 
 def _refuse_undeveloped(take: PlannedTake) -> None:
-    """JobError if an instant of the take is not kept where every part finds it: parts that made their own would not
-    match."""
+    """Raises JobError if an instant is not stored in the run's folder: instants developed per part would not match."""
     lacking = [int(t) for t in take.spec.instants.keys if not take.spec.instants.is_kept(t)]
     if lacking:
         raise JobError(

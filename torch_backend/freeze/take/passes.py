@@ -1,7 +1,7 @@
-"""Passes of a frozen frame: motion vectors of the camera's move, normals and positions, from the depth that is written.
+"""Passes of a frozen frame, computed from its depth: motion vectors of the camera move, normals and positions.
 
-The world stands still, so a pixel's motion is that of its point between the cameras of two frames. Layouts are those of
-Blender's own passes, as a Cycles render of bpy 5.0 has them.
+The world is static, so the motion of a pixel is that of its surface point between the cameras of two frames. The
+layout of the passes is that of a Cycles render with bpy 5.0.
 """
 
 from __future__ import annotations
@@ -25,42 +25,43 @@ from ..frozen import OutputFrame
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _NEAREST = 1e-6
-"""Depth in scene units of the model below which a point is behind a camera."""
+"""Depth in scene units of the model below which a point counts as behind a camera."""
 _VECTOR_SIGNS = np.array([1.0, 1.0, -1.0, -1.0], np.float32)
-"""Blender's Vector counts the frame after the other way: from there to here."""
+"""Signs of Blender's Vector pass: its second half points from the next frame to this frame."""
 
 
 @dataclass(frozen=True)
 class Passes:
-    """Makes the passes of a take's frames."""
+    """Computes the passes of a take's frames."""
 
     frames: Sequence[OutputFrame]
     """All frames of the take, ascending."""
     scene: Scene
-    """Of the shot."""
+    """The shot's cameras and frames."""
     to_scene: Similarity
-    """From solve units to the axes and units of Blender's scene."""
+    """Similarity from solve units to the axes and units of Blender's scene."""
 
     def facts(self, output: OutputFrame) -> list[Any]:
-        """What a frame's passes depend on beside its own picture, for its key."""
+        """Inputs of a frame's passes for its key, in addition to the inputs of its picture."""
         near = [floats(each.viewmat.flatten()) for each in self._beside(output) if each is not None]
         return [self.to_scene.matrix.flatten().tolist(), near]
 
     def of(self, output: OutputFrame, K: Tensor, depth: Tensor) -> dict[str, Made]:
-        """The layers of a frame by name, made some rows at a time.
+        """The layers of a frame by name, computed some rows at a time.
 
         Args:
             output: the frame.
-            K: [3, 3] its camera in pixels of `depth`, overscan included.
-            depth: [H, W] along the camera's axis, scene units of the model; `NO_DEPTH` where nothing is.
+            K: [3, 3] intrinsics of the frame in pixels of `depth`, overscan included.
+            depth: [H, W] along the camera's axis, scene units of the model; `NO_DEPTH` without a surface.
 
         Returns:
-            Vector: [H, W, 4] pixels, x right and y up: where the point was in the frame before, less where it is; where
-            it is, less where it will be in the frame after. 0 at the ends of the take and where nothing is.
-            forward: [H, W, 2] pixels, x right and y up: where the point will be in the frame after, less where it is.
-            backward: [H, W, 2] likewise, of the frame before; both as Nuke's VectorBlur reads them.
-            Normal: [H, W, 3] unit vectors towards the camera's side, in the scene's axes; 0 where nothing is.
-            Position: [H, W, 3] in the scene's axes and units; 0 where nothing is.
+            Vector: [H, W, 4] pixels, x right and y up: the point's position in the previous frame minus that in this
+            frame; then its position in this frame minus that in the next frame. 0 at the ends of the take.
+            forward: [H, W, 2] pixels, x right and y up: the point's position in the next frame minus that in this one.
+            backward: [H, W, 2] the same for the previous frame; both as Nuke's VectorBlur reads them.
+            Normal: [H, W, 3] unit vectors facing the camera, in the scene's axes.
+            Position: [H, W, 3] in the scene's axes and units.
+            All layers are 0 without a surface.
         """
         height, width = depth.shape
         lens = K.double().numpy()
@@ -68,7 +69,7 @@ class Passes:
         def seen(rows: slice) -> tuple[Array, Mask]:
             return _unprojected(depth[rows].double().numpy(), rows.start, output, lens)
 
-        @functools.lru_cache(maxsize=1)  # three layers are made of it, band by band
+        @functools.lru_cache(maxsize=1)  # three layers use the same band
         def moves(top: int, end: int) -> NDArray[np.float32]:
             return self._moves(*seen(slice(top, end)), output, lens, top)
 
@@ -87,7 +88,7 @@ class Passes:
         }
 
     def _beside(self, output: OutputFrame) -> tuple[OutputFrame | None, OutputFrame | None]:
-        """The take's frames before and after one."""
+        """(previous, next) frame of the take; None if missing."""
         at = {each.frame: each for each in self.frames}
         return at.get(output.frame - 1), at.get(output.frame + 1)
 
@@ -98,7 +99,7 @@ class Passes:
     def _normals(
         self, seen: Callable[[slice], tuple[Array, Mask]], rows: slice, height: int
     ) -> NDArray[np.float32]:  # fmt: skip
-        """Of the plane through each point and its nearer neighbours across and down: a step in depth is none of it."""
+        """[h, W, 3] normals from the nearer horizontal and vertical neighbour of each point, to ignore depth steps."""
         wide = slice(max(0, rows.start - 1), min(height, rows.stop + 1))
         inner = slice(rows.start - wide.start, rows.stop - wide.start)
         points, is_solid = seen(wide)
@@ -111,14 +112,14 @@ class Passes:
     def _moves(
         self, points: Array, is_solid: Mask, output: OutputFrame, lens: Array, top: int
     ) -> NDArray[np.float32]:  # fmt: skip
-        """[h, w, 4] pixels, x right and y up: from here to the frame before, then from here to the frame after."""
+        """[h, w, 4] image motion in pixels, x right and y up: to the previous frame, then to the next frame."""
         found = np.zeros((*is_solid.shape, 4), np.float32)
         x, y = _centres(is_solid.shape, top)
         for at, other in zip((0, 2), self._beside(output), strict=True):
             if other is None:
                 continue
             its_lens = other.K.double().numpy().copy()
-            its_lens[:2, 2] += (lens - output.K.double().numpy())[:2, 2]  # as much overscan as this frame has
+            its_lens[:2, 2] += (lens - output.K.double().numpy())[:2, 2]  # the same overscan as this frame
             viewmat = other.viewmat.double().numpy()
             local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
             is_ahead = is_solid & (local[..., 2] > _NEAREST)
@@ -131,14 +132,14 @@ class Passes:
 
 
 def _centres(shape: tuple[int, ...], top: int) -> tuple[Array, Array]:
-    """(x [w], y [h, 1]) of the pixels' centres of some rows, the first of which is row `top`."""
+    """(x [w], y [h, 1]) of pixel centres; the rows start at row `top`."""
     x, y = np.arange(shape[1], dtype=np.float64), np.arange(top, top + shape[0], dtype=np.float64)
     half = np.float64(0.5)
     return x + half, y[:, None] + half
 
 
 def _unprojected(depth: Array, top: int, output: OutputFrame, lens: Array) -> tuple[Array, Mask]:
-    """([h, w, 3] points in scene units of the model, [h, w] where there is something) of rows of depth [h, w]."""
+    """(points [h, w, 3] in scene units of the model, bool [h, w] True on surfaces) of rows of depth [h, w]."""
     x, y = _centres(depth.shape, top)
     is_solid = depth < NO_DEPTH
     solid = np.where(is_solid, depth, 1.0)
@@ -148,7 +149,7 @@ def _unprojected(depth: Array, top: int, output: OutputFrame, lens: Array) -> tu
 
 
 def _slope(points: Array, is_solid: Mask, axis: int) -> Array:
-    """[h, w, 3] the difference along an axis (0 down, 1 across) to the nearer of both neighbours; 0 without any."""
+    """[h, w, 3] difference along an axis (0 down, 1 across) to the nearer of two neighbours; 0 without neighbours."""
     steps = np.diff(points, axis=axis)
     has_both = np.take(is_solid, range(1, is_solid.shape[axis]), axis) & np.take(
         is_solid, range(is_solid.shape[axis] - 1), axis

@@ -1,4 +1,4 @@
-"""What a take will show, before any of it is rendered: its instant, its frames, what each of them is known by."""
+"""Plans a take before rendering: its instant, its frames, and the key of each frame."""
 
 from __future__ import annotations
 
@@ -45,60 +45,60 @@ from .motion_blur import MotionBlur
 from .passes import Passes
 
 TAKE_VERSION = 3
-"""Rises when frames rendered before must not stand beside new ones."""
+"""Version of frames. Raise it when older frames must not be mixed with new ones."""
 COMPOSITE_VERSION = 23
-"""The same, of frames made of plates."""
+"""Version of frames composited from plates, used like `TAKE_VERSION`."""
 DEEP_VERSION = 2
-"""The same, of deep pictures."""
+"""Version of deep EXRs, used like `TAKE_VERSION`."""
 
 
 @dataclass
 class FrameSpec:
-    """What every frame of a take has in common."""
+    """Everything that all frames of a take share."""
 
     run: LoadedRun
     """The run that is frozen."""
     instants: Instants
-    """Its scenes at the take's instants."""
+    """The run's scenes at the take's instants."""
     query: str
     """As in `FreezeParams`."""
     size: tuple[int, int]
     """Width and height of the frames in pixels, without overscan."""
     beyond: tuple[int, int]
-    """Pixels beyond the frame on the left and right, and above and below: overscan."""
+    """Pixels of overscan: (left and right, above and below)."""
     grain: Grain | None
-    """The plate's, None if it is not wanted."""
+    """Grain of the plates; None: no grain layer is written."""
     grain_size: tuple[int, int]
     """Width and height in pixels at which a frame's grain is drawn, without overscan."""
     depths: FrameDepths
-    """Makes the frames' depth."""
+    """Computes the frames' depth."""
     measured: MeasuredDepths
-    """What the artist's depth maps say of the instants."""
+    """The artist's depth maps at the instants."""
     detail: Compositor | None = None
-    """Makes the frames of plates; None: splats alone."""
+    """Composites frames from plates; None: frames are splats alone."""
     detail_key: str = ""
-    """Identifies the plates and mattes that it uses; empty without it."""
+    """Key of the plates and mattes that `detail` uses; empty without it."""
     light: str = LIGHTS[0]
-    """Primaries of the light in which frames leave, one of `LIGHTS`: the footage's own."""
+    """Primaries of the written frames, one of `LIGHTS`: those of the footage."""
     passes: Passes | None = None
-    """Makes motion vectors, normals and positions; None: they are not written."""
+    """Computes motion vectors, normals and positions; None: they are not written."""
     blur: MotionBlur | None = None
-    """The camera's motion blur; None: there is none."""
+    """The camera's motion blur; None: no motion blur."""
     deep: Similarity | None = None
-    """From solve units to the scene's, in which deep pictures leave; None: none are written."""
+    """Similarity from solve units to Blender's scene, for deep EXRs; None: no deep EXRs are written."""
     debug_terms: Path | None = None
-    """Folder that gets the terms behind each frame's decisions; None: they are not written."""
+    """Folder for the terms behind each frame's decisions; None: they are not written."""
     start: tuple[str, int, float] = ("", 0, 0.0)
-    """Timecode of one of the clip's frames, that frame's number, and frames per second; no code: the clip has none."""
+    """Timecode of one of the clip's frames ("" without timecodes), that frame's number, and frames per second."""
 
     def timecode(self, frame: int) -> str:
-        """Of a frame, as its file carries it: empty without one, and beyond 40 frames per second, which EXR cannot."""
+        """SMPTE timecode of a frame. Empty without one, and above 40 frames per second, which EXR cannot store."""
         code, at, fps = self.start
         return later(code, frame - at, fps) if code and 1 <= round(fps) <= 40 else ""
 
     @property
     def has_warps(self) -> bool:
-        """True if frames leave as warps of a plate, too: what is blurred over many cameras is none."""
+        """True if frames are also written as warps. A frame with motion blur is not a warp of one plate."""
         return self.detail is not None and self.blur is None
 
     @property
@@ -113,7 +113,7 @@ class FrameSpec:
         return round(width), round(height)
 
     def key(self, output: OutputFrame) -> str:
-        """Identifies what a frame shows and from what, to tell stale frames from good ones."""
+        """Key of a frame's inputs and settings, to detect outdated frames."""
         return content_key(
             TAKE_VERSION,
             self.run.stamp,
@@ -136,34 +136,34 @@ class FrameSpec:
 
 @dataclass(frozen=True)
 class PlannedTake:
-    """What a take will show, before any of it is rendered."""
+    """Plan of a take, made before rendering."""
 
     folder: TakeFolder
-    """takes/NAME; or where its frames are rendered to."""
+    """takes/NAME, or another folder to which its frames are rendered."""
     scene: Scene
-    """Of the shot."""
+    """The shot's cameras and frames."""
     t_star: int
-    """Frame at which time stands still."""
+    """Frame number of the frozen instant."""
     whole: list[OutputFrame]
-    """All frames that it can have."""
+    """All possible frames of the take."""
     spec: FrameSpec
-    """What they have in common."""
+    """Everything that the frames share."""
     keys: dict[int, str]
-    """Frame -> `FrameSpec.key`."""
+    """Frame number -> `FrameSpec.key`."""
     key: str
-    """`take_key`."""
+    """The take's key, from `take_key`."""
 
     @property
     def all_keys(self) -> str:
-        """Changes with anything that any frame of the take shows."""
+        """Key of all frames of the take: it changes if the key of any frame changes."""
         return content_key(sorted(self.keys.items()))
 
 
 def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | None = None) -> PlannedTake:
-    """What `params` ask for. Nothing of the take is written; motion mattes are, if the shot has none.
+    """The plan of the take that `params` describe. Missing motion mattes are written, but no file of the take.
 
-    `t_star`: the instant, where it is settled already; None: as `params` say, or suggested. JobError in words if it
-    cannot be done.
+    `t_star`: the instant, if already chosen. None: that of `params`, or the best suggestion. JobError if the take
+    cannot be rendered.
     """
     run = load_run(shot, params.run, choose_device(params.device, report, "Freezing"))
     scene = load_scene(shot)
@@ -177,10 +177,10 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
         shot.own(inner)
     beyond = margin(shot, params, width, height, intrinsics(whole))
     grain = plate_grain(shot, scene) if params.grain else None
-    # Grain belongs to the plate's pixels; a camera of the artist's own has their scale, and its own shape.
+    # Grain has the scale of the plate's pixels, also in frames of another aspect from a camera path.
     plate = (shot.info().width, round(shot.info().width * height / width))
     if params.detail == "on" or params.develop == "on":
-        find_motion(shot, report)  # of shots solved before the solve looked for it
+        find_motion(shot, report)  # for shots solved by versions whose solve did not find motion
     detail = plate_detail(shot, scene, run, params, whole[0], (width, height), report)
     instants = Instants(shot, run, scene, params.query, (f.t_star for f in whole), params.develop == "on")
     blur, placed = _motion_blur(whole, params, report), Similarity.of(placement_for(shot, params.placement))
@@ -203,7 +203,7 @@ def planned(shot: Shot, params: FreezeParams, report: Reporter, t_star: int | No
 
 
 def _motion_blur(whole: list[OutputFrame], params: FreezeParams, report: Reporter) -> MotionBlur | None:
-    """The motion blur that `params` ask for; None on the clip's own path, where the plates have the camera's own."""
+    """The motion blur of `params`; None on the clip's own path, where the plates have the blur of the real camera."""
     if params.shutter <= 0.0:
         return None
     if not params.camera_path:
@@ -216,7 +216,7 @@ def _motion_blur(whole: list[OutputFrame], params: FreezeParams, report: Reporte
 
 
 def _refuse_combined(folder: TakeFolder) -> None:
-    """JobError if a take was put together from others: frozen frames would take its place."""
+    """Raises JobError if a take is combined from others, because frozen frames would overwrite it."""
     try:
         is_combined = "combined" in read_json(folder.facts)
     except (OSError, ValueError):
@@ -233,10 +233,9 @@ def plate_detail(
     shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, first: OutputFrame, size: tuple[int, int],
     report: Reporter,
 ) -> Compositor | None:  # fmt: skip
-    """What makes a take's frames of plates; None where `params` wants splats alone. `first` is any frame of the take.
-    The shot's motion mattes must have been found.
+    """The compositor of a take; None if `params` selects splats alone. `first` is any frame of the take.
 
-    Plates are read at the scale of the frames, so that one pixel answers one: at their own size by default.
+    The shot's motion mattes must exist. Plates are read at the pixel scale of the frames, by default at full size.
     """
     if params.detail == "off":
         return None
@@ -252,20 +251,20 @@ def plate_detail(
 
 
 def detail_key(shot: Shot, detail: Compositor | None) -> str:
-    """Identifies what plate detail is made of, beside the run; empty without it."""
+    """Key of the plates, mattes and settings of plate detail, without the run; empty without plate detail."""
     if detail is None or not isinstance(detail.plates, Plates):
         return ""
     return content_key(COMPOSITE_VERSION, detail.plates.key, motion_key(shot), dataclasses.asdict(detail.config))
 
 
 def plate_grain(shot: Shot, scene: Scene) -> Grain:
-    """Grain of the shot's undistorted frames, which frozen ones are mixed with."""
+    """Grain of the shot's undistorted frames."""
     files = [shot.plate(n) for n in scene.frames]
     return measure_plate([path for path in files if path.is_file()], scene.display)
 
 
 def run_verdict(run: LoadedRun) -> Verdict | None:
-    """The verdict on the run as it was trained last; None if its summary has none, or cannot be read."""
+    """The verdict on the run's last training; None if its summary has none or cannot be read."""
     try:
         return verdict_of(read_json(run.folder / SUMMARY_FILE))
     except (OSError, ValueError):
@@ -273,9 +272,9 @@ def run_verdict(run: LoadedRun) -> Verdict | None:
 
 
 def suggested_instants(shot: Shot, scene: Scene, run: LoadedRun) -> list[tuple[int, CandidateInstant]]:
-    """(frame number, figures) of the trained frames that are good instants to freeze, best first.
+    """(frame number, scores) of the trained frames that are good instants to freeze, best first.
 
-    Only frames of the span that the run's verdict recommends are suggested: elsewhere the run does not show the clip.
+    Only frames of the span that the run's verdict recommends are suggested: the run fails to reproduce the others.
     """
     trained, table = run.train_frames, frame_table(shot)
     sharpness = np.array([table[f]["sharpness"] if f in table else 0.0 for f in trained])
@@ -283,13 +282,16 @@ def suggested_instants(shot: Shot, scene: Scene, run: LoadedRun) -> list[tuple[i
     verdict = run_verdict(run)
     if verdict is not None and len(verdict.instants) == 2:
         first, last = verdict.instants
-        # A verdict of other frames than these recommends none of them: all are ranked then.
+        # If the verdict recommends none of these frames, because it is about others, all are ranked.
         ranking = [i for i in ranking if first <= trained[i.index] <= last] or ranking
     return [(trained[i.index], i) for i in best_instants(ranking)]
 
 
 def choose_t_star(shot: Shot, scene: Scene, run: LoadedRun, params: FreezeParams, report: Reporter) -> int:
-    """The frame to freeze at, snapped to a trained one: a time that no frame constrains is a guess."""
+    """The frame number of t*: the trained frame nearest to `params.t_star`, or the best suggestion.
+
+    Untrained times are not used, because no frame constrains them.
+    """
     trained = np.array(run.train_frames)
     if params.t_star is None:
         return suggested_instants(shot, scene, run)[0][0]
@@ -317,9 +319,11 @@ def take_key(
     run: LoadedRun, params: FreezeParams, t_star: int, width: int, height: int, beyond: tuple[int, int] = (0, 0),
     developed: Sequence[str] = (), shutter: float = 0.0,
 ) -> str:  # fmt: skip
-    """Identifies what a take shows. The frame range is not part of it. Frames have keys of their own, see
-    `FrameSpec.key`; this one tells about frames that were rendered before they had. `developed`: keys of the instants
-    that are; `shutter`: degrees of motion blur that is there."""
+    """Key of a take's inputs and settings, without the frame range.
+
+    Frames also have keys, see `FrameSpec.key`; this one is for frames of versions that did not store keys.
+    `developed`: keys of the developed instants. `shutter`: angle of the motion blur in degrees, 0 without.
+    """
     path = Path(params.camera_path) if params.camera_path else ""
     return content_key(
         TAKE_VERSION,

@@ -1,6 +1,6 @@
 """Renders the frames of a take in several processes where cores and memory allow it.
 
-One process uses about two cores, however many there are, because each frame is decided in one thread. Each process
+One process uses only about two cores, because the decisions about a frame run in one thread. Each process
 renders consecutive frames, which share source plates. Frames that a process does not finish, because it was killed or
 could not start, are rendered by the process that started it.
 """
@@ -39,19 +39,20 @@ from .frames import make_ready, render_frames
 from .plan import PlannedTake
 
 THREADS = 2
-"""Threads of one process."""
+"""Number of threads per process."""
 _FEWEST = 12
-"""Least frames per process: it starts and loads the run in about 5 s, the time of 12 frames of 640 x 480."""
+"""Smallest number of frames per process: starting takes about 5 s, as long as 12 frames of 640 x 480."""
 _BYTES, _BYTES_A_PIXEL = 1.7e9, 130
-"""Memory of one process: `python -m benchmarks.detail_cost` peaks at 1.6 GB at 640 x 360, 2.5 GB at 3840 x 2160."""
+"""Memory per process, fixed and per pixel: `python -m benchmarks.detail_cost` peaks at 1.6 GB at 640 x 360 and 2.5 GB
+at 3840 x 2160."""
 _POLL_SECONDS = 0.2
 
 Message = tuple[dict[str, Any], bytes] | None
-"""Header and body of a process's message; None when its output ends."""
+"""Header and body of a process's message; None at the end of its output."""
 
 
 def processes_for(frames: int, pixels: int, core_count: int, free_bytes: float) -> int:
-    """Number of processes for so many frames of so many pixels each, at least 1."""
+    """Number of processes to render `frames` frames of `pixels` pixels each, at least 1."""
     return max(1, min(core_count // THREADS, frames // _FEWEST, int(free_bytes / (_BYTES + _BYTES_A_PIXEL * pixels))))
 
 
@@ -59,10 +60,10 @@ def render_side_by_side(
     shot: Shot, params: FreezeParams, take: PlannedTake, frames: list[OutputFrame], done: Set[int], report: Reporter,
     processes: int | None = None,
 ) -> dict[int, Tensor]:  # fmt: skip
-    """As `render_frames`, in several processes.
+    """Like `render_frames`, in several processes.
 
-    `processes` None: as many as `processes_for` allows. A run on a card is rendered by this process alone, and so is
-    one whose developed instants are not stored where other processes can read them.
+    `processes` None: as many as `processes_for` allows. This process renders alone if the run is on a GPU, or if its
+    developed instants are not stored where other processes can read them.
     """
     make_ready(take, frames, done, report)
     missing = [output.frame for output in frames if output.frame not in done]
@@ -95,7 +96,7 @@ def _listen(
     messages: queue.SimpleQueue[tuple[int, Message]], running: int, total: int, shares: dict[int, Tensor],
     report: Reporter,
 ) -> None:  # fmt: skip
-    """Waits until `running` processes have ended; fills `shares`, reports progress, raises the JobError of any."""
+    """Waits until `running` processes have ended. Fills `shares`, reports progress, raises any JobError received."""
     done = dict.fromkeys(range(running), 0)
     while running:
         report.check_cancelled()
@@ -119,8 +120,8 @@ def _listen(
 
 @contextlib.contextmanager
 def _started(requests: list[dict[str, Any]]) -> Generator[queue.SimpleQueue[tuple[int, Message]]]:
-    """Starts a process of `frame_process.py` for each request; yields the queue of their messages. Ends all of them at
-    the end of the block."""
+    """Starts a process of `frame_process.py` for each request, and yields the queue of their messages. At the end of
+    the block, all processes are killed."""
     root = Path(__file__).resolve().parents[3]
     environment = child_environment(root) | {"OMP_NUM_THREADS": str(THREADS), "OPENCV_FOR_THREADS_NUM": str(THREADS)}
     messages: queue.SimpleQueue[tuple[int, Message]] = queue.SimpleQueue()
@@ -128,7 +129,7 @@ def _started(requests: list[dict[str, Any]]) -> Generator[queue.SimpleQueue[tupl
 
     def read(n: int, process: subprocess.Popen[bytes]) -> None:
         answers = cast("BinaryIO", process.stdout)
-        with contextlib.suppress(ValueError, OSError):  # cut off in the middle of a word: it was killed
+        with contextlib.suppress(ValueError, OSError):  # incomplete message: the process was killed
             while (message := read_message(answers)) is not None:
                 messages.put((n, message))
         messages.put((n, None))
@@ -140,7 +141,7 @@ def _started(requests: list[dict[str, Any]]) -> Generator[queue.SimpleQueue[tupl
                 command["args"], cwd=command["cwd"], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE
             )
             running.append(process)
-            with contextlib.suppress(OSError):  # it has ended already
+            with contextlib.suppress(OSError):  # the process has already ended
                 write_message(cast("BinaryIO", process.stdin), request)
             threading.Thread(target=read, args=(n, process), name="frames out", daemon=True).start()
         yield messages

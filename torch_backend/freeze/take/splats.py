@@ -1,4 +1,4 @@
-"""The splats of a take for other programs, in the axes and units of Blender's scene: frozen.ply and frozen.usdc."""
+"""Exports the splats of a take, in the axes and units of Blender's scene, as frozen.ply and frozen.usdc."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ _NO_USD = (
     "Press Repair in the add-on's preferences, or run the setup of splannequin.py.",
 )
 PLAIN_FPS = 24.0
-"""Frames per second of a stage where the footage says none."""
+"""Frames per second of a stage if the footage has no frame rate."""
 
 
 def placed_splats(frozen: FrozenGaussians, scene: Scene, where: Similarity) -> PlyGaussians:
-    """A frozen instant in the axes and units of the scene that `where` leads to from solve units."""
+    """A frozen instant transformed to Blender's scene; `where` is the similarity from solve units."""
     state = {name: value.cpu() for name, value in frozen.state.items()}
     in_solve = PlyGaussians(
         (state["means"].double() / scene.scale + from_numpy(scene.centre)).float().numpy(),
@@ -53,14 +53,17 @@ def placed_splats(frozen: FrozenGaussians, scene: Scene, where: Similarity) -> P
 
 
 def camera_path_of(shot: Shot, file: str) -> CameraPath:
-    """The camera that a take was seen through, solve units: a path of Blender's, or the clip's own. Errors as these."""
+    """The camera path of a take, solve units: the path `file` from Blender if it exists, else the clip's own.
+
+    Raises the errors of `CameraPath.load` and `load_cameras`.
+    """
     return CameraPath.load(file) if file and Path(file).is_file() else load_cameras(shot)
 
 
 def write_stage(
     path: Path, splats: PlyGaussians, cameras: CameraPath, placement: Placement, fps: float, report: Reporter
 ) -> None:
-    """Writes a take's USD stage, or warns that the environment cannot, and removes the one of an earlier freeze.
+    """Writes a take's USD stage. Without usd-core, it warns and removes the stage of an earlier freeze.
 
     OSError if the file cannot be written.
     """
@@ -73,12 +76,12 @@ def write_stage(
 
 
 def export_splats(shot: Shot, kind: str, folder: Path, take: str, placement: str = "") -> list[Path]:
-    """Writes the splats of a finished take, placed anew: after Set Scale nothing has to be frozen again.
+    """Writes the splats of a finished take with the current placement, so that Set Scale needs no new freeze.
 
     Args:
         shot: a solved shot.
-        kind: of `FORMATS`. ply: frozen.ply. usd: frozen.usdc, with the animated camera.
-        folder: where to; made if it is not there.
+        kind: one of `FORMATS`. "ply" writes frozen.ply; "usd" writes frozen.usdc, with the animated camera.
+        folder: output folder, created if missing.
         take: name of the take.
         placement: see `placement_for`.
 
@@ -86,8 +89,8 @@ def export_splats(shot: Shot, kind: str, folder: Path, take: str, placement: str
         The files written.
 
     Raises:
-        ValueError: another format, or `placement` or the take's files are damaged.
-        JobError: there is no such take, or the environment cannot write USD.
+        ValueError: unknown format, or `placement` or the take's files are damaged.
+        JobError: the take does not exist, or the environment cannot write USD.
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}: it should be one of {', '.join(FORMATS)}")

@@ -1,7 +1,7 @@
-"""A take in words: how much of it is plate, how much a guess, where it will not hold, and what to do about it.
+"""The verdict on a take: shares of plate and guess, frames and places that are unreliable, and advice.
 
-A take is no better than its run. A person who walks through the clip is in no other plate where they stood at t*, and
-the model has another shape for them at every instant. So the faults in the run's verdict are repeated for the take.
+A take is no better than its run. No other plate shows a walking person where they stood at t*, and the model has
+another shape of them at every instant. The take's verdict therefore repeats the faults in the run's verdict.
 """
 
 from __future__ import annotations
@@ -18,34 +18,35 @@ from ...train.verdict import EXPLAINED, spans_of, where_words
 
 @dataclass(frozen=True)
 class TakeLimits:
-    """Where a take stops being good. Tuned on takes of preview runs of three clips of people who hold still (`sitting`,
-    `kitchen`, `hall`, at the suggested t*)."""
+    """Thresholds of the verdict. They are tuned on takes of preview runs of three clips of people who hold still
+    (`sitting`, `kitchen`, `hall`, at the suggested t*)."""
 
     good_invented: float = 0.06
-    """Share of the picture that may be a guess in a good take, on average over its frames; the clips have 0.007 to
+    """Largest share of the picture that may be a guess in a good take, mean over frames; the clips have 0.007 to
     0.028."""
     fair_invented: float = 0.2
-    """The same of a fair one."""
+    """Largest share of the picture that may be a guess in a fair take, mean over frames."""
     lost: float = 0.6
-    """Share of a cell of the picture that may be a guess: a person's place in it, not all of it. The clips have 0.12 to
-    0.53 in the worst cell of the worst frame."""
+    """Share of a cell of the picture's grid that may be a guess before the whole cell counts as one. It allows for a
+    person in part of the cell. The clips have 0.12 to 0.53 in the worst cell of the worst frame."""
     steady: float = 0.6
-    """Share of the frames from which on a place counts as one that is a guess all along."""
+    """Share of the frames above which a cell counts as a guess throughout the take."""
     named: float = 0.1
-    """Share of a frame that is a guess from which on the worst one is named, if no place is: `sitting` has 0.05 on
-    average, and 0.14 where it shows a man from a side that t* did not see."""
+    """Share of the worst frame that is a guess, above which the verdict names that frame if it names no place.
+    `sitting` has 0.05 on average, and 0.14 where it shows a man from a side that t* did not see."""
 
 
 def judge_take(
     facts: Mapping[str, Any], run: Verdict | None = None, limits: TakeLimits | None = None
 ) -> Verdict | None:
-    """The verdict on a take; None for one of before there was detail.
+    """The verdict on a take; None for takes of versions without plate detail.
 
     Args:
-        facts: of take.json: `t_star_frame`, `t_star_per_frame`, `camera_path`, and `detail` ({"plate_share",
-            "invented_share", "per_frame": [{"frame", "regions": 4x4 shares that are invented, ...}]}), None for a take
-            of splats alone.
-        run: the verdict on the run that was frozen, if it has one.
+        facts: content of take.json. Used are `t_star_frame`, `t_star_per_frame`, `camera_path`, and `detail`
+            ({"plate_share", "invented_share", "per_frame": [{"frame", "regions": 4x4 shares that are a guess, ...}]}),
+            which is None for a take of splats alone.
+        run: verdict on the run that was frozen, if it has one.
+        limits: thresholds.
     """
     if "detail" not in facts:
         return None
@@ -74,7 +75,7 @@ def judge_take(
 
 
 def _with_run(take: Verdict, run: Verdict | None) -> Verdict:
-    """A take's verdict with what its run's has found amiss."""
+    """A take's verdict with the faults in its run's verdict added."""
     if run is None or run.word == "good":
         return take
     words = list(VERDICT_WORDS)
@@ -85,7 +86,7 @@ def _with_run(take: Verdict, run: Verdict | None) -> Verdict:
 
 
 def unsure(verdict: Verdict, frames: list[int]) -> set[int]:
-    """Those of `frames` that a verdict says will not hold."""
+    """The `frames` that a verdict calls unreliable."""
     return {n for n in frames for place in verdict.where if place["first"] <= n <= place["last"]}
 
 
@@ -98,7 +99,7 @@ def _advice(
     facts: Mapping[str, Any], frames: list[int], places: list[dict[str, Any]], steady: bool, word: str,
     advised: list[int],
 ) -> list[str]:  # fmt: skip
-    """What to do about the worst of them. `advised`: `Verdict.instants` of the run."""
+    """Advice about the worst of `places`. `advised`: `Verdict.instants` of the run."""
     if not places and word == "good":
         return []
     sentences: list[str] = []
@@ -109,7 +110,7 @@ def _advice(
         sentences.append("Keep the camera nearer to the clip's own path there.")
     elif worst is not None and not steady:
         middle = (worst["first"] + worst["last"]) // 2
-        if advised:  # never advise an instant that the run's own verdict warns of
+        if advised:  # only suggest instants that the run's verdict recommends
             middle = min(max(middle, advised[0]), advised[1])
         if not facts.get("t_star_per_frame"):
             sentences.append(f"Try a t* nearer to frame {middle}.")
@@ -122,7 +123,7 @@ def _advice(
 
 
 def _longer_part(frames: list[int], worst: dict[str, Any]) -> tuple[int, int] | None:
-    """The longer part of a take before or after a place, if it is half of it or more."""
+    """(first, last) frame of the longer part before or after a place, if it has at least half of the frames."""
     before = [n for n in frames if n < worst["first"]]
     after = [n for n in frames if n > worst["last"]]
     longer = max(before, after, key=len)

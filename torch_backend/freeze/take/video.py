@@ -1,4 +1,4 @@
-"""A video of frames for review: H.264 in MP4, Rec.709, playable everywhere."""
+"""Writes a video of frames for review: H.264 in MP4, Rec.709, playable everywhere."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from ...shot import atomic_path
 CRF = 17
 """x264's constant rate factor: visually lossless at review size."""
 MPEG4_QSCALE = 2
-"""Quantiser of the fallback encoder, 2 is its best."""
+"""Quantiser of the fallback encoder; 2 is its best quality."""
 
 
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> str:
     """Encodes display-referred frames [H,W,3] uint8, all of one size, to an MP4, atomically.
 
-    Returns "" or, if this PyAV has no H.264 encoder and MPEG-4 part 2 was used, one sentence for the artist. Odd sizes
-    grow by one repeated row or column (4:2:0 needs even ones). ValueError on no frames, on a frame of another shape
-    or type, and on a bad fps; OSError if the file cannot be written.
+    Returns "". If this PyAV has no H.264 encoder, MPEG-4 part 2 is used, and a message for the artist is returned. Odd
+    sizes are padded by one repeated row or column, because 4:2:0 needs even sizes. ValueError if there are no frames,
+    if shape or type of a frame is wrong, or if `fps` is invalid; OSError if the file cannot be written.
     """
     rate = rational_fps(fps)
     codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
@@ -35,12 +35,12 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
     if first is None:
         raise ValueError("frames should hold at least one frame, got none")
     shape = _checked(first, 0, None).shape
-    # FFmpeg's errors are OSErrors with its errno, a full disk's among them.
+    # PyAV raises FFmpeg's errors as OSError with an errno, also for a full disk.
     with (
         atomic_path(path) as partial,
         av.open(str(partial), "w", format="mp4", options={"movflags": "faststart"}) as mp4,
     ):
-        output: Any = mp4  # PyAV does not say what its packets are packets of
+        output: Any = mp4  # PyAV's annotations leave the packet type open
         stream = _add_stream(mp4, codec, rate, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
         output.mux(stream.encode(_picture(first, 0, rate)))
         for index, frame in enumerate(source, start=1):
@@ -52,7 +52,7 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
 
 
 def rational_fps(fps: float) -> Fraction:
-    """`fps` as a fraction; 23.976, 29.97, 59.94 and their like become the exact n*1000/1001. ValueError unless > 0."""
+    """`fps` as a fraction; 23.976, 29.97, 59.94 and similar rates become exactly n*1000/1001. ValueError unless > 0."""
     if not (math.isfinite(fps) and fps > 0):
         raise ValueError(f"fps should be a positive number, got {fps}")
     ntsc = Fraction(round(fps * 1.001) * 1000, 1001)
@@ -89,7 +89,7 @@ def _picture(frame: NDArray[np.uint8], index: int, rate: Fraction) -> av.VideoFr
         dst_colorspace=Colorspace.ITU709,
     )
     picture.pts, picture.time_base = index, 1 / rate
-    # The pixels are sRGB; Rec.709 is the tag that players show unchanged.
+    # The pixels are sRGB. They are tagged as Rec.709, because players show that without a conversion.
     picture.color_primaries, picture.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
     picture.colorspace = Colorspace.ITU709
     return picture

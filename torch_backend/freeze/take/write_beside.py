@@ -1,4 +1,4 @@
-"""Frames are written while the next one is rendered: a thread encodes and compresses what the main one has made."""
+"""Writes frames in a background thread while the next frame is rendered."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
 HELD_BYTES = 400_000_000
-"""Frames larger than this are written before the next is rendered: two of 4K at once would not fit many machines."""
+"""Size above which a frame is written before the next is rendered: two 4K frames would not fit in memory."""
 
 
 class WriteBeside:
-    """Writes frame after frame, in their order, one at a time; a `with` block ends when the last is written.
+    """Context manager that writes frames in order, one at a time; the block ends after the last write.
 
-    At most one frame is being written while another is made: `write` waits for the one before. What a write raises
-    comes out of the next `write`, of `wait`, or of the block's end unless that is left by another error, a cancel among
-    them: then too what was begun is written to its end.
+    At most one frame is written while another is rendered: `write` waits for the previous write. An error of a write is
+    raised by the next `write`, by `wait`, or at the end of the block. If the block ends by another error (a cancel
+    included), a write in progress is still completed, but its error is dropped.
     """
 
     def __init__(self) -> None:
@@ -23,7 +23,7 @@ class WriteBeside:
         self._last: Future[None] | None = None
 
     def write(self, work: Callable[[], None], size: int) -> None:
-        """Has `work` done beside what follows; at once if the frame takes more (`size`) than `HELD_BYTES`."""
+        """Runs `work` in the background, or at once if `size` in bytes exceeds `HELD_BYTES`."""
         self.wait()
         if size > HELD_BYTES:
             work()
@@ -31,7 +31,7 @@ class WriteBeside:
             self._last = self._pool.submit(work)
 
     def wait(self) -> None:
-        """Until all is written. Raises what the last write raised."""
+        """Waits until everything is written. Raises the error of the last write."""
         last, self._last = self._last, None
         if last is not None:
             last.result()

@@ -1,1 +1,1 @@
-"""Clip frames as source views: where a plate shows a point, what moves in it, and region operations on masks."""
+"""Source views: visibility of points in the clip's plates, moving pixels, reprojection, and operations on masks."""

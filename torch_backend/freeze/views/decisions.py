@@ -1,8 +1,8 @@
-"""Decisions that do not hang on the last bit of a float: soft masks, [h, w] in 0..1, instead of bool ones.
+"""Decisions that do not depend on rounding: soft masks, [h, w] in 0..1, replace bool masks.
 
-Another instruction set, or another size of picture, changes floats by some 1e-7. A pixel that lies on a threshold would
-then jump from one plate to another. So a threshold is a ramp (`above`), and choices between plates prefer the first of
-those that are equally good.
+Another instruction set or picture size changes floats by about 1e-7. With a hard threshold, a pixel on the threshold
+would then switch from one plate to another. A threshold is therefore a ramp (`above`), and of plates that are about
+equally good the first is chosen.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 MARGIN = 0.1
-"""Half the width of a ramp, as a share of its threshold; values are equally good up to this share of the best, because
-choices between plates cannot be soft. Above rounding errors by a factor of 1000 in the smallest."""
+"""Half the width of a ramp, relative to its threshold. Choices between plates cannot be soft: values within this share
+of the best count as equal. Even the narrowest ramp is 1000 times wider than rounding errors."""
 _SHARPEST = 1e-4
 """Least width of a ramp."""
 
 
 def above(value: Tensor | float, threshold: Tensor | float) -> Tensor:
-    """In 0..1 whether a value is above a threshold of 0 or more: 0.5 at it, 0 and 1 from `MARGIN` of it on."""
+    """Soft `value > threshold` in 0..1, for a threshold of 0 or more: a ramp of +-`MARGIN` * threshold around it."""
     value = torch.as_tensor(value, device="cpu")
     width = 2.0 * MARGIN * threshold
     width = width.clamp_min(_SHARPEST) if isinstance(width, Tensor) else max(width, _SHARPEST)
@@ -28,11 +28,11 @@ def above(value: Tensor | float, threshold: Tensor | float) -> Tensor:
 
 
 def first_best(values: Tensor) -> Tensor:
-    """Index along the first dimension of the greatest value, of values of 0 or more; of equally good ones the first."""
+    """Index along the first dimension of the largest value (values >= 0); the first, if several are about equal."""
     return (values >= (1.0 - MARGIN) * values.amax(dim=0)).float().argmax(dim=0)
 
 
 def first_least(values: Sequence[float], least: float) -> int:
-    """Index of the smallest of values of 0 or more; of equally good ones, or of those up to `least`, the first."""
+    """Index of the smallest value (values >= 0); the first, if several are about equal or at most `least`."""
     most = max((1.0 + MARGIN) * min(values), least)
     return next(n for n, value in enumerate(values) if value <= most)

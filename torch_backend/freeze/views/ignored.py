@@ -1,4 +1,4 @@
-"""Ignored pixels of plates, by the artist's mask for the solve: they are not part of the scene."""
+"""Ignored pixels of plates: the artist's mask for the solve excludes them from the scene."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from ...shot import Shot
 from ...torch_types import from_numpy
 
 IgnoredOf = Callable[[int], "Tensor | None"]
-"""Frame number -> [h, w] in 0..1, what of its plate is no part of the scene, or None if all of it is."""
+"""Frame number -> [h, w] in 0..1: 1 on ignored pixels of its plate. None: no pixel is ignored."""
 
 
 def ignore_mattes(shot: Shot) -> IgnoredOf:
-    """Pixels that the masks of a shot's solve exclude from the scene."""
+    """The ignored pixels of a shot's plates, as an `IgnoredOf`."""
     if IGNORE not in given_masks(shot):
         return lambda frame: None
 

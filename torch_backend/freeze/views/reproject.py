@@ -1,6 +1,7 @@
-"""Where another camera sees what a pixel shows: points from depth, their places in other views, pictures there.
+"""Reprojection between views: unprojects pixels by depth, projects points, samples, resizes and filters pictures.
 
-Pure functions on tensors, the same on CPU and GPU. Pixel centres are at +0.5; depth is along the camera's axis.
+All functions are pure and give the same results on CPU and GPU. Pixel centres are at +0.5; depth is along the camera's
+axis.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from ...torch_types import from_numpy
 from ..bands import BAND_PIXELS
 
 _REACH = 3
-"""Rows beyond a place that a bicubic look-up may touch."""
+"""Rows around a sample position that a bicubic look-up may read."""
 
 
 def pixel_centres(width: int, height: int, device: torch.device | str = "cpu") -> Tensor:
@@ -28,7 +29,7 @@ def pixel_centres(width: int, height: int, device: torch.device | str = "cpu") -
 
 
 def unproject(pixels: Tensor, depth: Tensor, viewmat: Tensor, K: Tensor) -> Tensor:
-    """World points [..., 3] that a camera (viewmat [4, 4], K [3, 3]) sees at pixels [..., 2] in depth [...]."""
+    """World points [..., 3] at pixels [..., 2] and depth [...] of a camera (viewmat [4, 4], K [3, 3])."""
     focal, centre = torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
     rays = (pixels - centre) / focal
     local = torch.cat([rays, torch.ones_like(rays[..., :1])], dim=-1) * depth[..., None]
@@ -36,7 +37,7 @@ def unproject(pixels: Tensor, depth: Tensor, viewmat: Tensor, K: Tensor) -> Tens
 
 
 def project(points: Tensor, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels [..., 2] and depths [...] of world points [..., 3]. Behind the camera the pixel is far outside."""
+    """(pixels [..., 2], depth [...]) of world points [..., 3]. Points behind the camera get the pixel (-1e6, -1e6)."""
     local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = local[..., 2]
     safe = torch.where(depth > 1e-6, depth, torch.ones_like(depth))
@@ -45,7 +46,7 @@ def project(points: Tensor, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]
 
 
 def look_up(picture: Tensor, pixels: Tensor, mode: str = "bilinear") -> Tensor:
-    """`picture` [H, W] or [H, W, C] at pixels [..., 2] of its own size; beyond its border the border's value.
+    """`picture` [H, W] or [H, W, C] sampled at `pixels` [..., 2]; its border pixels are repeated outside.
 
     mode: bilinear, bicubic (sharper, may overshoot) or nearest.
     """
@@ -60,14 +61,14 @@ def look_up(picture: Tensor, pixels: Tensor, mode: str = "bilinear") -> Tensor:
 
 
 def inside(pixels: Tensor, width: int, height: int, soft: float) -> Tensor:
-    """[...] 0 outside of a picture to 1 within it, over `soft` pixels along its border."""
+    """[...] in 0..1: 0 outside a picture, rising to 1 over `soft` pixels inside its border."""
     size = torch.tensor([width, height], dtype=pixels.dtype, device=pixels.device)
     border = torch.minimum(pixels, size - pixels).amin(dim=-1)
     return (border / soft).clamp(0.0, 1.0)
 
 
 def resized(picture: Tensor, width: int, height: int) -> Tensor:
-    """[h, w] or [h, w, C] at another size: averaged where it shrinks, bilinear where it grows."""
+    """[h, w] or [h, w, C] resized: antialiased if smaller, bilinear if larger."""
     if picture.shape[:2] == (height, width):
         return picture
     flat = picture[..., None] if picture.ndim == 2 else picture
@@ -79,7 +80,7 @@ def resized(picture: Tensor, width: int, height: int) -> Tensor:
 
 
 def blurred(picture: Tensor, sigma: float) -> Tensor:
-    """[H, W] or [H, W, C] under a Gaussian of `sigma` pixels; the border goes on beyond itself."""
+    """[H, W] or [H, W, C] blurred by a Gaussian of `sigma` pixels; border pixels are repeated outside."""
     if sigma <= 0:
         return picture
     reach = max(1, round(3 * sigma))
@@ -100,14 +101,13 @@ def blurred(picture: Tensor, sigma: float) -> Tensor:
 
 
 def dilate(matte: Tensor, by: int) -> Tensor:
-    """[H, W] float or bool, every value spread `by` pixels to all sides: the greatest one around; beyond the border
-    nothing counts."""
+    """[H, W] float or bool: maximum over a square window of radius `by` pixels; pixels outside do not count."""
     if by <= 0:
         return matte
     if matte.device.type != "cpu":
         spread = F.max_pool2d(matte[None, None].float(), 2 * by + 1, 1, by)[0, 0]
         return spread.to(matte.dtype)
-    import cv2  # 2 to 7 times as fast as maxima of shifted pictures, 25 and more times as fast as pooling
+    import cv2  # 2 to 7 times as fast as maxima of shifted pictures, at least 25 times as fast as pooling
 
     values = np.ascontiguousarray(matte.detach().numpy())
     values = values.view(np.uint8) if matte.dtype == torch.bool else values
@@ -116,14 +116,14 @@ def dilate(matte: Tensor, by: int) -> Tensor:
 
 
 def erode(matte: Tensor, by: int) -> Tensor:
-    """[H, W] float or bool, the least value within `by` pixels; beyond the border nothing counts."""
+    """[H, W] float or bool: minimum over a square window of radius `by` pixels; pixels outside do not count."""
     return ~dilate(~matte, by) if matte.dtype == torch.bool else -dilate(-matte, by)
 
 
 def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:
-    """`look_up`, bicubic, of places that lie near to each other: only the rows that they need become float32.
+    """Bicubic `look_up` at positions close to each other: only the rows they need are converted to float32.
 
-    Equal to it but for the rounding of coordinates, some 1e-4 pixels.
+    The result equals `look_up` up to rounding of the coordinates, about 1e-4 pixels.
     """
     height, width = picture.shape[:2]
     if height * width <= BAND_PIXELS or not pixels.numel():
@@ -138,6 +138,6 @@ def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:
 
 
 def beyond(picture: Tensor, other: Tensor, reach: int) -> Tensor:
-    """[h, w] by how much a picture [h, w, 3] leaves the range of what another shows within `reach` pixels."""
+    """[h, w] distance of a picture [h, w, 3] from the range of `other` within `reach` pixels, largest over channels."""
     least, most = (torch.stack([of(each, reach) for each in other.unbind(-1)], -1) for of in (erode, dilate))
     return torch.maximum(least - picture, picture - most).clamp_min(0.0).amax(-1)

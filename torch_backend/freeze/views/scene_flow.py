@@ -1,4 +1,4 @@
-"""How the Gaussians of a frozen scene stand in the clip's other frames, as the run moves them."""
+"""Scene flow: moves the Gaussians of a frozen scene to the clip's other frames with the run's deformation field."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ...train import LoadedRun
 from ..frozen import FrozenGaussians, freeze_at
 
 HIDDEN = -20.0
-"""Opacity logit of a Gaussian that is not to be seen."""
+"""Opacity logit that makes a Gaussian invisible."""
 _KEPT = 90
-"""Frames whose changes are kept: of 25,000 open Gaussians about 3 MB each."""
+"""Number of frames whose changes are cached: about 3 MB each for 25,000 open Gaussians."""
 
 
 class SceneFlow:
-    """From a scene frozen at t* to the clip's frames.
+    """Scene flow from a scene frozen at t* to the clip's frames.
 
     Gaussians that were closed at t* (`static_baseline.py`) do not move. The run's own Gaussians come first in the
-    scene; what stands behind them (`missing.py`) is there at t* alone.
+    scene. Gaussians appended after them (`missing.py`) are only visible at t*.
     """
 
     def __init__(self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians, t_star: int) -> None:
@@ -37,7 +37,7 @@ class SceneFlow:
         self._at_t_star = self._field(t_star)
 
     def moved(self, state: dict[str, Tensor], frame: int) -> dict[str, Tensor]:
-        """The scene, or what it was developed to, as it is in a frame; with gradients."""
+        """The frozen or developed `state`, moved to a frame; differentiable."""
         made = dict(state)
         if frame == self.t_star:
             return made
@@ -67,12 +67,12 @@ class SceneFlow:
 
 
 class MovingScene:
-    """The scene as it stood in every frame of the clip: the run's own, or that which an instant was developed to."""
+    """The scene in every frame of the clip: the run's scene, or a developed instant moved by scene flow."""
 
     def __init__(
         self, run: LoadedRun, scene: Scene, frozen: FrozenGaussians | None = None, t_star: int | None = None
     ) -> None:
-        """`frozen` is the scene at frame `t_star`; None or not developed: the run's own, and no t* is needed."""
+        """`frozen` is the scene at frame `t_star`. If it is None or not developed, the run's scene is used."""
         self.run, self.scene, self.developed = run, scene, None
         self.rows = run.model.open_rows()
         """[M] int64, rows of the scene's Gaussians that move."""

@@ -1,6 +1,6 @@
-"""What a run knows of the clip's plates: where their surfaces are, what moves in them, what its own render missed.
+"""The clip's plates compared with a run: surface depth, moving pixels, and the residual of the run's own render.
 
-All of it is computed once for a plate and serves every frozen frame that uses that plate.
+Results are computed once per plate and cached for all frozen frames that use the plate.
 """
 
 from __future__ import annotations
@@ -28,85 +28,86 @@ from .scene_flow import MovingScene
 from .visibility import Visibility, visible_pixels
 
 MovingOf = Callable[[int], "Tensor | None"]
-"""Frame number -> [h, w] in 0..1, what moves in its plate, or None where nobody has looked."""
+"""Frame number -> [h, w] in 0..1, motion matte of its plate; None if the frame has no matte."""
 DOUBT = 0.5 - decisions.MARGIN
-"""How much of an unknown pixel is taken for moving: less than half, because most of the unknown is textureless wall."""
+"""Motion matte of an unknown pixel: less than 0.5, because most unknown pixels are textureless wall."""
 LENGTHS_OF = 640
-"""Width in pixels of the pictures in which lengths are configured."""
+"""Picture width in pixels to which all configured lengths refer."""
 MARGIN = 2
-"""Pixels of those pictures by which an outline may be misplaced: error of flow and depth, motion blur."""
+"""Possible misplacement of an outline, in pixels at width `LENGTHS_OF`: errors of flow and depth, and motion blur."""
 _VIEWS, _VIEWS_BYTES = 90, 700e6
-"""Plates kept at most. Between two uses of a plate, 16 frames apart, 80 others are examined: with fewer every one was
-made three times on its way through a take."""
+"""Largest number of cached plates. Between two uses of a plate, 16 frames apart, up to 80 other plates are used. With a
+smaller cache, every plate was computed three times per take."""
 _RESIDUALS_BYTES = 250e6
 _FINEST = 1280
-"""Width at which the model's own render of a plate is made at most: splats show no more, and 4K costs memory."""
+"""Largest width in pixels of the model's own render of a plate: splats show no finer detail, and 4K costs memory."""
 _ROWS = 256
 
 
 class PlateReader(Protocol):
-    """What plates are asked for: `footage.plates.Plates`."""
+    """Interface of `footage.plates.Plates`."""
 
     width: int
-    """Pixels of the undistorted plates."""
+    """Width of the undistorted plates in pixels."""
     height: int
-    """Pixels."""
+    """Height of the undistorted plates in pixels."""
     frames: list[int]
     """Every frame of the clip's range that has a plate, ascending."""
 
     deep: bool
-    """True if values may lie beyond 0 and 1."""
+    """True if values may lie outside 0..1."""
 
     def display(self, frame: int) -> Tensor:
-        """[height, width, 3] float32, in the scene's display, uncut."""
+        """[height, width, 3] float32 plate in the scene's display, not clipped."""
         ...
 
     def linear(self, frame: int, rows: slice = ...) -> Tensor:
-        """The same, scene-linear: all of it, or some rows."""
+        """[height, width, 3] float32 plate, scene-linear: all rows or a slice of them."""
         ...
 
 
 @dataclass
 class PlateView:
-    """Plate m as the model has it, [h, w] at the size of decisions."""
+    """One plate and the model's data for it, [h, w] at decision resolution (`SourceViews.size`)."""
 
     viewmat: Tensor
     """[4, 4] world-to-camera, scene units."""
     K: Tensor
-    """[3, 3] pixels of the size of decisions."""
+    """[3, 3] intrinsics in pixels at decision resolution."""
     surface: Tensor
-    """[h, w, 3], looked up together: median depth; in 0..1, something that moves in the clip is seen there; in 0..1,
-    the model shows there what the plate shows, but for detail."""
+    """[h, w, 3], stacked for a joint look-up: median depth; motion matte in 0..1; and, in 0..1, agreement of the model
+    with the plate except for detail."""
     picture: Tensor
     """[h, w, 3] float16, the plate, display-referred."""
     missed: Tensor
-    """[h, w] float16 in 0..1: low-passed difference between plate and the model's own render of it."""
+    """[h, w] float16 in 0..1: low-passed difference between the plate and the model's own render of it."""
     offsets: Tensor
     """[M, 3] means of the open Gaussians in that frame, scene units."""
     shown: Tensor | None
-    """[h, w, 3] float16, the model's own render of it, where plates are no larger than decisions; else None."""
+    """[h, w, 3] float16, the model's own render of the plate; None if plates are larger than decision resolution."""
     ignored: Tensor | None
-    """[h, w, 1] in 0..1: what of it is no part of the scene, as if something stood in front; None: nothing."""
+    """[h, w, 1] in 0..1: ignored pixels, treated as an occluder in front of the scene; None: no pixel is ignored."""
 
 
 @dataclass(frozen=True)
 class VisibilityConfig:
-    """At what size plates are examined for decisions, and how finely. Lengths are in pixels of pictures 640 wide."""
+    """Resolution and tolerances of decisions about plates. Lengths are in pixels at width 640."""
 
     width: int = LENGTHS_OF
-    """Mattes, depth and visibility are compared at this width at most: they are soft, and the model is no finer."""
+    """Largest width in pixels at which mattes, depth and visibility are compared (decision resolution): mattes are
+    soft, and the model is no finer."""
     depth_tolerance: float = 0.03
-    """Share of the depth by which a point may lie off the surface that a plate shows and still be it."""
+    """Relative depth difference up to which a point belongs to the surface that a plate shows."""
     margin: int = MARGIN
-    """What moves is dilated by this. Pictures are compared under a low-pass of this sigma, or twice that: splats are
-    soft, which contradicts nothing. A difference speaks for twice as many pixels around it: half-rejected movers leave
-    their outlines."""
+    """Radius by which motion mattes are dilated. Pictures are compared under a low-pass with this sigma or twice this
+    sigma, because splats are soft. Differences are dilated by twice this radius, because partly rejected movers would
+    leave outlines."""
     unexplained: float = 0.1
-    """Low-passed difference, display-referred, at which a plate is trusted 1/e."""
+    """Low-passed difference, display-referred, at which the trust in a plate falls to 1/e."""
 
 
 class SourceViews:
-    """The plates of a clip as one run sees them."""
+    """The plates of a clip, compared with one run or one developed instant."""
 
     def __init__(
         self,
@@ -118,9 +119,9 @@ class SourceViews:
         frozen: FrozenGaussians | None = None,
         t_star: int | None = None,
     ) -> None:
-        """`moving` None: the shot's motion mattes, and where it has none the model's own matte.
+        """`moving` None: the shot's motion mattes are used; frames without one use the model's own matte.
 
-        `frozen`: an instant that was developed, at frame `t_star`, which then is the model; None: the run.
+        `frozen`: a developed instant at frame `t_star`, used as the model. None: the run is the model.
         """
         self.run, self.scene, self.plates = run, scene, plates
         self.moving = moving or motion_mattes(Shot(scene.folder.parent))
@@ -133,7 +134,7 @@ class SourceViews:
         width = min(plates.width, self.config.width)
         self.size = width, max(8, round(plates.height * width / plates.width))
         self.unit = width / LENGTHS_OF
-        """Pixels of decisions to a pixel in which lengths are configured."""
+        """Pixels at decision resolution per pixel at width `LENGTHS_OF`."""
         self.stage = MovingScene(run, scene, frozen, t_star)
         """The model in every frame."""
         self.rows = self.stage.rows.cpu()
@@ -160,14 +161,14 @@ class SourceViews:
             width, height = self.size
             shown = 6.0 if self.size == (self.plates.width, self.plates.height) else 0.0
             each = (20.0 + shown) * width * height + 12.0 * len(self.rows)
-            room = _VIEWS_BYTES - 24.0 * self.plates.width * self.plates.height  # frames of 4K need it more
+            room = _VIEWS_BYTES - 24.0 * self.plates.width * self.plates.height  # large frames need memory themselves
             while len(self._views) > max(12, min(_VIEWS, room / each)):
                 self._views.popitem(last=False)
         self._views.move_to_end(frame)
         return self._views[frame]
 
     def residual(self, frame: int) -> Tensor:
-        """[H, W, 3] float16: plate `frame` less the model's own render of it, display-referred, at the plates' size."""
+        """[H, W, 3] float16: plate `frame` minus the model's own render of it, display-referred, at plate size."""
         if frame not in self._residuals:
             self._residuals[frame] = self._missed(frame)
             each = 6.0 * self.plates.width * self.plates.height
@@ -177,33 +178,33 @@ class SourceViews:
         return self._residuals[frame]
 
     def displayed(self, frame: int) -> Tensor:
-        """[H, W, 3] float16: plate `frame`, display-referred, uncut; the last one that was requested is kept."""
+        """[H, W, 3] float16: plate `frame`, display-referred, not clipped. The last plate is cached."""
         if self._displayed is None or self._displayed[0] != frame:
             self._displayed = frame, self.plates.display(frame).half()
         return self._displayed[1]
 
     def most(self, frame: int) -> float:
-        """The largest number in plate `frame`."""
+        """The largest value in plate `frame`, display-referred."""
         if frame not in self._most:
             self.residual(frame)
         return self._most[frame]
 
     def difference(self, a: Tensor, b: Tensor, margins: int = 1) -> Tensor:
-        """[h, w] greatest difference over channels of two pictures [h, w, 3] of decisions, low-passed.
+        """[h, w] low-passed difference of two pictures [h, w, 3] at decision resolution, largest over channels.
 
-        `margins`: sigma of the low-pass, in margins of the configuration.
+        `margins`: sigma of the low-pass, in units of `VisibilityConfig.margin`.
         """
         h, w = a.shape[:2]
         sigma = margins * self.config.margin * self.unit
         if sigma < 1.5:
             return blurred(a - b, sigma).abs().amax(dim=-1)
-        half = resized(a - b, (w + 1) // 2, (h + 1) // 2)  # what is left needs no more pixels
+        half = resized(a - b, (w + 1) // 2, (h + 1) // 2)  # enough for a low-passed picture
         return resized(blurred(half, 0.5 * sigma).abs().amax(dim=-1), w, h)
 
     def seen(self, frame: int, points: Tensor) -> Visibility:
-        """Where plate `frame` shows world points [..., 3]."""
+        """Visibility of world points [..., 3] in plate `frame`."""
         view = self.view(frame)
-        c, soft = self.config, float(self.config.margin)  # of decisions: small pictures have no narrower border
+        c, soft = self.config, float(self.config.margin)  # not scaled: the border is as wide in small pictures
         return visible_pixels(points, view.viewmat, view.K, view.surface, view.ignored, c.depth_tolerance, soft)
 
     def _missed(self, frame: int) -> Tensor:
@@ -239,10 +240,10 @@ class SourceViews:
         frozen, image = self._own_render(frame, width, height)
         matte = self.moving(frame)
         moving = image.motion if matte is None else resized(matte, width, height)
-        # The working frame will do, and need not be decoded from 4K footage.
+        # The working frame is large enough, and faster to read than 4K footage.
         plate = read_image(self.scene.image_path(self.index[frame]), width, height, self.scene.display)
         ignored = self._ignored(frame)
-        if ignored is not None:  # there is nothing that the model could miss
+        if ignored is not None:  # ignored pixels must not count as missed
             plate = torch.lerp(plate, image.color, ignored)
         missed = self.difference(plate, image.color)
         off = self.difference(plate, image.color, 2)
@@ -260,7 +261,7 @@ class SourceViews:
         )
 
     def _ignored(self, frame: int) -> Tensor | None:
-        """As in `PlateView`: dilate as mattes are, with a soft edge."""
+        """Ignored pixels as in `PlateView`, dilated by twice the margin, with a soft edge."""
         mask = self.ignored(frame)
         if mask is None or not bool((mask > 0).any()):
             return None
@@ -279,7 +280,7 @@ def motion_mattes(shot: Shot) -> MovingOf:
 
 
 def matte_of(stored: NDArray[np.uint8]) -> Tensor:
-    """[h, w] in 0..1 of a motion matte as it is stored, [h, w]: 0 still, `DOUBT` unknown, 1 moving."""
+    """[h, w] in 0..1 from a stored motion matte [h, w]: 0 still, `DOUBT` unknown, 1 moving."""
     matte = torch.zeros(stored.shape, device="cpu")
     codes = from_numpy(stored)
     matte[codes == UNKNOWN] = DOUBT

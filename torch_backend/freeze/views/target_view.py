@@ -1,4 +1,4 @@
-"""The frame that plate detail is making: its camera, what it shows of the frozen scene, and how that moves."""
+"""The target view, that is, the frozen frame being composited: its camera, visible surface and scene flow."""
 
 from __future__ import annotations
 
@@ -18,47 +18,47 @@ from .source_views import SourceViews
 
 @dataclass
 class TargetView:
-    """A frame that is being made: its camera at both sizes, and what it shows."""
+    """A frozen frame being composited: its camera, its render, and maps of the visible surface."""
 
     viewmat: Tensor
     """[4, 4] world-to-camera, scene units."""
     K: Tensor
     """[3, 3] in pixels of the picture with its overscan."""
     image: FrozenImage
-    """The splats' render of it."""
+    """The splats' render of the frame, overscan included."""
     exposed_at: float
-    """Normalised time whose exposure it has."""
+    """Normalised time whose exposure the frame has."""
     own: bool
-    """True if it is one of the clip's own frames, seen as its camera saw it."""
+    """True if pose, lens, exposure and size are those of a frame of the clip."""
     t: int
-    """Frame whose plate shows the instant."""
+    """Frame number of plate t*, the plate nearest to the instant."""
     frozen: FrozenGaussians
     """The scene at t*."""
     points: Tensor
-    """[h, w, 3] world points seen, at the size of decisions."""
+    """[h, w, 3] visible world points, at decision resolution."""
     depth: Tensor
-    """[h, w] of those points, along the camera's axis."""
+    """[h, w] depth of `points` along the camera's axis."""
     motion: Tensor
-    """[h, w] in 0..1: what moves in the clip, at t*."""
+    """[h, w] in 0..1: moving surfaces at t*."""
     per_pixel: float
-    """Pixels of decisions per pixel of the picture."""
+    """Pixels at decision resolution per pixel of the picture."""
     beyond: tuple[int, int]
-    """Pixels of the picture that are overscan, on either side, and above and below."""
+    """Pixels of overscan: (left and right, above and below)."""
     doubt: Tensor
     """[h, w] in 0..1: where plates of other times are trusted only if they agree with the model."""
     moved: Tensor
-    """[h, w] in 0..1: what moves in the clip, at t* or in the frame's own plate; else `motion`."""
+    """[h, w] in 0..1: `motion`, and on the clip's own poses also the pixels where the frame's own plate is rejected."""
     unseen: Tensor
     """[h, w] in 0..1: pixels of moving surfaces that no plate near t* shows, so their state at t* is unknown."""
 
     def settings(self, width: int, height: int) -> RasterSettings:
-        """How its camera renders the picture, overscan included, at another size."""
+        """Settings to render the picture, overscan included, at another size."""
         rows, columns = self.image.alpha.shape
         return RasterSettings(overscan=(self.beyond[0] * width / columns, self.beyond[1] * height / rows))
 
     @property
     def centre(self) -> Tensor:
-        """[3] of its camera, scene units."""
+        """[3] camera centre, scene units."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
@@ -70,12 +70,12 @@ def target_view(
     width: int,
     height: int,
 ) -> TargetView:
-    """What a frame shows, before any plate has been asked.
+    """The target view of a frame, from the splats alone.
 
     Args:
-        output: its camera and instant.
-        frozen: the scene frozen there.
-        image: the splats' render of it, which may show more around the frame: overscan.
+        output: camera and instant of the frame.
+        frozen: the scene frozen at `output.t_star`.
+        image: the splats' render of the frame, overscan included.
         width, height: pixels of the frame without overscan.
     """
     rows, columns = image.alpha.shape
@@ -83,7 +83,7 @@ def target_view(
     per_pixel = min(1.0, source_views.config.width / width)
     w, h = max(8, round(columns * per_pixel)), max(8, round(rows * per_pixel))
     small = pixel_centres(w, h)
-    # The pixel at each centre, in whole numbers: a centre that lies between two pixels is always the second's.
+    # Pixel at each centre, in integers: a centre on the border of two pixels always belongs to the second.
     across, down = ((2 * torch.arange(n, device="cpu") + 1) * of // (2 * n) for n, of in ((w, columns), (h, rows)))
     depth = image.depth[down[:, None], across]
     points = unproject(small, depth, output.viewmat, resize_intrinsics(K[None], columns, rows, w, h)[0])
@@ -98,7 +98,7 @@ def target_view(
 
 
 def _is_own(source_views: SourceViews, output: OutputFrame, width: int, height: int) -> bool:
-    """True if the frame is one of the clip's own, seen as its camera saw it and as large as its plate."""
+    """True if the frame has the pose, lens and exposure of a frame of the clip, and the size of its plate."""
     i = source_views.index.get(output.frame)
     return (
         i is not None
@@ -111,7 +111,7 @@ def _is_own(source_views: SourceViews, output: OutputFrame, width: int, height: 
 
 
 def parallax(source_views: SourceViews, target: TargetView, frame: int, depth: Tensor, depth_error: float) -> Tensor:
-    """Misplacement of points in a plate, in pixels of 640, by a depth that is wrong by the share `depth_error`."""
+    """Misplacement of points in a plate by a relative depth error `depth_error`, in pixels at width 640."""
     travel = norm_of_all(source_views.centres[source_views.index[frame]] - target.centre)
     focal = target.K[0, 0] * target.per_pixel
     return focal * travel / depth.clamp_min(1e-6) * depth_error / source_views.unit
@@ -120,9 +120,9 @@ def parallax(source_views: SourceViews, target: TargetView, frame: int, depth: T
 def displacements(
     source_views: SourceViews, target: TargetView, chosen: list[int], size: tuple[int, int] | None = None
 ) -> list[Tensor]:
-    """[h, w, 3] scene units from t* to each plate of what is seen.
+    """[h, w, 3] scene flow of the visible surface from t* to each plate, scene units.
 
-    `size` (w, h) None: that of decisions.
+    `size` is (w, h). None: decision resolution.
     """
     w, h = size or target.depth.shape[::-1]
     rows, state = source_views.rows, target.frozen.state
@@ -143,8 +143,8 @@ def displacements(
 
 
 def with_overscan(K: Tensor, image: FrozenImage, width: int, height: int) -> tuple[Tensor, tuple[int, int]]:
-    """([3, 3] the camera of a frame of `width` x `height` in pixels of its render, how many of those are beside it, and
-    above or below it)."""
+    """(intrinsics [3, 3] of a frame of `width` x `height` with its overscan, pixels of overscan on the left and right,
+    and above and below)."""
     rows, columns = image.alpha.shape
     beyond = (columns - width) // 2, (rows - height) // 2
     wide = K.clone()

@@ -1,8 +1,7 @@
-"""Where a plate shows world points, and how; C++ compiled by Warp.
+"""Visibility of world points in a plate, as a C++ kernel compiled by Warp.
 
-What it does is `project`, `inside`, `look_up` and `same_surface` of `reproject.py`, one after another. A frozen frame
-asks it of some 30 plates, and of most points in passing only: as 40 operators on tensors that was a third of a frame's
-time.
+The kernel fuses `project`, `inside` and `look_up` of `reproject.py` with a comparison of depths. A frozen frame needs
+it for about 30 plates. As 40 tensor operators it took a third of the time per frame.
 """
 
 from __future__ import annotations
@@ -18,24 +17,24 @@ from ...kernel_text import kernel_text
 from ...native import INTEGER, POINTER, Snippet
 
 _POINTS = 2048
-"""Points of a unit of work."""
+"""Number of points per unit of work."""
 _KERNEL = Path(__file__).with_name("kernels") / "visibility.cpp"
 
 
 @dataclass
 class Visibility:
-    """Where and how points are seen in one plate; leading dimensions are those of the points."""
+    """Visibility of points in one plate; leading dimensions are those of the points."""
 
     pixels: Tensor
-    """[..., 2] in pixels of the size of decisions; far outside for what is behind the camera."""
+    """[..., 2] in pixels at decision resolution; (-1e6, -1e6) for points behind the camera."""
     depth: Tensor
-    """[...] along the camera's axis."""
+    """[...] depth along the camera's axis."""
     visible: Tensor
-    """[...] in 0..1: within the picture, and nothing in front."""
+    """[...] in 0..1: the point is inside the picture and not occluded."""
     moving: Tensor
-    """[...] in 0..1, of the plate there."""
+    """[...] in 0..1: the plate's motion matte at the pixel."""
     explained: Tensor
-    """[...] in 0..1, of the plate there."""
+    """[...] in 0..1: agreement of model and plate at the pixel, as in `PlateView.surface`."""
 
 
 @functools.cache
@@ -48,7 +47,7 @@ def _snippet() -> Snippet:
 
 
 def warm_up() -> None:
-    """Compile, or load from the cache, from the main thread."""
+    """Compiles the kernel, or loads it from the cache. Call this from the main thread."""
     _snippet().warm_up()
 
 
@@ -56,14 +55,18 @@ def visible_pixels(
     points: Tensor, viewmat: Tensor, K: Tensor, surface: Tensor, ignored: Tensor | None, tolerance: float,
     soft: float,
 ) -> Visibility:  # fmt: skip
-    """How a plate shows world points [..., 3]. All on the CPU, float32; no gradient. ValueError for others.
+    """Visibility of world points [..., 3] in a plate. Not differentiable.
 
     Args:
-        viewmat: [4, 4] world-to-camera; K: [3, 3] in pixels of `surface`.
-        surface: [h, w, 3] median depth, and in 0..1 what moves and what is explained.
-        ignored: [h, w, 1] in 0..1 of what is no part of the scene; None: nothing.
-        tolerance: share of its depth by which a point may lie off the surface and still be it.
-        soft: pixels along the border over which points stop being seen.
+        viewmat: [4, 4] world-to-camera.
+        K: [3, 3] in pixels of `surface`.
+        surface: [h, w, 3] median depth, motion matte and agreement, as in `PlateView`.
+        ignored: [h, w, 1] in 0..1, ignored pixels; None: no pixel is ignored.
+        tolerance: relative depth difference up to which a point belongs to the surface.
+        soft: width in pixels of the ramp at the border over which visibility falls to 0.
+
+    Raises:
+        ValueError: a tensor is not float32 or not on the CPU.
     """
     shape, height, width = points.shape[:-1], *surface.shape[:2]
     points, surface = points.contiguous(), surface.contiguous()

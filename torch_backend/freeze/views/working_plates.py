@@ -1,4 +1,4 @@
-"""The shot's working frames as an instant is developed from them: pictures and what moves in them, at one size."""
+"""The shot's working frames at one size, with cameras and motion mattes, for developing and judging an instant."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from .reproject import dilate, resized
 from .source_views import LENGTHS_OF, MARGIN, MovingOf
 
 SEEN = 0.05
-"""Pixels that a camera has to see of a Gaussian before it can say whether that moves."""
+"""Smallest contribution of a Gaussian to a frame, in pixels, for the frame to count in decisions on the Gaussian."""
 
 MEASURED_WIDTH = 320
-"""Width in pixels of pictures by which scenes are compared and surfaces measured; never above the working frames'."""
+"""Largest width in pixels of the pictures that compare scenes and measure surfaces."""
 VIEWS = 12
-"""Number of frames, evenly over the clip, by which a scene is judged, where all of them would take too long."""
+"""Number of evenly spaced frames that judge a scene, where all frames would take too long."""
 
 
 class WorkingPlates:
-    """Pictures, cameras and mattes of a shot's frames at `width` pixels, at most the working frames' own."""
+    """Pictures, cameras and mattes of a shot's frames, at most `width` pixels wide."""
 
     def __init__(
         self, scene: Scene, width: int, moving: MovingOf, margin: float = MARGIN, device: torch.device | str = "cpu"
     ) -> None:
-        """`margin`: pixels of pictures `LENGTHS_OF` wide around what moves that count as moving too."""
+        """`margin`: radius by which motion mattes are dilated, in pixels at width `LENGTHS_OF`."""
         self.scene, self.moving, self.device = scene, moving, device
         self.width = min(scene.width, width)
         self.height = max(16, round(scene.height * self.width / scene.width))
@@ -40,17 +40,17 @@ class WorkingPlates:
         self._ignored = ignore_mattes(Shot(scene.folder.parent))
 
     def camera(self, frame: int) -> tuple[Tensor, Tensor, int, int]:
-        """(world-to-camera [4, 4], K [3, 3], width, height) of a frame, as `render` wants them."""
+        """(world-to-camera [4, 4], K [3, 3], width, height) of a frame, in the order of the arguments of `render`."""
         i = self.index[frame]
         return self._viewmats[i], self._Ks[i], self.width, self.height
 
     def centre(self, frame: int) -> Tensor:
-        """[3] where a frame's camera is, scene units."""
+        """[3] camera centre of a frame, scene units."""
         viewmat = self._viewmats[self.index[frame]]
         return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
     def picture(self, frame: int) -> Tensor:
-        """[H, W, 3] in 0..1 of the scene's display."""
+        """[H, W, 3] working frame in 0..1, in the scene's display."""
         if frame not in self._pictures:
             path = self.scene.image_path(self.index[frame])
             image = read_image(path, self.width, self.height, self.scene.display)
@@ -58,7 +58,7 @@ class WorkingPlates:
         return self._pictures[frame].to(self.device).float() / 255.0
 
     def matte(self, frame: int) -> Tensor:
-        """[H, W] in 0..1, the motion matte; 0 (still) for frames without one."""
+        """[H, W] in 0..1, the dilated motion matte; 0 (still) for frames without a matte."""
         if frame not in self._mattes:
             found = self.moving(frame)
             found = torch.zeros(self.height, self.width, device="cpu") if found is None else found
@@ -67,7 +67,7 @@ class WorkingPlates:
         return self._mattes[frame].to(self.device).float()
 
     def ignored(self, frame: int) -> Tensor | None:
-        """bool [H, W]: what of a frame is no part of the scene, and around it; None: nothing."""
+        """bool [H, W]: ignored pixels of a frame, dilated; None: no pixel is ignored."""
         mask = self._ignored(frame)
         if mask is None:
             return None
@@ -82,7 +82,7 @@ class WorkingPlates:
 
 
 def showing(trained: list[int], t_star: int) -> list[int]:
-    """The trained frames that show an instant: its own, else the nearest on either side of it."""
+    """The trained frames that show an instant: frame `t_star`, or else the nearest trained frame on either side."""
     if t_star in trained:
         return [t_star]
     before, after = [f for f in trained if f < t_star], [f for f in trained if f > t_star]
@@ -90,7 +90,7 @@ def showing(trained: list[int], t_star: int) -> list[int]:
 
 
 def spread(frames: list[int], most: int) -> list[int]:
-    """At most `most` of ascending frames, evenly spaced."""
+    """At most `most` evenly spaced elements of ascending frames."""
     if len(frames) <= most:
         return list(frames)
     step = len(frames) / max(1, most)

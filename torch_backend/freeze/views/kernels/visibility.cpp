@@ -1,4 +1,4 @@
-// Where a plate shows world points, and how: projection, surface there, and whether that is it, in one pass.
+// Visibility of world points in a plate: projection, surface look-up and comparison of depths in one pass.
 
 // points: [count][3]; camera: rows 0 to 2 of the view matrix, fx, fy, cx, cy; surface: [height][width][3], median depth,
 // motion, explained; ignored: [height][width] or null; pixels: [count][2]; depth, visible, moving, explained: [count].
@@ -9,7 +9,7 @@ const long long N = P.count, W = P.width, H = P.height;
 const float* V = P.camera;
 const float fx = V[12], fy = V[13], cx = V[14], cy = V[15], wide = (float)W, high = (float)H;
 const float tolerance = P.settings[0], soft = 1.f / P.settings[1];
-// Not above 0: so is what is no number.
+// Clamps x to 0..most; NaN becomes 0.
 auto within = FN(float x, float most) -> float { return !(x > 0.f) ? 0.f : x < most ? x : most; };
 for (long long first; (first = take() * @POINTS@) < N;) {
     long long last = first + @POINTS@ < N ? first + @POINTS@ : N;
