@@ -86,7 +86,7 @@ class TrainingLoop:
         self._save()
 
     def _with_room(self, work: Callable[[], None]) -> None:
-        """Runs repeatable `work` between steps. If GPU memory runs out, frees recordings or caches and runs it again."""
+        """Runs repeatable `work` between steps. If GPU memory runs out, frees recordings or caches and runs it anew."""
         with contextlib.suppress(torch.OutOfMemoryError):
             return work()
         if self.trainer.recorder is None or not self.trainer.recorder.give_up():

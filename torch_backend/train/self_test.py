@@ -76,7 +76,7 @@ class SelfTest:
     problem: str = ""
     """The fault that makes the GPU unusable, as a sentence; empty if there is none."""
     planes: str = ""
-    """The fault of the plane kernels; empty if there is none. PyTorch operators on the GPU can replace these kernels."""
+    """The fault of the plane kernels; empty if there is none. PyTorch operators on the GPU can replace the kernels."""
     recording: str = ""
     """The fault of steps recorded as CUDA graphs; empty if there is none. Steps can be launched unrecorded instead."""
     lasting: bool = True
@@ -100,7 +100,7 @@ def self_test_key() -> str:
 
 
 def run_self_test(device: torch.device, key: str = "") -> SelfTest:
-    """Tests the kernels on `device`. On 'cpu', the CUDA kernels run on fibers (for unit tests). Failures do not raise."""
+    """Tests the kernels on `device`. On 'cpu', CUDA kernels run on fibers (for unit tests). Failures do not raise."""
     found, since = SelfTest(key=key), time.perf_counter()
     found.problem = _problem(found, lambda: [*_frame(device), *_loss(device), *_adam(device)])
     if not found.problem:  # optional kernels last, since a faulty kernel breaks the CUDA context of the process
@@ -150,8 +150,7 @@ def card_verdict(folder: Path | None = None, test: Callable[[str], SelfTest] | N
 
 
 def keep(found: SelfTest, folder: Path, confirmed: bool = False) -> None:
-    """Stores a result. A result that is not `lasting`, or an unconfirmed failure, is not stored, and the previous one is
-    deleted."""
+    """Stores a result. If it is not `lasting`, or is an unconfirmed failure, deletes the stored result instead."""
     place = folder / "splannequin-card.json"
     try:
         if found.lasting and (confirmed or not found.failed):
@@ -240,7 +239,7 @@ def _camera(device: torch.device) -> dict[str, Any]:
 
 
 def _rendered(device: torch.device, backend: str) -> tuple[RasterOutput, dict[str, Tensor]]:
-    """Render of the test scene, and gradients of a weighted sum of its colours and depths with respect to all inputs."""
+    """Render of the test scene, and gradients of a weighted sum of its colours and depths by all inputs."""
     leaves: dict[str, Any] = {name: value.to(device).requires_grad_() for name, value in _scene().items()}
     out = rasterize(
         **leaves, **_camera(device), width=_WIDTH, height=_HEIGHT,

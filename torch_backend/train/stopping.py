@@ -286,7 +286,7 @@ class StoppingPolicy:
         return iterations if self.stopped is None else min(iterations, self.stopped + self._anneal)
 
     def rate_progress(self, iteration: int, iterations: int) -> float:
-        """Progress at which learning rates are evaluated; in a stopped run it advances faster, to reach 1 at its end."""
+        """Progress at which learning rates are evaluated. In a stopped run it rises faster, to reach 1 at the end."""
         if self.stopped is None:
             return iteration / iterations
         at = self.stopped / iterations
@@ -300,8 +300,10 @@ class StoppingPolicy:
     # ------------------------------------------------------------------ decisions
 
     def decide(self, probe: Probe) -> Iterator[LimitHarmonics]:
-        """Makes the decisions that are due; called between steps. The caller carries out each yielded decision before it
-        asks for the next. A decision interrupted by a cancellation is made again when the run is resumed.
+        """Makes the decisions that are due; called between steps.
+
+        The caller carries out each yielded decision before it requests the next. A decision interrupted by a
+        cancellation is made again when the run is resumed.
         """
         if not self.probes:
             return
