@@ -33,8 +33,8 @@ class ExposureConfig:
 
 
 class _Between(torch.autograd.Function):
-    """`torch.lerp` of two rows of values [B, 2, 3]. The backward pass uses the rounded shares [2], so that it matches
-    `torch.lerp` with a Python float, whose gradient rounds 1 - share."""
+    """`torch.lerp` of two rows of values [B, 2, 3]. The gradient uses both given weights. `torch.lerp` would compute
+    1 - weight in float32, and its gradient would differ from that of `Exposure.apply` by rounding."""
 
     @staticmethod
     def forward(ctx: AutogradContext, values: Tensor, bins: Tensor, shares: Tensor) -> Tensor:
@@ -54,8 +54,7 @@ def _exposed(color: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
     """color [H, W, 3] * gain [3] + offset [3]."""
     if color.is_cuda:
         return color * gain + offset
-    # PyTorch does not vectorise broadcasts over an axis of 3 on the CPU, so rows of width * channels are several times
-    # faster.
+    # On the CPU, torch does not vectorise broadcasts over an axis of 3; rows of width * channels are far faster.
     height, width, channels = color.shape
     rows = color.reshape(height, width * channels)
     return torch.addcmul(offset.repeat(width), rows, gain.repeat(width)).view(height, width, channels)

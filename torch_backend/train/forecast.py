@@ -19,7 +19,7 @@ STEPS = 20
 """Number of steps per measurement, with the first, untimed step in which memory is allocated."""
 GAUSSIAN_PIXELS = 3.0
 """Time per Gaussian divided by time per pixel. A fast-growing run at 640 x 360 had a ratio of 3.8 (76 ms of CPU time
-per step with 19,000 Gaussians, 127 with 58,000, 180 with 122,000). In long runs, Gaussians become smaller and faster."""
+per step with 19,000 Gaussians, 127 with 58,000, 180 with 122,000). In long runs, Gaussians are smaller and faster."""
 LONG_SECONDS = 3600.0
 """Duration in seconds above which a warning names faster settings."""
 _SAMPLES = 256

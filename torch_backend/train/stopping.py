@@ -340,8 +340,7 @@ class StoppingPolicy:
                 self.growth_ended = probe.iteration
         s = self.schedule
         hardened = (s.give_up * s.iterations if self.facts.hardened is None else self.facts.hardened) / s.iterations
-        # Training on low-resolution images gains nothing on full-resolution probes: without this condition, a run of
-        # 9000 steps ended at 5500.
+        # Training at low resolution gains nothing on sharp probes; without this, a run of 9000 steps ended at 5500.
         sharp = s.softened + self.config.stop_window if s.softened > 0.0 else 0.0
         over = probe.progress > max(hardened, sharp, s.densify_stop if self.growing else 0.0)
         gain = newest_gain(self.measured, probe.iteration - round(self.config.stop_window * s.iterations))
