@@ -77,8 +77,8 @@ class ControlPointsConfig(HostConfig):
     time_frequencies: int = 4
     """Octaves of the time encoding (10)."""
     published: bool = False
-    """Whether coordinates are not normalised, scale deltas and rotations are added after activation, and a node has a
-    separate rotation for positions (on)."""
+    """Whether to use the published variant (on): coordinates are not normalised, scale deltas are added after
+    activation, rotations are added to raw quaternions, and nodes have a separate rotation for positions."""
     lr: float = 5e-4
     """Initial learning rate of the network (8e-4)."""
     lr_end: float = 2e-5
@@ -161,7 +161,7 @@ class ControlPoints(Deformation):
         self.places: Tensor
         self.register_buffer("box", box.float().cpu())
         self.register_buffer("frames", torch.tensor(float(frames), device="cpu"))
-        self.frame_count = float(frames)  # value of `frames` on the host, which avoids a GPU synchronisation
+        self.frame_count = float(frames)  # value of `frames` in host memory, which avoids a GPU synchronisation
         self.register_buffer("places", places.float())
         self.hyper = nn.Parameter(places.new_full((count, config.hyper), 1e-2))
         self.log_radii = nn.Parameter(_radii(places, config.published).log())
@@ -209,7 +209,7 @@ class ControlPoints(Deformation):
         return Deltas(means=means, quats=quats, log_scales=log_scales)
 
     def _skin(self, x: Tensor, hyper: Tensor) -> tuple[Tensor, Tensor]:
-        """(nodes [M, K], weights [M, K]) that Gaussians at x [M, 3] with hyper [M, H] follow; weights sum to 1."""
+        """(nodes followed [M, K], weights [M, K]) of Gaussians at x [M, 3] with hyper [M, H]. Weights sum to 1."""
         with torch.no_grad():
             joint, nodes = torch.cat([x, hyper], dim=1), torch.cat([self.places, self.hyper], dim=1)
             index = nearest(joint, nodes, min(_FOLLOWED, len(nodes)))
@@ -221,7 +221,7 @@ class ControlPoints(Deformation):
         return index, share / share.sum(1, keepdim=True)
 
     def _motions(self, index: Tensor, times: Tensor) -> tuple[Tensor, _Motion, Tensor]:
-        """(places [R, 3], motions of R rows, rows [M, K]) of the nodes index [M, K] at times [M] or [1].
+        """(places [R, 3], their motions, row of each node [M, K]) for nodes `index` [M, K] at times [M] or [1].
 
         On the CPU, each pair of node and time is computed once.
         """

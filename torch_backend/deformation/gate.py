@@ -33,8 +33,8 @@ class GateConfig:
     WIDTH: ClassVar[int] = 320
     """Image width to which `pixels` refers, independent of the training resolution."""
     STRAY: ClassVar[tuple[float, int]] = 0.25, 2
-    """Least share of a Gaussian's contribution on moving pixels, and least number of such frames, for it to stay open
-    in a long run. Opening requires more; staying open requires less, because mattes miss much of an arm."""
+    """(share, frames): in a long run, a Gaussian stays open if at least `share` of its contribution falls on moving
+    pixels in at least `frames` frames. Opening requires more, but mattes miss much of an arm."""
     LONG: ClassVar[int] = 3000
     """Number of steps up to which strays are not closed. Short runs have few (6 and 25 % of the open Gaussians on two
     clips, 60 % after 9000 steps). Developing treats closed Gaussians as still, which would damage arms of which mattes
@@ -60,12 +60,12 @@ class GateConfig:
     neighbours: int = 8
     """Number of nearest open Gaussians over which the median change is taken, because noise is not shared by them."""
     moving_share: float = 0.5
-    """With motion mattes: least share of a Gaussian's contribution on moving pixels for a frame to count."""
+    """With motion mattes: a frame counts if more than this share of a Gaussian's contribution is on moving pixels."""
     moving_frames: int = 3
-    """With motion mattes: least number of such frames for a Gaussian to be opened on trial."""
+    """With motion mattes: least number of frames that count for a Gaussian to be opened on trial."""
     moving_often: float = 0.1
-    """With motion mattes: least share of such frames among the time bins in which the Gaussian was seen. It excludes a
-    wall that a hand passes."""
+    """With motion mattes: least number of frames that count, as a share of the time bins in which the Gaussian was
+    seen. It excludes a wall that a hand passes."""
 
 
 @torch.no_grad()

@@ -3,9 +3,9 @@
 Changes to the published code: Time is mapped to the whole plane. The heads' last layers start at zero, so that the
 field starts as the identity. Learning rates do not depend on the scene's extent, because the scene is normalised.
 Smoothness acts along both axes of a spatial plane. The activation is SiLU: with ReLU, the whole trunk often dies in the
-first steps, and the field stays constant. Sampling coordinates are detached, so that images do not move means through
-the field. Axes are stretched around the Gaussians: background behind a mover makes the box large, so that people would
-be only a few nodes wide. `published` reverts all of these changes.
+first steps, and the field stays constant. Sampling coordinates are detached, so that no gradient reaches the means
+through the field. Axes are stretched around the Gaussians: background behind a mover makes the box large, so that
+people would be only a few nodes wide. `published` reverts all of these changes.
 
 The trainer implements the following for every host, which differs from the published code: one image per step (2 to 4),
 the loss, learning rates and densification of the Gaussians, and one optimiser for both stages.
@@ -29,7 +29,7 @@ from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_sca
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
 PUBLISHED_ITERATIONS = 33_000
 _EXTENT = 1.1
-"""Factor of published learning rates: the scene's extent of 1.1 camera extents. Our camera extent is 1."""
+"""Scene extent (1.1 camera extents) by which the published code multiplies its rates. Our camera extent is 1."""
 _WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "sh0": 3}
 
 

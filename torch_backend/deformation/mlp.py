@@ -5,8 +5,8 @@ times are scaled to [-1, 1] before encoding. Scales change in the log and rotati
 every delta is valid. Heads start near zero, so that the field starts as the identity to about 1e-5. The 6-DoF variant
 is finite at angle 0. The network is smaller and its encoding has fewer octaves.
 
-`reference` is the published host. For every host, the trainer implements the loss, and learning rates and densification
-of the Gaussians. For densification, the published code has a second screen-gradient buffer and a separate threshold.
+`reference` is the published host. For every host, the trainer implements the loss, the learning rates of the Gaussians
+and their densification, for which the published code has a second screen-gradient buffer and a separate threshold.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class Mlp(Deformation):
         self.frames: Tensor
         self.register_buffer("box", box.float().cpu())
         self.register_buffer("frames", torch.tensor(float(frames), device="cpu"))
-        self.frame_count = float(frames)  # value of `frames` on the host, which avoids a GPU synchronisation
+        self.frame_count = float(frames)  # value of `frames` in host memory, which avoids a GPU synchronisation
         self.trunk = Trunk(
             config.depth, config.width, (config.position_frequencies, config.time_frequencies), generator
         )

@@ -1,10 +1,10 @@
 """Compiled feature planes of the HexPlane: products of samples, smoothness penalty, and gradients of both.
 
 The torch path in `hexplane` is the specification, and is used for other devices and types. Planes on an NVIDIA GPU use
-`planes_cuda`. On the CPU, scattered samples make torch wait for memory, because the channels of a sample are far apart;
-and six small operators per level have more overhead than arithmetic. Here, channels are contiguous (`channels_last`),
-and one pass computes the product of a level's six samples. One thread computes all gradients of a plane, so that
-results are bit-identical for any number of threads.
+`planes_cuda`. On the CPU, torch waits for memory, because the channels of a scattered sample are far apart. Its small
+operators also have more overhead than arithmetic. Here, channels are contiguous (`channels_last`), and one pass
+computes the product of a level's six samples. One thread computes all gradients of a plane, so that results are
+bit-identical for any number of threads.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ class Rehearsal:
 
 
 class Deformation(nn.Module):
-    """Deformation field of a host; `config` is its configuration. In our hosts, images do not move means through it."""
+    """Deformation field of a host; `config` is its configuration. In our hosts, it passes no gradient to the means."""
 
     config: Any
     rules: Mapping[str, Rule]
@@ -206,7 +206,7 @@ class HostSpec:
     settings: type
     """Class of its configuration, a HostConfig whose defaults are our configuration."""
     reference: Callable[[int], Any]
-    """Function iterations of the run -> published configuration, with schedules as shares of the run."""
+    """Function (iterations of the run) -> published configuration, with schedules as shares of the run."""
     create: Callable[[Any, Start], Deformation]
     """Creates a new field from a configuration."""
     restore: Callable[[Any, dict[str, Tensor]], Deformation]

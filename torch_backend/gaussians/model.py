@@ -1,6 +1,6 @@
 """Canonical Gaussians: parameters, optimiser state and per-Gaussian state, which are resized together.
 
-One function, `rebuild`, clones, splits and prunes; it is given the parent row of each new Gaussian. Children inherit
+One function, `rebuild`, clones, splits and prunes, by the parent row of each new Gaussian. Children inherit
 per-Gaussian state (the gate, the support bitmap), as the support preset requires (docs/architecture.md).
 """
 

@@ -147,7 +147,7 @@ def draw(rows: int, bins: int, config: SupervisionConfig, generator: torch.Gener
 def anchored_pairs(model: Gaussians, rows: Tensor, draws: Draws, config: SupervisionConfig) -> Anchored | None:
     """Pairs that `draws` select among the open `rows` [M]; None if no pair needs an anchor.
 
-    On a GPU, pairs that need no anchor stay with weight 0. To drop them, the host would have to wait for their number.
+    On a GPU, pairs that need no anchor stay with weight 0. To drop them, the CPU would have to wait for their number.
     """
     support = model.support[rows]
     lacking = ~support & model.hidden[rows] if config.anchor == "hidden" else ~support
@@ -237,7 +237,7 @@ def stillness(deltas: Deltas, count: int, error: Tensor, weight: Tensor, config:
 
 
 _FAR = 4
-"""Number of pairs with any bin for each pair near support; near pairs only fill the remaining count."""
+"""Number of pairs with any bin per near pair. Near pairs are used only if too few of the others are valid."""
 
 
 def _pairs(support: Tensor, lacking: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 The algorithm and the names of its state are those of `torch.optim.Adam` (Kingma & Ba 2015; no weight decay, no
 amsgrad), so checkpoints fit both. A step with a gradient that is not finite changes nothing. On the CPU, compiled code
-processes chunks on threads. On CUDA, a Warp kernel processes elements, and the host does not wait for the device.
+processes chunks on threads. On CUDA, a Warp kernel processes single elements, and nothing waits for the device.
 """
 
 import contextlib
@@ -99,7 +99,7 @@ class FusedAdam(torch.optim.Optimizer):
 
     Additional options of a parameter group:
 
-    - `rows=True`: the first axis is the Gaussian; `step(visible=...)` skips rows that are not visible, and moments.
+    - `rows=True`: the first axis is the Gaussian; `step(visible=...)` skips invisible rows and their moments.
     - `clamp=(low, high)`: the parameters are clamped to this range.
     - `reach`: a row's learning rate is multiplied by max(1, L2 norm of the row) / `reach`, so that means at different
       distances move by equally many pixels. 0: the same rate for all rows.
@@ -124,8 +124,8 @@ class FusedAdam(torch.optim.Optimizer):
         self._plan: _Plan | None = None
         self._recorded: StepTable | None = None
 
-    # The next two methods skip torch's decorator, which excludes them from torch.compile. At the first call, the
-    # decorator imports the compiler: 1.5 to 1.9 s and 68 MB in every process that trains or develops.
+    # The next two methods bypass torch's decorator, which excludes methods from torch.compile. At its first call, it
+    # would import the compiler: 1.5 to 1.9 s and 68 MB in every process that trains or develops.
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """See `torch.optim.Optimizer.add_param_group`."""
         inspect.unwrap(torch.optim.Optimizer.add_param_group)(self, param_group)
@@ -306,12 +306,12 @@ class StepTable:
     sent: Tensor
     """int64 table on the GPU, at least as long as `values`."""
     values: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
-    """The table on the host."""
+    """The table in host memory."""
     group_of: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
     """Parameter group of each of the table's last rows."""
 
     def filled(self, values: NDArray[np.int64], group_of: NDArray[np.int64]) -> Tensor:
-        """Stores the table's values on the host, and returns the GPU tensor that the step reads."""
+        """Stores the table's values in host memory, and returns the GPU tensor that the step reads."""
         self.values, self.group_of = values, group_of
         return self.sent[: len(values)]
 

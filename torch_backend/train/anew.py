@@ -18,10 +18,10 @@ from .extend import EXTENSION_FILE
 
 
 def folder_for(run: Path, key: str, resume: bool) -> Path:
-    """Folder in which the settings with key `key` are trained.
+    """Training folder for the settings with key `key`.
 
-    If `resume`, it is the folder in which they were begun. Otherwise it is the run's folder if that has no checkpoint,
-    else a folder in `NEXT_FOLDER`.
+    With `resume`, it is the folder of a training that was begun with these settings. Otherwise it is the run's folder
+    if that has no checkpoint, else a folder in `NEXT_FOLDER`.
     """
     folder = begun(run, key) if resume else None
     if folder is not None:
@@ -30,7 +30,7 @@ def folder_for(run: Path, key: str, resume: bool) -> Path:
 
 
 def begun(run: Path, key: str) -> Path | None:
-    """Folder with a checkpoint of the settings with key `key`; None if they were not begun."""
+    """Folder with a checkpoint of the settings with key `key`; None if there is none."""
     for place in (run, run / NEXT_FOLDER / key):
         checkpoint = place / CHECKPOINT_FILE
         if checkpoint.is_file() and read_meta(checkpoint).get("key") == key:
@@ -39,7 +39,7 @@ def begun(run: Path, key: str) -> Path | None:
 
 
 def replace_run(run: Path, done: Path) -> None:
-    """Moves the run trained in `done`, a folder of `folder_for`, to the run's folder. Other begun runs are removed.
+    """Moves the run trained in `done`, a folder of `folder_for`, to the run's folder. Removes unfinished trainings.
 
     Every file is replaced atomically, the checkpoint first, so that a freeze reads either the old run or the new one.
     `finish_replacing` resumes after a killed process.

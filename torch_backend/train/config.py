@@ -38,7 +38,7 @@ class TrainConfig:
     """Offset of the held-out frames within each interval. 0 for reported figures; tuning uses another offset, so that
     it does not see the frames that results are reported on."""
     method: str = "auto"
-    """auto: the gate selects which Gaussians the host moves. A host's name: all Gaussians move. static: no motion."""
+    """Which Gaussians move. auto: those selected by the gate. A host's name: all Gaussians. static: none."""
     host: str = "hexplane"
     """Name of the host, the deformation model that moves Gaussians (`deformation.registry`)."""
     host_config: str = "default"
@@ -204,8 +204,8 @@ _STATIC, _MOST_STATIC = 0.2, 600
 moving objects are fitted by ghosts: Gaussians far behind the object that each match one view only. The field cannot
 correct them (docs/decisions.md, "Gate and field")."""
 _MOST_PER_DEGREE = 1350
-"""Maximum number of steps between two raises of the SH degree. Long runs need no more. Short runs keep all of their
-smaller interval: with less, no degree would gain enough to be kept."""
+"""Maximum number of steps between two raises of the SH degree. Long runs need no more. The smaller interval of a short
+run must not be shortened further, or no degree would gain enough to be kept."""
 
 
 def _gate_for(config: TrainConfig) -> None:

@@ -2,7 +2,7 @@
 
 runs/NAME/depth.safetensors stores the fitted maps: inverse depth over the undistorted frames, in 1 / scene units, and
 the uncertainty of each frame. The key of the maps covers the files, the solve and `DepthConfig`. Stored maps are used
-only if they have the key of the run.
+only if their key matches.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DEPTH_VERSION = 1
 _MOST_POINTS = 4000
 """Maximum number of the solve's points in a frame's fit, of each kind (surface, sparse)."""
 _AHEAD = 1e-3
-"""Least depth of a point in scene units. Also the least alpha of a pixel by which mean depth is divided."""
+"""Least depth of a point in scene units. Also the least alpha by which a pixel's inverse depth is divided."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ def choose_device(requested: str, report: Reporter | None = None, doing: str = "
     The first use of a GPU on a machine runs its self-test: seconds, or tens of seconds if kernels must be compiled.
 
     Args:
-        report: receives a warning if `auto` does not use this machine's GPU, or not all kernels; None: no warning.
+        report: receives a warning if `auto` does not use this machine's GPU, or some kernels; None: no warning.
         doing: first word of the warning: "Training", "Freezing".
     """
     device, unused = decide_device(requested)

@@ -24,13 +24,13 @@ from .movers import Mattes
 from .trainer import Trainer
 
 GRID = 4
-"""Number of cells of the image along each side, in which results are reported."""
+"""Number of cells along each side of the image, for each of which results are reported."""
 MOST = 32
 """Maximum number of examined frames, evenly spaced over the clip; held-out frames are always examined."""
 BLUR = 0.0125
 """Radius of the two box filters on the difference image, as a share of the width (8 pixels of 640)."""
 UNEXPLAINED = 0.12
-"""Low-pass filtered difference, of a range of 0 to 1, above which a pixel counts as unexplained."""
+"""Low-pass filtered difference (0 to 1) above which a pixel counts as unexplained."""
 MOMENTS = 24
 """Number of times at which Gaussian positions are sampled."""
 MOVING_SHARE = 0.3
@@ -125,7 +125,7 @@ def _inspect_frame(
 ) -> FrameEvidence:
     model, rows, width = trainer.model, trainer.model.open_rows(), trainer.width
     viewmat, K, time = trainer.viewmats[index], trainer.Ks[index], float(trainer.scene.times[index])
-    motion = torch.zeros(len(model.gaussians), 2, device=trainer.device)  # how far, and whether at all
+    motion = torch.zeros(len(model.gaussians), 2, device=trainer.device)  # travel, and 1 for moving Gaussians
     if places.shape[1]:
         motion[rows, 0], motion[rows, 1] = travelled(places, viewmat, K) / width, 1.0
     out = render(
@@ -149,7 +149,7 @@ def _inspect_frame(
 
 
 def unexplained(plate: Tensor, shown: Tensor) -> Tensor:
-    """bool [H, W] on the CPU: pixels where the low frequencies of two display-referred images [H, W, 3] differ."""
+    """bool [H, W] on the CPU, True where low frequencies of two images [H, W, 3] differ by more than `UNEXPLAINED`."""
     radius = max(1, round(BLUR * plate.shape[1]))
     off = (plate - shown).permute(2, 0, 1)[None]
     for _ in range(2):

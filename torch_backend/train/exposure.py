@@ -69,7 +69,7 @@ class Exposure:
     def __init__(self, times: Tensor, config: ExposureConfig) -> None:
         self.times, self.config = times, config
         self.values = torch.nn.Parameter(torch.zeros(len(times), 2, 3, device=times.device))
-        self._at = times.cpu().numpy()  # bins are looked up on the host, without synchronising with a GPU
+        self._at = times.cpu().numpy()  # bins are looked up on the CPU, without synchronising with a GPU
 
     def place(self, time: float) -> tuple[int, int, float]:
         """(left, right, share): bins around a normalised time, and the weight of `right`. Clamped beyond the ends."""

@@ -37,7 +37,7 @@ class TrainingLoop:
     """Runs the remaining steps of a run."""
 
     def __init__(self, trainer: Trainer, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
-        """As in `train_to_end`."""
+        """Arguments as in `train_to_end`."""
         self.trainer, self.checkpoint, self.evaluate = trainer, checkpoint, evaluate
         self._foretold = False
         self._saved_at = time.perf_counter()
@@ -86,7 +86,7 @@ class TrainingLoop:
         self._save()
 
     def _with_room(self, work: Callable[[], None]) -> None:
-        """Runs repeatable `work` between steps. If GPU memory runs out, frees recordings or caches and runs it anew."""
+        """Runs repeatable `work` between steps. If GPU memory runs out, frees recordings or caches, and retries."""
         with contextlib.suppress(torch.OutOfMemoryError):
             return work()
         if self.trainer.recorder is None or not self.trainer.recorder.give_up():
@@ -94,8 +94,8 @@ class TrainingLoop:
         return work()
 
     def _foretell(self, watch: Stopwatch, resumed: bool) -> None:
-        """Reports the estimated time left after a step on the CPU, once enough steps have been timed. The first
-        estimate also raises a warning if the run will take long."""
+        """Reports the estimated time left after a step on the CPU, once enough steps have been timed. With the first
+        estimate, warns if the run will take long."""
         trainer = self.trainer
         pixels, now = trainer.width * trainer.height, len(trainer.model.gaussians)
         each = watch.step(step_work(pixels, now))

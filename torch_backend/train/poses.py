@@ -33,7 +33,7 @@ class PosesConfig:
     lr: float = 2e-4
     """Learning rate, in radians for rotations and in scene units for translations."""
     small: float = 1.0
-    """Weight of the mean squared correction, which pulls cameras that the images do not constrain to the solve."""
+    """Weight of the mean squared correction. It keeps cameras that the images do not constrain close to the solve."""
 
 
 class Poses:

@@ -1,8 +1,8 @@
 """Records training steps on a GPU as CUDA graphs, and replays them with other inputs.
 
-A step of a small run consists of a few hundred kernels of microseconds; the host takes six times as long to launch them
+A step of a small run consists of a few hundred kernels of microseconds; the CPU takes six times as long to launch them
 as the GPU to run them (docs/benchmarks.md, "GPU"). Between two events of a run (growth, the gate, a repair), all steps
-of one kind run the same operations on tensors at the same addresses. From the second on they are replayed.
+of one kind run the same operations on tensors at the same addresses. From the second step on they are replayed.
 
 Launched and replayed steps run the same code, `Trainer.carry_out`. A step is launched
 

@@ -47,9 +47,9 @@ _THROWN = 0.1
 _FAR, _LEAST_FAR = 6.0, 1.0
 """A Gaussian is displaced too far if it moves by more than 6 times the moving Gaussians' median distance from their
 median position. This bound is at least 1 scene unit and at most the scene's extent. A person may walk across the whole
-moving region, and an apple may swing by many times its size. In a stable preview run, a tenth of the Gaussians moves by
-more than 0.05 of that distance; in an unstable run, by hundreds of times as much at some times. The scene's extent
-alone, which includes far background, did not detect that run (docs/decisions.md)."""
+moving region, and an apple may swing by many times its size. In a stable preview run, the 90 % quantile of the
+displacement is at most 0.05 of that distance; in an unstable run, it was hundreds of times as large at some times. The
+scene's extent alone, which includes far background, did not detect that run (docs/decisions.md)."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _STATE = "memory."
 """Prefix of the tensors of `FieldMemory` in a checkpoint."""
@@ -128,7 +128,7 @@ class FieldMemory:
         return shift.abs().amax(1) > self._reach
 
     def of(self, name: str, p: Tensor) -> Tensor | None:
-        """Stored value of parameter `name`; None if there is none of the shape of `p`."""
+        """Stored value of parameter `name`; None if it is missing or its shape is not that of `p`."""
         kept = self._kept[-1].get(name) if self._kept else None
         return kept if kept is not None and kept.shape == p.shape else None
 

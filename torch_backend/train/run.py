@@ -239,7 +239,7 @@ def planned(
     config: TrainConfig, size: tuple[int, int], frames: int, images: Tensor, device: torch.device, report: Reporter,
     gaussians: int = 0,
 ) -> MemoryPlan | None:  # fmt: skip
-    """Memory plan of a run on a GPU; None on the CPU. A warning says if the run was reduced.
+    """Memory plan of a run on a GPU; None on the CPU. Warns if the run is reduced.
 
     Args:
         size: (width, height) of the images in pixels.

@@ -28,8 +28,8 @@ STAGE = "solve: still world"
 STEPS = 400
 """Usual number of training steps."""
 PER_FRAME = 2, 8
-"""Minimum and maximum of steps per frame. With more steps on few frames, the model also fits each frame's moving
-objects by Gaussians near that frame's camera."""
+"""Minimum and maximum number of steps per frame. With more steps on few frames, the model would also fit each frame's
+moving objects, by Gaussians near that frame's camera."""
 GAUSSIANS = 20_000
 """Maximum number of Gaussians: a coarse model that trains quickly."""
 FRAMES = 600

@@ -76,7 +76,7 @@ def probe_frames(frames: int, every: int, least: int = 24) -> list[int]:
 def growth_gain(measured: list[tuple[int, int, float]], steps: int = 0) -> float | None:
     """Gain in dB per 10 % more Gaussians: slope of PSNR over log count. None if the number grew too little.
 
-    The slope is fitted to the latest measurements (iteration, Gaussians, PSNR): as few as span a growth by the factor
+    The slope is fitted to the fewest latest measurements (iteration, Gaussians, PSNR) that span a growth by the factor
     `_GROWN` and `steps` iterations.
     """
     for first in range(len(measured) - _POINTS, -1, -1):
@@ -145,7 +145,7 @@ class Probe(Protocol):
         """Mean PSNR in dB on the training frames at positions `frames`; None if it is not finite.
 
         Options: another SH degree, no exposure correction, no field, or other cameras [F, 4, 4] of the scene's frames.
-        None if an exposure or field that the run does not have is switched off.
+        None if the run has no exposure correction or field to switch off.
         """
         ...
 
@@ -203,7 +203,7 @@ class RunFacts:
     hardened: int | None = None
     """Iteration at which the gate closed the Gaussians that did not move."""
     correlation_frames: float | None = None
-    """Lag in frames at which the autocorrelation of the static model's residual falls to one half."""
+    """Lag in frames at which the autocorrelation of the static model's residual is half of that at lag 1."""
     time_nodes: int | None = None
     """Number of nodes on the field's time axis, chosen from that lag."""
     poses_gain_db: float | None = None

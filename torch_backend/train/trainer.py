@@ -290,8 +290,8 @@ class Trainer:
     def layout(self) -> tuple[object, ...]:
         """The objects that steps read and write, and the repair count. Recorded steps stay valid while it is unchanged.
 
-        Densification, the gate, a repair, a change of SH degree or a checkpoint replaces some of these tensors. Each
-        replaces the optimiser moments of all parameters, or of none.
+        Densification, the gate, a repair, a change of SH degree or a checkpoint replaces some of these tensors. Moments
+        of the optimiser need not be compared: they are replaced only with these tensors.
         """
         model, growth, field = self.model.gaussians, self.densifier, self.model.field
         return (
@@ -302,7 +302,7 @@ class Trainer:
 
     def _deltas(self, rows: Tensor, when: Tensor, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
         """(deltas of `rows` at the frame's time `when` [1], deltas of the anchored `pairs`). One call of the field
-        computes both, unless the field asks for separate calls on a GPU (`apart`)."""
+        computes both, unless the field requires separate calls on a GPU (`apart`)."""
         field = self.model.field
         if field is None:
             return None, None

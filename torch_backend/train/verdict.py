@@ -266,7 +266,7 @@ def verdict_fields(figures: RunFigures) -> dict[str, Any]:
 
 
 def warn_if_poor(summary: dict[str, Any], report: Reporter) -> None:
-    """Raises a warning if the summary's verdict is poor."""
+    """Warns if the summary's verdict is poor."""
     verdict = Verdict(**summary["verdict"])
     if verdict.word == "poor":
         report.warning(verdict.lines()[0], " ".join([*verdict.sentences[1:], *verdict.advice]))
