@@ -298,7 +298,7 @@ class ControlPoints(Deformation):
         return c.arap * (c.arap_end / c.arap) ** share if c.arap > 0 else 0.0
 
     def paths(self, places: Tensor) -> Tensor:
-        """[R, 3 * 16] trajectories of places [R, 3] as features, whose distance is the RMS distance of trajectories."""
+        """[R, 3 * 16] features of places [R, 3], whose distance is the RMS distance of the places' trajectories."""
         times = torch.linspace(0.0, 1.0, _INSTANTS, device=places.device)
         paths = torch.cat([self.trajectories(chunk, times) for chunk in split(places, 1024)], dim=1)
         return paths.transpose(0, 1).flatten(1) / math.sqrt(_INSTANTS)

@@ -67,14 +67,14 @@ class HexPlaneConfig(HostConfig):
     until: float = 1.0
     """Share of the run at which the learning rates reach their final values."""
     stretch: float = 2.0
-    """Half-width of the region with nearly even nodes, around the median of the Gaussians, in median distances from it.
-    Beyond it, nodes become sparser (asinh). 0: even nodes everywhere, as published."""
+    """Half-width of the region with almost evenly spaced nodes around the median of the Gaussians, in units of their
+    median distance from it. Outside, nodes become sparser (asinh). 0: even spacing everywhere, as published."""
     silu: bool = True
     """Whether the activation is SiLU (off: ReLU)."""
     published: bool = False
     """Whether to use the published variant (on): times in [0, 1] for a sampler of [-1, 1], heads that start as noise,
-    smoothness along rows only (H, never along x), the bounds of the solve's points, even axes, moving SH coefficients
-    of all degrees, and gradients to the means through sampling."""
+    smoothness along H only (never along x), the bounds of the solve's points, axes that are not stretched, deltas of
+    all SH coefficients, and gradients to the means through sampling."""
 
     def row_bytes(self) -> int:
         """See `HostConfig.row_bytes`: features and gradients (all samples and products for torch operators), layers of
@@ -119,8 +119,8 @@ class HexPlane(Deformation):
 
     box: [2, 3] bounds of the planes; outside, features are those of the border.
     harmonics: number of SH bases beyond the constant one that the published field moves.
-    around: [2, 3] centre of the stretched axes, and distance up to which nodes are nearly even, in scene units; None:
-        even axes.
+    around: [2, 3] centre of the stretched axes, and distance up to which nodes are almost evenly spaced, in scene
+        units; None: axes are not stretched.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class HexPlane(Deformation):
         return torch.cat(parts, dim=1)
 
     def _stretched(self, places: Tensor) -> Tensor:
-        """Positions [P, 3] in the stretched coordinates in which the planes' nodes are even."""
+        """Positions [P, 3] in the stretched coordinates in which the planes' nodes are evenly spaced."""
         return places if self.around is None else torch.asinh((places - self.around[0]) / self.around[1])
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -302,7 +302,7 @@ def _create(config: HexPlaneConfig, start: Start) -> HexPlane:
 
 
 def _around(means: Tensor, box: Tensor, stretch: float) -> Tensor | None:
-    """`HexPlane`'s `around` [2, 3] for moving Gaussians with means [M, 3] (or `box` without any); None: even axes."""
+    """Argument `around` [2, 3] of `HexPlane` for moving Gaussians with means [M, 3], or for `box` if there are none."""
     if stretch <= 0:
         return None
     if not len(means):

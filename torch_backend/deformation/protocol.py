@@ -70,7 +70,7 @@ def add_to_unit_quat(quats: Tensor, delta: Tensor) -> Tensor:
 
 
 def turn(quats: Tensor, delta: Tensor) -> Tensor:
-    """Canonical rotation, followed by the rotation identity + `delta` (normalised)."""
+    """Canonical rotation, followed by the rotation of the normalised quaternion identity + `delta`."""
     return quat_product(near_identity(delta), F.normalize(quats, dim=1))
 
 

@@ -63,7 +63,7 @@ class SupervisionConfig:
     """`support` with anchor `hidden`: interval in iterations at which hidden Gaussians of the frame are marked."""
 
     still_weight: float = 22.0
-    """`support`: weight of `stillness`, relative to the photometric loss: the price of motion."""
+    """`support`: weight of `stillness`, the price of motion, relative to the photometric loss."""
     still_scale: float = 0.15
     """`support`: change above which the price is logarithmic instead of linear; 0.15 is a shift of 0.03 scene units."""
     still_ramp: float = 0.2

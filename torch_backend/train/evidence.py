@@ -65,7 +65,7 @@ class FrameEvidence:
 def gather_evidence(
     trainer: Trainer, test: list[int], held_out: Tensor, mattes: Mattes | None = None
 ) -> list[FrameEvidence]:
-    """Examines up to `MOST` frames of a run and all held-out frames. Returned in ascending order.
+    """Evidence of up to `MOST` frames of a run and of all held-out frames, in ascending order.
 
     Args:
         trainer: run whose model is judged.

@@ -33,9 +33,9 @@ _LEAST_PROBES, _MOST_PROBES = 3, 12
 _GROWN = 1.5
 """Least growth factor of the number of Gaussians over the measurements by which growth is judged."""
 _POINTS = 4
-"""Least number of those measurements."""
+"""Least number of measurements by which growth is judged."""
 _SPAN = 0.1
-"""Least span of those measurements, as a share of the run. In a long run, the schedule doubles the Gaussians in three
+"""Least span of these measurements, as a share of the run. In a long run, the schedule doubles the Gaussians in three
 rounds of densification; judged over three rounds only, growth ended at 42,000 of 160,000."""
 
 
