@@ -306,8 +306,8 @@ class ControlPoints(Deformation):
     def rehearse(self, stage: Rehearsal) -> None:
         """Runs SC-GS' stage one: trains moving surrogate balls of one size, and samples nodes from them.
 
-        The first fifth of the steps is static. At three quarters, the surrogates with the farthest trajectories become
-        the nodes, which are trained alone afterwards. Until then, surrogates are split (`_Surrogates`).
+        The first fifth of the steps is static. At three quarters, nodes are sampled by farthest trajectories, and are
+        trained alone afterwards. Until then, surrogates are split (`_Surrogates`).
         """
         _Surrogates(self, stage).run()
 

@@ -144,8 +144,8 @@ def _changes(model: DynamicModel, rows: Tensor, pixels: Tensor, config: GateConf
 def pixels_per_unit(run: RunView, rows: Tensor) -> Tensor:
     """[M] pixels per scene unit of the Gaussians `rows`, in the nearest camera that sees them.
 
-    Pixels are those of images `GateConfig.WIDTH` wide. Up to about `MOMENTS` cameras are sampled; 0 if none of them
-    sees the Gaussian.
+    Pixels are those of images `GateConfig.WIDTH` wide. Fewer than 2 * `MOMENTS` cameras, evenly spaced, are sampled; 0
+    if none of them sees the Gaussian.
     """
     means = run.model.gaussians.params["means"].detach()[rows]
     nearest = torch.full((len(rows),), torch.inf, device=run.device)

@@ -212,7 +212,7 @@ def _crashed(code: int) -> bool:
 
 
 def _relative(value: Tensor, truth: Tensor) -> float:
-    """Relative L2 error of `value` against `truth`; `_NO_NUMBER` if it is NaN."""
+    """Relative L2 error of `value` against `truth`; `_NO_NUMBER` if it is not finite."""
     value, truth = value.detach().cpu().double(), truth.detach().cpu().double()
     error = float(norm_of_all(value - truth) / norm_of_all(truth).clamp_min(1e-12))
     return min(error, _NO_NUMBER) if error == error else _NO_NUMBER
