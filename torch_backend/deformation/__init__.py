@@ -1,4 +1,4 @@
-"""How Gaussians move: one protocol, a host per file, and the gate that says which Gaussians move at all."""
+"""Deformation of Gaussians: a protocol, one host per file, and the gate that selects the moving Gaussians."""
 
 from .gate import GateConfig, change_of, painted, stays_open
 from .hexplane import HexPlane, HexPlaneConfig

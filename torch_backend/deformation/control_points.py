@@ -1,16 +1,16 @@
-"""Host C: sparse control points that carry the Gaussians round them (SC-GS).
+"""Host C: sparse control points (nodes) that move nearby Gaussians (SC-GS).
 
-Nodes move by a small network of place and time; a Gaussian follows its 3 nearest nodes in a space of place and learnt
-hyper-coordinates, each turning it about itself. Corrected against the published code: nodes are drawn from the
-Gaussians that move, so that no separate stage has to find them and the host works behind the gate; scales change in
-the log and one rotation serves both the frame of a node and the Gaussians in it. Positions of nodes and of Gaussians
-are detached throughout, as published.
+A small network of position and time moves the nodes. A Gaussian follows its 3 nearest nodes, in a space of position and
+learnt hyper-coordinates; each node rotates it about the node. Changes to the published code: nodes are sampled from the
+moving Gaussians, so no separate stage is needed and the host works with the gate. Scales change in the log. One
+rotation per node is used for both the positions and the orientations of its Gaussians. Positions of nodes and Gaussians
+are detached everywhere, as published.
 
-`reference` is the published host but for this: nodes are not densified and pruned once more at 10,000 steps of stage
-two (the screen gradients that decide it stay with the trainer, and its threshold is for the Gaussians' published
-rates; farthest paths have just spread the nodes), its optional losses that need optical flow or masks are left out,
-the surrogates multiply on a schedule instead of by a threshold, and positions of nodes stay after stage one. Losses,
-the Gaussians' own rates and their growth are the trainer's, as with every host.
+`reference` is the published host with these exceptions. Nodes are not densified and pruned at 10,000 steps of stage
+two: the trainer does not pass on the screen gradients for it, its threshold is for the published rates of the
+Gaussians, and sampling by farthest paths has just spread the nodes. Optional losses on optical flow or masks are left
+out. Surrogates are split by a schedule, not by a threshold. Node positions stay fixed after stage one. As for every
+host, the trainer implements losses, learning rates and densification of the Gaussians.
 """
 
 from __future__ import annotations
@@ -45,70 +45,72 @@ from .protocol import (
 
 PUBLISHED_ITERATIONS = 80_000
 _FOLLOWED = 3
-"""Nodes that a Gaussian follows (K)."""
+"""Number of nodes that a Gaussian follows (K)."""
 _WINDOW = 0.05
-"""ARAP: the two times lie within this."""
+"""ARAP: largest distance of the two times, in normalised time."""
 _SURROGATES = 16
-"""Pre-stage: at most this many surrogate points per node."""
+"""Pre-training: maximum number of surrogate points per node."""
 _PRUNED = 0.005
-"""Pre-stage: surrogates less opaque than this go."""
+"""Pre-training: opacity below which surrogates are pruned."""
 _INSTANTS = 16
-"""Times at which a trajectory is sampled."""
+"""Number of times at which a trajectory is sampled."""
 
 
 @dataclass
 class ControlPointsConfig(HostConfig):
-    """Sizes, learning rates and weights; SC-GS' numbers in brackets (arguments/__init__.py, utils/time_utils.py)."""
+    """Sizes, learning rates and weights. SC-GS' values are in brackets (arguments/__init__.py, utils/time_utils.py)."""
 
     still: float = 0.1
-    """As in `HostConfig`. Smooth by itself, the host bends few walls, and a full price keeps it from moving people."""
+    """See `HostConfig`. This host is smooth by design and bends few walls; a full price would keep it from moving
+    people."""
     nodes: int = 192
-    """Most nodes at the start (512); fewer where there are few Gaussians to move."""
+    """Maximum number of nodes (512); fewer if few Gaussians move."""
     hyper: int = 2
-    """Hyper-coordinates (8; its readme advises 2 for large real scenes)."""
+    """Number of hyper-coordinates (8; its readme advises 2 for large real scenes)."""
     depth: int = 4
-    """Layers of the nodes' network (8)."""
+    """Number of layers of the nodes' network (8)."""
     width: int = 128
-    """Width of them (256)."""
+    """Width of the layers (256)."""
     position_frequencies: int = 6
-    """Octaves of the position's encoding (10). Synthetic scene `quick` 0, all move, 1500 steps, one seed: 23.9 dB on
-    moving pixels of held-out frames, 23.6 with 3; static 22.0."""
+    """Octaves of the position encoding (10). Synthetic scene `quick` 0, all Gaussians move, 1500 steps, one seed:
+    23.9 dB on moving pixels of held-out frames, 23.6 with 3 octaves, 22.0 for a static model."""
     time_frequencies: int = 4
-    """Octaves of the time's encoding (10)."""
+    """Octaves of the time encoding (10)."""
     published: bool = False
-    """Raw coordinates, scale deltas after activation, rotation added, a rotation of its own for a node's frame (on)."""
+    """Whether to use the published variant (on): coordinates are not normalised, scale deltas are added after
+    activation, rotations are added to raw quaternions, and nodes have a separate rotation for positions."""
     lr: float = 5e-4
-    """Start learning rate of the network (8e-4)."""
+    """Initial learning rate of the network (8e-4)."""
     lr_end: float = 2e-5
-    """End learning rate of the network (1.6e-6)."""
+    """Final learning rate of the network (1.6e-6)."""
     until: float = 1.0
-    """Share of the run at which that rate has ended."""
+    """Share of the run at which the network's rate reaches its final value."""
     lr_nodes: float = 1e-3
     """Learning rate of radii, weights and hyper-coordinates of nodes (8e-4, constant)."""
     lr_hyper: float = 2.5e-3
     """Learning rate of the Gaussians' hyper-coordinates (2.5e-3)."""
     arap: float = 1e-3
-    """Weight of the as-rigid-as-possible energy (1e-4)."""
+    """Initial weight of the as-rigid-as-possible (ARAP) energy (1e-4)."""
     arap_end: float = 1e-4
-    """Weight it falls to (1e-5)."""
+    """Final weight of the ARAP energy (1e-5)."""
     arap_fall: tuple[float, float] = (0.5, 1.0)
-    """Shares of the run between which it falls, in the log (5000 and 10,000 of stage two)."""
+    """Shares of the run between which the ARAP weight falls log-linearly (5000 and 10,000 of stage two)."""
     arap_until: float = 1.0
-    """Share of the run after which it is off (20,000 of stage two)."""
+    """Share of the run after which the ARAP energy is off (20,000 of stage two)."""
     noise: float = 0.0
-    """Training times are blurred by this many frames, falling to nothing (0.1)."""
+    """Initial standard deviation, in frames, of noise on training times; it falls linearly to 0 (0.1)."""
     noise_until: float = 0.5
-    """Share of the run at which the blur is gone."""
+    """Share of the run at which that noise reaches 0."""
     rehearsal: float = 0.0
-    """Share of the run for the nodes' own stage (10,000 of 80,000); 0: nodes are drawn from the moving Gaussians."""
+    """Share of the run for pre-training of the nodes (10,000 of 80,000); 0: nodes are sampled from moving Gaussians."""
 
     def row_bytes(self) -> int:
-        """The nodes that a Gaussian follows: their indices, shares and what is looked up of each, and the blend."""
+        """See `HostConfig.row_bytes`: indices, shares and parameters of the nodes of a Gaussian, and the blend."""
         return 4 * (_FOLLOWED * (3 * (self.hyper + 2) + 4) + 40)
 
 
 def _reference(iterations: int) -> ControlPointsConfig:
-    """The published host: stage one 10,000 of 80,000 steps, then its schedules; rates as published (see Host B)."""
+    """Configuration of the published host: stage one takes 10,000 of 80,000 steps; rates as published (see Host B)."""
     whole = float(PUBLISHED_ITERATIONS)
     return ControlPointsConfig(
         start=0.0,
@@ -136,7 +138,7 @@ def _reference(iterations: int) -> ControlPointsConfig:
 
 
 class _Motion(NamedTuple):
-    """How rows (a node at a time) move: shift [R, 3], frame [R, 4], quats [R, 4], log_scales [R, 3]."""
+    """Motion of R rows, each a node at a time: shift [R, 3], frame [R, 4], quats [R, 4], log_scales [R, 3]."""
 
     shift: Tensor
     frame: Tensor
@@ -145,7 +147,7 @@ class _Motion(NamedTuple):
 
 
 class ControlPoints(Deformation):
-    """The field. Nodes: places [M, 3] at rest, scene units; hyper [M, H]; log_radii [M]; weights [M], logits."""
+    """Deformation field of M nodes: canonical places [M, 3] (scene units), hyper [M, H], log_radii [M], weights [M]."""
 
     def __init__(
         self, config: ControlPointsConfig, places: Tensor, box: Tensor, frames: int, generator: torch.Generator
@@ -159,7 +161,7 @@ class ControlPoints(Deformation):
         self.places: Tensor
         self.register_buffer("box", box.float().cpu())
         self.register_buffer("frames", torch.tensor(float(frames), device="cpu"))
-        self.frame_count = float(frames)  # what `frames` holds: nobody has to ask a GPU for it
+        self.frame_count = float(frames)  # value of `frames` in host memory, which avoids a GPU synchronisation
         self.register_buffer("places", places.float())
         self.hyper = nn.Parameter(places.new_full((count, config.hyper), 1e-2))
         self.log_radii = nn.Parameter(_radii(places, config.published).log())
@@ -170,26 +172,26 @@ class ControlPoints(Deformation):
         if config.published:
             stds["frame"] = (4, 1e-4)
         self.heads = nn.ModuleDict({n: linear(config.width, size, generator, std) for n, (size, std) in stds.items()})
-        # The published host adds its rotation to the raw quaternion, which is what no rule does.
+        # The published host adds its rotation to the raw quaternion, as is done without a rule.
         self.rules = {"log_scales": add_to_scale} if config.published else {"quats": turn}
         self.owned = {"hyper": Owned((config.hyper,), -1e-2, config.lr_hyper, 0.1 * config.lr_hyper)}
 
     @property
     def apart(self) -> bool:
-        """Gaussians of one time share its nodes' motions; those of many times do not."""
+        """True: Gaussians at one time share the motion of the nodes, which is computed once per node."""
         return True
 
     @property
     def rehearsal(self) -> float:
-        """Share of the run that the nodes' own stage takes."""
+        """Share of the run for pre-training of the nodes."""
         return self.config.rehearsal
 
     # ------------------------------------------------------------------ motion
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
-        """Deltas of M Gaussians; means [M, 3] scene units (detached here), times [M] or [1] in [0, 1].
+        """Deltas of M Gaussians; means [M, 3] in scene units (detached), times [M] or [1] in [0, 1].
 
-        own: hyper [M, H]; without it every Gaussian has the starting value.
+        own: hyper [M, H]; without it, every Gaussian has the initial value.
         """
         x = means.detach()
         hyper = (own or {}).get("hyper")
@@ -197,7 +199,7 @@ class ControlPoints(Deformation):
             hyper = x.new_full((len(x), self.config.hyper), self.owned["hyper"].value)
         index, share = self._skin(x, hyper)
         places, motion, at = self._motions(index, times)
-        # Of the turn only what it changes is blended: a node that stands still moves nothing, however far off.
+        # Blends R - I instead of R, so that a node without motion does not move distant Gaussians by rounding errors.
         turned = rotation_matrices(near_identity(motion.frame)) - torch.eye(3, device=x.device)
         offset = motion.shift - (turned @ places[..., None])[..., 0]
         rows = torch.cat([turned.flatten(1), offset, motion.quats, motion.log_scales], dim=1)
@@ -207,7 +209,7 @@ class ControlPoints(Deformation):
         return Deltas(means=means, quats=quats, log_scales=log_scales)
 
     def _skin(self, x: Tensor, hyper: Tensor) -> tuple[Tensor, Tensor]:
-        """(nodes followed [M, K], their shares [M, K]) of Gaussians at x [M, 3] with hyper [M, H]."""
+        """(nodes followed [M, K], weights [M, K]) of Gaussians at x [M, 3] with hyper [M, H]. Weights sum to 1."""
         with torch.no_grad():
             joint, nodes = torch.cat([x, hyper], dim=1), torch.cat([self.places, self.hyper], dim=1)
             index = nearest(joint, nodes, min(_FOLLOWED, len(nodes)))
@@ -219,11 +221,14 @@ class ControlPoints(Deformation):
         return index, share / share.sum(1, keepdim=True)
 
     def _motions(self, index: Tensor, times: Tensor) -> tuple[Tensor, _Motion, Tensor]:
-        """What index [M, K] needs at times [M] or [1]: (places [R, 3], motions, rows [M, K]); on the CPU each once."""
+        """(places [R, 3], their motions, row of each node [M, K]) for nodes `index` [M, K] at times [M] or [1].
+
+        On the CPU, each pair of node and time is computed once.
+        """
         if times.shape[0] == 1:
             return self.places, self.node_motion(self.places, times), index
         if index.device.type != "cpu":
-            # How many are distinct a GPU would have to be asked: `apart` keeps these few.
+            # Removing duplicates would synchronise with the GPU. `apart` keeps the number of these rows small.
             rows = torch.arange(index.numel(), device=index.device).view_as(index)
             places = self.places[index.flatten()]
             return places, self.node_motion(places, times.repeat_interleave(index.shape[1])), rows
@@ -233,7 +238,7 @@ class ControlPoints(Deformation):
         return places, self.node_motion(places, instants[pairs % len(instants)]), at
 
     def node_motion(self, places: Tensor, times: Tensor) -> _Motion:
-        """The network at places [R, 3] (detached) and times [R] or [1]."""
+        """Motion of nodes at places [R, 3] (detached) and times [R] or [1], by the network."""
         where, when = places.detach(), times
         if not self.config.published:
             where = 2.0 * (where - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
@@ -243,19 +248,19 @@ class ControlPoints(Deformation):
         return _Motion(out["means"], out.get("frame", out["quats"]), out["quats"], out["log_scales"])
 
     def trajectories(self, places: Tensor, times: Tensor) -> Tensor:
-        """[T, R, 3]: where nodes at places [R, 3] are at times [T]."""
+        """[T, R, 3] positions at times [T] of nodes at places [R, 3]."""
         rows = places.detach().repeat(len(times), 1)
         shift = self.node_motion(rows, times.repeat_interleave(len(places))).shift
         return places + shift.view(len(times), len(places), 3)
 
     def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:
-        """Blurred as in Host B."""
+        """`time` with noise as in Host B (`mlp.blurred`)."""
         return blurred(time, self.frame_count, progress, self.config.noise, self.config.noise_until, generator)
 
     # ------------------------------------------------------------------ training
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Two groups: the nodes and the network. Published: the nodes' rate does not decay."""
+        """Two groups: the nodes and the network. In the published configuration, the nodes' rate does not decay."""
         c = self.config
         own = [self.hyper, self.log_radii, self.weights]
         network = [*self.trunk.parameters(), *self.heads.parameters()]
@@ -273,7 +278,7 @@ class ControlPoints(Deformation):
         ]
 
     def regularisation(self, progress: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
-        """As rigid as possible, over at most 512 nodes at two near times; weighted by the schedule."""
+        """ARAP energy of at most 512 nodes at two near times, weighted by the schedule."""
         weight = self._arap_weight(progress)
         if weight <= 0.0 or len(self.places) < 2:
             return self.places.new_zeros(())
@@ -293,22 +298,22 @@ class ControlPoints(Deformation):
         return c.arap * (c.arap_end / c.arap) ** share if c.arap > 0 else 0.0
 
     def paths(self, places: Tensor) -> Tensor:
-        """[R, 3 * 16]: trajectories of places [R, 3] as features, in which distance is root mean square distance."""
+        """[R, 3 * 16] features of places [R, 3], whose distance is the RMS distance of the places' trajectories."""
         times = torch.linspace(0.0, 1.0, _INSTANTS, device=places.device)
         paths = torch.cat([self.trajectories(chunk, times) for chunk in split(places, 1024)], dim=1)
         return paths.transpose(0, 1).flatten(1) / math.sqrt(_INSTANTS)
 
     def rehearse(self, stage: Rehearsal) -> None:
-        """SC-GS' stage one: surrogate balls of one size move point-wise; farthest paths become the nodes.
+        """Runs SC-GS' stage one: trains moving surrogate balls of one size, and samples nodes from them.
 
-        A fifth of the steps with motion off, nodes drawn at three quarters, the rest with the nodes alone. Until they
-        are drawn the surrogates multiply, up to 16 per node (`_Surrogates`).
+        The first fifth of the steps is static. At three quarters, nodes are sampled by farthest trajectories, and are
+        trained alone afterwards. Until then, surrogates are split (`_Surrogates`).
         """
         _Surrogates(self, stage).run()
 
     @torch.no_grad()
     def place(self, places: Tensor) -> None:
-        """Puts the nodes at places [M, 3]; M may differ from before only while no optimiser holds them."""
+        """Sets the nodes to places [M, 3] and resets their parameters. Call it before an optimiser refers to them."""
         self.places = places.detach().clone()
         count = len(places)
         self.hyper = nn.Parameter(self.hyper.new_full((count, self.config.hyper), 1e-2))
@@ -316,14 +321,14 @@ class ControlPoints(Deformation):
         self.weights = nn.Parameter(self.weights.new_zeros(count))
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Inverse of `state`, whatever the number of nodes."""
+        """Inverse of `state`, for any number of nodes."""
         self.place(tensors["field.places"])
         super().load_state(tensors)
         self.frame_count = float(self.frames)
 
 
 def _with_rows(old: nn.Parameter, kept: Tensor | None, fresh: Tensor, optimizer: torch.optim.Optimizer) -> nn.Parameter:
-    """The rows `kept` [K] of a parameter (None: all), then `fresh` ones, which the optimiser has no memory of."""
+    """Parameter of the rows `kept` [K] of `old` (None: all) and rows `fresh`, which get zero optimiser moments."""
 
     def rows(values: Tensor) -> Tensor:
         return values if kept is None else values[kept]
@@ -344,13 +349,13 @@ def _with_rows(old: nn.Parameter, kept: Tensor | None, fresh: Tensor, optimizer:
 
 
 def _near_times(count: int, window: float, generator: torch.Generator | None) -> Tensor:
-    """[count] times in [0, 1] within a window round a random one."""
+    """[count] random times in [0, 1] within a window around a random time."""
     draw = torch.rand(1 + count, generator=generator, device="cpu")
     return (draw[0] + window * (draw[1:] - 0.5)).clamp(0.0, 1.0)
 
 
 def _radii(places: Tensor, published: bool) -> Tensor:
-    """[M] what nodes reach at the start: published a tenth of the scene's range, ours the distance to 3 neighbours."""
+    """[M] initial radii of nodes: published a tenth of the scene's range, ours the mean distance to 3 neighbours."""
     if published or len(places) < 2:
         return torch.full_like(places[:, 0], max(0.1 * float(places.max() - places.min()), 1e-3))
     index = nearest(places, places, min(4, len(places)))[:, 1:]
@@ -361,11 +366,11 @@ def _radii(places: Tensor, published: bool) -> Tensor:
 
 
 class _Surrogates:
-    """Balls of one common size, SH degree 0, that find the motion before any Gaussian has to follow it.
+    """Surrogate balls of one common size and SH degree 0, which are trained to find the motion for the nodes.
 
-    They multiply every hundredth of the stage (at least 10 steps apart, so that a round has frames to judge by) from a
-    twentieth on, as published; but on a schedule that ends at 16 per node when nodes are drawn, where the image pulls
-    hardest, since the published threshold is on a screen gradient that this stage is not told.
+    As published, they are split at every hundredth of the stage (at least every 10 steps, so that several frames
+    contribute to the decision) from a twentieth on. The published threshold is on screen gradients, which this stage
+    does not have. Instead, a schedule splits those with the largest gradients, up to 16 per node.
     """
 
     def __init__(self, field: ControlPoints, stage: Rehearsal) -> None:
@@ -388,7 +393,7 @@ class _Surrogates:
         self.pull, self.limit = torch.zeros_like(points[:, 0]), limit
 
     def run(self) -> None:
-        """All steps; the field's nodes are placed at the end."""
+        """Runs all steps, then sets the field's nodes."""
         stage, field = self.stage, self.field
         warm, sampling = round(0.2 * stage.steps), round(0.75 * stage.steps)
         first, every = round(0.05 * stage.steps), max(10, round(0.01 * stage.steps))
@@ -446,7 +451,7 @@ class _Surrogates:
 
     @torch.no_grad()
     def _multiply(self, rounds: int) -> None:
-        """Gives those that are pulled hardest a second one within their size, drops those that nobody sees."""
+        """Drops transparent surrogates, and adds copies near those with the largest gradients."""
         shown = torch.sigmoid(self.params["opacity_logits"]) >= _PRUNED
         kept = torch.nonzero(shown).flatten() if bool(shown.any()) else torch.arange(len(shown), device=shown.device)
         more = min(len(kept), max(0, self.limit - len(kept)) // rounds)
@@ -477,7 +482,7 @@ class _Surrogates:
 
 
 def _create(config: ControlPointsConfig, start: Start) -> ControlPoints:
-    """Nodes at the farthest of the means that move; a pre-stage, if there is one, moves them later."""
+    """A field whose nodes are the farthest of the moving means. Pre-training, if configured, replaces them later."""
     count = max(1, min(config.nodes, len(start.means) // 8))
     places = start.means[farthest_points(start.means, count)] if len(start.means) else start.box.mean(0)[None]
     return ControlPoints(config, places, start.box, start.frames, start.generator)

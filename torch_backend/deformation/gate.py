@@ -1,13 +1,12 @@
-"""The gate: which Gaussians move at all.
+"""The gate: selects the Gaussians that move.
 
-All start closed, and the first part of the run is static. Then those that lie in what the motion mattes call moving are
-opened on trial, or every one that is painted where a shot has no mattes, under a price on motion
-(`supervision.stillness`); those that did not use it are closed for good, their mean change kept. Closed Gaussians never
-touch the field: no cost, no drift, nothing to anchor.
+All Gaussians start closed, and the first part of the run is static. Then Gaussians on moving pixels of the motion
+mattes are opened on trial; without mattes, all Gaussians that contribute. During the trial, motion has a price
+(`supervision.stillness`). Gaussians that did not move are closed for the rest of the run and keep their mean change.
+Closed Gaussians do not use the field, so they cost nothing, do not drift and need no anchors.
 
-The error of the static model was tried as the judge, and is a poor one: where a surface is hard to fit it is as large
-as where something moves (figures in docs/architecture.md), while motion that is worth its price to several frames in a
-row is rarely anything else.
+The error of the static model is not a good criterion: it is as large on surfaces that are hard to fit as on moving
+objects (figures in docs/architecture.md). Motion that is worth its price in several consecutive frames is rarely false.
 """
 
 from __future__ import annotations
@@ -29,48 +28,49 @@ from .protocol import Deltas
 
 @dataclass
 class GateConfig:
-    """When the gate opens, and what keeps it open."""
+    """Schedule and thresholds of the gate."""
 
     WIDTH: ClassVar[int] = 320
-    """Width of the pictures that `pixels` counts in, whatever is trained on: a motion is as large as it looks."""
+    """Image width to which `pixels` refers, independent of the training resolution."""
     STRAY: ClassVar[tuple[float, int]] = 0.25, 2
-    """Share of a Gaussian's contribution that must fall on movers, and in how many frames, for it to stay open in a
-    long run. Opening requires more, because mattes miss much of an arm."""
+    """(share, frames): in a long run, a Gaussian stays open if at least `share` of its contribution falls on moving
+    pixels in at least `frames` frames. Opening requires more, but mattes miss much of an arm."""
     LONG: ClassVar[int] = 3000
-    """Runs of at most this many steps do not close strays. Strays are few then (6 and 25 % of the open Gaussians on two
-    clips, 60 % after 9000 steps), and developing treats closed Gaussians as still, which costs arms of which mattes
-    find a third."""
+    """Number of steps up to which strays are not closed. Short runs have few (6 and 25 % of the open Gaussians on two
+    clips, 60 % after 9000 steps). Developing treats closed Gaussians as still, which would damage arms of which mattes
+    find only a third."""
 
     start: float = 1.0 / 3.0
     """Share of the run that stays static (the paper's 10,000 of 30,000 iterations)."""
     harden: float = 0.45
-    """Share of the run at which what did not move is closed for good."""
+    """Share of the run at which Gaussians that did not move are closed for the rest of the run."""
     give_up: float = 0.75
-    """Share of the run until which that is put off while nothing moves yet: some fields take their time."""
+    """Share of the run until which closing is postponed if nothing has moved yet, since some fields learn slowly."""
     pixels: float = 0.2
-    """A Gaussian stays open if it moves by so many pixels of pictures `WIDTH` wide, seen from the nearest camera..."""
+    """Motion in pixels of an image `WIDTH` wide, in the nearest camera, above which a Gaussian stays open."""
     color: float = 0.02
-    """...or changes its colour by this (display-referred, 0 to 1)..."""
+    """Change of colour (display-referred, 0 to 1) above which a Gaussian stays open."""
     opacity: float = 0.05
-    """...or its opacity by this."""
+    """Change of opacity above which a Gaussian stays open."""
     noise: float = 4.0
-    """Nor does it stay open with less than this many times the change of the quarter that changes least: where cameras
-    are solved, everything seems to move a little, and what holds still tells how much. Without motion mattes only."""
+    """Least change of a Gaussian that stays open, as a multiple of the 25 % quantile of all changes. Errors of solved
+    cameras move everything a little; still Gaussians measure how much. Only used without motion mattes."""
     max_share: float = 0.5
-    """Most Gaussians that stay open; what moves most goes first."""
+    """Maximum share of Gaussians that stay open, those with the largest changes."""
     neighbours: int = 8
-    """The median over this many nearest open ones stands for a Gaussian: things move in pieces, noise does not."""
+    """Number of nearest open Gaussians over which the median change is taken, because noise is not shared by them."""
     moving_share: float = 0.5
-    """With motion mattes, a Gaussian is put on trial if this share of what it paints of a frame falls on movers..."""
+    """With motion mattes: a frame counts if more than this share of a Gaussian's contribution is on moving pixels."""
     moving_frames: int = 3
-    """...in at least this many frames,"""
+    """With motion mattes: least number of frames that count for a Gaussian to be opened on trial."""
     moving_often: float = 0.1
-    """and in this share of the time bins in which it was seen: a wall that a hand passes is a wall."""
+    """With motion mattes: least number of frames that count, as a share of the time bins in which the Gaussian was
+    seen. It excludes a wall that a hand passes."""
 
 
 @torch.no_grad()
 def painted(model: Gaussians) -> Tensor:
-    """bool [N]: Gaussians that have contributed to any training frame."""
+    """bool [N] Gaussians that have contributed to any training frame."""
     return model.support.any(1)
 
 
@@ -83,17 +83,17 @@ def change_of(
     config: GateConfig,
     seen: Tensor | None = None,
 ) -> tuple[Tensor, Deltas]:
-    """How much Gaussians change over time, in units of what keeps them open; and their mean deltas.
+    """Change of Gaussians over time, in units of the thresholds that keep them open, and their mean deltas.
 
     Args:
-        rows: [M] who.
-        moments: their deltas [M] at times spread over the clip.
-        pixels: [M] pixels per scene unit where each is seen from nearest.
-        seen: bool [T, M], moments at which a frame shows each Gaussian: elsewhere the field is arbitrary. A Gaussian
-            that no moment shows is evaluated at all of them. None: all are shown.
+        rows: [M] Gaussians.
+        moments: T deltas of `rows`, at times spread over the clip.
+        pixels: [M] pixels per scene unit in the nearest camera that sees the Gaussian.
+        seen: bool [T, M] True at times when a frame shows the Gaussian; the field is arbitrary at other times. For
+            Gaussians that are never shown, all times are used. None: all are always shown.
 
     Returns:
-        (change [M], mean deltas [M]): the largest departure from the mean over the moments at which each was seen.
+        (change [M], mean deltas [M]): largest deviation from the mean, and the mean, over the times with `seen`.
     """
     moments = list(moments)
     counts = torch.ones(len(moments), len(rows), device=rows.device) if seen is None else seen.float()
@@ -114,7 +114,7 @@ def change_of(
 
 
 def _weighted(shares: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
-    """Sum of parts [T] of [M, ...] by shares [T, M]."""
+    """[M, ...] sum of T parts [M, ...], weighted by shares [T, M]."""
     return torch.einsum("tm,tm...->m...", shares, torch.stack(parts))
 
 
@@ -122,9 +122,9 @@ def _weighted(shares: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
 def stays_open(
     model: Gaussians, rows: Tensor, change: Tensor, config: GateConfig, noise: float | None = None
 ) -> Tensor:
-    """bool [M]: which of the open `rows` stay so, by their `change` [M] and that of their neighbours.
+    """bool [M] True for open `rows` that stay open, by the median `change` [M] of their neighbours.
 
-    `noise` stands for the configuration's.
+    noise: replaces that of `config`; None: as in `config`.
     """
     noise = config.noise if noise is None else noise
     if len(rows) <= config.neighbours:

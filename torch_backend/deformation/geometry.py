@@ -1,4 +1,4 @@
-"""Rotations, rigid motions and samples of point sets that hosts share. Finite values and gradients everywhere."""
+"""Rotations, rigid motions and point sampling for hosts. All values and gradients are finite."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ..native import INTEGER, POINTER, Snippet
 from ..torch_types import cross, determinant, norm, singular_values, split
 
 _SERIES = 0.25
-"""Below this squared angle sin and cos quotients are series: their closed forms cancel in float32."""
+"""Squared angle below which quotients of sin and cos are computed by series. Closed forms lose precision in float32."""
 
 
 def quat_product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product [..., 4] of quaternions wxyz: the rotation b, then a."""
+    """Hamilton product [..., 4] of quaternions wxyz: rotation `b` followed by `a`."""
     w, x, y, z = a.unbind(-1)
     p, q, r, s = b.unbind(-1)
     return torch.stack(
@@ -33,7 +33,7 @@ def quat_product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def near_identity(change: Tensor) -> Tensor:
-    """Unit quaternions [..., 4] of changes from (1, 0, 0, 0); the identity where the sum vanishes."""
+    """Unit quaternions [..., 4]: (1, 0, 0, 0) + `change`, normalised; the identity where the sum is 0."""
     one = torch.zeros_like(change)
     one[..., 0] = 1.0
     quats = one + change
@@ -41,9 +41,9 @@ def near_identity(change: Tensor) -> Tensor:
 
 
 def screw(points: Tensor, turn: Tensor, shift: Tensor) -> Tensor:
-    """Points [M, 3] under the rigid motions exp(turn, shift) of SE(3), both [M, 3]; turn in radians about its own axis.
+    """Points [M, 3] after the rigid motions exp(turn, shift) of SE(3). `turn` [M, 3] is a rotation vector in radians.
 
-    Deformable 3DGS divides by the angle and gives NaN at 0; here the quotients are series there.
+    Deformable 3DGS divides by the angle and returns NaN at 0. This function uses series near 0.
     """
     a, b, c = _quotients(turn.square().sum(1, keepdim=True))
     rotated = points + a * cross(turn, points) + b * _twice(turn, points)
@@ -57,7 +57,7 @@ def _twice(turn: Tensor, v: Tensor) -> Tensor:
 def _quotients(s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """sin(x) / x, (1 - cos(x)) / x^2 and (x - sin(x)) / x^3 for s = x^2."""
     near = s < _SERIES
-    # Both branches must be finite for the gradient of the chosen one to be.
+    # Both branches of `where` must be finite, or the gradient would be NaN.
     t = torch.where(near, s, 0.0)
     x = torch.where(near, 1.0, s).sqrt()
     a = 1 - t / 6 * (1 - t / 20 * (1 - t / 42 * (1 - t / 72)))
@@ -71,9 +71,9 @@ def _quotients(s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def farthest_points(features: Tensor, count: int) -> Tensor:
-    """Indices int64 [<= count] of features [N, D], each the farthest from those before it.
+    """Indices int64 [<= count] of features [N, D] by farthest point sampling.
 
-    Starts at the one nearest to the mean. Stops early when only duplicates are left.
+    Starts at the feature nearest to the mean. Stops early if only duplicates are left.
     """
     picked = [int((features - features.mean(0)).square().sum(1).argmin())]
     distance = torch.cdist(features, features[picked], compute_mode="donot_use_mm_for_euclid_dist").amin(1)
@@ -87,7 +87,7 @@ def farthest_points(features: Tensor, count: int) -> Tensor:
 
 
 _MOST = 16
-"""Most neighbours that the compiled search keeps."""
+"""Maximum number of neighbours in the compiled search."""
 
 _NEAREST = Path(__file__).with_name("kernels") / "nearest.cpp"
 
@@ -102,15 +102,15 @@ def _search() -> Snippet:
 
 
 def warm_up() -> None:
-    """Compile, or load from the cache, from the main thread."""
+    """Compiles the search, or loads it from the cache. Call it from the main thread."""
     _search().warm_up()
 
 
 @torch.no_grad()
 def nearest(queries: Tensor, points: Tensor, count: int) -> Tensor:
-    """Indices int64 [Q, count] of the points [P, D] nearest to queries [Q, D], nearest first; no gradient.
+    """Indices int64 [Q, count] of the points [P, D] nearest to queries [Q, D], nearest first; without gradient.
 
-    On the CPU compiled; a query that is no number gets the first points.
+    Uses compiled code on the CPU, which returns the first points for queries that are NaN.
     """
     if queries.device.type == "cpu" and queries.dtype == torch.float32 and count <= min(_MOST, len(points)):
         padded = F.pad(points.float().t(), (0, -len(points) % 16), value=1e18).contiguous()
@@ -120,7 +120,7 @@ def nearest(queries: Tensor, points: Tensor, count: int) -> Tensor:
             index=index.data_ptr(), count=len(queries), padded=padded.shape[1], dims=len(padded), neighbours=count,
         )  # fmt: skip
         return index
-    # Products of coordinates are twice as fast as differences, and exact enough near the origin.
+    # cdist by matrix products is twice as fast as by differences, and precise enough near the origin.
     centre = points.mean(0)
     targets = points - centre
     chunks = split(queries - centre, 4096)
@@ -129,10 +129,10 @@ def nearest(queries: Tensor, points: Tensor, count: int) -> Tensor:
 
 
 def rigid_rotations(before: Tensor, after: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotations that turn edges best: (R [M, 3, 3], usable bool [M]), without gradient.
+    """(R [M, 3, 3], usable bool [M]): rotations that best map edges `before` to `after`, without gradient.
 
-    before, after: [M, K, 3] edges of M nodes; valid: bool [M, K]. det R is +1. A node whose edges are collapsed or not
-    finite is not usable and gets the identity: the gradient of the SVD is no number there.
+    before, after: [M, K, 3] edges of M nodes; valid: bool [M, K]. det R is +1. Nodes whose edges are collapsed or not
+    finite are not usable and get the identity.
     """
     with torch.no_grad():
         kept = valid[..., None].to(before.dtype)

@@ -1,14 +1,14 @@
-"""Host A: a HexPlane field and five heads (4DGaussians; numbers and departures in docs/architecture.md).
+"""Host A: a HexPlane field and five heads (4DGaussians; figures and differences in docs/architecture.md).
 
-Corrected against the published code: time is mapped to the whole plane, the heads' last
-layers start at zero so that the field starts as the identity, learning rates do not follow the scene's extent
-(the scene is normalised), smoothness acts along both axes of a spatial plane, the network bends by SiLU (with ReLU the
-whole trunk often dies in the first steps, and the field stands still for good), and sampling coordinates are detached:
-the field says how things move, the image says where they are. Axes are stretched where the Gaussians are: background
-behind what moves makes the box large, and people a few nodes wide. `published` brings all of that back.
+Changes to the published code: Time is mapped to the whole plane. The heads' last layers start at zero, so that the
+field starts as the identity. Learning rates do not depend on the scene's extent, because the scene is normalised.
+Smoothness acts along both axes of a spatial plane. The activation is SiLU: with ReLU, the whole trunk often dies in the
+first steps, and the field stays constant. Sampling coordinates are detached, so that no gradient reaches the means
+through the field. Axes are stretched around the Gaussians: background behind a mover makes the box large, so that
+people would be only a few nodes wide. `published` reverts all of these changes.
 
-Handled by the trainer for every host, and thus different from the published code: one image per step (2 to 4), the
-loss, the Gaussians' own rates and their growth, and one optimiser for both stages.
+The trainer implements the following for every host, which differs from the published code: one image per step (2 to 4),
+the loss, learning rates and densification of the Gaussians, and one optimiser for both stages.
 """
 
 from __future__ import annotations
@@ -29,62 +29,62 @@ from .protocol import Deformation, Deltas, HostConfig, HostSpec, Start, rate_sca
 _SPATIAL = ((0, 1), (0, 2), (1, 2))
 PUBLISHED_ITERATIONS = 33_000
 _EXTENT = 1.1
-"""Published rates are times the scene's extent: 1.1 camera extents, and ours is 1."""
+"""Scene extent (1.1 camera extents) by which the published code multiplies its rates. Our camera extent is 1."""
 _WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "sh0": 3}
 
 
 @dataclass
 class HexPlaneConfig(HostConfig):
-    """Sizes, learning rates and regularisers; defaults in brackets are 4DGaussians' (arguments/__init__.py)."""
+    """Sizes, learning rates and regularisers. 4DGaussians' values are in brackets (arguments/__init__.py)."""
 
     features: int = 16
-    """Channels per plane (dynerf: 16)."""
+    """Number of channels per plane (dynerf: 16)."""
     resolution: int = 32
-    """Nodes per spatial axis of the coarsest level (64)."""
+    """Number of nodes per spatial axis of the coarsest level (64)."""
     levels: tuple[int, ...] = (1, 2)
-    """Multipliers of the spatial resolution (dynerf: 1, 2)."""
+    """Multiplier of the spatial resolution for each level (dynerf: 1, 2)."""
     time_nodes: int = 0
-    """Nodes on the time axis (150); 0: about half the trained frames."""
+    """Number of nodes on the time axis (150); 0: chosen by the run, or about half the number of training frames."""
     width: int = 64
     """Width of the trunk and the heads (64)."""
     lr_grid: float = 3e-2
-    """Start learning rate of the planes (1.6e-3 times the scene's extent)."""
+    """Initial learning rate of the planes (1.6e-3 times the scene's extent)."""
     lr_heads: float = 1e-3
-    """Start learning rate of trunk and heads (1.6e-4 times the scene's extent)."""
+    """Initial learning rate of trunk and heads (1.6e-4 times the scene's extent)."""
     lr_end: float = 0.1
-    """Learning rates end at this share of their start (0.1)."""
+    """Final learning rates as a share of the initial ones (0.1)."""
     smooth_space: float = 2e-3
     """Weight of the squared second difference along both axes of the spatial planes (2e-4)."""
     smooth_time: float = 2e-3
     """Weight of the squared second difference along time on the time planes (1e-3)."""
     time_l1: float = 0.0
-    """Weight of mean |1 - plane| on the time planes (1e-4). With heads that start at zero it wins the first steps, the
-    planes fall to 1 for good, and nothing ever moves."""
+    """Weight of mean |1 - plane| on the time planes (1e-4). With heads that start at zero, it would dominate the first
+    steps: the planes become 1 and the field stays static."""
     space_range: tuple[float, float] = (0.5, 1.5)
-    """Spatial planes start between these (0.1 and 0.5, and the network hardly hears the products of three)."""
+    """Range of the spatial planes' initial values (0.1 to 0.5, for which products of three planes are very small)."""
     time_spread: float = 0.1
-    """Time planes start at 1 and up to this much above or below (0)."""
+    """Largest deviation of the time planes' initial values from 1 (0)."""
     until: float = 1.0
-    """Share of the run at which the learning rates have ended."""
+    """Share of the run at which the learning rates reach their final values."""
     stretch: float = 2.0
-    """Axes are stretched around the median of the Gaussians: even within so many times their median distance from it,
-    and the coarser the farther beyond (asinh); 0: even throughout, as published."""
+    """Half-width of the region with almost evenly spaced nodes around the median of the Gaussians, in units of their
+    median distance from it. Outside, nodes become sparser (asinh). 0: even spacing everywhere, as published."""
     silu: bool = True
-    """The network bends by SiLU (off: by ReLU)."""
+    """Whether the activation is SiLU (off: ReLU)."""
     published: bool = False
-    """Times fed as they are to a sampler of [-1, 1], heads that start as noise, smoothness down the planes only (so
-    never along x), the box of the first points, even axes, all harmonics move, and means are pulled through the lookup
-    (on)."""
+    """Whether to use the published variant (on): times in [0, 1] for a sampler of [-1, 1], heads that start as noise,
+    smoothness along H only (never along x), the bounds of the solve's points, axes that are not stretched, deltas of
+    all SH coefficients, and gradients to the means through sampling."""
 
     def row_bytes(self) -> int:
-        """A level's product and its gradient (by torch's own operators six samples and their products), and a layer
-        before and after it bends: the trunk's, five heads'; on the way back the gradients of three layers."""
+        """See `HostConfig.row_bytes`: features and gradients (all samples and products for torch operators), layers of
+        trunk and heads before and after the activation, and gradients of three layers."""
         kept = 12 if planes_cuda.refused else 2
         return 4 * (kept * self.features * len(self.levels) + self.width * (2 * (1 + len(_WIDTHS)) + 3))
 
 
 def _reference(iterations: int) -> HexPlaneConfig:
-    """The published host with the sizes of its Splannequin configuration: 3000 static steps, 30,000 with the field."""
+    """Published host in the size of its Splannequin configuration: 3000 static steps, then 30,000 with the field."""
     scale, whole = _EXTENT * rate_scale(PUBLISHED_ITERATIONS, iterations), float(PUBLISHED_ITERATIONS)
     return HexPlaneConfig(
         start=3000 / whole,
@@ -106,20 +106,21 @@ def _reference(iterations: int) -> HexPlaneConfig:
 
 
 class _InOrder(NamedTuple):
-    """A field's parameters in the order in which they are used."""
+    """Parameters of a field in the order of their use."""
 
     planes: list[Tensor]
-    """Three of space, then three of time, level by level."""
+    """Per level: three spatial planes, then three time planes."""
     trunk: network.Layer
     heads: list[tuple[network.Layer, network.Layer]]
 
 
 class HexPlane(Deformation):
-    """The field. `box` [2, 3] is the part of the scene it resolves; outside it the rim's feature holds.
+    """HexPlane deformation field. It is created on the CPU, so that a seed gives the same start on every device.
 
-    Made on the CPU, so that a seed means one start on every device; `to` moves it. `harmonics`: how many SH bases
-    beyond the constant one the published field moves. `around`: [2, 3], the place that axes are stretched around, and
-    the distance from it within which they stay about even, scene units; None: they are even throughout.
+    box: [2, 3] bounds of the planes; outside, features are those of the border.
+    harmonics: number of SH bases beyond the constant one that the published field moves.
+    around: [2, 3] centre of the stretched axes, and distance up to which nodes are almost evenly spaced, in scene
+        units; None: axes are not stretched.
     """
 
     def __init__(
@@ -165,7 +166,7 @@ class HexPlane(Deformation):
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
 
     def features_at(self, means: Tensor, times: Tensor) -> Tensor:
-        """Product of the six planes' samples, levels concatenated: [M, features * levels]."""
+        """[M, features * levels] products of the samples of six planes, concatenated over levels."""
         means = means if self.config.published else means.detach()
         low, high = self._rim
         where = 2.0 * (self._stretched(means) - low) / (high - low) - 1.0
@@ -184,16 +185,16 @@ class HexPlane(Deformation):
         return torch.cat(parts, dim=1)
 
     def _stretched(self, places: Tensor) -> Tensor:
-        """Places [P, 3] along the axes as the planes' nodes lie."""
+        """Positions [P, 3] in the stretched coordinates in which the planes' nodes are evenly spaced."""
         return places if self.around is None else torch.asinh((places - self.around[0]) / self.around[1])
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """As `Deformation.load_state`."""
+        """See `Deformation.load_state`."""
         super().load_state(tensors)
         self._rim.copy_(self._stretched(self.box))
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
-        """Deltas of M Gaussians; means [M, 3] scene units (ours detaches them), times [M] or [1] in [0, 1]."""
+        """Deltas of M Gaussians; means [M, 3] scene units (detached unless `published`), times [M] or [1] in [0, 1]."""
         out = dict(zip(self.out, self._network(self.features_at(means, times)), strict=True))
         return Deltas(
             means=out["means"],
@@ -206,11 +207,11 @@ class HexPlane(Deformation):
 
     @property
     def recordable(self) -> bool:
-        """It is: nothing is drawn, and kernels and torch's own operators are launched alike."""
+        """True: a step draws no random numbers, and all kernels can be recorded."""
         return True
 
     def _network(self, features: Tensor) -> tuple[Tensor, ...]:
-        """What each head says of features [M, features * levels]."""
+        """Outputs of the heads for features [M, features * levels]."""
         _, trunk, heads = self._in_order()
         if self.config.silu and network.supports(features, trunk, heads):
             return network.network(features, trunk, heads)
@@ -219,12 +220,11 @@ class HexPlane(Deformation):
         return tuple(F.linear(bent(F.linear(hidden, *first)), *last) for first, last in heads)
 
     def _by_level(self) -> list[Tensor]:
-        """Three planes of space, then three of time, level by level."""
+        """Planes in the order of `_InOrder.planes`."""
         return self._in_order().planes
 
     def _in_order(self) -> _InOrder:
-        """Kept, for torch's lists of parameters look each up by its name: a fifteenth of what a card's host did in a
-        step."""
+        """Cached parameter lists. Lookups by name in torch's lists took 1/15 of the CPU time of a step on a GPU."""
         if self._held is None or self._held.trunk.weight is not self.trunk.weight:
             levels = range(0, len(self.spatial), 3)
             self._held = _InOrder(
@@ -235,7 +235,7 @@ class HexPlane(Deformation):
         return self._held
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Two groups: the planes and the network. Published: their schedule begins when the field does."""
+        """Two groups: planes and network. In the published configuration, their schedule begins with the field."""
         c = self.config
         span = {"since": c.start if c.published else 0.0, "until": c.until}
         planes = [*self.spatial, *self.temporal]
@@ -247,7 +247,7 @@ class HexPlane(Deformation):
         ]
 
     def regularisation(self, progress: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
-        """Smoothness of the planes and closeness of the time planes to 1, weighted, summed over planes."""
+        """Weighted penalties on non-smooth planes and on time planes that differ from 1, summed over planes."""
         c, planes = self.config, self._by_level()
         along = 0.0 if c.published else c.smooth_space
         if compiled.supports(planes):
@@ -260,7 +260,7 @@ class HexPlane(Deformation):
 
 
 def _plane(values: Tensor) -> nn.Parameter:
-    """A plane [1, C, H, W] with its channels side by side in memory."""
+    """Parameter of a plane [1, C, H, W] in channels-last memory layout."""
     return nn.Parameter(values.contiguous(memory_format=torch.channels_last))
 
 
@@ -277,13 +277,13 @@ def _layer(linear: nn.Module) -> network.Layer:
 
 
 def _sample(plane: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """Bilinear samples [M, C] of a plane [1, C, R_second, R_first] at coordinates in [-1, 1]; the rim holds outside."""
+    """Bilinear samples [M, C] of a plane [1, C, R_second, R_first] at coordinates in [-1, 1], clamped to the border."""
     grid = torch.stack([first, second], dim=1)[None, None]
     return F.grid_sample(plane, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
 
 
 def _bend(plane: Tensor, axis: int) -> Tensor:
-    """Mean squared second difference along an axis."""
+    """Mean squared second difference of a plane along `axis`."""
     count = plane.shape[axis]
     if count < 3:
         return plane.new_zeros(())
@@ -302,7 +302,7 @@ def _create(config: HexPlaneConfig, start: Start) -> HexPlane:
 
 
 def _around(means: Tensor, box: Tensor, stretch: float) -> Tensor | None:
-    """[2, 3] what the axes are stretched around for the Gaussians means [M, 3] in `box`; None: they are even."""
+    """Argument `around` [2, 3] of `HexPlane` for moving Gaussians with means [M, 3], or for `box` if there are none."""
     if stretch <= 0:
         return None
     if not len(means):

@@ -1,12 +1,12 @@
 """Host B: one network of encoded position and time (Deformable 3DGS).
 
-It moves means, rotations and scales; opacity and colour stay. Corrected against the published code: positions and
-times are scaled to [-1, 1] before they are encoded, scales change in the log and rotations by a quaternion product, so
-that no delta leaves the domain; heads start near zero, so that the field starts as the identity to about 1e-5; the
-6-DoF variant is finite at angle 0. The net is smaller and its encoding has fewer octaves.
+It moves means, rotations and scales; opacity and colour stay constant. Changes to the published code: Positions and
+times are scaled to [-1, 1] before encoding. Scales change in the log and rotations by a quaternion product, so that
+every delta is valid. Heads start near zero, so that the field starts as the identity to about 1e-5. The 6-DoF variant
+is finite at angle 0. The network is smaller and its encoding has fewer octaves.
 
-`reference` is the published host; what stays the trainer's for every host are the loss, the Gaussians' own rates and
-their growth, for which the published code keeps a second screen-gradient buffer and a threshold of its own.
+`reference` is the published host. For every host, the trainer implements the loss, the learning rates of the Gaussians
+and their densification, for which the published code has a second screen-gradient buffer and a separate threshold.
 """
 
 from __future__ import annotations
@@ -37,49 +37,49 @@ PUBLISHED_ITERATIONS = 40_000
 
 @dataclass
 class MlpConfig(HostConfig):
-    """Sizes and learning rates; Deformable 3DGS' numbers in brackets (utils/time_utils.py, arguments/__init__.py)."""
+    """Sizes and learning rates. Values in brackets: Deformable 3DGS (utils/time_utils.py, arguments/__init__.py)."""
 
     still: float = 0.1
-    """As in `HostConfig`. Smooth by itself, the host bends few walls, and a full price keeps it from moving people."""
+    """See `HostConfig`. This host is smooth by design and bends few walls; a full price would keep people static."""
     depth: int = 4
-    """Layers of the trunk; the input joins again after the middle one (8)."""
+    """Number of layers of the trunk, with a skip connection from the input after the middle layer (8)."""
     width: int = 64
     """Width of the layers (256)."""
     position_frequencies: int = 6
-    """Octaves of the position's encoding (10, of positions in scene units). Synthetic scene `quick` 0, all move, 1500
-    steps, one seed, lr 1e-3, width 128: 23.8 dB on moving pixels of held-out frames, 23.3 with 3; static 22.0."""
+    """Octaves of the position encoding (10, of scene units). Synthetic scene `quick` 0, all Gaussians move, 1500 steps,
+    one seed, lr 1e-3, width 128: 23.8 dB on moving held-out pixels, 23.3 with 3 octaves, 22.0 for a static model."""
     time_frequencies: int = 4
-    """Octaves of the time's encoding (10, of times in [0, 1]). Behind the gate of the bundled clip, 240 px, 1200 steps,
-    one seed, lr 2e-4: 23.03 dB with 3 and 4 octaves, 22.41 with 6 and 6; static 22.86."""
+    """Octaves of the time encoding (10, of times in [0, 1]). Bundled clip with the gate, 240 px, 1200 steps, one seed,
+    lr 2e-4: 23.03 dB with 3 (position) and 4 (time) octaves, 22.41 with 6 and 6, 22.86 for a static model."""
     head_std: float = 1e-5
-    """Standard deviation that the heads start with; 0: torch's default, so that the field starts as noise (0)."""
+    """Standard deviation of the heads' initial weights; 0: torch's default, so that the field starts as noise (0)."""
     published: bool = False
-    """Raw coordinates, deltas after activation, rotations added (on)."""
+    """Whether coordinates are not normalised, and deltas and rotations are added after activation (on)."""
     six_dof: bool = False
-    """Means move by a rigid motion about the origin of the encoded box instead of a shift (off)."""
+    """Whether means move by a rigid motion about the centre of the encoded box instead of a translation (off)."""
 
     def row_bytes(self) -> int:
-        """The encoding thrice, as it is made and joined, and every layer before and after it bends."""
+        """See `HostConfig.row_bytes`: three copies of the encoding, and all layers before and after activation."""
         inputs = 4 + 6 * self.position_frequencies + 2 * self.time_frequencies
         return 4 * (3 * inputs + 2 * self.width * self.depth)
 
     lr: float = 1e-3
-    """Start learning rate (8e-4). Synthetic scene as above: half of it left the moving pixels at 23.0 dB."""
+    """Initial learning rate (8e-4). In the synthetic scene above, half of it reached 23.0 dB on moving pixels."""
     lr_end: float = 2e-5
-    """End learning rate (1.6e-6)."""
+    """Final learning rate (1.6e-6)."""
     until: float = 1.0
-    """Share of the run at which the learning rate has ended (1: 40,000 of 40,000)."""
+    """Share of the run at which the learning rate reaches its final value (1: 40,000 of 40,000)."""
     noise: float = 0.0
-    """Training times are blurred by this many frames, falling to nothing (0.1)."""
+    """Initial standard deviation, in frames, of noise on training times; it falls linearly to 0 (0.1)."""
     noise_until: float = 0.5
-    """Share of the run at which the blur is gone (0.5: 20,000 of 40,000)."""
+    """Share of the run at which that noise reaches 0 (0.5: 20,000 of 40,000)."""
 
 
 def _reference(iterations: int) -> MlpConfig:
-    """The published host. Warm-up 3000 of 40,000; the blur is of 1 / (training frames), not of the frames left.
+    """Configuration of the published host. Warm-up takes 3000 of 40,000 steps; time noise is in training frames.
 
-    Rates are as published in runs of any length: a network moves all Gaussians with each step, and higher rates than
-    ours did no better in short runs.
+    Learning rates are as published in runs of any length: each step changes the deltas of all Gaussians, and rates
+    above ours gained nothing in short runs.
     """
     return MlpConfig(
         start=3000 / PUBLISHED_ITERATIONS,
@@ -96,13 +96,13 @@ def _reference(iterations: int) -> MlpConfig:
 
 
 def encode(values: Tensor, octaves: int) -> Tensor:
-    """[M, D (1 + 2 octaves)]: values [M, D], then sin and cos of 2^k times them."""
+    """[M, D (1 + 2 octaves)] positional encoding: values [M, D], then sin and cos of 2^k * values."""
     angles = values[:, :, None] * 2.0 ** torch.arange(octaves, dtype=values.dtype, device=values.device)
     return torch.cat([values, angles.sin().flatten(1), angles.cos().flatten(1)], dim=1)
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator, std: float | None = None) -> nn.Linear:
-    """A layer that starts as torch's own do (std None), or normal with `std` and without bias."""
+    """Linear layer with torch's default initialisation (std None), or normal weights with `std` and zero bias."""
     layer = nn.Linear(inputs, outputs, device="cpu")
     with torch.no_grad():
         if std is None:
@@ -116,7 +116,7 @@ def linear(inputs: int, outputs: int, generator: torch.Generator, std: float | N
 
 
 class Trunk(nn.Module):
-    """ReLU layers over encoded position and time; the input joins again after the middle layer."""
+    """ReLU layers over encoded position and time, with a skip connection from the input after the middle layer."""
 
     def __init__(
         self, depth: int, width: int, octaves: tuple[int, int], generator: torch.Generator, kaiming: bool = False
@@ -127,7 +127,7 @@ class Trunk(nn.Module):
         self.octaves, self.join = octaves, depth // 2
         inputs = 3 * (1 + 2 * octaves[0]) + 1 + 2 * octaves[1]
         sizes = [inputs] + [width + (inputs if n == self.join else 0) for n in range(depth - 1)]
-        # Kaiming for ReLU with zero bias is SC-GS's start; torch's default is Deformable 3DGS'.
+        # SC-GS uses Kaiming initialisation with zero bias; Deformable 3DGS uses torch's default.
         self.layers = nn.ModuleList([linear(size, width, generator) for size in sizes])
         if kaiming:
             for layer in self.layers:
@@ -135,7 +135,7 @@ class Trunk(nn.Module):
                 nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
 
     def forward(self, where: Tensor, when: Tensor) -> Tensor:
-        """[M, width] at where [M, 3] and when [M] or [1]."""
+        """[M, width] features at positions `where` [M, 3] and times `when` [M] or [1]."""
         moment = encode(when[:, None], self.octaves[1]).expand(len(where), -1)
         inputs = torch.cat([encode(where, self.octaves[0]), moment], dim=1)
         hidden = inputs
@@ -147,7 +147,7 @@ class Trunk(nn.Module):
 
 
 class Mlp(Deformation):
-    """The field. `box` [2, 3] is what the encoding takes for [-1, 1]."""
+    """Deformation field. `box` [2, 3] are the bounds that are scaled to [-1, 1] for the encoding."""
 
     def __init__(self, config: MlpConfig, box: Tensor, frames: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ class Mlp(Deformation):
         self.frames: Tensor
         self.register_buffer("box", box.float().cpu())
         self.register_buffer("frames", torch.tensor(float(frames), device="cpu"))
-        self.frame_count = float(frames)  # what `frames` holds: nobody has to ask a GPU for it
+        self.frame_count = float(frames)  # value of `frames` in host memory, which avoids a GPU synchronisation
         self.trunk = Trunk(
             config.depth, config.width, (config.position_frequencies, config.time_frequencies), generator
         )
@@ -166,7 +166,7 @@ class Mlp(Deformation):
         self.rules = {"quats": add_to_unit_quat, "log_scales": add_to_scale} if config.published else {"quats": turn}
 
     def forward(self, means: Tensor, times: Tensor, own: Mapping[str, Tensor] | None = None) -> Deltas:
-        """Deltas of M Gaussians; means [M, 3] scene units (detached here), times [M] or [1] in [0, 1]."""
+        """Deltas of M Gaussians; means [M, 3] in scene units (detached), times [M] or [1] in [0, 1]."""
         where, when = means.detach(), times
         if not self.config.published:
             where = 2.0 * (where - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
@@ -181,11 +181,11 @@ class Mlp(Deformation):
 
     @property
     def recordable(self) -> bool:
-        """It is: the blur of its times is drawn outside (`training_time`)."""
+        """True: the noise on times is drawn outside of the recording (`training_time`)."""
         return True
 
     def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:
-        """Blurred by normal noise of `noise` frames, falling linearly to nothing at `noise_until`."""
+        """`time` plus normal noise of `noise` frames, which falls linearly to 0 at `noise_until`."""
         return blurred(time, self.frame_count, progress, self.config.noise, self.config.noise_until, generator)
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -202,7 +202,7 @@ class Mlp(Deformation):
 def blurred(
     time: float, frames: float, progress: float, noise: float, until: float, generator: torch.Generator
 ) -> float:
-    """`time` plus normal noise of `noise` / frames, falling linearly to 0 at the share `until` of the run."""
+    """`time` plus normal noise of `noise` / frames, which falls linearly to 0 at the share `until` of the run."""
     if noise <= 0.0 or progress >= until:
         return time
     draw = float(torch.randn((), generator=generator, device="cpu"))

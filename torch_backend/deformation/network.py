@@ -1,10 +1,10 @@
-"""The HexPlane's network on the CPU, compiled: a trunk and heads of two layers, and their gradients.
+"""Compiled CPU implementation of the HexPlane's network (a trunk and two-layer heads) and its gradients.
 
-torch's own path (`hexplane`) is the specification and serves every other device and type. It writes each layer of all
-Gaussians before and after it bends, some hundred floats apiece, and reads them again on the way back: with many
-Gaussians that is more memory than arithmetic. Here a few dozen Gaussians at a time go through the whole network,
-nothing is kept but what comes out, and the way back makes the layers anew. The gradients of the weights are sums over
-fixed shares of the Gaussians, so that any number of threads gives the same bits.
+The torch path in `hexplane` is the specification, and is used for other devices and types. It stores every layer of all
+Gaussians before and after activation, some hundred floats each, and reads them in the backward pass. With many
+Gaussians, memory traffic dominates. This implementation sends tiles of a few dozen Gaussians through the whole network,
+stores only the outputs, and recomputes the layers in the backward pass. Weight gradients are summed over fixed shares
+of the Gaussians, so that results are bit-identical for any number of threads.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from ..native import INTEGER, POINTER, Snippet
 from ..torch_types import AutogradContext, applied, once_differentiable, split
 
 _TILE = 32
-"""Gaussians that go through the network at a time."""
+"""Number of Gaussians per tile."""
 _UNITS = 64
-"""Shares of the Gaussians, at most, each with gradients of its own."""
+"""Maximum number of shares of the Gaussians, each with separate gradients."""
 _LEAST = 8 * _TILE
-"""Gaussians of a share, at least."""
+"""Least number of Gaussians per share."""
 _PAD = 16
-"""Outputs of a head, at most; fewer are filled up with zeros."""
+"""Maximum number of outputs of a head; fewer are padded with zeros."""
 _KERNEL = Path(__file__).with_name("kernels") / "network.cpp"
 
 
@@ -53,13 +53,13 @@ def _snippet(inputs: int, width: int, heads: int) -> Snippet:
 
 
 def warm_up(inputs: int, width: int, heads: int) -> None:
-    """Compile, or load from the cache, from the main thread."""
+    """Compiles the network, or loads it from the cache. Call it from the main thread."""
     _snippet(inputs, width, heads).warm_up()
 
 
 def supports(features: Tensor, trunk: Layer, heads: Sequence[tuple[Layer, Layer]]) -> bool:
-    """Whether this module takes this network: float32 on the CPU, widths that are multiples of 16, and heads of at most
-    16 outputs."""
+    """True if this module can run the network: float32 on the CPU, widths that are multiples of 16, and heads with at
+    most 16 outputs."""
     return (
         features.device.type == "cpu"
         and all(t.dtype == torch.float32 for t in (features, trunk.weight))
@@ -69,7 +69,7 @@ def supports(features: Tensor, trunk: Layer, heads: Sequence[tuple[Layer, Layer]
 
 
 class _Packed(NamedTuple):
-    """All weights as the kernel wants them; its file says how they lie."""
+    """All weights in the kernel's layout, which is documented in `network.cpp`."""
 
     trunk: Tensor
     trunk_t: Tensor
@@ -84,7 +84,7 @@ class _Packed(NamedTuple):
 
 
 def _packed(params: Sequence[Tensor]) -> _Packed:
-    """Of the trunk's weight and bias, then of each head those of its hidden and of its last layer."""
+    """Packs `params`: weight and bias of the trunk, then for each head those of the hidden and of the last layer."""
     trunk, trunk_b, *rest = params
     hidden, hidden_b = torch.stack(rest[0::4]), torch.stack(rest[1::4])
     out = torch.zeros(len(hidden), _PAD, trunk.shape[0], device="cpu")
@@ -98,7 +98,7 @@ def _packed(params: Sequence[Tensor]) -> _Packed:
 
 
 def _run(stage: int, threads: int | None, packed: _Packed, **values: Tensor | int) -> None:
-    """One stage of the kernel; what it has no use for is 0."""
+    """Runs one stage of the kernel; unused arguments are 0."""
     used: dict[str, Tensor | int] = {
         **dict.fromkeys(("x", "dx", "results", "pulls", "partial", "sums", "count", "rows", "units"), 0),
         **packed._asdict(),
@@ -115,11 +115,11 @@ def _table(tensors: Sequence[Tensor]) -> Tensor:
 
 class _Through(AutogradContext, Protocol):
     threads: int | None
-    """Workers that the backward pass runs on, too."""
+    """Number of threads, also of the backward pass."""
 
 
 class _Network(torch.autograd.Function):
-    """Output of the heads, with gradients for the features and all weights."""
+    """Outputs of the heads, with gradients for the features and all weights."""
 
     @staticmethod
     def forward(ctx: _Through, features: Tensor, threads: int | None, *params: Tensor) -> tuple[Tensor, ...]:
@@ -147,7 +147,7 @@ class _Network(torch.autograd.Function):
         _run(2, ctx.threads, packed, sums=sums, **held)
         found: list[Tensor] = []
         for n, (part, param) in enumerate(zip(split(sums, sizes), params, strict=True)):
-            if n >= 2 and n % 4 == 0:  # a last layer's weights: turned, and filled up
+            if n >= 2 and n % 4 == 0:  # weights of a last layer are transposed and padded
                 part = part.view(-1, _PAD)[:, : len(param)].T
             elif n >= 2 and n % 4 == 1:
                 part = part[: len(param)]
@@ -156,7 +156,7 @@ class _Network(torch.autograd.Function):
 
 
 def _sizes(packed: _Packed) -> list[int]:
-    """Values in the kernel's sums: of the trunk's weight and bias, then four a head."""
+    """Number of values of each gradient in the kernel's sums: weight and bias of the trunk, then four per head."""
     width, inputs = packed.trunk.shape
     return [width * inputs, width, *[width * width, width, width * _PAD, _PAD] * len(packed.sizes)]
 
@@ -164,10 +164,10 @@ def _sizes(packed: _Packed) -> list[int]:
 def network(
     features: Tensor, trunk: Layer, heads: Sequence[tuple[Layer, Layer]], threads: int | None = None
 ) -> tuple[Tensor, ...]:
-    """What each head says of features [M, inputs]: [M, its outputs], differentiable in everything.
+    """Outputs [M, outputs] of each head for features [M, inputs], differentiable in features and weights.
 
-    The trunk's layer bends by SiLU, and so does the first of each head; the last does not. ValueError unless `supports`
-    takes the network.
+    The trunk's layer and the first layer of each head are followed by SiLU; the last layer is linear. ValueError unless
+    `supports` accepts the network.
     """
     if not supports(features, trunk, heads):
         raise ValueError("a network should be float32 on the CPU, its widths multiples of 16, heads of 16 at most")

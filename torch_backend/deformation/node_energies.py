@@ -1,4 +1,4 @@
-"""Energies of control points' motion: how far it is from rigid, elastic and smooth (SC-GS)."""
+"""Energies of control point motion that penalise non-rigid, stretching and accelerated motion (SC-GS)."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from ..torch_types import norm
 from .geometry import nearest, rigid_rotations
 
 _EDGES, _SURE_EDGES, _EDGE_RADIUS = 10, 3, 0.1
-"""ARAP: neighbours of a node; those always kept; the others only if nearer than this, scene units."""
+"""ARAP: number of neighbours of a node; number that is always used; maximum distance of the others, scene units."""
 
 
 def arap_energy(before: Tensor, after: Tensor) -> Tensor:
-    """Sum over nodes and edges of |e' - R e|^2: before, after [M, 3] at two times.
+    """As-rigid-as-possible energy: sum over nodes and edges of |e' - R e|^2, for nodes before, after [M, 3].
 
-    Edges lead to the 10 nearest nodes of `before`; beyond the third only within 0.1. R is each node's best rotation,
-    without gradient; nodes with collapsed edges are left out.
+    Edges connect a node to its 10 nearest nodes in `before`, beyond the third only within 0.1 scene units. R is the
+    best-fitting rotation of each node, without gradient. Nodes with collapsed edges are left out.
     """
     count = min(_EDGES, len(before) - 1)
     index = nearest(before, before, count + 1)[:, 1:]
@@ -28,15 +28,16 @@ def arap_energy(before: Tensor, after: Tensor) -> Tensor:
 
 
 def elastic_energy(paths: Tensor) -> Tensor:
-    """Variance over T times of the edges to the 2 nearest nodes, each by its own value: paths [T, M, 3]."""
+    """Mean over edges to the 2 nearest nodes of v / v.detach(), where v is the variance of the edge's length over the T
+    times of paths [T, M, 3]. Every edge has the same weight."""
     index = nearest(paths[0], paths[0], min(3, paths.shape[1]))[:, 1:]
     edges = paths[:, index] - paths[:, :, None]
-    # The added 1e-20 keeps the root's gradient finite where two nodes meet.
+    # Adding 1e-20 keeps the gradient of the square root finite where two nodes coincide.
     variance = (edges.square().sum(3) + 1e-20).sqrt().var(0)
     return (variance / (variance.detach() + 1e-8)).mean()
 
 
 def acceleration_energy(paths: Tensor) -> Tensor:
-    """Mean |x(t - d) + x(t + d) - 2 x(t)|, each by its own value: paths [3, M, 3]."""
+    """Mean over nodes of a / a.detach() with a = |x(t - d) + x(t + d) - 2 x(t)|, for paths [3, M, 3]."""
     length = ((paths[0] + paths[2] - 2.0 * paths[1]).square().sum(1) + 1e-20).sqrt()
     return (length / (length.detach() + 1e-8)).mean()

@@ -1,10 +1,10 @@
-"""Feature planes of the HexPlane, compiled: samples and their product, smoothness, and both gradients.
+"""Compiled feature planes of the HexPlane: products of samples, smoothness penalty, and gradients of both.
 
-torch's own path (`hexplane`) is the specification and serves every other device and type; planes on an NVIDIA GPU go to
-`planes_cuda`. On the CPU a few thousand scattered samples leave torch waiting for memory: a plane's channels lie a
-plane apart, and six small operators per sample each cost more than their arithmetic. Here channels lie together
-(`channels_last`), one pass makes the product of a level's six samples, and the gradients of a plane are one worker's,
-so that any number of threads gives the same bits.
+The torch path in `hexplane` is the specification, and is used for other devices and types. Planes on an NVIDIA GPU use
+`planes_cuda`. On the CPU, torch waits for memory, because the channels of a scattered sample are far apart. Its small
+operators also have more overhead than arithmetic. Here, channels are contiguous (`channels_last`), and one pass
+computes the product of a level's six samples. One thread computes all gradients of a plane, so that results are
+bit-identical for any number of threads.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ def _penalty(channels: int) -> Snippet:
 
 
 def warm_up(channels: int = 16) -> None:
-    """Compile, or load from the cache, from the main thread."""
+    """Compiles the kernels, or loads them from the cache. Call it from the main thread."""
     _sampler(channels).warm_up()
     _penalty(channels).warm_up()
 
 
 def supports(planes: Sequence[Tensor]) -> bool:
-    """Whether this module takes these planes: float32, channels last, and on the CPU features a multiple of `LANES`."""
+    """True if this module supports the planes: float32, channels last, on the CPU a multiple of `LANES` features."""
     if planes[0].is_cuda:
         return planes_cuda.supports(planes)
     return all(
@@ -76,7 +76,7 @@ def _sizes(planes: Sequence[Tensor]) -> Tensor:
 
 class _Sampling(AutogradContext, Protocol):
     threads: int | None
-    """Workers that the backward pass runs on, too."""
+    """Number of threads, also of the backward pass."""
 
 
 class _Product(torch.autograd.Function):
@@ -101,7 +101,7 @@ class _Product(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: _Sampling, *grads_in: Tensor) -> tuple[Tensor | None, ...]:
-        saved: tuple[Tensor, ...] = ctx.saved_tensors  # once: where the field works in pieces they are made anew for it
+        saved: tuple[Tensor, ...] = ctx.saved_tensors  # read once: under checkpointing, each access recomputes them
         where, samples, *planes = saved
         out = [torch.empty_like(p) for p in planes]
         grad = grads_in[0].contiguous()
@@ -117,11 +117,11 @@ class _Product(torch.autograd.Function):
 
 
 def features(where: Tensor, planes: Sequence[Tensor], threads: int | None = None) -> Tensor:
-    """Product over a level's six planes of their bilinear samples, [M, levels * C], differentiable in both arguments.
+    """[M, levels * C] products of bilinear samples of each level's six planes, differentiable in both arguments.
 
-    where [M, 4]: x, y, z and time in [-1, 1]; outside the rim holds, without gradient. planes: [1, C, rows, columns],
-    six per level in the order of the axes xy, xz, yz, xt, yt, zt (first along a row). ValueError unless `supports`
-    takes the planes.
+    where: [M, 4] x, y, z and time in [-1, 1]; values outside are clamped, without gradient.
+    planes: [1, C, rows, columns] each, six per level, of axes xy, xz, yz, xt, yt, zt (the first axis along a row).
+    ValueError unless `supports` accepts the planes.
     """
     if planes[0].is_cuda:
         return planes_cuda.features(where, planes)
@@ -131,7 +131,7 @@ def features(where: Tensor, planes: Sequence[Tensor], threads: int | None = None
 
 
 class _Bend(torch.autograd.Function):
-    """The penalty's value; its gradient is computed along with it, being linear in the incoming one."""
+    """Value of the penalty. The forward pass also computes its gradient, which the backward pass only scales."""
 
     @staticmethod
     def forward(ctx: AutogradContext, weights: Tensor, threads: int | None, *planes: Tensor) -> Tensor:
@@ -157,7 +157,7 @@ class _Bend(torch.autograd.Function):
 def penalty(
     planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]], threads: int | None = None
 ) -> Tensor:
-    """Sum over planes [1, C, H, W] of weighted means: squared second differences down and along, and |1 - plane|."""
+    """Sum over planes [1, C, H, W] of weighted means: squared second differences along H and W, and |1 - plane|."""
     if planes[0].is_cuda:
         return planes_cuda.penalty(planes, weights)
     if not supports(planes):

@@ -1,13 +1,14 @@
-"""Feature planes of the HexPlane on a GPU: Warp kernels, one launch for a job of `planes`, nothing read back.
+"""GPU implementation of `planes` by Warp kernels, with few launches and without synchronisation.
 
-torch's own path (`hexplane`) launches six samplers and their products a level, and as many ways back. Here one launch
-samples all planes of all levels and multiplies, one adds up the gradients of all planes, a third, where it is wanted,
-makes those of the points; one does the penalty of all planes with its gradient. Samples are made anew on the way back:
-a level's six would take as much memory as a Gaussian's harmonics, and the planes lie in the card's cache.
+The torch path in `hexplane` launches six samplers and their products per level, and as many backward kernels. Here, one
+launch samples and multiplies all planes of all levels. A second launch computes the gradients of all planes, and a
+third those of the points, if needed. One launch computes the penalty of all planes with its gradient. Samples are
+recomputed in the backward pass: storing six samples per level would take as much memory as the SH coefficients of a
+Gaussian, and the planes fit the GPU's cache.
 
-The planes' gradients are sums by atomics: their last bits depend on the order, which no two runs on a card share, as
-those of the rasteriser do. Everything else here gives the same bits every time. Any number of features is taken. The
-same kernels run on Warp's cpu device, where tests compare them with float64.
+Plane gradients are summed by atomics, so their last bits depend on the order of execution, as in the rasteriser. All
+other results are deterministic. Any number of features is supported. Tests run the same kernels on Warp's CPU device,
+and compare them with float64.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ from ..torch_types import AutogradContext, applied, once_differentiable, split
 _KERNELS = Path(__file__).with_name("kernels")
 
 refused = ""
-"""Why the card's self-test forbids these kernels (`train.device`); then `supports` says no, and torch's own path
-serves. Of the process, as the card is."""
+"""Why the self-test forbids these kernels (set by `train.device`, for the whole process); empty if they are allowed.
+If it is set, `supports` returns False and the torch path is used."""
 
 
 class Kernels(NamedTuple):
-    """The kernels for one number of channels."""
+    """Warp kernels for one number of channels."""
 
     samples: Any
     gradients: Any
@@ -43,19 +44,19 @@ class Kernels(NamedTuple):
 
 
 def source(name: str, channels: int) -> str:
-    """Text of the kernel `name`, as its file is called."""
+    """Source of the kernel in the file <name>.cu."""
     text = kernel_text(_KERNELS / f"{name}.cu").replace("@CHANNELS@", str(channels))
     return text.replace("@WIDTH@", str(4 if channels % 4 == 0 else 1))
 
 
 def module_name(channels: int) -> str:
-    """Name of the Warp module that holds the kernels."""
+    """Name of the Warp module of the kernels."""
     return f"{__name__}.planes{channels}"
 
 
 @functools.lru_cache(maxsize=8)
 def kernels(channels: int) -> Kernels:
-    """The Warp kernels; compiled for a device at their first launch there, all at once."""
+    """Warp kernels. The first launch on a device compiles all of them."""
     initialised_warp()
     module, options = wp.get_module(module_name(channels)), {"enable_backward": False}
 
@@ -87,7 +88,7 @@ def kernels(channels: int) -> Kernels:
 
 
 def supports(planes: Sequence[Tensor]) -> bool:
-    """Whether this module takes these planes: float32 on one device (CUDA, or the CPU for tests), channels last."""
+    """True if this module supports the planes: float32 on one device (CPU for tests), channels last and aligned."""
     device = planes[0].device
     return not refused and device.type in ("cpu", "cuda") and all(
         p.dtype == torch.float32 and p.device == device and p.data_ptr() % 16 == 0
@@ -96,17 +97,17 @@ def supports(planes: Sequence[Tensor]) -> bool:
 
 
 def _table(planes: Sequence[Tensor]) -> Tensor:
-    """[planes, 4] int64: a plane's address, H, W, and how many values the planes before it have."""
+    """[planes, 4] int64: address of a plane, H, W, and total number of values of the planes before it."""
     rows: list[tuple[int, ...]] = []
     before = 0
     for plane in planes:
         rows.append((plane.data_ptr(), plane.shape[2], plane.shape[3], before))
         before += plane.numel()
-    return small_table(tuple(rows), torch.int64, planes[0].device)  # planes stay where they are for a run
+    return small_table(tuple(rows), torch.int64, planes[0].device)  # addresses of planes do not change during a run
 
 
 def _like(flat: Tensor, planes: Sequence[Tensor]) -> list[Tensor]:
-    """Consecutive views of a flat tensor, each with the layout of its plane."""
+    """Consecutive views of a flat tensor, each with the shape and memory layout of its plane."""
     parts = split(flat, [p.numel() for p in planes])
     shapes = [(1, p.shape[2], p.shape[3], p.shape[1]) for p in planes]
     return [part.view(shape).permute(0, 3, 1, 2) for part, shape in zip(parts, shapes, strict=True)]
@@ -144,14 +145,14 @@ class _Product(torch.autograd.Function):
 
 
 def features(where: Tensor, planes: Sequence[Tensor]) -> Tensor:
-    """`planes.features` on the device of `where` and the planes. ValueError unless `supports` takes the planes."""
+    """See `planes.features`, for planes on a GPU. ValueError unless `supports` accepts the planes."""
     if not supports(planes):
         raise ValueError("planes should be float32 on one device, channels last, and aligned to 16 bytes")
     return applied(_Product, where.float().contiguous(), *planes)
 
 
 class _Bend(torch.autograd.Function):
-    """The penalty's value; its gradient is computed along with it, being linear in the incoming one."""
+    """Value of the penalty. The forward pass also computes its gradient, which the backward pass only scales."""
 
     @staticmethod
     def forward(ctx: AutogradContext, weights: tuple[tuple[float, ...], ...], *planes: Tensor) -> Tensor:
@@ -177,7 +178,7 @@ class _Bend(torch.autograd.Function):
 def over_counts(
     planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]]
 ) -> tuple[tuple[float, float, float], ...]:
-    """Weights of `penalty`, each over how many values its mean is of."""
+    """Weights of `penalty`, each divided by the number of values in its mean."""
     scaled: list[tuple[float, float, float]] = []
     for plane, (down, along, still) in zip(planes, weights, strict=True):
         _, c, h, w = plane.shape
@@ -186,7 +187,7 @@ def over_counts(
 
 
 def penalty(planes: Sequence[Tensor], weights: Sequence[tuple[float, float, float]]) -> Tensor:
-    """`planes.penalty` on the planes' device. ValueError unless `supports` takes the planes."""
+    """See `planes.penalty`, for planes on a GPU. ValueError unless `supports` accepts the planes."""
     if not supports(planes):
         raise ValueError("planes should be float32 on one device, channels last, and aligned to 16 bytes")
     return applied(_Bend, over_counts(planes, weights), *planes)

@@ -1,7 +1,7 @@
-"""What a host of the method is: (means, times) -> deltas, with its own parameters, learning rates and regularisers.
+"""Protocol of a host, a deformation model (means, times) -> deltas with parameters, learning rates and regularisers.
 
-A host stands in one file: a subclass of `Deformation`, a dataclass of its numbers, and a `HOST` that names both
-(`registry.py` finds it).
+A host is one file with a subclass of `Deformation`, a dataclass of its configuration, and a `HOST` that refers to both
+(found by `registry.py`).
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from .geometry import near_identity, quat_product
 
 
 class Deltas(NamedTuple):
-    """Changes of M Gaussians at their times; None for what a host does not move.
+    """Changes of M Gaussians at their times; None for parameters that a host does not change.
 
-    means [M, 3] scene units, quats [M, 4], log_scales [M, 3], opacity_logits [M], sh0 [M, 1, 3], shN [M, K - 1, 3].
-    How they meet the canonical parameters is the host's `rules`; without a rule they are added.
+    means [M, 3] in scene units, quats [M, 4], log_scales [M, 3], opacity_logits [M], sh0 [M, 1, 3], shN [M, K - 1, 3].
+    The host's `rules` combine deltas with canonical parameters; without a rule, they are added.
     """
 
     means: Tensor
@@ -34,7 +34,7 @@ class Deltas(NamedTuple):
     shN: Tensor | None = None  # noqa: N815 - the field's name
 
     def moved(self) -> dict[str, Tensor]:
-        """Those that are there, by the name of the parameter they change."""
+        """All deltas that are not None, by parameter name."""
         return {name: delta for name, delta in self._asdict().items() if delta is not None}
 
     def detached(self) -> Deltas:
@@ -44,38 +44,38 @@ class Deltas(NamedTuple):
 
 
 def split_deltas(deltas: Deltas, first: int) -> tuple[Deltas, Deltas]:
-    """The deltas of the first `first` Gaussians, and of the others."""
+    """(deltas of the first `first` Gaussians, deltas of the others)."""
     parts = [(None, None) if delta is None else (delta[:first], delta[first:]) for delta in deltas]
     return Deltas(*(part[0] for part in parts)), Deltas(*(part[1] for part in parts))  # type: ignore[arg-type]
 
 
 Rule = Callable[[Tensor, Tensor], Tensor]
-"""(canonical rows, their deltas) -> rows at the time."""
+"""Function (canonical values, deltas) -> deformed values."""
 
 MIN_SCALE = 1e-5
-"""Smallest standard deviation in scene units that `add_to_scale` leaves (the trainer's own limit)."""
+"""Smallest standard deviation in scene units that `add_to_scale` returns, equal to the trainer's limit."""
 
 
 def add_to_scale(log_scales: Tensor, delta: Tensor) -> Tensor:
     """log(exp(log_scales) + delta), the published rule of Deformable 3DGS and SC-GS.
 
-    The sum can leave the domain; it is held at MIN_SCALE, where it passes no gradient.
+    The sum can be negative; it is clamped to at least MIN_SCALE, without gradient below.
     """
     return (log_scales.exp() + delta).clamp_min(MIN_SCALE).log()
 
 
 def add_to_unit_quat(quats: Tensor, delta: Tensor) -> Tensor:
-    """normalise(quats) + delta, Deformable 3DGS. Its rasteriser does not normalise the sum; ours does."""
+    """normalise(quats) + delta, as in Deformable 3DGS, whose rasteriser (unlike ours) does not normalise the sum."""
     return F.normalize(quats, dim=1) + delta
 
 
 def turn(quats: Tensor, delta: Tensor) -> Tensor:
-    """The canonical rotation, then the one that `delta` says as a change from the identity quaternion."""
+    """Canonical rotation, followed by the rotation of the normalised quaternion identity + `delta`."""
     return quat_product(near_identity(delta), F.normalize(quats, dim=1))
 
 
 class Owned(NamedTuple):
-    """A parameter per Gaussian that belongs to a host: what a row starts as, and its learning rates."""
+    """Parameter per Gaussian that belongs to a host: shape and initial value of a row, and learning rates."""
 
     shape: tuple[int, ...]
     value: float
@@ -85,68 +85,68 @@ class Owned(NamedTuple):
 
 @dataclass
 class HostConfig:
-    """What every host's numbers say. Shares are of the run's length."""
+    """Settings that all hosts have. Shares are of the run's length."""
 
     start: float = 1.0 / 3.0
-    """Share of the run at which the field joins where all Gaussians move (behind the gate, the gate says when)."""
+    """Share of the run at which the field is created if all Gaussians move. With the gate, the gate decides."""
     detached: float = 0.0
-    """Until this share the images move the Gaussians through the deformation, but not the field."""
+    """Share of the run until which the photometric loss trains the deformed Gaussians, but not the field."""
     still: float = 1.0
-    """Share of `support`'s price on motion (`supervision.stillness`) that the host's deltas pay."""
+    """Factor of the price of motion (`supervision.stillness`) for this host's deltas."""
 
     def row_bytes(self) -> int:
-        """Bytes that the deltas of one Gaussian hold on a GPU from the forward to the backward pass, results left out.
-        A host says its own; this is that of ours with the most."""
+        """Bytes per Gaussian that the field keeps on a GPU from forward to backward pass, without its outputs. Hosts
+        override it; the default is the largest value of our hosts."""
         return 4800
 
 
 @dataclass
 class Start:
-    """What a host is made from."""
+    """Inputs for the creation of a host's field."""
 
     means: Tensor
-    """[N, 3] canonical means of the Gaussians that it will move, scene units."""
+    """[N, 3] canonical means, in scene units, of the Gaussians that the field will move."""
     box: Tensor
-    """[2, 3] robust bounds of them, with a margin."""
+    """[2, 3] robust bounds of those means, with a margin."""
     points: Tensor
-    """[P, 3] the solve's points."""
+    """[P, 3] points of the solve."""
     frames: int
-    """How many frames are trained."""
+    """Number of training frames."""
     harmonics: int
-    """K - 1, how many SH bases beyond the constant one a Gaussian has."""
+    """Number K - 1 of SH bases of a Gaussian beyond the constant one."""
     generator: torch.Generator
-    """Source of every random draw."""
+    """Random number generator of the run."""
     time_nodes: Callable[[], int] = lambda: 0
-    """How many nodes a time axis needs for what these Gaussians do; 0: it cannot be told. Renders dozens of frames to
-    find out, so only a host that has such an axis should ask."""
+    """Returns the number of nodes that a time axis needs for the motion of these Gaussians; 0: unknown. It renders
+    dozens of frames, so only a host with such an axis should call it."""
 
 
 @dataclass
 class Rehearsal:
-    """What a host's pre-stage trains with, before the run's own steps."""
+    """Inputs of a host's pre-training, before the run's own steps."""
 
     points: Tensor
-    """[P, 3] where to start."""
+    """[P, 3] initial points."""
     colors: Tensor
     """[P, 3] display-referred colours of the points."""
     times: list[float]
     """Normalised times of the training frames."""
     steps: int
-    """How many steps to take."""
+    """Number of steps."""
     loss: Callable[[dict[str, Tensor], int], Tensor]
-    """(parameters of a set of Gaussians at the frame's time, SH degree 0; frame) -> photometric loss."""
+    """Function (parameters of Gaussians at the frame's time, with SH degree 0; frame) -> photometric loss."""
     generator: torch.Generator
-    """Source of every random draw."""
+    """Random number generator of the run."""
 
 
 class Deformation(nn.Module):
-    """A host of the method. `config` is its dataclass of numbers. Ours never move means through the field."""
+    """Deformation field of a host; `config` is its configuration. In our hosts, it passes no gradient to the means."""
 
     config: Any
     rules: Mapping[str, Rule]
-    """How deltas meet canonical parameters, by parameter; what is not named is added."""
+    """Rules that combine deltas with canonical parameters, by parameter name; others are added."""
     owned: Mapping[str, Owned]
-    """Parameters per Gaussian that belong to the host, by name; calls get their rows as `own`."""
+    """Parameters per Gaussian that belong to the host, by name; calls receive their rows as `own`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -157,35 +157,35 @@ class Deformation(nn.Module):
         raise NotImplementedError
 
     def training_time(self, time: float, progress: float, generator: torch.Generator) -> float:
-        """The time at which a training frame of `time` is to be asked for; all Gaussians share a draw."""
+        """Time at which the field is evaluated to train a frame of `time`; hosts may add noise to it."""
         return time
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Optimiser groups: params, lr (start), lr_end, name; the rate falls between the shares `since` and `until`."""
+        """Optimiser groups with params, lr (initial), lr_end, name, and the shares `since` and `until` of the decay."""
         raise NotImplementedError
 
     def regularisation(self, progress: float = 1.0, generator: torch.Generator | None = None) -> Tensor:
-        """Scalar that keeps the field plausible, already weighted; `progress` is the share of the run that is done."""
+        """Weighted regularisation loss of the field, 0-dim; `progress` is the share of the run that is done."""
         return next(self.parameters()).new_zeros(())
 
     def rehearse(self, stage: Rehearsal) -> None:
-        """The host's pre-stage, `rehearsal` of the run's steps long. Only hosts with `rehearsal` > 0 are asked."""
+        """Runs the host's pre-training. Only called for hosts with `rehearsal` > 0."""
         raise NotImplementedError
 
     @property
     def apart(self) -> bool:
-        """On a GPU many Gaussians at one time and a few at others are cheaper in two calls than in one."""
+        """True if, on a GPU, many Gaussians at one time and few at other times are cheaper in two calls than in one."""
         return False
 
     @property
     def recordable(self) -> bool:
-        """Is a step's work the same at every step, but for the numbers it is told, and does it ask a GPU nothing? Then
-        it is recorded, and launched at once (`train.recorder`)."""
+        """True if the field runs the same operations at every step and reads nothing back from a GPU. Steps are then
+        recorded as CUDA graphs (`train.recorder`)."""
         return False
 
     @property
     def rehearsal(self) -> float:
-        """Share of the run that the pre-stage takes; 0: there is none."""
+        """Share of the run for pre-training; 0: none."""
         return 0.0
 
     def state(self) -> dict[str, Tensor]:
@@ -193,30 +193,30 @@ class Deformation(nn.Module):
         return {f"field.{name}": value.detach() for name, value in self.state_dict().items()}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Inverse of `state`; RuntimeError names what does not fit."""
+        """Inverse of `state`. RuntimeError names tensors that do not fit."""
         self.load_state_dict({k.removeprefix("field."): v for k, v in tensors.items() if k.startswith("field.")})
 
 
 @dataclass(frozen=True)
 class HostSpec:
-    """A host as `registry.py` finds it: a module's `HOST`."""
+    """Description of a host. `registry.py` finds it as `HOST` of a module."""
 
     name: str
-    """What the command line and config.json call it."""
+    """Name on the command line and in config.json."""
     settings: type
-    """Dataclass of its numbers, a HostConfig; the defaults are our configuration."""
+    """Class of its configuration, a HostConfig whose defaults are our configuration."""
     reference: Callable[[int], Any]
-    """Iterations of the run -> the published numbers, schedules as shares of the run."""
+    """Function (iterations of the run) -> published configuration, with schedules as shares of the run."""
     create: Callable[[Any, Start], Deformation]
-    """A new field from its numbers."""
+    """Creates a new field from a configuration."""
     restore: Callable[[Any, dict[str, Tensor]], Deformation]
-    """The field of a checkpoint, from its numbers and the checkpoint's tensors."""
+    """Restores the field of a checkpoint from a configuration and the checkpoint's tensors."""
     warm_up: Callable[[Any], None] = lambda settings: None
-    """Compiles, from the main thread of a run on the CPU, what a field of these numbers will call."""
+    """Compiles the CPU kernels that a field with this configuration uses. Call it from the main thread."""
 
 
 def field_box(means: Tensor) -> Tensor:
-    """Box [2, 3] that a field should resolve for the Gaussians means [M, 3]: robust bounds and a margin."""
+    """Bounds [2, 3] that a field should resolve for means [M, 3]: 1 % and 99 % quantiles with a margin."""
     low, high = np.quantile(means.cpu().numpy(), (0.01, 0.99), axis=0)
     low, high = (torch.as_tensor(bound, dtype=torch.float32, device=means.device) for bound in (low, high))
     margin = 0.15 * (high - low).clamp_min(1e-2)
@@ -224,10 +224,10 @@ def field_box(means: Tensor) -> Tensor:
 
 
 def rate_scale(published: int, iterations: int) -> float:
-    """Factor on a grid's published learning rates in a run shorter than the published one: the root of the ratio.
+    """Factor of a grid's published learning rates in a shorter run: square root of published / iterations, at least 1.
 
-    Adam moves a parameter by about a rate per step: in a short run at the rates of a long one a grid ends far from
-    where that one does, and a comparison would flatter ours. At least 1.
+    Adam changes a parameter by about the learning rate per step. With the rates of a long run, a grid would change too
+    little in a short run, and a comparison would favour our configuration.
     """
     return max(1.0, published / iterations) ** 0.5
 
@@ -239,14 +239,13 @@ def apply_deltas(
     rules: Mapping[str, Rule] | None = None,
     canonical: bool = True,
 ) -> dict[str, Tensor]:
-    """The model's parameters with `deltas` met at `rows` [M] by a host's `rules`; without deltas the canonical ones.
-
-    canonical: whether gradients reach the canonical parameters; if not, they reach the deltas alone.
+    """The model's parameters after applying `deltas` to `rows` [M] by a host's `rules`; without deltas, the canonical
+    parameters. canonical: whether gradients reach the canonical parameters, not only the deltas.
     """
     state: dict[str, Tensor] = {n: model.params[n] if canonical else model.params[n].detach() for n in PARAM_NAMES}
     if deltas is None or len(rows) == 0:
         return state
-    # Indexing costs ten times the sum; where all move there is nothing to index. A GPU would have to be asked.
+    # Indexing takes ten times as long as the sum, and is skipped if all rows move. On a GPU the test would synchronise.
     whole = len(rows) == len(model) and rows.device.type == "cpu" and bool((rows[1:] > rows[:-1]).all())
     for name, delta in deltas.moved().items():
         rule = (rules or {}).get(name)

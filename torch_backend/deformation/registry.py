@@ -1,4 +1,4 @@
-"""The hosts there are: every module of this package that says `HOST` is one. A fourth host is one more file here."""
+"""Registry of hosts: all modules of this package with a `HOST`. A new host only needs a new file in this package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CONFIGURATIONS = ("default", "reference")
 
 @functools.cache
 def hosts() -> dict[str, HostSpec]:
-    """Name -> host, in the order of names. ValueError if two modules claim one name."""
+    """Hosts by name, in alphabetical order. ValueError if two modules use the same name."""
     package = importlib.import_module(__package__ or "")
     found: dict[str, HostSpec] = {}
     for module in pkgutil.iter_modules(package.__path__):
@@ -28,14 +28,14 @@ def hosts() -> dict[str, HostSpec]:
 
 
 def host(name: str) -> HostSpec:
-    """The host of that name; ValueError names those there are."""
+    """Host with the given name. ValueError lists the existing names."""
     if name not in hosts():
         raise ValueError(f"host is {name!r}: it should be one of {', '.join(hosts())}")
     return hosts()[name]
 
 
 def host_config(name: str, configuration: str, iterations: int) -> Any:
-    """A host's numbers: `default` (ours) or `reference` (published) for a run of `iterations`."""
+    """Configuration of a host for a run of `iterations`: `default` (ours) or `reference` (published)."""
     if configuration not in CONFIGURATIONS:
         raise ValueError(f"host configuration is {configuration!r}: it should be one of {', '.join(CONFIGURATIONS)}")
     spec = host(name)

@@ -1,4 +1,4 @@
-"""The Gaussian model: its parameters, how it starts, grows and is written. Depends on the scene only."""
+"""Gaussian model: parameters, initialisation, densification and PLY files. Depends on the scene only."""
 
 from .densify import Densifier, DensifyConfig
 from .initialise import InitConfig, initialise

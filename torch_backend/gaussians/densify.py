@@ -1,9 +1,9 @@
-"""Growth within a budget: split what the image pulls hardest, drop what nobody sees.
+"""Densification within a budget: splits the Gaussians with the largest screen gradients, and prunes faint ones.
 
-Departures from 3DGS: the signal is the sum of absolute screen gradients (clashing pulls
-do not cancel); growth is a schedule towards a budget rather than a threshold, so a run's cost is known before it
-starts; a Gaussian is split along its longest axis into two that keep its second moment, never cloned in place,
-because twins at one place get the same gradient; opacities are not reset.
+Differences from 3DGS: the signal is the sum of absolute screen gradients, so that opposite gradients do not cancel.
+Growth follows a schedule towards a budget instead of a threshold, so the cost of a run is known before it starts. A
+Gaussian is split along its longest axis into two that keep its second moment. Gaussians are not cloned in place, since
+both clones would get the same gradient. Opacities are not reset.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .model import Gaussians
 from .rotations import rotation_matrices
 
 _SHRINK = 1.6
-"""Standard deviation of a child along the split axis is the parent's over this (3DGS densify_and_split)."""
+"""Ratio of the parent's standard deviation along the split axis to a child's (3DGS densify_and_split)."""
 
 
 @dataclass
@@ -27,24 +27,24 @@ class DensifyConfig:
     """Schedule and thresholds; iterations are shares of the run's length."""
 
     budget: int = 58_000
-    """Most Gaussians the run may have: of a preview, about one per pixel of its training images."""
+    """Maximum number of Gaussians. The default, for previews, is about one per pixel of a training image."""
     start: float = 0.06
     """Share of the run at which growth begins."""
     stop: float = 0.5
-    """Share of the run at which growth ends; pruning goes on."""
+    """Share of the run at which growth ends; pruning continues."""
     every: int = 100
     """Iterations between two rounds."""
     prune_opacity: float = 0.01
-    """Gaussians less opaque than this are dropped (3DGS: 0.005)."""
+    """Opacity below which Gaussians are pruned (3DGS: 0.005)."""
     max_scale: float = 0.5
-    """Gaussians whose largest standard deviation exceeds this times their distance from the cameras' centre (at
-    least 1 scene unit) are dropped."""
+    """Largest standard deviation above which Gaussians are pruned, as a multiple of their distance from the cameras'
+    centre (at least 1 scene unit)."""
     min_gradient: float = 0.0
-    """Gaussians with a mean absolute screen gradient below this are never split."""
+    """Mean absolute screen gradient below which Gaussians are not split."""
 
 
 class Densifier:
-    """Gathers the signal between two rounds and carries a round out."""
+    """Accumulates screen gradients between rounds, and carries out rounds of densification."""
 
     def __init__(self, config: DensifyConfig, count: int, device: torch.device | str = "cpu") -> None:
         self.config = config
@@ -52,7 +52,7 @@ class Densifier:
         self.reset(count)
 
     def reset(self, count: int) -> None:
-        """Forgets the signal; called after every round, for `count` Gaussians."""
+        """Resets the accumulated gradients to 0, for `count` Gaussians. Called after every round."""
         self.gradient = torch.zeros(count, device=self.device)
         self.seen = torch.zeros(count, device=self.device)
 
@@ -64,7 +64,7 @@ class Densifier:
         self.seen += visible
 
     def target(self, initial: int, progress: float) -> int:
-        """How many Gaussians the schedule allows at `progress` (0 to 1) of the run."""
+        """Number of Gaussians that the schedule allows at `progress` (0 to 1) of the run."""
         c = self.config
         share = min(max((progress - c.start) / (c.stop - c.start), 0.0), 1.0)
         return round(initial + (max(c.budget, initial) - initial) * math.sqrt(share))
@@ -73,7 +73,7 @@ class Densifier:
     def step(
         self, model: Gaussians, optimizer: torch.optim.Optimizer, initial: int, progress: float, grow: bool = True
     ) -> tuple[int, int]:
-        """One round: prune, then, if it is to `grow`, split up to the schedule. Returns (split, pruned)."""
+        """Runs one round: prunes and, if `grow`, splits up to the scheduled number. Returns numbers (split, pruned)."""
         keep = self._keep(model)
         score = self.gradient / self.seen.clamp_min(1.0)
         room = self.target(initial, progress) - int(keep.sum())
@@ -111,7 +111,10 @@ class Densifier:
 
 @torch.no_grad()
 def _separate(model: Gaussians, first: int, count: int) -> None:
-    """Moves the `count` pairs of twins that start at row `first` apart along their longest axis."""
+    """Turns pairs of copies into children that are separated along their longest axis.
+
+    The first copies are the `count` rows from `first`; the second copies follow in the same order.
+    """
     if not count:
         return
     p = model.params
@@ -123,7 +126,7 @@ def _separate(model: Gaussians, first: int, count: int) -> None:
     # The mixture of the two keeps the parent's second moment: s^2 = d^2 + (s / 1.6)^2.
     distance = log_scales.gather(1, longest[:, None]).exp() * math.sqrt(1.0 - _SHRINK**-2)
     shrunk = log_scales.scatter_add(1, longest[:, None], log_scales.new_full((count, 1), -math.log(_SHRINK)))
-    # Half the parent's mass each, spread over a shorter axis: peak opacity 1.6 / 2 of the parent's.
+    # Each child has half the parent's mass on a shorter axis, so its peak opacity is 1.6 / 2 of the parent's.
     logit = torch.logit((torch.sigmoid(p["opacity_logits"][one]) * _SHRINK / 2).clamp(1e-4, 1.0 - 1e-4))
     for rows, sign in ((one, 1.0), (two, -1.0)):
         p["means"].data[rows] += sign * distance * axis

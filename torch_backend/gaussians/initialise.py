@@ -1,10 +1,11 @@
-"""Where the Gaussians start: the sparse points, points of still surfaces, and seeds for what has no point.
+"""Initial Gaussians: from the sparse points, points of still surfaces, and seeds for regions without points.
 
-COLMAP leaves walls and skin almost empty. The search for motion knows the depth of most of what stands still, plain or
-not (`solve.surface`), and training starts from a draw of that. Pixels far from any point are lifted to the depth of the
-nearest points in the same image: right to within a furniture's width, which a few hundred steps repair, and better than
-holes that densification must fill from the rims (both measured: docs/decisions.md). A guess that is farther off is not
-repaired: a man before a plain wall, lifted to the depth of somebody before him, is never found, and taken for motion.
+COLMAP finds almost no points on walls and skin. Motion detection knows the depth of most still surfaces, textured or
+not (`solve.surface`), and training starts from a random sample of these points. Pixels far from any point become seeds
+at the depth of the nearest points in the same image. Their error is about the width of a piece of furniture, and a few
+hundred steps correct it. Holes, which densification must fill from their edges, are worse (docs/decisions.md has
+figures for both). Larger errors are not corrected: a man in front of a plain wall whose seeds get the depth of a person
+in front of him is not reconstructed, and is taken for motion.
 """
 
 from __future__ import annotations
@@ -22,45 +23,45 @@ from .model import SH_C0, Gaussians, sh_bases
 from .neighbours import nearest
 
 _OUTLIERS = 0.005
-"""Share of the sparse points at either end of each axis that do not say where the scene ends."""
+"""Share of the sparse points at either end of each axis that is ignored when the scene's bounds are measured."""
 _PIXELS_PER_SEED = 100
-"""A small picture needs no more seeds than one per so many pixels of a frame."""
+"""Least number of pixels per seed in a frame, which limits the number of seeds of small images."""
 
 
 @dataclass
 class InitConfig:
-    """How many Gaussians to start with, and how they look."""
+    """Number and appearance of the initial Gaussians."""
 
     surface: int = 20_000
-    """Most points of still surfaces; never more than a third of the budget."""
+    """Maximum number of points of still surfaces; also limited to a third of the budget."""
     seeds: int = 8000
-    """Seeds lifted from pixels without a point near them, over all frames together."""
+    """Number of seeds in all frames together, lifted from pixels far from any point."""
     frames: int = 12
-    """Training frames that seeds are lifted from, evenly over the clip."""
+    """Number of training frames from which seeds are lifted, evenly spaced over the clip."""
     opacity: float = 0.1
-    """Starting opacity of points (3DGS create_from_pcd: 0.1)."""
+    """Initial opacity of points (3DGS create_from_pcd: 0.1)."""
     seed_opacity: float = 0.1
-    """Starting opacity of seeds."""
+    """Initial opacity of seeds."""
     sh_degree: int = 2
-    """Highest SH degree the model can hold."""
+    """Highest SH degree that the model can store."""
     min_scale: float = 1e-4
-    """Smallest starting scale in scene units."""
+    """Smallest initial scale in scene units."""
 
 
 def initialise(
     scene: Scene, images: Tensor, indices: list[int], bins: int, config: InitConfig, generator: torch.Generator,
     budget: int, ignored: Mapping[int, Tensor] | None = None, depth: Callable[[int], Tensor | None] | None = None,
 ) -> Gaussians:  # fmt: skip
-    """Gaussians from points and seeds, on the CPU, where the scene is.
+    """Initial Gaussians from points and seeds, on the CPU. ValueError if there are fewer than 4 points.
 
     Args:
-        scene: the scene; its points [P, 3].
-        images: [I, H, W, 3] training frames, display-referred, on any device.
-        indices: [I] frame of the scene that each image shows.
-        bins: time bins of the support bitmap.
-        budget: most Gaussians to start with; a random choice is kept.
-        ignored: frame of the scene -> bool [H, W] which pixels of it are no part of the scene: none of them is lifted.
-        depth: frame number -> its inverse depth, 0 where unknown, and deviation, [2, h, w]; pixels are lifted there.
+        scene: scene with its points [P, 3], on the CPU.
+        images: [I, H, W, 3] display-referred training frames, on any device.
+        indices: [I] index of each image in the scene's frames.
+        bins: number of time bins of the support bitmap.
+        budget: maximum number of initial Gaussians; a random subset is kept.
+        ignored: index of a scene frame -> bool [H, W] ignored pixels, which give no seeds.
+        depth: frame number -> [2, h, w] inverse depth (0: unknown) and its standard deviation, used for seeds.
     """
     points, colors = _known(scene, indices, min(config.surface, budget // 3), generator)
     known = points, colors
@@ -107,10 +108,10 @@ def initialise(
 
 
 def neighbour_distance(points: Tensor) -> Tensor:
-    """Root mean squared distance to the 3 nearest neighbours (3DGS create_from_pcd), float32 [N]; fewer if there are
-    fewer points, 0 for a point alone.
+    """Root mean square distance to the 3 nearest neighbours (3DGS create_from_pcd), float32 [N].
 
-    points [N, 3] on the CPU. ValueError if one is not finite.
+    Uses fewer neighbours if there are fewer points; 0 for a single point. points: [N, 3] on the CPU. ValueError if one
+    is not finite.
     """
     if not bool(points.isfinite().all()):
         raise ValueError("points must be finite")
@@ -122,10 +123,10 @@ def neighbour_distance(points: Tensor) -> Tensor:
 
 
 def _known(scene: Scene, indices: list[int], most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """(points [P, 3], colours [P, 3]): the sparse ones and up to `most` of still surfaces.
+    """(points [P, 3], colours [P, 3]): all sparse points, and up to `most` random points of still surfaces.
 
-    None that was found in a frame that is held out, `indices` being the frames trained on; none far outside of where
-    sparse points are.
+    Surface points found in held-out frames (solved frames that are not in `indices`) are left out. So are points far
+    outside of the sparse points' bounds.
     """
     points, colors, frames = surface_of(scene)
     held = {scene.frames[i] for i in scene.solved} - {scene.frames[i] for i in indices}
@@ -144,10 +145,10 @@ def _lift_seeds(
     scene: Scene, known: tuple[Tensor, Tensor], image: Tensor, index: int, count: int, generator: torch.Generator,
     ignored: Tensor | None, measured: Tensor | None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """`count` pixels of one frame, preferably far from `known` points, at a depth between their neighbours' in it, or
-    at that of `measured`, inverse depth and its deviation [2, h, w], where it has one.
+    """(points, colours) of up to `count` pixels of one frame that are far from the `known` points.
 
-    Fewer if some of them are `ignored`, bool [H, W].
+    Their depth is interpolated from the nearest known points in the image. Where `measured` [2, h, w] (inverse depth
+    and its standard deviation) is known, it is used instead. Pixels in `ignored`, bool [H, W], are left out.
     """
     height, width = image.shape[:2]
     K = scene.camera_at(width, height)[index]
@@ -162,7 +163,7 @@ def _lift_seeds(
     candidates = torch.rand(4 * count, 2, generator=generator, device="cpu") * limits
     distance, neighbours = (from_numpy(found) for found in nearest(pixels[seen].numpy(), candidates.numpy(), 4))
     far = distance[:, 0].argsort(descending=True, stable=True)[: 2 * count]
-    # Half the far ones: a bare top-k would put every seed into the largest hole.
+    # A random half of the farthest candidates: the farthest alone would all lie in the largest hole.
     keep = far[torch.randperm(len(far), generator=generator, device="cpu")[:count]]
     weights = 1.0 / (distance[keep] + 1.0)
     depth = (weights * camera[seen][:, 2][neighbours[keep]]).sum(1) / weights.sum(1)

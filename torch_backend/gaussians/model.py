@@ -1,7 +1,7 @@
-"""The canonical Gaussians: parameters, optimiser state and per-Gaussian memory, which grow and shrink together.
+"""Canonical Gaussians: parameters, optimiser state and per-Gaussian state, which are resized together.
 
-One primitive, `rebuild`, clones, splits and prunes: it takes the row each new Gaussian comes from. Children inherit
-per-Gaussian state (the gate, the support bitmap), as the support preset needs (docs/architecture.md).
+One function, `rebuild`, clones, splits and prunes, by the parent row of each new Gaussian. Children inherit
+per-Gaussian state (the gate, the support bitmap), as the support preset requires (docs/architecture.md).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ def sh_bases(degree: int) -> int:
 
 
 class Gaussians:
-    """N Gaussians in scene units. Scales as logs, opacities as logits, quaternions wxyz and not normalised.
+    """N Gaussians in scene units. Scales are stored as logs, opacities as logits, quaternions as unnormalised wxyz.
 
-    params: means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh0 [N, 1, 3], shN [N, K - 1, 3].
-    A host's own parameters, [N, ...] each, stand behind those in `params` (see `adopt`).
-    open: bool [N], the gate: which Gaussians the deformation moves.
-    support: bool [N, B], time bins in which a Gaussian contributed to a training frame.
-    hidden: bool [N, B], time bins in which it was out of the frame or behind what is seen, when last looked.
+    params: means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh0 [N, 1, 3], shN [N, K - 1, 3],
+        followed by parameters of the host, [N, ...] each (see `adopt`).
+    open: bool [N] gate: Gaussians that the deformation moves.
+    support: bool [N, B] time bins in which a Gaussian contributed to a training frame.
+    hidden: bool [N, B] time bins in which it was out of the frame or occluded at the last check.
     """
 
     def __init__(self, params: dict[str, Tensor], bins: int) -> None:
@@ -52,21 +52,21 @@ class Gaussians:
         return math.isqrt(1 + self.params["shN"].shape[1]) - 1
 
     def adopt(self, name: str, shape: tuple[int, ...], value: float) -> nn.Parameter:
-        """Gives every Gaussian a parameter of a host's own: [N, *shape], all `value`. ValueError for a taken name."""
+        """Adds a host's parameter [N, *shape] with the initial value `value`. ValueError if the name is in use."""
         if name in self.params:
             raise ValueError(f"the Gaussians have a parameter {name!r} already")
         self.params[name] = nn.Parameter(self.params["means"].new_full((len(self), *shape), value))
         return self.params[name]
 
     def own(self, rows: Tensor) -> dict[str, Tensor]:
-        """The host's own parameters of rows [M], by name."""
+        """Host parameters of the Gaussians `rows` [M], by name."""
         return {name: p[rows] for name, p in self.params.items() if name not in PARAM_NAMES}
 
     @torch.no_grad()
     def rebuild(self, parent: Tensor, fresh: Tensor, optimizer: torch.optim.Optimizer) -> None:
-        """Makes row i a copy of row `parent[i]` [M]; rows marked `fresh` [M] start with zero optimiser moments.
+        """Replaces row i by a copy of row `parent[i]` [M]. Rows set in `fresh`, bool [M], get zero optimiser moments.
 
-        All of it or, if memory ends meanwhile, nothing.
+        If memory runs out, nothing is changed.
         """
         made = {name: nn.Parameter(old.detach()[parent].contiguous()) for name, old in self.params.items()}
         is_open, support, hidden = self.open[parent], self.support[parent], self.hidden[parent]
@@ -88,7 +88,7 @@ class Gaussians:
         self.open, self.support, self.hidden = is_open.contiguous(), support.contiguous(), hidden.contiguous()
 
     def state(self) -> dict[str, Tensor]:
-        """Tensors for a checkpoint; the bitmap packed to bytes."""
+        """Tensors for a checkpoint, with bitmaps packed to bytes."""
         tensors = {f"gaussians.{name}": p.detach() for name, p in self.params.items()}
         tensors["gaussians.open"] = self.open
         tensors["gaussians.support"] = pack_bits(self.support)
@@ -96,7 +96,7 @@ class Gaussians:
         return tensors
 
     def to(self, device: torch.device) -> Gaussians:
-        """The same model on another device, with parameters of its own; this one if it is there already."""
+        """Copy of the model on `device`; the model itself if it is already there."""
         if self.open.device == device:
             return self
         model = Gaussians({name: p.detach().to(device) for name, p in self.params.items()}, self.support.shape[1])
@@ -119,8 +119,7 @@ class Gaussians:
 
 @torch.no_grad()
 def covering(model: Gaussians, count: int) -> Tensor:
-    """Rows int64 [count], ascending, of the Gaussians that cover most: by opacity times the area of their two longest
-    axes."""
+    """Rows int64 [count], ascending, of the Gaussians with the largest opacity times area of their two longest axes."""
     area = model.params["log_scales"].topk(2, dim=1).values.sum(1)
     weight = torch.nn.functional.logsigmoid(model.params["opacity_logits"]) + area
     return weight.topk(count).indices.sort().values

@@ -1,5 +1,5 @@
 # pyright: reportMissingTypeStubs=false
-"""Nearest neighbours among points of space, by SciPy's tree, which has no types of its own."""
+"""Typed access to SciPy's k-d tree for nearest neighbours."""
 
 from typing import Any, cast
 
@@ -11,9 +11,10 @@ from scipy.spatial import KDTree
 def nearest(
     points: NDArray[Any], queries: NDArray[Any], count: int, workers: int = 1
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The points [N, D] nearest to queries [Q, D], nearest first: (distances [Q, count], index [Q, count]).
+    """(distances [Q, count], indices [Q, count]) of the points [N, D] nearest to queries [Q, D], nearest first.
 
-    Where there are fewer points than `count`, distances are infinite and the index is N. `workers`: threads; -1: all.
+    If there are fewer points than `count`, missing distances are infinite and their index is N.
+    workers: number of threads; -1: all cores.
     """
     found: Any = cast(Any, KDTree)(points).query(queries, k=count, workers=workers)
     shape = (len(queries), count)

@@ -1,4 +1,4 @@
-"""Gaussians as a standard 3DGS PLY: what SuperSplat, KIRI's add-on, Nuke's and Houdini's splat readers open.
+"""Reads and writes Gaussians as a standard 3DGS PLY, which SuperSplat, KIRI's add-on, Nuke and Houdini can open.
 
 Layout of the original 3D Gaussian Splatting code (graphdeco-inria/gaussian-splatting, scene/gaussian_model.py,
 `save_ply`): binary little endian, float32, per vertex x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..(3(K-1)-1)
@@ -22,12 +22,12 @@ SH_BASES = (1, 4, 9, 16)
 
 
 class PlyGaussians(NamedTuple):
-    """Gaussians as stored: nothing activated, world frame of whoever wrote them."""
+    """Gaussians as stored, without activation functions, in the world frame of the file."""
 
     means: NDArray[np.float32]
-    """[N,3], world units."""
+    """[N,3] in world units."""
     quats: NDArray[np.float32]
-    """[N,4] wxyz, not necessarily of unit length."""
+    """[N,4] wxyz, not normalised."""
     log_scales: NDArray[np.float32]
     """[N,3]."""
     opacity_logits: NDArray[np.float32]
@@ -56,10 +56,9 @@ def write_ply(
     opacity_logits: ArrayLike,  # [N]
     sh: ArrayLike,  # [N,K,3]
 ) -> Path:
-    """Writes the Gaussians atomically, in the frame and units they are in; values are cast to float32.
+    """Writes the Gaussians atomically, without changing frame or units; values are cast to float32.
 
-    ValueError names the array whose shape is wrong or that holds NaN or infinity; OSError if the file cannot be
-    written.
+    ValueError names an array with a wrong shape, or with NaN or infinity. OSError if the file cannot be written.
     """
     gaussians = PlyGaussians(
         *(np.asarray(array, dtype=np.float32) for array in (means, quats, log_scales, opacity_logits, sh))
@@ -88,14 +87,14 @@ def write_ply(
     path = Path(path)
     with atomic_path(path) as partial, open(partial, "wb") as handle:
         handle.write(header.encode("ascii"))
-        handle.write(rows.data)  # `tofile` would not say that the disk is full
+        handle.write(rows.data)  # `tofile` does not report a full disk
     return path
 
 
 def read_ply(path: str | Path) -> PlyGaussians:
-    """Reads a binary 3DGS PLY of any SH degree from 0 to 3; further vertex properties and elements are passed over.
+    """Reads a binary 3DGS PLY of SH degree 0 to 3; other vertex properties and elements are skipped.
 
-    FileNotFoundError without a file; ValueError if it is not such a PLY, is cut short, or holds NaN or infinity.
+    FileNotFoundError if the file is missing. ValueError if it is not such a PLY, is truncated, or has NaN or infinity.
     """
     path = Path(path)
     with open_regular(path, LONGEST_CHECKPOINT) as handle:
@@ -146,6 +145,6 @@ def _check(gaussians: PlyGaussians, where: str = "") -> None:
 
 
 def vertex_layout(handle: BinaryIO, path: Path) -> tuple[int, np.dtype]:
-    """Number of vertices and the layout of one; leaves the handle at the first vertex. ValueError as `read_ply`."""
+    """(number of vertices, dtype of a vertex). Leaves the handle at the first vertex. ValueError as `read_ply`."""
     count, fields = read_ply_header(handle, path)
     return count, np.dtype(fields)

@@ -1,4 +1,4 @@
-"""Quaternions as rotation matrices."""
+"""Rotation matrices from quaternions."""
 
 import torch
 from torch import Tensor
@@ -7,7 +7,7 @@ from ..torch_types import unflatten
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """[..., 3, 3] of unit quaternions [..., 4] wxyz."""
+    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4] wxyz."""
     w, x, y, z = quats.unbind(-1)
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

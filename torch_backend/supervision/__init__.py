@@ -1,4 +1,4 @@
-"""Support over time, hidden and defective Gaussians, and the anchoring losses that hold unsupervised states."""
+"""Temporal support, detection of hidden and defective Gaussians, and anchoring losses for unsupervised states."""
 
 from .anchors import (
     Anchored,

@@ -1,8 +1,8 @@
-"""The anchoring losses: which states are anchored, to which, and with what weight.
+"""Anchoring losses: the anchored states, their references and weights.
 
-`support` needs no rendering: an unsupported (Gaussian, time) is drawn to the deltas of its nearest supported bins.
-`paper` is the Splannequin paper's rule (section "Temporally-Anchored Regularization"): hidden states to the past,
-defective ones to the future, over activated parameters.
+`support` needs no rendering: deltas of an unsupported (Gaussian, time) pair are pulled to those of its nearest
+supported bins. `paper` is the rule of the Splannequin paper (section "Temporally-Anchored Regularization"): hidden
+states are anchored to the past and defective states to the future, over activated parameters.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from .support import SEEN_WEIGHT, nearest_supported
 
 @dataclass
 class SupervisionConfig:
-    """Which losses anchor, and their weights. Shares are of the run's length."""
+    """Settings and weights of the anchoring losses. Shares are of the run's length."""
 
     preset: str = "support"
-    """support, paper or none."""
+    """Anchoring rule: support, paper or none."""
     start: float = 1.0 / 3.0
     """Share of the run at which anchoring begins (paper: iteration 10,000 of 30,000)."""
     switch: float = 2.0 / 3.0
-    """Share at which `paper` goes from L2 to L1 (paper: 20,000 of 30,000)."""
+    """`paper`: share at which the loss changes from L2 to L1 (paper: 20,000 of 30,000)."""
     every: int = 10
     """`paper`: interval in iterations (paper: 10)."""
     tau: float = 5.0
@@ -45,27 +45,27 @@ class SupervisionConfig:
     """`paper`: test for Gaussians that an image supervises. grad_norm: norm of the screen gradient, as in the paper;
     grad_signed: its signed sum over x and y, as in the published code; weight: the contribution to the image."""
     pulls: str = "field"
-    """`paper`: which parameters get its gradient. field: the deformation field alone. all: canonical parameters too, as
-    in the published code, which detaches the reference state but not the canonical parameters that both states share.
+    """`paper`: parameters that get its gradient. field: the deformation field only. all: also canonical parameters. The
+    published code does so: it detaches the reference state, but not the canonical parameters that both states share.
     Published configurations (`host_config`) set all."""
     support_every: int = 4
     """`support`: interval in iterations."""
     support_weight: float = 0.2
     """`support`: weight of the whole term (docs/decisions.md)."""
     support_samples: int = 1024
-    """`support`: (Gaussian, time) pairs drawn each time."""
+    """`support`: number of (Gaussian, time) pairs per step."""
     support_seconds: float = 4.0
-    """`support`: confidence in an anchor decays as exp(-|dt| / this)."""
+    """`support`: time constant in seconds with which the confidence in an anchor decays, exp(-|dt| / constant)."""
     anchor: str = "hidden"
-    """`support`: which (Gaussian, time) pairs without contribution are anchored. hidden: those outside the frame or
-    behind a surface; unsupported: all of them."""
+    """`support`: (Gaussian, time) pairs without contribution that are anchored. hidden: pairs outside the frame or
+    behind a surface. unsupported: all pairs."""
     look_every: int = 4
     """`support` with anchor `hidden`: interval in iterations at which hidden Gaussians of the frame are marked."""
 
     still_weight: float = 22.0
-    """`support`: weight of `stillness`, relative to the photometric loss: the price of motion."""
+    """`support`: weight of `stillness`, the price of motion, relative to the photometric loss."""
     still_scale: float = 0.15
-    """`support`: change at which the price turns from linear to logarithmic; 0.15 is a shift of 0.03 scene units."""
+    """`support`: change above which the price is logarithmic instead of linear; 0.15 is a shift of 0.03 scene units."""
     still_ramp: float = 0.2
     """`support`: share of the run, from `start` on, over which `still_weight` grows from 0. With the full price at once
     the field would learn no motion."""
@@ -92,7 +92,8 @@ class SupervisionConfig:
 
 
 _ATTRIBUTE_WEIGHTS = {"means": 5.0, "quats": 0.2, "log_scales": 0.2, "opacity_logits": 0.1, "sh0": 0.2, "shN": 0.2}
-"""Weights of the attributes in `support`, so that typical deltas of each count alike; means in scene units."""
+"""Weights of the attributes in `support`, chosen so that typical deltas of all attributes have similar weight. Means
+are in scene units."""
 _STILL_WEIGHTS = {"means": 5.0, "quats": 0.5, "log_scales": 0.5, "opacity_logits": 1.0, "sh0": 1.0, "shN": 0.5}
 """Weights of the attributes in `stillness`. Opacity and colour weigh more: they let a Gaussian become another
 object."""
@@ -102,37 +103,37 @@ _KNEE = 0.02
 
 @dataclass
 class Anchored:
-    """(Gaussian, time) pairs to anchor: no frame supports them, and none contradicts them."""
+    """(Gaussian, time) pairs to anchor, which no frame supports or contradicts."""
 
     rows: Tensor
     """[S] int64 rows of the model."""
     bins: Tensor
     """[S] int64 time bins."""
     weights: Tensor
-    """[S] 1 for a pair that counts, 0 for one that does not."""
+    """[S] 1 for pairs that count, 0 for others."""
 
 
 @dataclass
 class Draws:
-    """Random numbers that choose the pairs to anchor; on the CPU on any device."""
+    """Random numbers that select the pairs to anchor. They are always drawn on the CPU."""
 
     picked: Tensor
-    """[P] int64 indices into the open rows: the last `support_samples` are paired with bins near support, others with
-    any bin."""
+    """[P] int64 indices into the open rows. The last `support_samples` are near pairs, with a bin near support; the
+    others have any bin."""
     anywhere: Tensor
-    """[P - support_samples] int64 time bins of the first."""
+    """[P - support_samples] int64 time bins of the pairs with any bin."""
     start: Tensor
-    """[support_samples] float32 in [0, 1): supported bin of the row at which a near pair starts."""
+    """[support_samples] float32 in [0, 1): selects a supported bin of the row for each near pair."""
     step: Tensor
-    """[support_samples] int64 signed distance in bins from that one."""
+    """[support_samples] int64 signed distance in bins of a near pair from that bin."""
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """All of them."""
+        """All tensors in a fixed order."""
         return self.picked, self.anywhere, self.start, self.step
 
 
 def draw(rows: int, bins: int, config: SupervisionConfig, generator: torch.Generator) -> Draws:
-    """Random draws for a number of open rows and of time bins."""
+    """Random draws for `rows` open Gaussians and `bins` time bins."""
     count = config.support_samples
     far = _FAR * count
     picked = torch.randint(rows, (far + count,), generator=generator, device="cpu")
@@ -144,9 +145,9 @@ def draw(rows: int, bins: int, config: SupervisionConfig, generator: torch.Gener
 
 
 def anchored_pairs(model: Gaussians, rows: Tensor, draws: Draws, config: SupervisionConfig) -> Anchored | None:
-    """The pairs that `draws` choose among the open `rows` [M]; None if none of them needs an anchor.
+    """Pairs that `draws` select among the open `rows` [M]; None if no pair needs an anchor.
 
-    On a GPU pairs that need none stay, with weight 0: to drop them, the host would have to wait for their number.
+    On a GPU, pairs that need no anchor stay with weight 0. To drop them, the CPU would have to wait for their number.
     """
     support = model.support[rows]
     lacking = ~support & model.hidden[rows] if config.anchor == "hidden" else ~support
@@ -167,9 +168,9 @@ def support_loss(
     seconds: float,
     config: SupervisionConfig,
 ) -> Tensor:
-    """Draws deltas at unsupported times to those at the nearest supported bins on either side, weighted.
+    """Loss that pulls deltas at unsupported times to deltas interpolated between the nearest supported bins, 0-dim.
 
-    Canonical parameters are not moved: only the field learns.
+    Canonical parameters get no gradient: only the field is trained.
 
     Args:
         deltas: the field's deltas of `pairs`, with gradient.
@@ -214,10 +215,10 @@ def still_weight(progress: float, config: SupervisionConfig) -> float:
 def stillness(deltas: Deltas, count: int, error: Tensor, weight: Tensor, config: SupervisionConfig) -> Tensor:
     """Price of motion of one frame's `deltas` [M] in a model of `count` Gaussians.
 
-    One camera alone sees each time, so a delta that overfits that frame is not penalised by any other, and shows as
-    soon as the instant is seen from elsewhere. Motion must therefore improve the image by more than this price. Per
-    Gaussian the price is the logarithm of an L1 norm: starting to move costs most, moving farther costs little. The sum
-    is divided by the number of all Gaussians, so that the price of one does not depend on how many others may move.
+    Each time is seen by one camera only. No other frame penalises a delta that overfits this camera's frame, but the
+    error is visible when the instant is seen from another view. Motion must therefore improve the image by more than
+    this price. Per Gaussian, the price is the logarithm of an L1 norm: starting to move costs most, moving farther
+    costs little. The sum is divided by the number of all Gaussians, so that it does not depend on how many may move.
 
     Args:
         error: the frame's photometric loss, 0-dim; it scales the price, because an image that is harder to fit gains
@@ -236,16 +237,15 @@ def stillness(deltas: Deltas, count: int, error: Tensor, weight: Tensor, config:
 
 
 _FAR = 4
-"""Number of pairs with any bin for each pair near support; near pairs only fill the remaining count."""
+"""Number of pairs with any bin per near pair. Near pairs are used only if too few of the others are valid."""
 
 
 def _pairs(support: Tensor, lacking: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
     """(row, bin, valid) of the drawn pairs. A pair is valid where `lacking` [M, B] is set, in a row with any `support`
-    [M, B]; at most as many pairs are valid as are drawn near support.
+    [M, B]. The number of valid pairs is limited to the number of near pairs.
 
-    The first pairs take any bin, the last a bin at a log-uniform distance from support.
-
-    Near pairs pull hardest, also on Gaussians that faded because they moved away: with weight 1 an even mix of both
+    The first pairs have any bin; the last (near) pairs have a bin at a log-uniform distance from support. Near pairs
+    pull hardest, also on Gaussians that faded because their object moved away. With weight 1, equal numbers of both
     kinds trained the bundled clip to 22.96 dB on held-out frames, against 24.39 dB with mostly far pairs.
     """
     bins, count, picked = support.shape[1], len(draws.start), draws.picked
@@ -269,21 +269,20 @@ class PaperView:
     state: dict[str, Tensor]
     """Deformed parameters of M Gaussians (means, quats, log_scales, opacity_logits, sh0)."""
     inside: Tensor
-    """bool [M]: the centre is inside the camera's frustum; False is the paper's `hidden`."""
+    """bool [M] True if the centre is inside the camera's frustum. The paper calls the other Gaussians `hidden`."""
     supervised: Tensor
-    """bool [M]: the view's image supervises the Gaussian (`well_supervised`)."""
+    """bool [M] True if the view's image supervises the Gaussian (`well_supervised`)."""
 
 
 def well_supervised(
     config: SupervisionConfig, weight: Tensor, norm: Tensor, pull: Tensor, K: Tensor, viewmat: Tensor, means: Tensor,
     size: tuple[int, int],
 ) -> Tensor:  # fmt: skip
-    """bool [M]: Gaussians that an image supervises, by the configured detector; the others in its frustum are
-    *defective*.
+    """bool [M] Gaussians that an image supervises, by the configured detector. Others in its frustum are *defective*.
 
     grad_signed adds the components of the screen gradient in NDC, as the published code does, so that about half of the
-    supervised Gaussians fail. The rasteriser returns only the norm of that gradient; its components equal those of the
-    gradient of the 3D means across the line of sight, to first order in the Gaussian's size over its depth.
+    supervised Gaussians fail. The rasteriser returns only the norm of that gradient. Its components are computed from
+    the gradient of the 3D means across the line of sight, to first order in the Gaussian's size over its depth.
 
     Args:
         weight: [M] sum of alpha * T over the image.
@@ -304,11 +303,11 @@ def well_supervised(
 
 
 def paper_loss(one: PaperView, two: PaperView, progress: float, config: SupervisionConfig) -> Tensor | None:
-    """The paper's two terms for a pair of views; None if no valid anchor was found.
+    """Sum of the paper's two terms for a pair of views, 0-dim; None if there is no valid anchor.
 
-    Hidden Gaussians of the later view are anchored to the earlier view, defective ones of the earlier view to the
-    later. The reference is detached and must be well supervised: inside the frustum, and supervised by the image. Mean
-    over the selected Gaussians, summed over the attributes.
+    Hidden Gaussians of the later view are anchored to the earlier view. Defective Gaussians of the earlier view are
+    anchored to the later view. The reference is detached and must be well supervised: inside the frustum, and
+    supervised by the image. Each term is averaged over the Gaussians and summed over the attributes.
     """
     early, late = (one, two) if one.time < two.time else (two, one)
     if early.time == late.time:

@@ -1,7 +1,8 @@
 """The support bitmap: per Gaussian, the time bins in which it contributed to a training frame.
 
-It is filled at no cost from the rasteriser's sum of alpha * T, and inherited on split. It decides where to anchor, at
-which time to evaluate a Gaussian in a freeze, and which frozen pixels are guesses (docs/architecture.md, "The method").
+It is filled at no cost from the rasteriser's sum of alpha * T, and inherited when a Gaussian is split. It determines
+which states are anchored, the time at which a freeze evaluates a Gaussian, and which frozen pixels are guesses
+(docs/architecture.md, "The method").
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def bin_times(times: np.ndarray) -> Tensor:
 
 
 def bin_of(centres: Tensor, time: float) -> int:
-    """Index of the bin nearest to a time."""
+    """Index of the bin nearest to `time`."""
     return int((centres - time).abs().argmin())
 
 
@@ -57,14 +58,14 @@ def mark_hidden(
 ) -> None:
     """Marks the Gaussians of `rows` [M] that a frame cannot show: outside the frame, or behind its surface.
 
-    A Gaussian in plain view that does not contribute is not unsupervised: the frame contradicts it. It may have faded,
-    or its object moved away, so it is not anchored to where it was seen (`anchors.anchored_pairs`).
+    The frame contradicts a Gaussian that is in plain view but does not contribute: it may have faded, or its object may
+    have moved away. Such a Gaussian is not anchored to where it was seen (`anchors.anchored_pairs`).
 
     Args:
         time_bin: int64 [1], on the model's device.
         state: the Gaussians at the frame's time.
         viewmat: [4, 4]; K: [3, 3] px.
-        depth: [H, W] median depth of the frame's render, 1e10 where there is nothing.
+        depth: [H, W] median depth of the frame's render, 1e10 where it is empty.
     """
     height, width = depth.shape
     camera = state["means"].detach()[rows] @ viewmat[:3, :3].T + viewmat[:3, 3]
@@ -79,14 +80,14 @@ def mark_hidden(
 
 
 def nearest_supported(support: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The nearest supported bins on either side of a bin, itself included.
+    """Nearest supported bins before and after each bin, which may be the bin itself.
 
     Args:
         support: bool [M, B].
         bins: int64 [M].
 
     Returns:
-        (left [M], has_left [M], right [M], has_right [M]); where there is none the index is the bin itself.
+        (left [M], has_left [M], right [M], has_right [M]). An index without a supported bin is the bin itself.
     """
     index = torch.arange(support.shape[1], device=support.device).expand_as(support)
     before = torch.where(support & (index <= bins[:, None]), index, -1).amax(1)
@@ -96,7 +97,7 @@ def nearest_supported(support: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 def nearest_bin(support: Tensor, centres: Tensor, time: float) -> tuple[Tensor, Tensor]:
-    """For each of M Gaussians the supported bin nearest to a time: (bin [M], has one [M]); ties go to the past."""
+    """(bin [M], has_bin [M]): supported bin of each Gaussian that is nearest to `time`; ties go to the past."""
     distance = (centres - time).abs()
     cost = torch.where(support, distance, torch.inf)
     best = cost.argmin(1)
@@ -104,12 +105,12 @@ def nearest_bin(support: Tensor, centres: Tensor, time: float) -> tuple[Tensor, 
 
 
 def support_confidence(support: Tensor, is_open: Tensor, centres: Tensor, time: float, decay: float) -> Tensor:
-    """Confidence in each Gaussian's state at a time, [N] in [0, 1].
+    """Confidence in each Gaussian's state at `time`, [N] in [0, 1]; 0 for Gaussians that were never seen.
 
-    1 for a Gaussian that does not move and was ever seen, or that was seen at that time; for a moving one it decays
-    with the distance to its nearest supported bin as exp(-|dt| / decay), both in normalised time; 0 if never seen.
+    It is 1 for static Gaussians. For moving Gaussians, it decays with the distance |dt| from the nearest supported bin
+    as exp(-|dt| / decay), both in normalised time; distances up to half a bin count as 0.
     """
-    known = support.view(torch.uint8).amax(1).float()  # a third of the time of any()
+    known = support.view(torch.uint8).amax(1).float()  # takes a third of the time of any()
     rows = torch.nonzero(is_open).flatten()
     distance = torch.where(support[rows], (centres - time).abs(), torch.inf).amin(1)
     half_bin = 0.5 * float((centres[1:] - centres[:-1]).max())

@@ -1,4 +1,4 @@
-"""A run: presets, schedules, the loop, checkpoints, metrics over time."""
+"""Training of a run: presets, schedules, the training loop, checkpoints and metrics."""
 
 from .config import PRESETS, TrainConfig, config_from_params
 from .device import choose_device

@@ -1,8 +1,8 @@
-"""Adam over all of a model's tensors in one pass: gradients checked, moments and parameters updated, ranges kept.
+"""Adam over all tensors of a model in one pass, which checks gradients, updates parameters and clamps their ranges.
 
-The mathematics is `torch.optim.Adam`'s (Kingma & Ba 2015; no weight decay, no amsgrad) and so are the names of its
-state, so checkpoints fit both. A step whose gradients are not all finite changes nothing. On the CPU a compiled snippet
-runs over chunks on threads; on CUDA a Warp kernel does the same per element, and nothing waits for the device.
+The algorithm and the names of its state are those of `torch.optim.Adam` (Kingma & Ba 2015; no weight decay, no
+amsgrad), so checkpoints fit both. A step with a gradient that is not finite changes nothing. On the CPU, compiled code
+processes chunks on threads. On CUDA, a Warp kernel processes single elements, and nothing waits for the device.
 """
 
 import contextlib
@@ -29,9 +29,11 @@ from ..torch_types import norm
 _CHUNK = 4096
 """Elements per unit of work."""
 _WHOLE, _REAL = 9, 8
-"""Columns of a segment's tables: addresses of p, g, m, v, elements, row width (0: no rows), first chunk, addresses of
-the step count and of a factor of the rate per element (0: none) | rate, 1 - b1, 1 - b2, eps, low, high, rate /
-(1 - b1^t), 1 / sqrt(1 - b2^t). No p: only a check."""
+"""Columns of the integer and the float table, which have one row per segment (tensor).
+
+Integers: addresses of p, g, m and v, number of elements, row width (0: no rows), first chunk, address of the step
+count, address of a learning rate factor per element (0: none). If p is 0, g is only checked for finite values.
+Floats: rate, 1 - b1, 1 - b2, eps, low, high, rate / (1 - b1^t), 1 / sqrt(1 - b2^t)."""
 
 _KERNELS = Path(__file__).with_name("kernels")
 
@@ -51,13 +53,13 @@ def _snippet() -> Snippet:
 
 
 def warm_up() -> None:
-    """Compile, or load from the cache, from the main thread."""
+    """Compiles the CPU code, or loads it from the cache. Call it from the main thread."""
     _snippet().warm_up()
 
 
 @functools.lru_cache(maxsize=1)
 def _kernel() -> Any:
-    """The Warp kernel of `adam.cu`, for CUDA; it runs on Warp's cpu device too, where tests compare it."""
+    """Warp kernel of `adam.cu`, for CUDA. Tests also run it on Warp's CPU device."""
     initialised_warp()
 
     def adam_element(
@@ -77,7 +79,7 @@ def _kernel() -> Any:
 
 
 def all_finite(tensors: Sequence[Tensor], threads: int | None = None) -> bool:
-    """Whether every value of dense float32 CPU `tensors` is finite; on `threads` workers (default: all cores)."""
+    """True if all values of dense float32 CPU `tensors` are finite. Uses `threads` threads (default: all cores)."""
     whole: list[int] = []
     chunks = 0
     for values in tensors:
@@ -93,13 +95,16 @@ def all_finite(tensors: Sequence[Tensor], threads: int | None = None) -> bool:
 
 
 class FusedAdam(torch.optim.Optimizer):
-    """Adam as `torch.optim.Adam(params, lr, betas, eps)`, for float32 parameters on one device.
+    """Adam like `torch.optim.Adam(params, lr, betas, eps)`, for float32 parameters on one device.
 
-    A group may say `rows=True`: its parameters' first axis is the Gaussian's, and `step(visible=...)` skips the rows
-    that are not visible, moments included; `clamp=(low, high)`: the range its parameters are kept in; and `reach`: a
-    row's rate is times its length, which counts as one at least, over `reach` (0: all rows have the same). A mean that
-    is twice as far moves by as many pixels then.
-    `applied` is 0-dim bool on the parameters' device: whether the last step was carried out.
+    Additional options of a parameter group:
+
+    - `rows=True`: the first axis is the Gaussian; `step(visible=...)` skips invisible rows and their moments.
+    - `clamp=(low, high)`: the parameters are clamped to this range.
+    - `reach`: a row's learning rate is multiplied by max(1, L2 norm of the row) / `reach`, so that means at different
+      distances move by equally many pixels. 0: the same rate for all rows.
+
+    `applied` is 0-dim bool on the parameters' device: True if the last step was applied.
     """
 
     def __init__(
@@ -111,7 +116,7 @@ class FusedAdam(torch.optim.Optimizer):
         threads: int | None = None,
         kernel: bool | None = None,
     ) -> None:
-        """`threads`: workers on the CPU (default: all cores). `kernel`: use the Warp kernel (default: not on a CPU)."""
+        """`threads`: CPU threads (default: all cores). `kernel`: use the Warp kernel (default: only on a GPU)."""
         usual = {"rows": False, "clamp": (-math.inf, math.inf), "reach": 0.0}
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, **usual})
         self.threads, self.kernel = threads, kernel
@@ -119,20 +124,23 @@ class FusedAdam(torch.optim.Optimizer):
         self._plan: _Plan | None = None
         self._recorded: StepTable | None = None
 
-    # To keep its compiler out of these two torch imports it at their first call: 1.5 to 1.9 s and 68 MB in every
-    # process that trains or develops. Nothing here is compiled.
+    # The next two methods bypass torch's decorator, which excludes methods from torch.compile. At its first call, it
+    # would import the compiler: 1.5 to 1.9 s and 68 MB in every process that trains or develops.
     def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """As `torch.optim.Optimizer.add_param_group`."""
+        """See `torch.optim.Optimizer.add_param_group`."""
         inspect.unwrap(torch.optim.Optimizer.add_param_group)(self, param_group)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """As `torch.optim.Optimizer.zero_grad`."""
+        """See `torch.optim.Optimizer.zero_grad`."""
         inspect.unwrap(torch.optim.Optimizer.zero_grad)(self, set_to_none)
 
     @contextlib.contextmanager
     def recording(self, device: torch.device) -> Generator["StepTable"]:
-        """A step in here, on a card, is recorded and not carried out (`recorder`): its table is sent by `send`, before
-        each replay. Every parameter that the step will update has been updated by one before."""
+        """Context in which a GPU step is recorded and not carried out (`recorder`).
+
+        Yields the step's table, which `send` transfers before each replay. All parameters of the step must have been
+        updated by an earlier step.
+        """
         rows = sum(len(group["params"]) for group in self.param_groups) + _GUARDS
         sent = torch.zeros(rows * (_WHOLE + _REAL // 2), dtype=torch.int64, device=device)
         self._recorded = StepTable(sent)
@@ -142,7 +150,7 @@ class FusedAdam(torch.optim.Optimizer):
             self._recorded = None
 
     def send(self, table: "StepTable") -> None:
-        """Sends a recorded step its table, with the rates of now."""
+        """Transfers the table of a recorded step to the GPU, with the current learning rates."""
         rows = len(table.values) // (_WHOLE + _REAL // 2)
         real = table.values[rows * _WHOLE :].view(np.float32).reshape(rows, _REAL)
         real[rows - len(table.group_of) :] = self._rates()[table.group_of]
@@ -151,7 +159,7 @@ class FusedAdam(torch.optim.Optimizer):
         table.sent[: len(values)].copy_(values, non_blocking=True)
 
     def _rates(self) -> NDArray[np.float32]:
-        """[groups, _REAL], as a segment has them."""
+        """[groups, _REAL] floats of a segment in each group; the last two columns are 0."""
         rates = [
             (g["lr"], 1.0 - g["betas"][0], 1.0 - g["betas"][1], g["eps"], *g["clamp"], 0.0, 0.0)
             for g in self.param_groups
@@ -162,8 +170,8 @@ class FusedAdam(torch.optim.Optimizer):
     def step(self, closure: None = None, *, visible: Tensor | None = None, guard: Sequence[Tensor] = ()) -> None:  # type: ignore[override]
         """Updates every parameter that has a gradient, unless a gradient or a value of `guard` is not finite.
 
-        visible: bool [N], the Gaussians whose rows are updated (None: all). ValueError for parameters that are not
-        dense float32, or a `closure`.
+        visible: bool [N] Gaussians whose rows are updated; None: all. ValueError for a `closure`, and for parameters
+        that are not float32 or not on one device.
         """
         if closure is not None:
             raise ValueError("FusedAdam takes no closure")
@@ -180,7 +188,7 @@ class FusedAdam(torch.optim.Optimizer):
             return
         whole: list[int] = []
         real: list[float] = []
-        kept: list[Tensor] = []  # alive until the step is done: the tables hold their addresses
+        kept: list[Tensor] = []  # keeps tensors alive whose addresses are in the tables
         chunks = 0
         for value in guard:
             value = value.detach().float().reshape(-1)
@@ -216,7 +224,7 @@ class FusedAdam(torch.optim.Optimizer):
             raise ValueError(f"FusedAdam takes float32 parameters on one device, got {p.dtype} on {p.device}")
 
     def _state_of(self, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Moments and step count; moments lie in memory as their parameter does, wherever they came from."""
+        """(exp_avg, exp_avg_sq, step) of a parameter, converted to its device and memory layout."""
         state = self.state[p]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32, device=p.device)
@@ -248,7 +256,7 @@ class FusedAdam(torch.optim.Optimizer):
     def _run_kernel(
         self, found: list[tuple[Any, dict[str, Any]]], guard: Sequence[Tensor], bad: Tensor, visible: Tensor | None
     ) -> None:
-        """The step on a card. All but gradients and rates is the same from step to step and kept in a `_Plan`."""
+        """Runs the step on a GPU. Table entries other than gradients and rates are cached in a `_Plan`."""
         device, plan = bad.device, self._plan
         if plan is None or not plan.fits(found, self.state):
             for p, _ in found:
@@ -261,7 +269,7 @@ class FusedAdam(torch.optim.Optimizer):
         ]
         factors = [_factors(p, group) for p, group in found]
         segments = len(checked) + len(grads)
-        # One table, so one way to the card: the integers, then the floats, two of them in the place of an integer.
+        # One table needs only one transfer: the integers, followed by the floats, two per int64.
         table = np.zeros((segments, _WHOLE + _REAL // 2), np.int64).reshape(-1)
         whole = table[: segments * _WHOLE].reshape(segments, _WHOLE)
         real = table[segments * _WHOLE :].view(np.float32).reshape(segments, _REAL)
@@ -288,28 +296,28 @@ class FusedAdam(torch.optim.Optimizer):
 
 
 _GUARDS = 4
-"""Values that a recorded step may guard, at most."""
+"""Maximum number of guarded values of a recorded step."""
 
 
 @dataclass
 class StepTable:
-    """What a recorded step reads from its card: addresses of gradients stay as they were recorded, rates do not."""
+    """Table that a recorded step reads. The addresses stay those of the recording; learning rates are updated."""
 
     sent: Tensor
-    """int64, on the card, at least as long as `values`."""
+    """int64 table on the GPU, at least as long as `values`."""
     values: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
-    """The table on the host."""
+    """The table in host memory."""
     group_of: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
-    """Which group each of the table's last rows is of."""
+    """Parameter group of each of the table's last rows."""
 
     def filled(self, values: NDArray[np.int64], group_of: NDArray[np.int64]) -> Tensor:
-        """Where the step will find these values."""
+        """Stores the table's values in host memory, and returns the GPU tensor that the step reads."""
         self.values, self.group_of = values, group_of
         return self.sent[: len(values)]
 
 
 def _factors(p: Tensor, group: dict[str, Any]) -> Tensor | None:
-    """Factor of a group's `reach` on the rate of each element, in the layout of `p`; None if it is one for all."""
+    """Learning rate factor of each element by the group's `reach`, in the layout of `p`; None without `reach`."""
     if not group["reach"]:
         return None
     rows = p.detach().reshape(len(p), -1)
@@ -319,16 +327,18 @@ def _factors(p: Tensor, group: dict[str, Any]) -> Tensor | None:
 
 @dataclass
 class _Plan:
-    """What a step's tables say that is the same in the next one, S parameters with gradients."""
+    """The part of the tables that stays the same from step to step, for S parameters with gradients."""
 
     known: list[tuple[weakref.ref[Tensor], ...]]
-    """Parameter, moments and step count of each. Not held: what growth replaced would stay until the next step."""
+    """[S] parameter, moments and step count. Weak references, so that replaced tensors are freed at once."""
     strides: list[tuple[int, ...]]
+    """[S] strides of the parameters."""
     whole: NDArray[np.int64]
-    """[S, _WHOLE], without the addresses of gradients and factors."""
+    """[S, _WHOLE] integers, without the addresses of gradients and factors."""
     group_of: NDArray[np.int64]
-    """[S] which group each is of."""
+    """[S] parameter group of each parameter."""
     chunks: int
+    """Total number of chunks."""
 
     @classmethod
     def of(
@@ -353,7 +363,7 @@ class _Plan:
         )
 
     def fits(self, found: list[tuple[Any, dict[str, Any]]], state: Any) -> bool:
-        """Is it of these parameters, with these states, where they lie now?"""
+        """True if the plan was made for these parameters and states at their current addresses."""
         if len(found) != len(self.known):
             return False
         for (p, _), known, row in zip(found, self.known, self.whole.tolist(), strict=True):

@@ -1,8 +1,8 @@
-"""A run trained anew in the name of one that is there: beside it, and in its place only when it is done.
+"""Retraining of an existing run: the new run is trained in a separate folder and replaces the old one at its end.
 
-runs/<name>/next/<key>/ holds what a run's folder holds, one folder for each set of settings that was begun, so neither
-a finished run nor hours of a paused one go before there is another. Inside of the run's own folder it is part of the
-run: it is not listed as a run, and is removed with the run.
+runs/<name>/next/<key>/ has the contents of a run folder, with one folder per set of settings. A finished or paused run
+is therefore kept until the new one is finished. The folders are part of the run: they are not listed as runs, and are
+removed with the run.
 """
 
 from __future__ import annotations
@@ -18,7 +18,11 @@ from .extend import EXTENSION_FILE
 
 
 def folder_for(run: Path, key: str, resume: bool) -> Path:
-    """The folder in which settings of a key are trained: the run's own if it holds nothing else, or has begun them."""
+    """Training folder for the settings with key `key`.
+
+    With `resume`, it is the folder of a training that was begun with these settings. Otherwise it is the run's folder
+    if that has no checkpoint, else a folder in `NEXT_FOLDER`.
+    """
     folder = begun(run, key) if resume else None
     if folder is not None:
         return folder
@@ -26,7 +30,7 @@ def folder_for(run: Path, key: str, resume: bool) -> Path:
 
 
 def begun(run: Path, key: str) -> Path | None:
-    """The folder in which settings of a key were begun, or finished; None if nowhere."""
+    """Folder with a checkpoint of the settings with key `key`; None if there is none."""
     for place in (run, run / NEXT_FOLDER / key):
         checkpoint = place / CHECKPOINT_FILE
         if checkpoint.is_file() and read_meta(checkpoint).get("key") == key:
@@ -35,12 +39,13 @@ def begun(run: Path, key: str) -> Path | None:
 
 
 def replace_run(run: Path, done: Path) -> None:
-    """Moves what was trained in `done`, a folder of `folder_for`, to the run's own; nothing else that was begun stays.
+    """Moves the run trained in `done`, a folder of `folder_for`, to the run's folder. Removes unfinished trainings.
 
     Every file is replaced atomically, the checkpoint first, so that a freeze reads either the old run or the new one.
-    `finish_replacing` goes on where a killed process stopped.
+    `finish_replacing` resumes after a killed process.
     """
-    if not (done / DEPTH_FILE).is_file() and (done / CHECKPOINT_FILE).is_file():  # else a killed process has moved it
+    # Without the checkpoint in `done`, a killed process may already have moved the depth file.
+    if not (done / DEPTH_FILE).is_file() and (done / CHECKPOINT_FILE).is_file():
         remove_file(run / DEPTH_FILE)
     for name in (CHECKPOINT_FILE, DEPTH_FILE, CONFIG_FILE, METRICS_FILE):
         if (done / name).is_file():
@@ -54,8 +59,8 @@ def replace_run(run: Path, done: Path) -> None:
 
 
 def finish_replacing(run: Path) -> None:
-    """Goes on with a `replace_run` that was killed halfway."""
-    if is_link(run / NEXT_FOLDER):  # none of ours: a shot folder may come from anywhere
+    """Completes a `replace_run` that was killed."""
+    if is_link(run / NEXT_FOLDER):  # never created by this package: the shot folder may come from an untrusted source
         remove_link(run / NEXT_FOLDER)
     for summary in sorted((run / NEXT_FOLDER).glob(f"*/{SUMMARY_FILE}")):
         if is_link(summary.parent):
@@ -65,5 +70,5 @@ def finish_replacing(run: Path) -> None:
 
 
 def drop_begun(run: Path, key: str) -> None:
-    """Drops what was begun of settings that the run itself is finished with: it could only come to the same."""
+    """Removes an unfinished training with the settings of the finished run, whose result would be the same."""
     shutil.rmtree(run / NEXT_FOLDER / key, ignore_errors=True)

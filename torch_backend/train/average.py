@@ -1,8 +1,8 @@
-"""The mean of a run's last steps, which is what the run keeps.
+"""Parameter averaging over the last steps of a run; the mean is the result of the run.
 
-Every step follows one frame, and the rates that a short run needs keep its parameters moving about what all frames
-agree on until the very end. Their mean over the last steps is nearer to it than any of them (Polyak and Juditsky,
-"Acceleration of stochastic approximation by averaging", 1992), so rates need not fall as far. Figures:
+Each step fits one frame. At the learning rates of a short run, parameters oscillate around the optimum of all frames
+until the end. Their mean over the last steps is nearer to that optimum than any single step (Polyak and Juditsky,
+"Acceleration of stochastic approximation by averaging", 1992), so learning rates need not fall as far. Figures:
 docs/decisions.md, "Rates, Gaussians and the end of a run".
 """
 
@@ -17,16 +17,16 @@ _PREFIX = "mean."
 
 
 class ParameterMean:
-    """Running mean of named parameters. It starts over where their shapes change: rows were dropped or split."""
+    """Running mean of named parameters. It restarts when shapes change because Gaussians were dropped or split."""
 
     def __init__(self) -> None:
         self.count = 0
-        """Steps that are in it."""
+        """Number of averaged steps."""
         self._mean: dict[str, Tensor] = {}
 
     @torch.no_grad()
     def add(self, parameters: Mapping[str, Tensor]) -> None:
-        """Takes the parameters after a step in."""
+        """Adds the parameters after a step to the mean."""
         if {name: value.shape for name, value in parameters.items()} != {n: v.shape for n, v in self._mean.items()}:
             self.count, self._mean = 0, {name: value.detach().clone() for name, value in parameters.items()}
         self.count += 1
@@ -35,21 +35,21 @@ class ParameterMean:
 
     @torch.no_grad()
     def put_into(self, parameters: Mapping[str, Tensor]) -> None:
-        """Sets the parameters to their mean, and forgets it. Without a step in it, or a finite mean, they stay."""
+        """Sets the parameters to their mean and resets it. Values without a finite mean stay unchanged."""
         for name, mean in self._mean.items():
             value = parameters[name].detach()
             value.copy_(torch.where(mean.isfinite(), mean, value))
         self.count, self._mean = 0, {}
 
     def state(self) -> dict[str, Tensor]:
-        """For a checkpoint; empty without a step."""
+        """Tensors for a checkpoint; empty if no step was averaged."""
         if not self.count:
             return {}
         count = torch.tensor(self.count, device="cpu")
         return {f"{_PREFIX}{name}": value for name, value in self._mean.items()} | {f"{_PREFIX}steps": count}
 
     def restore(self, tensors: Mapping[str, Tensor], device: torch.device) -> None:
-        """Inverse of `state`, from a checkpoint's tensors."""
+        """Inverse of `state`: restores the mean from a checkpoint's tensors."""
         found = {n.removeprefix(_PREFIX): v for n, v in tensors.items() if n.startswith(_PREFIX)}
         self.count = int(found.pop("steps", 0))
         self._mean = {name: value.to(device, copy=True) for name, value in found.items()}

@@ -1,4 +1,4 @@
-"""Checkpoints: one safetensors file that holds all a run needs to go on. Nothing in it can execute."""
+"""Checkpoints: one safetensors file with the whole state of a run. The format cannot contain executable code."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ CHECKPOINT_VERSION = 1
 
 
 _DAMAGED = (SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError)
-"""What reading a file that is no checkpoint of ours raises."""
+"""Exceptions raised by reading a damaged file, or a file that is not a checkpoint."""
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-    """Writes tensors and JSON-able facts beside `path`, and renames: the last good checkpoint stays until then.
+    """Writes tensors and JSON-able facts to a temporary file, which then replaces `path` atomically.
 
-    OSError if it cannot be written (errno ENOSPC when the disk is full).
+    OSError if the file cannot be written (errno ENOSPC when the disk is full).
     """
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"version": CHECKPOINT_VERSION, **meta}, allow_nan=False)
     with atomic_path(path) as partial:
         try:
             write_stored(contiguous, partial, {"splannequin": text})
-        except SafetensorError as error:  # it hands the system's reason on in words: "... (os error 28)"
+        except SafetensorError as error:  # the system's error number is only in its message: "... (os error 28)"
             code = int(number[1]) if (number := re.search(r"os error (\d+)", str(error))) else errno.EIO
             windows = (code,) if os.name == "nt" else ()
             raise OSError(code, f"checkpoint not written: {error}", str(path), *windows) from error
 
 
 MISFITS = (KeyError, TypeError, IndexError, AttributeError, ValueError, RuntimeError)
-"""What a checkpoint that is whole, but not as `resume.save_run` wrote it, ends in: a tensor is missing, say."""
+"""Exceptions raised by a readable checkpoint with unexpected contents, for instance a missing tensor."""
 
 
 def misfit(path: Path, error: Exception, code: ExitCode) -> Exception:
-    """One of `MISFITS` as a JobError; as it is if a card raised it: then nothing is wrong with the checkpoint."""
+    """JobError for an exception in `MISFITS`. Errors of the GPU, which the checkpoint did not cause, stay unchanged."""
     if isinstance(error, torch.OutOfMemoryError | torch.AcceleratorError):
         return error
     what = str(error).strip().splitlines()
@@ -57,12 +57,12 @@ def misfit(path: Path, error: Exception, code: ExitCode) -> Exception:
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """(tensors, facts). JobError in words if the file is damaged or from a newer version."""
+    """(tensors, facts) of a checkpoint. JobError if the file is damaged or from a newer version."""
     try:
         with open_stored(path) as stored:
             meta = _facts(stored)
             check_version(meta, str(path), CHECKPOINT_VERSION)
-            # Copies: views of the mapped file would keep Windows from replacing it at the next save.
+            # Cloned, because Windows cannot replace a file while views of its memory map exist.
             return {name: stored.get_tensor(name).clone() for name in stored.keys()}, meta  # noqa: SIM118 - not a dict
     except _DAMAGED as error:
         raise JobError(
@@ -82,7 +82,7 @@ def read_meta(path: Path) -> dict[str, Any]:
 
 
 def _facts(stored: StoredTensors) -> dict[str, Any]:
-    """What an open file says of itself. One of `_DAMAGED` if that is no object of JSON."""
+    """Facts in the metadata of an open file. Raises one of `_DAMAGED` if they are not a JSON object."""
     facts: object = json.loads((stored.metadata() or {})["splannequin"])
     if not isinstance(facts, dict):
         raise TypeError(f"the facts are a {type(facts).__name__}")
@@ -90,7 +90,7 @@ def _facts(stored: StoredTensors) -> dict[str, Any]:
 
 
 def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Adam's moments by parameter name."""
+    """Adam's moments and step counts, named adam.<key>.<parameter>."""
     tensors: dict[str, Tensor] = {}
     for name, parameter in named.items():
         for key, value in optimizer.state.get(parameter, {}).items():
@@ -99,9 +99,9 @@ def optimizer_state(named: dict[str, Tensor], optimizer: torch.optim.Optimizer) 
 
 
 def restore_optimizer(named: dict[str, Tensor], optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Inverse of `optimizer_state`: moments lie where their parameter does, in its type and order, counts beside them.
+    """Inverse of `optimizer_state`. Moments get the device, dtype and memory layout of their parameter.
 
-    Gaussians may be cloned and dropped, moments with them, before the optimiser makes another step.
+    They are converted at once, because Gaussians and moments may be cloned and dropped before the next step.
     """
     for name, parameter in named.items():
         keys = ("step", "exp_avg", "exp_avg_sq")

@@ -1,4 +1,4 @@
-"""Presets and every number of a run."""
+"""Training configuration: the presets and all parameters of a run."""
 
 from __future__ import annotations
 
@@ -19,45 +19,46 @@ from .stopping import StoppingConfig
 
 @dataclass
 class TrainConfig:
-    """One run. Learning rates are per scene unit of camera extent 1; shares are of the run's length.
+    """Parameters of one run. Learning rates assume a camera extent of 1 scene unit; shares are of the run's length.
 
-    The Gaussians' rates are those of 3000 steps, tuned on the bundled clip (docs/decisions.md); `config_from_params`
-    scales them to the run's length by the root of the ratio.
+    The Gaussians' learning rates are for a run of 3000 steps, tuned on the bundled clip (docs/decisions.md).
+    `config_from_params` scales them by the square root of 3000 / `iterations`.
     """
 
     preset: str = "preview"
-    """Preset these numbers come from."""
+    """Name of the preset that the parameters come from."""
     iterations: int = 2000
-    """Training steps of one image each."""
+    """Training steps; each step uses one image."""
     width: int = 320
-    """Width in pixels of the training images, never above the working frames', or the source's with `plates`; 0:
-    theirs."""
+    """Width in pixels of the training images. It is limited to the width of the working frames, or of the source if
+    `plates` is set. 0: that limit."""
     holdout: int = 8
-    """Every how many solved frames one is held out, never the first or last; 0: none."""
+    """Interval, in solved frames, at which a frame is held out (first and last excluded); 0: no held-out frames."""
     holdout_phase: int = 0
-    """Which of every `holdout` frames: 0 is what is reported; tuning uses another, so as not to tune on the judge."""
+    """Offset of the held-out frames within each interval. 0 for reported figures; tuning uses another offset, so that
+    it does not see the frames that results are reported on."""
     method: str = "auto"
-    """auto: the host behind the gate. A host's name: all Gaussians move. static: no deformation."""
+    """Which Gaussians move. auto: those selected by the gate. A host's name: all Gaussians. static: none."""
     host: str = "hexplane"
-    """Which host moves them (`deformation.registry`)."""
+    """Name of the host, the deformation model that moves Gaussians (`deformation.registry`)."""
     host_config: str = "default"
-    """What the host's numbers in `field` started as: default (ours) or reference (published)."""
+    """Initial values of the host's configuration `field`: default (ours) or reference (published)."""
     seed: int = 0
-    """Seed of every random draw."""
+    """Seed of the random number generator."""
     dssim: float = 0.2
-    """Share of D-SSIM in the photometric loss (3DGS: 0.2)."""
+    """Weight of D-SSIM in the photometric loss; L1 has the rest (3DGS: 0.2)."""
     sh_degree: int = 2
     """Highest SH degree."""
     sh_every: float = 0.15
-    """The SH degree rises by one every this share of the run."""
+    """Share of the run after which the SH degree rises by one."""
     lr_means: float = 1.6e-3
-    """Start learning rate of means (3DGS 1.6e-4 over 30,000 steps; shorter runs need longer ones)."""
+    """Initial learning rate of means. 3DGS uses 1.6e-4 over 30,000 steps; shorter runs need larger steps."""
     lr_means_end: float = 8e-5
-    """End learning rate of means."""
+    """Final learning rate of means."""
     lr_means_reach: float = 5.0
-    """Distance from the cameras' centre, in scene units, at which a mean has these rates. Others have them in
-    proportion to theirs, of one unit at least, so that near and far ones move by as many pixels; 0: all have the same,
-    as in 3DGS."""
+    """Distance from the cameras' centre, in scene units, at which a mean is trained with exactly these rates. The rate
+    is proportional to a mean's distance (at least 1 unit), so that near and far means move by equally many pixels.
+    0: one rate for all means, as in 3DGS."""
     lr_scales: float = 2.8e-2
     """Learning rate of log-scales (3DGS: 5e-3)."""
     lr_quats: float = 5.6e-3
@@ -67,49 +68,49 @@ class TrainConfig:
     lr_sh0: float = 1e-2
     """Learning rate of the constant colour (3DGS: 2.5e-3)."""
     lr_sh_rest: float = 5e-3
-    """Learning rate of the other harmonics (3DGS: 2.5e-3 / 20)."""
+    """Learning rate of the higher SH coefficients (3DGS: 2.5e-3 / 20)."""
     lr_end: float = 0.2
-    """Share of its start that each of these rates, but that of means, has at the end."""
+    """Final value of each learning rate, except that of means, as a share of its initial value."""
     soft_movers: float = 0.2
-    """Share of the run, from the opening of the gate on, in which what the motion mattes call moving is learnt from
-    softened pictures (`softened.py`); 0: none, as published."""
+    """Share of the run, starting when the gate opens, in which pixels that the motion mattes mark as moving are
+    trained on low-resolution images (`softened.py`). 0: never, as published."""
     soft_block: float = 8.0
-    """Side of a pixel of these, in pixels of pictures 640 wide."""
+    """Side of a pixel of those low-resolution images, in pixels of an image 640 wide."""
     average: float = 0.1
-    """Share of the run, its end, whose steps' mean the run keeps (`average.py`); 0: the last step."""
+    """Share of the run, at its end, over which the parameters are averaged (`average.py`); 0: no averaging."""
     opacity_weight: float = 2e-3
-    """Weight of the mean opacity: keeps what no image needs from staying (3DGS-MCMC: 1e-2)."""
+    """Weight of the mean opacity in the loss, which fades Gaussians that no image needs (3DGS-MCMC: 1e-2)."""
     scale_weight: float = 2e-3
-    """Weight of the mean standard deviation in scene units (3DGS-MCMC: 1e-2)."""
+    """Weight in the loss of the Gaussians' mean standard deviation in scene units (3DGS-MCMC: 1e-2)."""
     field_every: int = 4
-    """Interval in steps at which the field's regularisers are evaluated; their weight is multiplied by it."""
+    """Interval in steps at which the field's regularisers are evaluated. Their weight is multiplied by the interval."""
     evaluate_every: float = 0.1
-    """Share of the run between two measurements on held-out frames."""
+    """Interval between two evaluations on held-out frames, as a share of the run."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints."""
     init: InitConfig = dataclasses.field(default_factory=InitConfig)
-    """Start of the Gaussians."""
+    """Initialisation of the Gaussians."""
     densify: DensifyConfig = dataclasses.field(default_factory=DensifyConfig)
-    """Growth of the Gaussians."""
+    """Densification of the Gaussians."""
     field: HostConfig = dataclasses.field(default_factory=HexPlaneConfig)
-    """The host's numbers, of its own class."""
+    """Configuration of the host; its class depends on `host`."""
     gate: GateConfig = dataclasses.field(default_factory=GateConfig)
-    """Which Gaussians move."""
+    """Gate that selects the moving Gaussians."""
     supervision: SupervisionConfig = dataclasses.field(default_factory=SupervisionConfig)
-    """Anchoring."""
+    """Anchor supervision."""
     exposure: ExposureConfig = dataclasses.field(default_factory=ExposureConfig)
-    """Brightness and tint that drift along the clip."""
+    """Correction of brightness and tint that drift along the clip."""
     needs: StoppingConfig = dataclasses.field(default_factory=StoppingConfig)
-    """When `auto` has enough: SH degree, Gaussians, time nodes, steps."""
+    """Criteria by which `auto` limits the SH degree, the Gaussians, the time nodes and the steps."""
     poses: PosesConfig = dataclasses.field(default_factory=PosesConfig)
-    """Small corrections of the solve's cameras."""
+    """Refinement of the solved cameras."""
     plates: bool = False
-    """Images wider than the working frames are made of the source's own; else they stay at the working frames'."""
+    """Whether training images may be larger than the working frames; they are then read from the source footage."""
 
     @property
     def decides(self) -> bool:
-        """Does the run decide what it needs and heed the motion mattes? Published configurations, and hosts that move
-        everything, are left as they are."""
+        """True if the run limits itself by `needs` and uses the motion mattes. False for published configurations and
+        for methods in which all Gaussians move."""
         return self.method in ("auto", "static") and self.host_config == "default"
 
 
@@ -142,18 +143,18 @@ def _final() -> TrainConfig:
 
 
 PRESETS = {"preview": _preview, "standard": _standard, "final": _final}
-"""Name -> a fresh configuration."""
+"""Preset name -> function that returns a new configuration."""
 
 
 def _for_card(config: TrainConfig) -> None:
-    """What a preset has on a card; the others have the same there."""
+    """Sets the values that the final preset uses on a GPU. Other presets are the same on CPU and GPU."""
     if config.preset == "final":
         config.width, config.plates, config.densify.budget = CARD_WIDTH, True, CARD_GAUSSIANS
 
 
 def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfig:
-    """The preset, that of a card or of the processor, with the artist's changes. ValueError names a choice that does
-    not exist."""
+    """Configuration of the preset that `params` names, for GPU or CPU, with the user's changes. UserError (a
+    ValueError) names an option that does not exist."""
     for name, value, allowed in (
         ("preset", params.preset, tuple(PRESETS)),
         ("method", params.method, METHODS),
@@ -187,11 +188,11 @@ def config_from_params(params: TrainParams, on_card: bool = False) -> TrainConfi
 
 
 _RATES_FOR = 3000
-"""Steps of the run that the rates in TrainConfig are for."""
+"""Length in steps of the run for which the learning rates in TrainConfig were tuned."""
 
 
 def _rates_for(config: TrainConfig) -> None:
-    """Scales the Gaussians' rates, and how often they multiply, to the length of the run."""
+    """Scales the Gaussians' learning rates and the densification interval to the length of the run."""
     scale = min(max(math.sqrt(_RATES_FOR / max(1, config.iterations)), 0.3), 1.5)
     for name in ("lr_means", "lr_means_end", "lr_scales", "lr_quats", "lr_sh0", "lr_sh_rest"):
         setattr(config, name, getattr(config, name) * scale)
@@ -199,15 +200,16 @@ def _rates_for(config: TrainConfig) -> None:
 
 
 _STATIC, _MOST_STATIC = 0.2, 600
-"""Share of a run with a gate that stays static, and its most steps. In more of them Gaussians paint what moves as
-ghosts that fit one view each, far behind it, and no field puts them right (docs/decisions.md, "Gate and field")."""
+"""Length of the static phase of a gated run, as a share of the run and as a maximum in steps. During a longer phase,
+moving objects are fitted by ghosts: Gaussians far behind the object that each match one view only. The field cannot
+correct them (docs/decisions.md, "Gate and field")."""
 _MOST_PER_DEGREE = 1350
-"""Most steps between two raises of the SH degree. A long run needs no more; in a short one each degree has fewer, and
-needs them, or none seems worth its while."""
+"""Maximum number of steps between two raises of the SH degree. Long runs need no more. The smaller interval of a short
+run must not be shortened further, or no degree would gain enough to be kept."""
 
 
 def _gate_for(config: TrainConfig) -> None:
-    """Opens the gate sooner than published; the trial is as long as it was, anchors and price begin with it."""
+    """Opens the gate earlier than published. The trial keeps its length; anchors and motion price move with it."""
     if config.method != "auto" or config.host_config == "reference":
         return
     gate, anchors, steps = config.gate, config.supervision, max(1, config.iterations)
@@ -217,20 +219,20 @@ def _gate_for(config: TrainConfig) -> None:
 
 
 def config_to_json(config: TrainConfig) -> dict[str, Any]:
-    """Plain types for config.json."""
+    """The configuration as JSON-able types, for config.json."""
     plain = dataclasses.asdict(config)
-    if not config.plates:  # part of the run's key: runs that are older than this choice keep their key
+    if not config.plates:  # the run's key is computed from these: runs older than this field keep their key
         del plain["plates"]
     return plain
 
 
 def _as_tuple(value: Any) -> Any:
-    """A tuple of what JSON keeps as a list."""
+    """Converts a JSON list to a tuple; other values are returned unchanged."""
     return tuple(cast(list[Any], value)) if isinstance(value, list) else value
 
 
 def config_from_json(data: Mapping[str, Any]) -> TrainConfig:
-    """Inverse of `config_to_json`; ValueError names an unknown field."""
+    """Inverse of `config_to_json`. UserError (a ValueError) names an unknown field."""
     nested = {
         "init": InitConfig, "densify": DensifyConfig, "gate": GateConfig,
         "supervision": SupervisionConfig, "exposure": ExposureConfig, "needs": StoppingConfig,

@@ -1,8 +1,8 @@
-"""Depth maps of an artist's, fitted to the solve: what a training pulls moving Gaussians to, and a freeze measures by.
+"""Depth maps of the user, fitted to the solve. Training pulls moving Gaussians to them; freezing uses them as well.
 
-runs/NAME/depth.safetensors holds them: inverse depth over the undistorted frames, in 1 / scene units, with each frame's
-uncertainty. A run is known by the files, the solve and `DepthConfig`; what is kept beside it is trusted only if it
-carries the same key.
+runs/NAME/depth.safetensors stores the fitted maps: inverse depth over the undistorted frames, in 1 / scene units, and
+the uncertainty of each frame. The key of the maps covers the files, the solve and `DepthConfig`. Stored maps are used
+only if their key matches.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from .checkpoint import load_checkpoint, read_meta, save_checkpoint
 from .depth_fit import KINDS, LEAST_POINTS, SequenceFit, fit_sequence
 
 DEPTH_VERSION = 1
-"""Changes when the same maps would be fitted otherwise."""
+"""Version of the fit, part of the key. Increase it when a change alters the fitted maps."""
 _MOST_POINTS = 4000
-"""Points of the solve that a frame's fit looks at, of each kind."""
+"""Maximum number of the solve's points in a frame's fit, of each kind (surface, sparse)."""
 _AHEAD = 1e-3
-"""Least depth of a point that counts, scene units; and least share of a pixel that Gaussians cover."""
+"""Least depth of a point in scene units. Also the least alpha by which a pixel's inverse depth is divided."""
 
 
 @dataclass(frozen=True)
 class DepthConfig:
-    """How depth maps are used."""
+    """Settings of depth supervision."""
 
     width: int = 480
-    """Width in pixels at which fitted maps are kept; less for smaller working frames. Networks work at about 500."""
+    """Width in pixels of the fitted maps, at most that of the working frames. Depth networks work at about 500."""
     every: int = 4
-    """Steps from one pull to the next; each counts for all of them. A pull takes nearly as long as a step's picture."""
+    """Interval in steps of the depth loss, whose weight is multiplied by it. It costs nearly as much as a render."""
     weight: float = 0.08
-    """Colour difference, display-referred, that each standard deviation of a moving pixel's depth counts for. With 0.02
-    in place of 0.08 the error of depth on the tests' tiny world was 1.3 instead of 1.1 % (`every` 1)."""
+    """Loss per standard deviation of a moving pixel's depth error, as a display-referred colour difference. With 0.02
+    instead of 0.08, the depth error on the tests' tiny world was 1.3 instead of 1.1 % (`every` 1)."""
 
 
 @dataclass
@@ -58,16 +58,16 @@ class FittedDepth:
     frames: list[int]
     """[F] frame numbers of the clip that have a map, ascending."""
     inverse: Tensor
-    """float16 [F, h, w] inverse depth over the undistorted frames, 1 / scene units, 0 where it is not known."""
+    """float16 [F, h, w] inverse depth over the undistorted frames, 1 / scene units; 0 where unknown."""
     sigma: list[float]
-    """[F] standard deviation of a frame's depth, scene units, or of its inverse: of what the maps are linear in."""
+    """[F] standard deviation of a frame's depth, or of its inverse depth if the maps are linear in inverse depth."""
     facts: dict[str, Any]
-    """As summary.json has them: `source`, `key`, `linear_in`, `residual`, `frames`, `of_frames`."""
+    """Facts for summary.json: `source`, `key`, `linear_in`, `residual`, `frames`, `of_frames`."""
     config: DepthConfig = dataclasses.field(default_factory=DepthConfig)
-    """What it is used with."""
+    """Settings of depth supervision."""
 
     def at(self, frame: int) -> Tensor | None:
-        """Inverse depth of a frame by its number, and its standard deviation, float32 [2, h, w]; None without a map."""
+        """Inverse depth of frame number `frame` and its standard deviation, float32 [2, h, w]; None without a map."""
         if frame not in self.frames:
             return None
         n = self.frames.index(frame)
@@ -77,7 +77,7 @@ class FittedDepth:
         return torch.stack([inverse, deviation.clamp_min(1e-6)])
 
     def sized(self, frame: int, width: int, height: int) -> Tensor | None:
-        """The same, [2, height, width], each pixel from the nearest of the map: nothing is mixed over edges."""
+        """Result of `at` resized to [2, height, width] by nearest neighbour, which does not mix depths over edges."""
         found = self.at(frame)
         if found is None:
             return None
@@ -85,12 +85,12 @@ class FittedDepth:
 
 
 class DepthTargets:
-    """Inverse depth that the pixels of trained frames should have where something moves.
+    """Target inverse depth of the moving pixels of training frames.
 
     Args:
-        fitted: the maps.
-        frames: [I] number of each trained frame.
-        movers: bool [I, H, W] what moves in it by the motion mattes.
+        fitted: fitted depth maps.
+        frames: [I] number of each training frame.
+        movers: bool [I, H, W] moving pixels by the motion mattes.
     """
 
     def __init__(self, fitted: FittedDepth, frames: list[int], movers: Tensor) -> None:
@@ -98,8 +98,10 @@ class DepthTargets:
         self.every, self.weight = fitted.config.every, fitted.config.every * fitted.config.weight
 
     def at(self, frame: int) -> Tensor | None:
-        """Inverse depth of the trained frame at position `frame`, 0 where nothing is asked, and its standard deviation,
-        [2, H, W] in 1 / scene units; None if nothing is asked of it."""
+        """[2, H, W] target inverse depth (0: no target) and its standard deviation, in 1 / scene units.
+
+        frame: position of the training frame. None if it has no targets.
+        """
         movers = self._movers[frame].cpu()
         found = self._fitted.sized(self._frames[frame], movers.shape[1], movers.shape[0]) if movers.any() else None
         if found is None:
@@ -109,17 +111,17 @@ class DepthTargets:
 
 
 def depth_pull(state: Mapping[str, Tensor], moves: Tensor | None, viewmat: Tensor, K: Tensor, wanted: Tensor) -> Tensor:
-    """How far the Gaussians of a view are from the depth that they should have, 0-dim, see `deviation`.
+    """Depth loss of one view, 0-dim; see `deviation`.
 
-    The gradient moves means along the camera's axis and does nothing else. Through the rendered depth it would also
-    reach opacities and sizes, and a noisy map would fade what it disagrees with: on the tests' tiny world that left an
-    error of 5.9 % and cost 2.6 dB, this 0.9 % and 0.5 dB (500 steps, maps of 2 % noise, 11.7 % without maps).
+    Its gradient only moves means along the camera's axis. A loss on rendered depth would also change opacities and
+    sizes, and fade Gaussians that disagree with a noisy map. On the tests' tiny world, that loss left a depth error of
+    5.9 % and cost 2.6 dB; this loss leaves 0.9 % and costs 0.5 dB (500 steps, maps of 2 % noise, 11.7 % without maps).
 
     Args:
-        state: parameters at the frame's time, as `DynamicModel.moved` gives them.
-        moves: bool [N] which Gaussians are pulled; None: all.
-        viewmat: [4, 4] world-to-camera. `K`: [3, 3] pixels of a picture of H x W.
-        wanted: [2, H, W] inverse depth, 0 where nothing is asked, and its standard deviation.
+        state: parameters at the frame's time, as returned by `DynamicModel.moved`.
+        moves: bool [N] Gaussians that receive the gradient; None: all.
+        viewmat: [4, 4] world-to-camera matrix. `K`: [3, 3] intrinsics for an image of H x W pixels.
+        wanted: [2, H, W] target inverse depth (0: no target) and its standard deviation.
     """
     height, width = wanted.shape[1:]
     view = viewmat.detach()
@@ -138,14 +140,14 @@ def depth_pull(state: Mapping[str, Tensor], moves: Tensor | None, viewmat: Tenso
 
 
 def deviation(moments: Tensor, wanted: Tensor) -> Tensor:
-    """Mean over all pixels of the Pseudo-Huber loss of how many standard deviations inverse depth is off, 0-dim.
+    """Pseudo-Huber loss of the inverse depth error in standard deviations, averaged over all pixels; 0-dim.
+
+    The loss grows linearly beyond one standard deviation, so that outliers of the map have a bounded gradient.
 
     Args:
-        moments: [H, W, 2] mean of the inverse depth of a pixel's Gaussians, and of its square: each of them has to be
-            right, not their mean alone.
+        moments: [H, W, 2] first and second moment of the inverse depth of each pixel's Gaussians. The second moment
+            makes the loss penalise the error of each Gaussian, not only of their mean.
         wanted: as in `depth_pull`.
-
-    Linear beyond one standard deviation, so that a wrong pixel of the map pulls no more than a right one.
     """
     squared = moments[..., 1] - 2.0 * wanted[0] * moments[..., 0] + wanted[0].square()
     squared = torch.where(wanted[0] > 0, (squared / wanted[1].square()).clamp_min(0.0), 0.0)
@@ -153,17 +155,17 @@ def deviation(moments: Tensor, wanted: Tensor) -> Tensor:
 
 
 def depth_key(sequence: DepthSequence, solve: str, config: DepthConfig | None = None) -> str:
-    """Identifies fitted maps before they are read: by their files, the solve and what is done with them."""
+    """Key of fitted maps by their files, the solve and the settings. The files need not be read."""
     return content_key(DEPTH_VERSION, sequence.key, solve, dataclasses.asdict(config or DepthConfig()))
 
 
 def fitted_depth(
     sequence: DepthSequence, scene: Scene, key: str, folder: Path, report: Reporter, config: DepthConfig | None = None
 ) -> FittedDepth:
-    """The maps of the scene's solved frames, fitted to its points; from the run's `folder` if they are there.
+    """Depth maps of the solved frames, fitted to the scene's points. Fitted maps are stored in the run's `folder`.
 
-    A new fit is written there. JobError (TRAIN) if no map can be used, or if they do not fit the solve; maps of single
-    frames that cannot be used are left out, and said in one sentence.
+    JobError (TRAIN) if no map is usable, or if the maps do not fit the solve. Unusable maps of single frames are
+    skipped with one warning.
     """
     if _stored_key(folder / DEPTH_FILE) == key:
         return load_fitted(folder, key, config)
@@ -202,7 +204,7 @@ def fitted_depth(
 
 
 def load_fitted(folder: Path, key: str, config: DepthConfig | None = None) -> FittedDepth:
-    """The maps that lie beside a run. JobError (TRAIN) if they are damaged, missing, or not those of `key`."""
+    """Loads the fitted maps in a run's folder. JobError (TRAIN) if they are missing, damaged or not those of `key`."""
     path = folder / DEPTH_FILE
     try:
         tensors, meta = load_checkpoint(path)
@@ -224,7 +226,7 @@ def load_fitted(folder: Path, key: str, config: DepthConfig | None = None) -> Fi
 
 
 def _stored_key(path: Path) -> str:
-    """Key of the maps in a file; empty if there is none."""
+    """Key of the maps in a file; empty if the file is missing or damaged."""
     facts = read_meta(path).get("facts") if path.is_file() else None
     return str(facts.get("key", "")) if is_json_object(facts) else ""
 
@@ -232,7 +234,7 @@ def _stored_key(path: Path) -> str:
 def _undistorted_maps(
     sequence: DepthSequence, scene: Scene, width: int, height: int, report: Reporter
 ) -> dict[int, NDArray[np.float32]]:
-    """Frame number -> values [height, width] of its map over the undistorted frame, NaN where there are none."""
+    """Frame number -> map [height, width] resampled to the undistorted frame; NaN outside the map."""
     lenses = load_plate_lenses(Shot(scene.folder.parent))
     maps: dict[int, NDArray[np.float32]] = {}
     lens: PlateLens | MapLens | None = None
@@ -244,7 +246,7 @@ def _undistorted_maps(
         report.progress("depth", done, len(scene.solved), f"frame {frame}")
         if values is None:
             continue
-        if lenses[frame] is not lens:  # a clip has one, a zoom one per frame
+        if lenses[frame] is not lens:  # a clip has one lens, a zoom has one per frame
             lens = lenses[frame]
             where = lens.where(width, height)
         h, w = values.shape
@@ -258,8 +260,11 @@ def _undistorted_maps(
 def _samples(
     scene: Scene, maps: dict[int, NDArray[np.float32]], width: int, height: int
 ) -> dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Frame -> (values of its map, depths of the solve's points there): of still surfaces that the nearest key frame
-    shows, else sparse points. Some of these are hidden in a frame: the fit is robust."""
+    """Frame -> (map values, depths) at the solve's points.
+
+    Uses points of still surfaces seen in the nearest key frame, or the sparse points if there are too few. Some sparse
+    points are occluded in the frame; the fit is robust to them.
+    """
     surface, _, of_frame = surface_of(scene)
     keys = np.array(of_frame, np.int64)
     places = np.unique(keys)

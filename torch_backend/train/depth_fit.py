@@ -1,14 +1,14 @@
-"""What the values of depth maps mean: the line, per frame, between them and the depth of the solve's points.
+"""Fits depth maps to the solve: a slope and a shift per frame between map values and depths of the solve's points.
 
-A map is linear in depth (a sensor, a metric network) or in inverse depth (disparity); both are tried over the whole
-sequence. Each frame has its own line. Lines are drawn towards the sequence's common one by as much as their spread over
-the clip and their own uncertainty say (empirical Bayes): a metric sequence has one line, a network that normalises each
-picture has many, and a frame with few points takes the common one.
+A map is linear in depth (a sensor, a metric network) or in inverse depth (disparity). Both models are fitted to the
+whole sequence, and the better one is used. Each frame has its own line, shrunk towards the sequence's common line
+according to the spread between frames and the line's uncertainty (empirical Bayes). So a metric sequence gets one line,
+a network that normalises each image gets many, and a frame with few points gets the common line.
 
-Values are regressed on the points' depth, not the other way round: points are exact to about 1 %, maps are not, and a
-line through noisy abscissas is too flat. Least absolute deviations, since a point that something hides has the value of
-what hides it. A redescending estimator would be wrong here: where most points lie on one wall, it takes all others for
-errors.
+Map values are regressed on the points' depth. Points are accurate to about 1 % and maps are less accurate; a line
+fitted to noisy abscissas would be too flat. The fit uses least absolute deviations, because an occluded point is paired
+with the value of its occluder. A redescending estimator would fail where most points lie on one wall: it would treat
+all other points as outliers.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ Array = NDArray[np.float64]
 Samples = Mapping[int, tuple[Array, Array]]
 """Frame -> (values [P] of its map, depths [P] of the solve's points there, above 0)."""
 LEAST_POINTS = 20
-"""Points from which on a frame has a line of its own."""
+"""Least number of points for a line per frame."""
 LEAST_SIGMA = 0.01
 """Least standard deviation of a fitted depth, as a share of the frame's median depth: the points' own error."""
 _ROUNDS = 30
-"""Reweighted least squares in which the deviations settle."""
+"""Iterations of reweighted least squares."""
 _TO_SIGMA = 1.4826
-"""Standard deviation over median deviation, of Gaussian errors."""
+"""Ratio of standard deviation to median absolute deviation, for normally distributed errors."""
 _UNEXPLAINED, _FAR, _CLOSE = 0.5, 0.15, 0.05
-"""Maps fit the solve if at most half of their deviation is not explained by the points' depth, and half of the points
-are off by less than 15 %: networks reach 5 to 12 %, maps of the same room mirrored 23 %. They also fit if that is less
-than 5 %, since points that all lie at one depth explain nothing."""
+"""Maps fit the solve if less than half of their deviation is unexplained by the points' depth, and the median relative
+error is below 15 %. Networks reach 5 to 12 %; mirrored maps of the same room reach 23 %. Maps also fit if the error is
+below 5 %, because points that all lie at one depth cannot explain any deviation."""
 
 
 @dataclass(frozen=True)
 class FrameFit:
-    """Of one frame: value -> (value - shift) / slope, which is depth or its inverse."""
+    """Fit of one frame: (value - shift) / slope is depth, or inverse depth, depending on the kind of the sequence."""
 
     slope: float
-    """Value per scene unit, or per 1 / scene unit."""
+    """Change of the value per unit of depth, or of inverse depth."""
     shift: float
     """Value at depth, or inverse depth, 0."""
     sigma: float
-    """Standard deviation of the fitted depth, or inverse depth, in scene units, or 1 / scene units."""
+    """Standard deviation of the fitted depth in scene units, or of inverse depth in 1 / scene units."""
     points: int
-    """Points of the solve that lie on the frame's map."""
+    """Number of the solve's points that lie on the frame's map."""
 
     def of(self, values: NDArray[np.floating]) -> Array:
-        """Depth, or inverse depth, that values stand for."""
+        """Depth, or inverse depth, of map values."""
         return (values.astype(np.float64) - self.shift) / self.slope
 
     def inverse_of(self, values: NDArray[np.float32], kind: str) -> NDArray[np.float32]:
-        """Inverse depth of values, in 1 / scene units; 0 where a value is NaN, or means nothing before the camera."""
+        """Inverse depth of map values, in 1 / scene units; 0 where a value is NaN or not in front of the camera."""
         fitted = np.nan_to_num(self.of(values), nan=0.0)
         is_positive = fitted > 1e-12
         safe = np.where(is_positive, fitted, 1.0)
@@ -65,25 +65,25 @@ class FrameFit:
 
 @dataclass(frozen=True)
 class SequenceFit:
-    """Of a whole sequence."""
+    """Fit of a whole sequence."""
 
     kind: str
-    """One of `KINDS`: what the maps are linear in."""
+    """Quantity that the maps are linear in, one of `KINDS`."""
     frames: dict[int, FrameFit]
     """Fits of all requested frames, ascending."""
     residual: float
-    """Median over the frames of the median relative error of their points."""
+    """Median relative error of a frame's points; median over the frames."""
     unexplained: float
     """Share, 0 to 1, of the maps' mean deviation that the points' depth does not explain; median over the frames."""
 
     @property
     def fits(self) -> bool:
-        """False if the maps do not belong to what the solve shows."""
+        """False if the maps do not match the solve."""
         return self.residual < _CLOSE or (self.residual < _FAR and self.unexplained < _UNEXPLAINED)
 
 
 def fit_sequence(samples: Samples) -> SequenceFit | None:
-    """The fit of maps to points, of the kind that explains more. None if no frame has `LEAST_POINTS`."""
+    """Fit of the kind that explains more of the maps. None if no frame has `LEAST_POINTS` points."""
     enough = [frame for frame, (values, _) in samples.items() if len(values) >= LEAST_POINTS]
     if not enough:
         return None
@@ -127,7 +127,7 @@ def _frame_fit(line: Array, sigma: float, points: int) -> FrameFit:
 
 
 def _line(values: Array, y: Array) -> tuple[Array, Array]:
-    """(line [2], its covariance [2, 2]): slope and shift of values [P] over y [P] by least absolute deviations."""
+    """(line [2], covariance [2, 2]): slope and shift of values [P] over y [P] by least absolute deviations."""
     rows = np.stack([y, np.ones_like(y)], axis=1)
     weight = np.ones_like(y)
     line = np.zeros(2)
@@ -137,6 +137,6 @@ def _line(values: Array, y: Array) -> tuple[Array, Array]:
         line = np.asarray(np.linalg.lstsq(weighted.T @ rows, weighted.T @ values, rcond=None)[0], np.float64)
         weight = 1.0 / np.maximum(np.abs(values - rows @ line), least)
     sigma = _TO_SIGMA * float(np.median(np.abs(values - rows @ line)))
-    # Of Gaussian errors a median's variance is pi / 2 times that of a mean.
+    # For normally distributed errors, the variance of a median is pi / 2 times that of a mean.
     covariance = 0.5 * np.pi * sigma * sigma * np.linalg.pinv(rows.T @ rows)
     return line, np.asarray(covariance, np.float64)

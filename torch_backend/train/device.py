@@ -1,4 +1,4 @@
-"""Where a run lives: the CPU, or the NVIDIA GPU if torch and Warp can use it and a self-test finds nothing wrong."""
+"""Selects the device of a run: the CPU, or an NVIDIA GPU if torch and Warp support it and it passes the self-test."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _REPORT = (
 
 
 def choose_device(requested: str, report: Reporter | None = None, doing: str = "") -> torch.device:
-    """The device for `auto`, `cpu` or `cuda`. ValueError for another word, JobError if `cuda` cannot be had.
+    """Device for `auto`, `cpu` or `cuda`. UserError (a ValueError) for other values, JobError if `cuda` is unusable.
 
-    The first use of a card on a machine tests it, in seconds, or tens of them where nothing is compiled yet.
+    The first use of a GPU on a machine runs its self-test: seconds, or tens of seconds if kernels must be compiled.
 
     Args:
-        report: receives one warning that says why `auto` leaves this machine's card unused; None: no warning.
-        doing: first word of that sentence: "Training", "Freezing".
+        report: receives a warning if `auto` does not use this machine's GPU, or some kernels; None: no warning.
+        doing: first word of the warning: "Training", "Freezing".
     """
     device, unused = decide_device(requested)
     if report is not None and unused is not None:
@@ -46,17 +46,17 @@ def choose_device(requested: str, report: Reporter | None = None, doing: str = "
 
 
 def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]:
-    """`choose_device`, and why `auto` leaves this machine's card unused with what to do about it; None if it does not,
-    or there is none.
+    """(device, (reason, advice)): the second item says why `auto` does not use this machine's GPU.
 
-    Both of one look at the card: one that does not answer is waited for once.
+    It is None if the GPU is used, or if there is none. One self-test determines both, since a GPU that does not respond
+    takes a long timeout.
     """
     if requested not in DEVICES:
         raise UserError(f"device is {requested!r}: it should be one of {', '.join(DEVICES)}")
     if requested == "cpu":
         return torch.device("cpu"), None
     refusal = cuda_refusal()
-    found = None if refusal else card_verdict()  # asked once: a card that does not answer is waited for
+    found = None if refusal else card_verdict()
     unused = _unused(refusal) if found is None else _failed(found)
     if found is not None and unused is None:
         planes_cuda.refused, recorder.refused = found.planes, found.recording
@@ -68,12 +68,12 @@ def decide_device(requested: str) -> tuple[torch.device, tuple[str, str] | None]
 
 
 def unused_words(unused: tuple[str, str], doing: str) -> tuple[str, str]:
-    """(sentence, hint) that says why `doing` does not use the card, from the answer of `decide_device`."""
+    """(sentence, hint) of a warning that `doing` does not use the GPU, from the second item of `decide_device`."""
     return f"{doing} uses the processor, not the graphics card: {unused[0]}", unused[1]
 
 
 def cuda_refusal() -> str:
-    """Why no NVIDIA GPU can be used, in a sentence; empty if one can."""
+    """Reason why no NVIDIA GPU can be used, as a sentence; empty if one can be used."""
     if torch.version.hip is not None:
         return "This PyTorch is built for AMD GPUs, which the rasteriser has no body for."
     if not torch.cuda.is_available():
@@ -87,18 +87,18 @@ def cuda_refusal() -> str:
 
 
 def failed_self_test() -> tuple[str, str] | None:
-    """(sentence, hint) about the fault that the self-test found in a usable card; None if nothing."""
+    """(sentence, hint) about a fault found by the GPU's self-test; None if it passed."""
     return _failed(card_verdict())
 
 
 def _failed(found: SelfTest) -> tuple[str, str] | None:
-    """`failed_self_test`, of what it found."""
+    """Result of `failed_self_test` for the self-test result `found`."""
     return (f"The graphics card failed its self-test: {found.problem}.", _REPORT) if found.problem else None
 
 
 def _unused(refusal: str) -> tuple[str, str] | None:
-    """Why this machine's NVIDIA card, which `cuda_refusal` refuses so, is not used, and what to do about it; None if
-    there is none."""
+    """(reason, advice) why this machine's NVIDIA GPU is not used, for a `refusal` of `cuda_refusal`; None if the
+    machine has no NVIDIA GPU."""
     if torch.version.hip is not None:
         return None
     return (refusal, "") if torch.cuda.is_available() else why_unused(torch.version.cuda)

@@ -1,4 +1,4 @@
-"""What happens between two steps of a run: harmonics are added, Gaussians multiply, the gate opens and hardens."""
+"""Events between two steps of a run: raising the SH degree, densification, opening and hardening of the gate."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from .trainer import Trainer
 
 
 def schedule_events(trainer: Trainer) -> None:
-    """What happens between steps: SH degree, densification, the gate."""
+    """Runs the events that are due before the next step: SH degree, densification, the gate."""
     if not trainer.extensions:
         _due_events(trainer)
-    trainer.model.open_rows()  # asked again where they changed: the step itself shall not wait for a GPU
+    trainer.model.open_rows()  # updates the cached rows here, so that the step itself does not synchronise with the GPU
 
 
 def _due_events(trainer: Trainer) -> None:
@@ -31,16 +31,16 @@ def _due_events(trainer: Trainer) -> None:
     due = trainer.iteration > 0 and trainer.iteration % c.densify.every == 0
     if due and c.densify.start <= trainer.progress < 0.9:
         if trainer.recorder is not None:
-            trainer.recorder.forget()  # growth takes the place of what they read, and needs the room
+            trainer.recorder.forget()  # growth replaces the tensors that recordings use, and needs their memory
         trainer.densifier.step(
             trainer.model.gaussians, trainer.optimizer, trainer.initial, trainer.progress, trainer.policy.growing
         )
-        if trainer.policy.facts.hardened is not None:  # bare hosts are as they were published
+        if trainer.policy.facts.hardened is not None:  # not in methods without a gate, which stay as published
             drop_thrown(trainer.model, trainer.optimizer, trainer.densifier, trainer.soundness.memory)
     if c.method == "static":
         return
     if c.method == "auto":
-        # Once more if a card's memory ended in that step: as long as there is no field the gate did not open.
+        # Repeated if GPU memory ran out in this step: while there is no field, the gate has not opened.
         if trainer.iteration == round(c.gate.start * c.iterations) and trainer.model.field is None:
             open_gate(trainer)
         elif _on_trial(trainer):
@@ -62,7 +62,8 @@ def open_gate(trainer: Trainer) -> None:
 
 
 def _on_trial(trainer: Trainer) -> bool:
-    """Is the trial judged now? At `harden`, and as long as nothing has begun to move, again until `give_up`."""
+    """True if the trial is judged at this step: at `harden`, and then at intervals until a Gaussian moves or the run
+    reaches `give_up`."""
     c = trainer.config
     if trainer.model.field is None or trainer.policy.facts.hardened is not None:
         return False
@@ -73,8 +74,9 @@ def _on_trial(trainer: Trainer) -> bool:
 
 
 def harden_gate(trainer: Trainer) -> None:
-    """Closes for good what did not move or only stands beside it. While nothing moves at all, the trial goes on."""
-    trainer.inspect_nonfinite()  # one NaN would spoil the neighbours' verdicts
+    """Closes the Gaussians that did not move and those that only lie next to movers. Before `give_up`, the trial
+    continues if nothing moves."""
+    trainer.inspect_nonfinite()  # a NaN would spread to the decisions on neighbours
     if trainer.model.field is None or not len(trainer.model.open_rows()):
         return
     if harden(trainer):
@@ -83,7 +85,7 @@ def harden_gate(trainer: Trainer) -> None:
 
 
 def _create_field(trainer: Trainer) -> None:
-    trainer.inspect_nonfinite()  # and every bound of the field
+    trainer.inspect_nonfinite()  # a NaN would spread to the field's bounds
     model, c = trainer.model.gaussians, trainer.config
     means = model.params["means"].detach()[model.open].cpu()
     harmonics = model.params["shN"].shape[1]
@@ -92,21 +94,21 @@ def _create_field(trainer: Trainer) -> None:
         lambda: trainer.policy.time_nodes(trainer),
     )  # fmt: skip
     field = host(c.host).create(c.field, start).to(trainer.device)
-    # Behind the gate the Gaussians that open say where the motion is.
+    # With the gate, the opened Gaussians already show where the motion is.
     if field.rehearsal > 0 and c.method != "auto":
         _rehearse(trainer, field)
     for name, owned in field.owned.items():
-        if name not in model.params:  # memory may have ended between two of them
+        if name not in model.params:  # an earlier attempt may have run out of memory after some of them
             model.adopt(name, owned.shape, owned.value)
     trainer.soundness.memory.keep(field, means)
-    # Takes no memory: what is before it can be done again.
+    # From here on, nothing allocates memory. Everything before can be repeated after an out-of-memory error.
     add_field(trainer.optimizer, field, model, c, trainer.soundness.memory.rates)
     trainer.policy.field_opened(trainer.iteration, trainer.trained_seconds)
     trainer.model.field = field
 
 
 def _rehearse(trainer: Trainer, field: Deformation) -> None:
-    """The host's pre-stage; its steps are steps of the run. Interrupted, it starts again."""
+    """Runs the host's pre-training; its steps count as steps of the run. It restarts if it was interrupted."""
     steps = round(field.rehearsal * trainer.config.iterations)
 
     def loss(state: dict[str, Tensor], frame: int) -> Tensor:

@@ -1,8 +1,8 @@
-"""Measures the residual of a trained run in its frames, and how far things travel: what its verdict is based on.
+"""Measures residual and motion of a trained run in its frames, on which the verdict is based.
 
-Where the low frequencies of a frame differ from the render at its own time, the run has something else there, whatever
-its sharpness. Travel is that of the picture's surfaces over the clip, in pixels of the very view, at those times only
-at which somebody saw them.
+The residual compares low frequencies of a frame and of the render at its time: a difference means wrong content, not
+lack of sharpness. Motion is how far visible surfaces travel over the clip, projected into the frame's camera. Only
+times at which a surface was seen count.
 """
 
 from __future__ import annotations
@@ -24,54 +24,54 @@ from .movers import Mattes
 from .trainer import Trainer
 
 GRID = 4
-"""Cells of the picture along each side, in which is told where something is."""
+"""Number of cells along each side of the image, for each of which results are reported."""
 MOST = 32
-"""Frames that are examined, evenly over the clip."""
+"""Maximum number of examined frames, evenly spaced over the clip; held-out frames are always examined."""
 BLUR = 0.0125
-"""Radius of the two box filters before a difference counts, as a share of the width: 8 pixels of 640."""
+"""Radius of the two box filters on the difference image, as a share of the width (8 pixels of 640)."""
 UNEXPLAINED = 0.12
-"""Difference of the low-passed pictures, of 1, above which a pixel is not explained."""
+"""Low-pass filtered difference (0 to 1) above which a pixel counts as unexplained."""
 MOMENTS = 24
-"""Times at which it is asked where a Gaussian is."""
+"""Number of times at which Gaussian positions are sampled."""
 MOVING_SHARE = 0.3
-"""Share of a pixel that has to be of what moves before it is taken to travel."""
+"""Minimum alpha contribution of moving Gaussians for a pixel to count as moving."""
 STILL_SHARE = 1 / 640
-"""Travel below this share of the width counts as none."""
+"""Travel below this share of the width counts as zero."""
 
 
 @dataclass(frozen=True)
 class FrameEvidence:
-    """One frame beside the render at its own time."""
+    """Comparison of one frame with the render at its time."""
 
     frame: int
-    """Number in the clip."""
+    """Frame number in the clip."""
     held_out: bool
-    """The run was not trained on it."""
+    """True if the run was not trained on this frame."""
     psnr_db: float
-    """PSNR against the plate, without what is ignored; NaN if that is all of it."""
+    """PSNR against the training image, without ignored pixels; NaN if all are ignored."""
     unexplained: NDArray[np.float32]
-    """[GRID, GRID] share of each cell's pixels that differ by more than `UNEXPLAINED`; rows from above."""
+    """[GRID, GRID] share of each cell's pixels that differ by more than `UNEXPLAINED`; top row first."""
     travel: NDArray[np.float32]
-    """[GRID, GRID] how far the surfaces of each cell travel, as a share of the width: the 97th percentile, so
-    that a fifth of a percent of the picture counts."""
+    """[GRID, GRID] travel of the surfaces in each cell, as a share of the width. It is the 97th percentile, so that a
+    moving object that covers 0.2 % of the image counts."""
     moving: NDArray[np.float32]
-    """[K] travel of the picture's pixels that travel at all, as a share of the width, every 16th."""
+    """[K] travel of every 16th moving pixel of the image, as a share of the width."""
     still_unexplained: float | None = None
-    """Share of the pixels that the motion matte calls still that differ; None without a matte."""
+    """Share of unexplained pixels among those that the motion matte marks as still; None without such pixels."""
     matte_moving: float | None = None
-    """Share of the pixels that the motion matte calls moving; None without a matte."""
+    """Share of pixels that the motion matte marks as moving; None without a matte."""
 
 
 def gather_evidence(
     trainer: Trainer, test: list[int], held_out: Tensor, mattes: Mattes | None = None
 ) -> list[FrameEvidence]:
-    """Looks at up to `MOST` of a run's frames, held out or not; ascending.
+    """Evidence of up to `MOST` frames of a run and of all held-out frames, in ascending order.
 
     Args:
-        trainer: its model is judged.
-        test: scene indices of the frames held out.
-        held_out: [I, H, W, 3] those frames.
-        mattes: the shot's motion mattes, if there are any.
+        trainer: run whose model is judged.
+        test: scene indices of the held-out frames.
+        held_out: [I, H, W, 3] images of the held-out frames.
+        mattes: motion mattes of the shot; None without.
     """
     images = {i: held_out[n] for n, i in enumerate(test)}
     images |= {i: trainer.images[n] for n, i in enumerate(trainer.train_ids) if n not in trainer.soundness.unusable}
@@ -90,7 +90,7 @@ def gather_evidence(
 
 @torch.no_grad()
 def seen_places(model: DynamicModel) -> Tensor:
-    """[T, M, 3] where the open Gaussians are at `MOMENTS` times of the clip, scene units; NaN where nobody saw them."""
+    """[T, M, 3] positions of the open Gaussians at `MOMENTS` times of the clip, scene units; NaN where unseen."""
     rows = model.open_rows()
     count = len(model.centres)
     bins = evenly_spaced(count, MOMENTS)
@@ -105,9 +105,9 @@ def seen_places(model: DynamicModel) -> Tensor:
 
 
 def travelled(places: Tensor, viewmat: Tensor, K: Tensor) -> Tensor:
-    """[M] pixels that each of places [T, M, 3] travels in a view: the diagonal of the box around where it is seen.
+    """[M] travel in pixels of each point of places [T, M, 3] in one view: the diagonal of its 2D bounding box.
 
-    NaNs are left out; 0 for what is seen at fewer than two times, or is ever behind the camera.
+    NaNs are left out. 0 for points that are seen at fewer than two times, or that are behind the camera at any time.
     """
     camera = places @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = camera[..., 2]
@@ -125,7 +125,7 @@ def _inspect_frame(
 ) -> FrameEvidence:
     model, rows, width = trainer.model, trainer.model.open_rows(), trainer.width
     viewmat, K, time = trainer.viewmats[index], trainer.Ks[index], float(trainer.scene.times[index])
-    motion = torch.zeros(len(model.gaussians), 2, device=trainer.device)  # how far, and whether at all
+    motion = torch.zeros(len(model.gaussians), 2, device=trainer.device)  # travel, and 1 for moving Gaussians
     if places.shape[1]:
         motion[rows, 0], motion[rows, 1] = travelled(places, viewmat, K) / width, 1.0
     out = render(
@@ -134,7 +134,7 @@ def _inspect_frame(
     )  # fmt: skip
     shown = model.exposure.apply(out.colors[0, ..., :3], time)
     plate, ignored = image.to(trainer.device, torch.float32), trainer.ignored_at(index)
-    if ignored is not None:  # nothing there is asked of the run
+    if ignored is not None:  # ignored pixels count as explained
         plate = torch.where(ignored[..., None], shown, plate)
     off = unexplained(plate, shown)
     far, share = out.colors[0, ..., 3:].cpu().unbind(-1)
@@ -149,7 +149,7 @@ def _inspect_frame(
 
 
 def unexplained(plate: Tensor, shown: Tensor) -> Tensor:
-    """bool [H, W] on the CPU: where two display-referred pictures [H, W, 3] differ by more than edges and grain."""
+    """bool [H, W] on the CPU, True where low frequencies of two images [H, W, 3] differ by more than `UNEXPLAINED`."""
     radius = max(1, round(BLUR * plate.shape[1]))
     off = (plate - shown).permute(2, 0, 1)[None]
     for _ in range(2):
@@ -163,13 +163,13 @@ def shares(values: Tensor) -> NDArray[np.float32]:
 
 
 def _cells(values: Tensor, share: float) -> NDArray[np.float32]:
-    """[GRID, GRID] quantile of each cell of values [H, W]."""
+    """[GRID, GRID] quantile `share` of each cell of values [H, W]."""
     rows = [torch.stack([cell.flatten().quantile(share) for cell in row.tensor_split(GRID, 1)])
             for row in values.tensor_split(GRID, 0)]  # fmt: skip
     return torch.stack(rows).numpy().astype(np.float32)
 
 
 def _resized(mask: NDArray[np.bool_], shape: torch.Size) -> Tensor:
-    """bool [h, w] at another size, nearest."""
+    """The mask resized to `shape` by nearest neighbour."""
     values = from_numpy(mask.astype(np.float32))[None, None]
     return F.interpolate(values, size=tuple(shape), mode="nearest")[0, 0] > 0.5

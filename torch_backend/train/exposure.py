@@ -1,10 +1,10 @@
-"""Exposure that drifts along the clip: a gain and an offset per channel and time bin, smooth in time.
+"""Exposure correction: a gain and an offset per channel and time bin, smooth in time.
 
-A bin is a trained frame; of a clip that has more than 256 of them, some share one (`supervision.bin_times`).
+A bin is a training frame; in clips with more than 256 training frames, several share a bin (`supervision.bin_times`).
 
-A camera on automatic changes by several percent within a second: what runs of three clips fitted goes up or down by 8
-to 9 % within one at most. Left alone, the gate would open for it and the field would learn it as motion; so it
-is fitted from the first step on, long before the gate opens.
+The exposure of a camera on automatic changes by several percent within a second: by at most 8 to 9 % in the fits of
+three clips. Without a correction, the gate would open for the change and the field would model it as motion. The
+correction is therefore fitted from the first step on, long before the gate opens.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from ..torch_types import AutogradContext, applied, once_differentiable
 
 @dataclass
 class ExposureConfig:
-    """How freely the exposure may follow the clip."""
+    """Settings of the exposure correction."""
 
     on: bool = True
-    """Fit it at all."""
+    """Whether the exposure correction is used."""
     lr: float = 2e-3
     """Learning rate of log-gains and offsets."""
     smooth: float = 0.05
     """Weight of the squared difference between neighbouring frames."""
     small: float = 0.01
-    """Weight of the squared values: without need, no correction."""
+    """Weight of the squared values, which keeps corrections small."""
 
 
 class _Between(torch.autograd.Function):
-    """`torch.lerp` of two rows of values [B, 2, 3]; its own gradient takes 1 less the second share, rounded."""
+    """`torch.lerp` of two rows of values [B, 2, 3]. The gradient uses both given weights. `torch.lerp` would compute
+    1 - weight in float32, and its gradient would differ from that of `Exposure.apply` by rounding."""
 
     @staticmethod
     def forward(ctx: AutogradContext, values: Tensor, bins: Tensor, shares: Tensor) -> Tensor:
@@ -53,14 +54,14 @@ def _exposed(color: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
     """color [H, W, 3] * gain [3] + offset [3]."""
     if color.is_cuda:
         return color * gain + offset
-    # Along an axis of three torch goes number by number, which takes a processor several times as long.
+    # On the CPU, torch does not vectorise broadcasts over an axis of 3; rows of width * channels are far faster.
     height, width, channels = color.shape
     rows = color.reshape(height, width * channels)
     return torch.addcmul(offset.repeat(width), rows, gain.repeat(width)).view(height, width, channels)
 
 
 class Exposure:
-    """image -> exp(log_gain) * image + offset, per channel, interpolated between the trained frames' times.
+    """Maps an image to exp(log_gain) * image + offset, per channel, interpolated between the bins' times.
 
     times: [B] ascending normalised times; values: [B, 2, 3] log-gains and offsets of display-referred colour.
     """
@@ -68,11 +69,10 @@ class Exposure:
     def __init__(self, times: Tensor, config: ExposureConfig) -> None:
         self.times, self.config = times, config
         self.values = torch.nn.Parameter(torch.zeros(len(times), 2, 3, device=times.device))
-        self._at = times.cpu().numpy()  # times are looked up on the host: a GPU need not be asked where a frame lies
+        self._at = times.cpu().numpy()  # bins are looked up on the CPU, without synchronising with a GPU
 
     def place(self, time: float) -> tuple[int, int, float]:
-        """The bins at or before and at or after a normalised time, and the share of the second; held constant beyond
-        the ends."""
+        """(left, right, share): bins around a normalised time, and the weight of `right`. Clamped beyond the ends."""
         right = min(int(np.searchsorted(self._at, np.float32(time))), len(self._at) - 1)
         left = max(right - 1, 0)
         span = float(self._at[right] - self._at[left])
@@ -86,22 +86,22 @@ class Exposure:
         return log_gain.exp(), offset
 
     def apply(self, color: Tensor, time: float, alpha: Tensor | None = None) -> Tensor:
-        """Exposes display-referred colour [H, W, 3] as the camera did at `time`; with alpha [H, W], premultiplied."""
+        """Applies the exposure at `time` to display-referred colour [H, W, 3]; with alpha [H, W], premultiplied."""
         if not self.config.on:
             return color
         gain, offset = self.at(time)
         return _exposed(color, gain, offset) if alpha is None else color * gain + offset * alpha[..., None]
 
     def apply_at(self, color: Tensor, bins: Tensor, shares: Tensor) -> Tensor:
-        """`apply` at a place, to the bit: bins [2] int64, shares [2] float32 of the first and of the second, on the
-        device (a recorded step is told other ones each time)."""
+        """`apply` with bins [2] int64 and their weights [2] float32 as device tensors, so that a recorded step can be
+        replayed with other values. The result is bit-identical to that of `apply`."""
         if not self.config.on:
             return color
         log_gain, offset = applied(_Between, self.values, bins, shares)
         return _exposed(color, log_gain.exp(), offset)
 
     def regularisation(self) -> Tensor:
-        """Smooth in time, and no larger than needed."""
+        """Loss that keeps the corrections smooth in time and small, 0-dim."""
         steps = self.values[1:] - self.values[:-1]
         return (
             self.config.smooth * steps.square().sum() / len(self.times)

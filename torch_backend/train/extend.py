@@ -1,7 +1,7 @@
-"""More steps for a run that has ended: what an extension is, where its rates stand, and the one that is not done yet.
+"""Extensions: additional steps for a finished run, and their learning rates.
 
-The finished run stays what it is, summary and checkpoint, until the last added step is done: an extension saves itself
-to a file of its own, and takes the checkpoint's place only then.
+The summary and checkpoint of the finished run stay valid until the last added step is done. Until then the extension
+is saved to a separate file, which replaces the checkpoint at the end.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from ..contract import EXTENSION_FILE as EXTENSION_FILE
 from .checkpoint import read_meta
 
 _REWIND = 1.0 / 3.0
-"""Most of the run's schedule, as a share of it, that the learning rates go back."""
+"""Maximum rewind of the learning rate schedule, as a share of the run."""
 
 
 @dataclass(frozen=True)
 class Extension:
-    """Steps added to a run that had ended."""
+    """Steps added to a finished run."""
 
     from_iteration: int
-    """Iterations that the run had."""
+    """Iterations of the run before the extension."""
     steps: int
-    """How many are added."""
+    """Number of added steps."""
     heldout_psnr_db_before: float | None
-    """What the run was worth then: mean PSNR in dB on held-out frames, None without any."""
+    """Mean PSNR in dB on held-out frames before the extension; None without such frames."""
     train_seconds_before: float
-    """Seconds it had trained for."""
+    """Training time in seconds before the extension."""
 
     @property
     def end(self) -> int:
-        """Iterations after which the run is over again."""
+        """Iteration at which the extended run ends."""
         return self.from_iteration + self.steps
 
     def rate_progress(self, iteration: int, iterations: int) -> float:
-        """The progress, of a run of `iterations`, at which learning rates are looked up.
+        """Progress, in a run of `iterations` steps, at which learning rates are evaluated.
 
-        They go back by as many steps as are added, at most by a third of the run, and fall to their end again: rates
-        that stay at their end learn next to nothing, and a few steps at high rates would leave noise behind.
+        The schedule is rewound by the number of added steps, at most by a third of the run, and then runs to its end
+        again. At the final rates the model would hardly change; high rates for a few steps would leave noise.
         """
         back = min(self.steps / iterations, _REWIND)
         done = min(max((iteration - self.from_iteration) / self.steps, 0.0), 1.0)
@@ -47,7 +47,7 @@ class Extension:
 
 
 def pending(folder: Path, finished: dict[str, Any]) -> Extension | None:
-    """The extension in a run's folder that was begun on the checkpoint with the facts `finished` and is not done."""
+    """Unfinished extension in a run's folder that continues the checkpoint with the facts `finished`; None without."""
     path = folder / EXTENSION_FILE
     facts = read_meta(path) if path.is_file() else {}
     if not facts.get("extensions") or facts.get("key") != finished.get("key"):

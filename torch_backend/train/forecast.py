@@ -1,8 +1,8 @@
-"""How long a training will take on the processor, told from its own first steps.
+"""Estimates the duration of a training on the CPU from its first steps.
 
-A step takes so long for each pixel of its image and so long for each Gaussian, however few or many there are: their
-ratio is a figure of two long runs (`GAUSSIAN_PIXELS`), how long a pixel takes here is measured, and how many Gaussians
-there will be is the schedule of growth. A run that ends its growth or itself early takes less.
+The time of a step is modelled as linear in its pixels and Gaussians. The ratio of the two costs is a constant
+(`GAUSSIAN_PIXELS`), measured in two long runs. The time per pixel is measured on this machine, and the number of
+Gaussians follows the densification schedule. A run that ends its growth early, or stops early, takes less.
 """
 
 from __future__ import annotations
@@ -16,30 +16,31 @@ from ..gaussians import Densifier
 from .config import PRESETS
 
 STEPS = 20
-"""Steps that are timed; the first of them, in which memory is taken for the first time, counts for nothing."""
+"""Number of steps per measurement, with the first, untimed step in which memory is allocated."""
 GAUSSIAN_PIXELS = 3.0
-"""Time per Gaussian, in pixels that take as long. In a run that grew fast, at 640 x 360, as 3.8: 76 ms of CPU a step
-with 19,000, 127 with 58,000, 180 with 122,000. In long ones they become small, and take less."""
+"""Time per Gaussian divided by time per pixel. A fast-growing run at 640 x 360 had a ratio of 3.8 (76 ms of CPU time
+per step with 19,000 Gaussians, 127 with 58,000, 180 with 122,000). In long runs, Gaussians are smaller and faster."""
 LONG_SECONDS = 3600.0
-"""A run that takes longer says so in a warning, and what would take less."""
+"""Duration in seconds above which a warning names faster settings."""
 _SAMPLES = 256
+"""Number of steps at which the remaining work is sampled."""
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """Steps of a run that are still to be taken."""
+    """Remaining steps of a run."""
 
     pixels: int
-    """Of a training image."""
+    """Number of pixels of a training image."""
     begin: int
-    """Steps that are done."""
+    """Number of finished steps."""
     end: int
-    """Steps after which it is over."""
+    """Step at which the run ends."""
     gaussians: Callable[[int], float]
-    """How many there are after so many steps."""
+    """Step -> number of Gaussians at that step."""
 
     def work(self) -> float:
-        """All of those steps, in pixels."""
+        """Work of the remaining steps, as an equivalent number of pixels."""
         steps = max(0, self.end - self.begin)
         parts = min(steps, _SAMPLES)
         at = (self.begin + int((n + 0.5) * steps / parts) for n in range(parts))
@@ -47,24 +48,24 @@ class Outlook:
 
 
 def step_work(pixels: int, gaussians: float) -> float:
-    """What a step comes to, in pixels."""
+    """Work of one step, as an equivalent number of pixels."""
     return pixels + GAUSSIAN_PIXELS * gaussians
 
 
 class Stopwatch:
-    """Times steps as they are taken, one after the other with nothing between them."""
+    """Times consecutive steps."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
         self.begin()
 
     def begin(self) -> None:
-        """Times the next `STEPS` steps: called where something else was done."""
+        """Restarts the measurement over the next `STEPS` steps. Call it after work that is not a step."""
         self._since: float | None = None
         self._steps, self._work = 0, 0.0
 
     def step(self, work: float) -> float | None:
-        """After a step of so much work: seconds that a pixel of it takes, when `STEPS` are done; else None."""
+        """Call it after each step. Returns seconds per unit of `work` once `STEPS` steps are done, otherwise None."""
         self._steps += 1
         if self._since is None:
             self._since = self._clock()
@@ -75,24 +76,24 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Alternative:
-    """A preset that takes less."""
+    """A faster preset."""
 
     preset: str
-    """Its name."""
+    """Name of the preset."""
     seconds: float
-    """That it takes."""
+    """Estimated duration in seconds."""
     width: int
-    """Pixels of its training images."""
+    """Width of its training images in pixels."""
 
 
 def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: float) -> list[Alternative]:
-    """Those that come to less than `preset`, the largest first.
+    """Presets below `preset`, the largest first.
 
     Args:
-        preset: of the run.
+        preset: preset of the run.
         size: (width, height) of the working frames in pixels.
-        initial: Gaussians that a run begins with, about.
-        each: seconds that a pixel takes.
+        initial: approximate initial number of Gaussians.
+        each: seconds per pixel.
     """
     found: list[Alternative] = []
     for name in list(PRESETS)[: list(PRESETS).index(preset)]:
@@ -110,13 +111,13 @@ def smaller_presets(preset: str, size: tuple[int, int], initial: int, each: floa
 
 
 def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternative]) -> tuple[str, str] | None:
-    """(sentence, hint) for a run that will take longer than `LONG_SECONDS`; None for another.
+    """(sentence, hint) of a warning for a run that will take longer than `LONG_SECONDS`; None for shorter runs.
 
     Args:
-        seconds: until it is over.
-        width: pixels of its training images.
-        resumed: does it go on with what was trained before?
-        smaller: those that take less, the largest first.
+        seconds: estimated remaining time.
+        width: width of the training images in pixels.
+        resumed: whether the run was resumed.
+        smaller: faster presets, the largest first.
     """
     if seconds <= LONG_SECONDS:
         return None
@@ -129,7 +130,8 @@ def warning_of(seconds: float, width: int, resumed: bool, smaller: list[Alternat
         other = next((row for row in smaller if row.seconds <= LONG_SECONDS), smaller[-1])
         takes = duration(other.seconds)
         less = f"The preset {other.preset} would take about {takes}."
-        if other.width >= width:  # then more steps are all that it saves: on one clip of 640 pixels they gained nothing
+        # At the same width, the preset only saves steps; on a clip 640 pixels wide, the extra steps gained nothing.
+        if other.width >= width:
             less = f"The preset {other.preset} would take about {takes} on pictures of the same size."
     kept = "It can be paused at any time and goes on where it stopped."
     return sentence, f"{kept} {less}"

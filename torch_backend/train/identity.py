@@ -1,4 +1,4 @@
-"""What a run is known by: its numbers, the cameras, pictures, mattes and depth maps that it is trained on."""
+"""Key of a run, computed from its configuration and its cameras, images, mattes and depth maps."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from .depth import depth_key
 def asked_for(
     shot: Shot, scene: Scene, run: Path, params: TrainParams, device: torch.device, report: Reporter, depth: list[str]
 ) -> tuple[TrainConfig, str, str | None]:
-    """(numbers, key, motion) of the run that is requested; motion is the key of its mattes, None without. `depth` is
-    `depth_identity` of its depth maps.
+    """(configuration, key, motion) of the requested run. `motion` is the key of its mattes; None without mattes.
 
-    A preset has other numbers on a card. What was begun or finished with those of the other device stays that run, and
-    goes on: a driver that fails for a day makes no training begin anew.
+    A preset differs between CPU and GPU. A run that was begun or finished with the configuration of the other device
+    keeps it, so that a temporary driver fault does not restart the training.
+
+    depth: `depth_identity` of the run's depth maps.
     """
     on_card = device.type == "cuda"
     config, elsewhere = config_from_params(params, on_card), config_from_params(params, not on_card)
@@ -47,12 +48,12 @@ def asked_for(
 
 
 def depth_identity(shot: Shot, sequence: DepthSequence | None) -> list[str]:
-    """What a run's key has of its depth maps; empty without."""
+    """Parts of a run's key that identify its depth maps; empty without maps."""
     return [] if sequence is None else [f"depth {depth_key(sequence, solve_key(shot))}"]
 
 
 def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig, depth: list[str]) -> tuple[str, str | None]:
-    """(key, motion) of a run of these numbers, see `asked_for`."""
+    """(key, motion) of a run with this configuration, see `asked_for`."""
     train, test = split_frames(scene.solved, config.holdout, config.holdout_phase)
     motion = motion_of(shot, config)
     key = content_key(config_to_json(config), solve_key(shot), train, test, *masks_key(shot, IGNORE), *depth)
@@ -60,7 +61,7 @@ def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig, depth: l
         key = content_key(key, motion)
     else:
         motion = None
-    # With cameras that were given, another grade of the footage is the same solve.
+    # With imported cameras, regraded footage has the same solve key, so the images are part of the key.
     anew, folder = content_key(key, pictures_key(shot)), begun(run, key)
     if begun(run, anew) is not None or (folder and of_other_pictures(shot, read_meta(folder / CHECKPOINT_FILE))):
         key = anew
@@ -68,7 +69,7 @@ def _identity(shot: Shot, scene: Scene, run: Path, config: TrainConfig, depth: l
 
 
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
-    """The summary of a run that was finished with the same settings on the same solve, extended or not; or None."""
+    """Summary of a finished run with key `key`, extended or not; None if there is none."""
     path = folder / SUMMARY_FILE
     checkpoint = folder / CHECKPOINT_FILE
     if not path.is_file() or not checkpoint.is_file():
@@ -79,31 +80,31 @@ def finished(folder: Path, key: str) -> dict[str, Any] | None:
 
 
 def solve_key(shot: Shot) -> str:
-    """Identifies the solved cameras, by content: a copied shot is still the same shot."""
+    """Key of the solved cameras by content, so that a copied shot keeps its runs."""
     return content_key(read_json(shot.cameras))
 
 
 def pictures_key(shot: Shot) -> str:
-    """Identifies the working frames: of which footage they were taken, and how."""
+    """Key of the working frames by their footage and import settings."""
     return str(load_frames(shot).get("key", ""))
 
 
 def of_other_pictures(shot: Shot, facts: dict[str, Any]) -> bool:
-    """Was a checkpoint of these facts trained on other pictures than the shot has now?"""
+    """True if a checkpoint with these facts was trained on other working frames than the shot has now."""
     return facts.get("pictures") != pictures_key(shot)
 
 
 def motion_of(shot: Shot, config: TrainConfig) -> str | None:
-    """Identifies the motion mattes that a run of these settings is trained with; None if it is trained without."""
+    """Key of the motion mattes that a run with this configuration uses; None if it uses none."""
     frames = load_scene(shot).frames if config.decides else []
     has = any(load_motion(shot, frame) is not None for frame in frames)
     return motion_key(shot) if has else None
 
 
 def trained_without(shot: Shot, run: Path, key: str) -> bool:
-    """Was the run, of this key, trained before mattes were found? It stays, unless an artist has painted some since.
+    """True if the run with key `key` was trained before the shot had mattes, and the user has painted none.
 
-    A freeze finds mattes where the solve did not: that alone is no reason to train anew what it froze.
+    A freeze may add mattes that the solve did not find. These alone are no reason to retrain the run.
     """
     checkpoint = run / CHECKPOINT_FILE
     if any(shot.painted.glob("*.png")) or not checkpoint.is_file():

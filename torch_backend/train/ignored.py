@@ -1,4 +1,4 @@
-"""Pixels of trained frames that teach nothing: what the artist's mask says is no part of the scene."""
+"""Ignored pixels of training frames: pixels that the user's mask excludes from the scene."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from ..scene import Scene
 from ..torch_types import from_numpy
 
 _COVERED = 0.1
-"""Share of a training pixel that has to be covered before the pixel is: a logo's edge is half its colour."""
+"""Masked share of a training pixel above which the pixel is ignored. It is low because mixed pixels at the mask's edge
+would still train the model on the colour of a logo."""
 
 Masks = Callable[[int], "NDArray[np.bool_] | None"]
-"""Frame number -> what is ignored in it, bool [h, w]; None where nothing is."""
+"""Frame number -> bool [h, w] ignored pixels; None if there are none."""
 
 
 def load_ignored(masks: Masks, scene: Scene, indices: list[int], width: int, height: int) -> dict[int, Tensor]:
-    """Index of a frame of the scene -> bool [height, width] on the CPU, of those that have something to ignore.
+    """Index of a scene frame -> bool [height, width] ignored pixels, on the CPU, for frames that have any.
 
     Frames with the same mask share a tensor. JobError if a mask is damaged.
     """

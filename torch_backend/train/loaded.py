@@ -1,4 +1,4 @@
-"""A run read again, to be rendered or frozen."""
+"""Loads a trained run for rendering or freezing."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from .identity import of_other_pictures, solve_key
 from .model import DynamicModel, restore_model
 
 _ATTEMPTS = 5
-"""A checkpoint that is replaced while it is read is read so often; a training writes one in 30 s."""
+"""Number of attempts to read a checkpoint that is replaced during reading. Training writes one every 30 s."""
 
 
 @dataclass
 class LoadedRun:
-    """A finished (or interrupted) run, ready to be rendered."""
+    """A finished or interrupted run, ready to be rendered."""
 
     folder: Path
-    """runs/<name>."""
+    """Folder of the run: runs/<name>."""
     config: TrainConfig
-    """Its numbers."""
+    """Configuration of the run."""
     model: DynamicModel
-    """Its Gaussians and field."""
+    """Gaussians and deformation field."""
     width: int
-    """Width in pixels of the images it was trained on."""
+    """Width of the training images in pixels."""
     height: int
-    """Height of them."""
+    """Height of the training images in pixels."""
     train_frames: list[int]
-    """Frame numbers it was trained on."""
+    """Frame numbers of the training images."""
     stamp: str
-    """`contract.file_digest` of the checkpoint. Takes and developed instants store it, to tell which checkpoint they
-    are from."""
+    """`contract.file_digest` of the checkpoint. Takes and developed instants store it to identify the checkpoint that
+    they were made from."""
     former_stamp: list[Any] = dataclasses.field(default_factory=list[Any])
-    """The checkpoint's name, size and modification time (ns), by which earlier versions knew it."""
+    """Name, size and modification time (ns) of the checkpoint, which earlier versions stored instead of `stamp`."""
     depth_key: str = ""
-    """Identifies the artist's depth maps that it was trained with; empty without."""
+    """Key of the user's depth maps that the run was trained with; empty without maps."""
 
     def depth(self) -> FittedDepth | None:
-        """Those maps, read from the run's folder; None without. JobError (TRAIN) if they are not there any more."""
+        """Reads the depth maps from the run's folder; None if it was trained without. JobError (TRAIN) if missing."""
         return load_fitted(self.folder, self.depth_key) if self.depth_key else None
 
     @property
@@ -56,7 +56,7 @@ class LoadedRun:
 
 
 def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> LoadedRun:
-    """A run as it stands in its checkpoint, on `device`. JobError if there is none."""
+    """Loads a run from its checkpoint, on `device`. JobError if it is missing, or does not fit the shot or version."""
     folder = shot.run(name)
     checkpoint = folder / CHECKPOINT_FILE
     if not checkpoint.is_file():
@@ -65,7 +65,7 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
     for _ in range(_ATTEMPTS):
         stamp = _stamp(checkpoint)
         tensors, meta = load_checkpoint(checkpoint)
-        if stamp == _stamp(checkpoint):  # else it was replaced meanwhile: which one was read cannot be told
+        if stamp == _stamp(checkpoint):  # otherwise the checkpoint was replaced while it was read
             break
     else:
         message = f"The run {name!r} is written again and again while it is read."
@@ -84,12 +84,12 @@ def load_run(shot: Shot, name: str, device: torch.device | str = "cpu") -> Loade
         return LoadedRun(
             folder, config, model, *size, list(meta["train_frames"]), stamp, _former_stamp(checkpoint), depth
         )
-    except MISFITS as error:  # whole, but not as `save` wrote it
+    except MISFITS as error:  # a readable file with missing or unexpected contents
         raise misfit(checkpoint, error, ExitCode.FREEZE) from None
 
 
 def _stamp(checkpoint: Path) -> str:
-    """Digest of a checkpoint, empty if it is gone."""
+    """Digest of a checkpoint; empty if the file is missing."""
     try:
         return file_digest(checkpoint)
     except FileNotFoundError:
@@ -97,6 +97,6 @@ def _stamp(checkpoint: Path) -> str:
 
 
 def _former_stamp(checkpoint: Path) -> list[Any]:
-    """See `LoadedRun.former_stamp`."""
+    """Value of `LoadedRun.former_stamp`."""
     status = checkpoint.stat()
     return [checkpoint.name, status.st_size, status.st_mtime_ns]

@@ -1,4 +1,4 @@
-"""A run to its end: steps and what happens between them, checkpoints, the time left, and memory that ends."""
+"""Training loop: steps, events between steps, checkpoints, the time estimate and handling of out-of-memory errors."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from .trainer import Trainer
 
 
 def train_to_end(trainer: Trainer, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
-    """Trains to the end, saving to `checkpoint` now and then and when cancelled; calls `evaluate` as configured,
-    once more for a step that it goes on from.
+    """Trains a run to its end.
 
-    Without a checkpoint nothing is written.
+    Saves to `checkpoint` at intervals and on cancellation; None: nothing is written. Calls `evaluate` at the
+    configured interval. If a resumed run starts at such an interval, `evaluate` is called for this step again.
     """
     on_cpu = trainer.device.type == "cpu"
     with torch_threads(3 * trainer.width * trainer.height) if on_cpu else contextlib.nullcontext():
@@ -34,16 +34,16 @@ def train_to_end(trainer: Trainer, checkpoint: Path | None, evaluate: Callable[[
 
 
 class TrainingLoop:
-    """The steps of a run until it is over."""
+    """Runs the remaining steps of a run."""
 
     def __init__(self, trainer: Trainer, checkpoint: Path | None, evaluate: Callable[[Trainer], None]) -> None:
-        """As in `train_to_end`."""
+        """Arguments as in `train_to_end`."""
         self.trainer, self.checkpoint, self.evaluate = trainer, checkpoint, evaluate
         self._foretold = False
         self._saved_at = time.perf_counter()
 
     def run(self) -> None:
-        """All that are left, as of now."""
+        """Runs all remaining steps."""
         trainer = self.trainer
         begin, length = 0, trainer.config.iterations
         if trainer.extensions:
@@ -52,7 +52,7 @@ class TrainingLoop:
         since = time.perf_counter() - trainer.trained_seconds
         started = trainer.iteration
         watch = Stopwatch() if trainer.device.type == "cpu" else None
-        if started > begin and (started - begin) % every == 0:  # a cancel may have ended it in this very evaluation
+        if started > begin and (started - begin) % every == 0:  # a cancellation may have interrupted this evaluation
             self._with_room(lambda: self.evaluate(trainer))
         try:
             while trainer.iteration < trainer.end:
@@ -86,7 +86,7 @@ class TrainingLoop:
         self._save()
 
     def _with_room(self, work: Callable[[], None]) -> None:
-        """Work between steps, which may be begun again: once more, without recordings, where the card's memory ends."""
+        """Runs repeatable `work` between steps. If GPU memory runs out, frees recordings or caches, and retries."""
         with contextlib.suppress(torch.OutOfMemoryError):
             return work()
         if self.trainer.recorder is None or not self.trainer.recorder.give_up():
@@ -94,8 +94,8 @@ class TrainingLoop:
         return work()
 
     def _foretell(self, watch: Stopwatch, resumed: bool) -> None:
-        """After a step on the processor: how long the run will still take, once some were timed; the first time a
-        long one says so in words."""
+        """Reports the estimated time left after a step on the CPU, once enough steps have been timed. With the first
+        estimate, warns if the run will take long."""
         trainer = self.trainer
         pixels, now = trainer.width * trainer.height, len(trainer.model.gaussians)
         each = watch.step(step_work(pixels, now))
@@ -118,25 +118,25 @@ class TrainingLoop:
                 trainer.report.warning(*warning)
 
     def _step_that_fits(self) -> Tensor | None:
-        """What is due and a step; None if the card's memory ended. Nothing is half done then: growth is all or nothing,
-        and the optimiser comes last."""
+        """Runs the events that are due and one step; returns its loss, or None if GPU memory ran out. After None the
+        state is consistent: growth is atomic, and the optimiser runs last."""
         try:
             schedule_events(self.trainer)
             return self.trainer.step()
         except torch.OutOfMemoryError:
-            return None  # the frames that hold the step's tensors go with the error
+            return None  # leaving the handler drops the traceback, whose stack frames hold the step's tensors
 
     def _make_room(self) -> None:
-        """After the card's memory ended: saves, and makes the run smaller. JobError if there is nothing left to take.
+        """Reduces the run's memory after GPU memory ran out. JobError if it cannot be reduced further.
 
-        Frees the recordings of steps first; then the field works in pieces; then the fifth of the Gaussians that cover
-        least is dropped. In the last two cases the number of Gaussians does not grow any more.
+        Each call takes the first measure that is left: free the recorded steps; halve the chunks in which the field is
+        evaluated; drop the fifth of the Gaussians that cover least. The last two save the run first, and stop growth.
         """
         trainer = self.trainer
         model = trainer.model.gaussians
         before = len(model)
         trainer.optimizer.zero_grad(set_to_none=True)
-        if len(trainer.densifier.seen) != before:  # it ended between a round of growth and its end
+        if len(trainer.densifier.seen) != before:  # memory ran out within a round of growth
             trainer.densifier.reset(before)
         forget_demands()
         held = trainer.recorder is not None and trainer.recorder.give_up()

@@ -1,4 +1,4 @@
-"""Photometric losses on display-referred images in [0, 1]; renders are not clamped before them."""
+"""Photometric losses on display-referred images in [0, 1]. Renders are not clamped before."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ _WINDOW, _SIGMA = compiled_ssim.WINDOW, compiled_ssim.SIGMA
 def photometric(image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None = None) -> Tensor:
     """(1 - dssim) * L1 + dssim * (1 - SSIM) of [H, W, 3] images (3DGS: dssim 0.2).
 
-    Pixels `ignored`, bool [H, W], teach nothing: the image stands there in the place of the target, and no gradient
-    leaves it.
+    At pixels `ignored`, bool [H, W], the detached image replaces image and target, so they have no loss or gradient.
     """
     structured = dssim > 0 and min(image.shape[:2]) >= _WINDOW
     if structured and compiled_ssim.supports(image, target):
@@ -39,9 +38,9 @@ def photometric(image: Tensor, target: Tensor, dssim: float, ignored: Tensor | N
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity of [H, W, C] images, data_range 1, Gaussian window 11 x 11 with sigma 1.5.
 
-    ValueError if a side is smaller than the window. Borders are weighted by what lies inside the image. Differentiable
-    in `image`. float32 runs compiled on the CPU (`raster.ssim`) and on an NVIDIA GPU (`raster.ssim_cuda`); anything
-    else, float64 for instance, runs in torch.
+    ValueError if a side is smaller than the window. At borders, the window is normalised over pixels inside the image.
+    Differentiable in `image`. float32 uses compiled code on the CPU (`raster.ssim`) and on an NVIDIA GPU
+    (`raster.ssim_cuda`). Other types, for instance float64, use torch operators.
     """
     if image.shape != target.shape or min(image.shape[:2]) < _WINDOW:
         raise ValueError(f"SSIM needs two images of one shape and at least {_WINDOW} px, got {tuple(image.shape)}")
@@ -55,7 +54,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 def psnr(image: Tensor, target: Tensor, ignored: Tensor | None = None) -> float:
     """Peak signal-to-noise ratio in dB of images in [0, 1] without pixels `ignored`; `image` is clamped first.
 
-    NaN if all pixels are ignored: nothing is known of such a frame.
+    NaN if all pixels are ignored.
     """
     squares = (image.clamp(0.0, 1.0).double() - target.double()).square()
     error = squares.mean() if ignored is None else squares[~ignored].mean()
@@ -66,7 +65,7 @@ def psnr(image: Tensor, target: Tensor, ignored: Tensor | None = None) -> float:
 def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """[size, size] matrix that blurs along an axis; rows sum to 1.
 
-    Two dense products beat torch's depthwise 11-tap convolution on CPU at these sizes.
+    On the CPU, two dense products are faster than torch's depthwise 11-tap convolution at these sizes.
     """
     offset = torch.arange(size, dtype=torch.float64, device="cpu")
     distance = offset[:, None] - offset[None, :]
@@ -102,7 +101,7 @@ class _TorchSsim(torch.autograd.Function):
         inverse = 1.0 / (b1 * b2)
         d_xy = 2 * a1 * inverse
         d_xx = -score / b2
-        # Through the mean of x: directly, and inside both variances.
+        # The mean of x enters the score directly, through the variance of x and through the covariance.
         d_mx = 2 * my * (a2 - a1) * inverse - 2 * mx * score * (1.0 / b1 - 1.0 / b2)
         back = _blur(torch.cat([d_mx, d_xx, d_xy]), rows.T, columns.T).view(3, *x.shape)
         pull = back[0] + 2 * x * back[1] + y * back[2]

@@ -1,10 +1,10 @@
-"""How much of a card's memory a run will take, by arithmetic, and how it is made to fit before it starts.
+"""Computes the GPU memory that a run needs, and reduces a run that does not fit before it starts.
 
-The figures are bytes of the tensors that live at once in a training step (`tests/backend/card/test_card.py` holds them
-against what a pretended card counts). `_FIXED` stands for torch, its libraries and the compiled kernels, `_WASTE` for
-memory that the allocator cannot use; neither was measured on a card. A run that does not fit is made smaller in the
-order of what that costs: the frames wait in host memory; the field works in pieces and computes them again on the way
-back; fewer Gaussians.
+The figures are bytes of the tensors that exist at the same time in a training step. `tests/backend/card/test_card.py`
+compares them with the count of a simulated GPU. `_FIXED` is the memory of torch, its libraries and the compiled
+kernels; `_WASTE` accounts for fragmentation. Neither was measured on a GPU. A run that does not fit is reduced in this
+order: frames stay in host memory; the field is evaluated in pieces that are recomputed in the backward pass; the number
+of Gaussians is lowered.
 """
 
 from __future__ import annotations
@@ -20,42 +20,45 @@ from ..supervision.support import MAX_BINS
 from .config import TrainConfig
 
 PIECE = 65_536
-"""Gaussians that the field works on at a time where memory is short."""
+"""Number of Gaussians per call of the field where memory is short."""
 LEAST_PIECE = 8_192
-"""Smaller pieces save nothing that counts."""
+"""Least size of a piece. Smaller pieces save no significant memory."""
 LEAST = 2_000
-"""Fewer Gaussians than this are no run."""
+"""Least number of Gaussians of a run."""
 _FIXED = 450_000_000
-"""Of a card: libraries, kernels, small tensors."""
+"""Fixed memory in bytes: libraries, kernels and small tensors."""
 _WASTE = 1.15
 """Memory that the allocator reserves, as a multiple of the memory in use."""
 _MOVED = 14
-"""Numbers of a Gaussian that a field moves."""
+"""Number of values per Gaussian that a field changes."""
 _TILES = 12
-"""Tiles that a Gaussian meets, those out of view counted in: of the benchmark's scenes, rounded up."""
+"""Mean number of tiles per Gaussian, including Gaussians out of view, in the benchmark's scenes; rounded up."""
 _RASTER_BYTES = 240
-"""Of a Gaussian in a frame: its record, order, keys, the sort's scratch, figures, the gradient before projection."""
+"""Bytes per Gaussian in a frame: record, order, keys, scratch memory of the sort, statistics, projected gradients."""
 _PIXEL_BYTES = 230
-"""Of a pixel in a step: colours, alphas, depths, the target, SSIM's four blurs and three gradients, and theirs."""
+"""Bytes per pixel in a step: colours, alphas, depths, target, SSIM's four blurs, and gradients."""
 
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """What of a run fits."""
+    """How a run fits into GPU memory."""
 
     gaussians: int
-    """Most that it may have."""
+    """Maximum number of Gaussians."""
     pieces: int | None
-    """Gaussians that the field works on at a time; None: all."""
+    """Number of Gaussians per call of the field; None: all in one call."""
     on_card: bool
-    """Do the frames lie on the card?"""
+    """True if the frames are stored on the GPU."""
     sentence: str
-    """What was made smaller, and why; empty if it is as requested."""
+    """What was reduced and why; empty if nothing visible to the user was reduced."""
 
 
 def gaussian_bytes(config: TrainConfig, bins: int) -> int:
-    """Of one Gaussian in a step: parameters with gradient, two moments and the mean of the last steps, the harmonics
-    once more with their gradient, its raster work and hits, and the bitmaps of `bins` time bins."""
+    """Bytes per Gaussian in a step.
+
+    They cover parameters with gradient, two moments and the averaged parameters; a copy of the SH coefficients with
+    gradient; the rasteriser's data and hits; and the bitmaps of `bins` time bins.
+    """
     harmonics = 3 * (config.sh_degree + 1) ** 2
     numbers = 11 + harmonics
     hits = math.ceil(_TILES * 4 / 3) * HIT_BYTES
@@ -63,22 +66,22 @@ def gaussian_bytes(config: TrainConfig, bins: int) -> int:
 
 
 def moving_bytes(config: TrainConfig, whole: bool) -> int:
-    """Of one Gaussian that the field moves: what has met its deltas, with gradients, and the field's own work, if the
-    `whole` field works at once."""
+    """Bytes per moving Gaussian: deformed parameters with gradients and, if all Gaussians are evaluated at once
+    (`whole`), the field's intermediate tensors."""
     return 4 * 4 * _MOVED + (config.field.row_bytes() if whole else 0)
 
 
 def peak_bytes(
     config: TrainConfig, pixels: int, bins: int, gaussians: int, *, whole: bool = True, frames: int = 0
 ) -> int:
-    """Most bytes of tensors that a step takes.
+    """Peak bytes of the tensors in a step.
 
     Args:
-        pixels: of a training image.
-        bins: time bins of the support bitmap: trained frames, at most 256.
-        gaussians: how many there are; all of them may be on trial at once.
-        whole: does the field work on all of them at once?
-        frames: bytes of the training images, if they lie on the card.
+        pixels: number of pixels of a training image.
+        bins: time bins of the support bitmap: number of training frames, at most 256.
+        gaussians: number of Gaussians; all may be on trial at the same time.
+        whole: whether the field is evaluated for all Gaussians at once.
+        frames: bytes of the training images if they are stored on the GPU, otherwise 0.
     """
     total = frames + pixels * _PIXEL_BYTES + gaussians * gaussian_bytes(config, bins)
     if config.method != "static":
@@ -90,16 +93,14 @@ def peak_bytes(
 def plan_memory(
     config: TrainConfig, size: tuple[int, int], bins: int, frames: int, free: int, gaussians: int = 0
 ) -> MemoryPlan:
-    """How a run fits into `free` bytes of a card.
+    """Plans how a run fits into `free` bytes of GPU memory. JobError if it cannot be reduced enough.
 
     Args:
-        size: (width, height) px of the training images.
-        bins: trained frames.
-        frames: bytes of all images.
-        free: bytes.
-        gaussians: how many there are and will be; 0: as many as the configuration's budget.
-
-    JobError if it cannot be made small enough.
+        size: (width, height) of the training images in pixels.
+        bins: number of training frames.
+        frames: bytes of all training images.
+        free: free GPU memory in bytes.
+        gaussians: fixed number of Gaussians; 0: the configured budget, which may be reduced.
     """
     budget, pixels = gaussians or config.densify.budget, size[0] * size[1]
     room = (free - _FIXED) / _WASTE
@@ -131,7 +132,7 @@ def plan_memory(
 
 
 def _each(config: TrainConfig, bins: int, room: float) -> tuple[float, float]:
-    """(bytes that one more Gaussian takes, bytes left for them): with the field in pieces, if they are many."""
+    """(bytes per Gaussian, bytes available for Gaussians); with the field in pieces if more than `PIECE` fit."""
     fixed, moves = gaussian_bytes(config, bins), config.method != "static"
     if not moves:
         return fixed, room
@@ -149,6 +150,6 @@ def _asked(budget: int, size: tuple[int, int], free: int) -> str:
 
 
 def free_bytes(device: torch.device) -> int:
-    """Bytes of a card that are free for tensors, with what torch holds and does not use."""
+    """Free GPU memory in bytes, including memory that torch has reserved but does not use."""
     free, _ = torch.cuda.mem_get_info(device)
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

@@ -1,4 +1,4 @@
-"""How a training goes: metrics.jsonl, preview images and the summary of a run."""
+"""Metrics of a training: metrics.jsonl, preview images and the summary of a run."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from .verdict import figures_of, verdict_fields
 
 
 class Metrics:
-    """metrics.jsonl and preview images of a run, while it trains.
+    """Writes metrics.jsonl and preview images of a run during training.
 
-    iteration: where the run goes on; what an earlier process measured later than that is dropped. -1: it begins.
+    iteration: step from which the run continues; later measurements of an earlier process are dropped. -1: a new run.
     """
 
     def __init__(self, folder: Path, report: Reporter, iteration: int) -> None:
         self.folder, self.report = folder, report
         self.path = folder / METRICS_FILE
-        if is_link(self.path):  # lines would be appended to what it leads to
+        if is_link(self.path):  # lines would be appended to the link's target
             remove_link(self.path)
         make_folder(folder / PREVIEWS_FOLDER)
         for picture in (folder / PREVIEWS_FOLDER).glob("*.png"):
@@ -43,7 +43,7 @@ class Metrics:
             write_atomic(self.path, "".join(f"{line}\n" for line in kept).encode("utf-8"))
 
     def add(self, trainer: Trainer, test: list[int], held_out: Tensor) -> None:
-        """Measures on the held-out frames, appends a line, shows a preview; of a step only what is not there yet."""
+        """Measures PSNR on held-out frames, appends a line and saves a preview, unless the step already has them."""
         if self._measured < trainer.iteration:
             self._measure(trainer, test, held_out)
         preview = self.folder / PREVIEWS_FOLDER / f"{trainer.iteration:06d}.png"
@@ -73,7 +73,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def _iteration_of(line: str) -> float:
-    """Of a line of metrics.jsonl; infinite if it was half written."""
+    """Iteration of a line of metrics.jsonl; infinite if the line is incomplete."""
     try:
         return float(json.loads(line)["iteration"])
     except (ValueError, KeyError, TypeError):
@@ -93,7 +93,7 @@ def save_png(path: Path, image: Tensor) -> None:
 def summarise(
     trainer: Trainer, name: str, test: list[int], held_out: Tensor, key: str, mattes: Mattes | None = None
 ) -> dict[str, Any]:
-    """The run's figures, units in the key names; what was modelled and what it cost."""
+    """Content of summary.json: the run's figures with units in the key names, what was modelled and its cost."""
     value = trainer.heldout_psnr(test, held_out)
     model, seen = trainer.model, gather_evidence(trainer, test, held_out, mattes)
     return {

@@ -1,4 +1,4 @@
-"""A dynamic scene as one thing: Gaussians, field and gate, rendered at a time from a camera."""
+"""Dynamic scene model: Gaussians, deformation field and gate, rendered at a given time from a given camera."""
 
 from __future__ import annotations
 
@@ -20,45 +20,49 @@ from .exposure import Exposure
 
 @dataclass
 class DynamicModel:
-    """Gaussians in scene units; `field` is None while nothing moves."""
+    """Gaussians in scene units with a deformation field; `field` is None while the model is static."""
 
     gaussians: Gaussians
     """Canonical Gaussians with gate and support."""
     field: Deformation | None
-    """The host's field, once something moves."""
+    """Deformation field of the host; None while the model is static."""
     centres: Tensor
     """[B] normalised times of the support bins."""
     sh_degree: int
     """SH degree in use."""
     exposure: Exposure
-    """How the camera exposed each frame; the Gaussians' colours are those of no correction."""
+    """Exposure correction per time. The Gaussians' colours are those without correction."""
     pieces: int | None = None
-    """Gaussians that the field works on at a time, where memory is short; None: all."""
+    """Number of Gaussians per call of the field, where memory is short; None: all in one call."""
     _rows: tuple[Tensor, int, Tensor] | None = dataclasses.field(default=None, repr=False)
 
     @property
     def device(self) -> torch.device:
-        """Where all tensors of the model are."""
+        """Device of all tensors of the model."""
         return self.gaussians.open.device
 
     def open_rows(self) -> Tensor:
-        """Rows of the Gaussians that the field moves, int64 [M]."""
+        """Rows int64 [M] of the Gaussians that the field moves."""
         is_open = self.gaussians.open
         if self.field is None:
             return torch.zeros(0, dtype=torch.long, device=is_open.device)
-        # Asking which are open makes the host wait for a GPU; they change between steps only.
+        # `nonzero` synchronises with the GPU. Rows change only between steps, so they are cached.
         if self._rows is None or self._rows[0] is not is_open or self._rows[1] != is_open._version:
             self._rows = (is_open, is_open._version, torch.nonzero(is_open).flatten())
         return self._rows[2]
 
     def deltas(self, rows: Tensor, times: Tensor) -> Deltas | None:
-        """The field at the canonical means of `rows` [M]; times [M] or [1]. None without a field or rows."""
+        """Deltas of the Gaussians `rows` [M] at times [M] or [1]. None without a field or rows."""
         if self.field is None or not len(rows):
             return None
         return self.ask(self.field, self.gaussians.params["means"][rows], times, self.gaussians.own(rows))
 
     def ask(self, field: Deformation, means: Tensor, times: Tensor, own: Mapping[str, Tensor]) -> Deltas:
-        """The field at means [M, 3] and times [M] or [1]; in pieces, whose work is done again on the way back."""
+        """Evaluates `field` at means [M, 3] and times [M] or [1].
+
+        With `pieces` set, the Gaussians are split into chunks that are recomputed in the backward pass (gradient
+        checkpointing).
+        """
         if self.pieces is None or len(means) <= self.pieces:
             return field(means, times, own)
         parts: list[Deltas] = []
@@ -71,11 +75,11 @@ class DynamicModel:
         return Deltas(*joined)  # type: ignore[arg-type]
 
     def moved(self, rows: Tensor, deltas: Deltas | None) -> dict[str, Tensor]:
-        """All parameters where `deltas` have met those of rows [M], with gradients."""
+        """All parameters after `deltas` have been applied to the Gaussians `rows` [M], with gradients."""
         return apply_deltas(self.gaussians, rows, deltas, None if self.field is None else self.field.rules)
 
     def state_at(self, time: float, canonical: bool = True) -> dict[str, Tensor]:
-        """All parameters at a normalised time, with gradients: of the field, and of the `canonical` ones or not."""
+        """All parameters at a normalised time. Gradients reach the field, and with `canonical` also the Gaussians."""
         rows, when = self.open_rows(), torch.tensor([time], device=self.device)
         if canonical or self.field is None or not len(rows):
             return self.moved(rows, self.deltas(rows, when))
@@ -86,7 +90,7 @@ class DynamicModel:
 def restore_model(
     tensors: dict[str, Tensor], meta: dict[str, Any], config: TrainConfig, device: torch.device | str = "cpu"
 ) -> DynamicModel:
-    """The model of a checkpoint, without its optimiser, on `device`."""
+    """Restores the model of a checkpoint, without its optimiser, on `device`."""
     centres = tensors["centres"].to(device, copy=True)
     gaussians = Gaussians.from_state(tensors, len(centres)).to(torch.device(device))
     field = None
@@ -109,7 +113,7 @@ def render(
 ) -> RasterOutput:
     """Rasterises one camera (viewmat [4, 4], K [3, 3]) of a parameter state; `options` go to `rasterize`.
 
-    The background [3] (+ extra channels) is what shows where alpha < 1.
+    The background [3] (+ extra channels) is blended in where alpha < 1.
     """
     return rasterize(
         means=state["means"],
@@ -131,9 +135,10 @@ def render(
 def gathered(
     state: Mapping[str, Tensor], viewmat: Tensor, K: Tensor, width: int, height: int, weights: Tensor
 ) -> Tensor:
-    """[N, C]: what one camera sees of each Gaussian, the sum of its alpha * T over the pixels, weighted by [H, W, C].
+    """[N, C] blending weights (alpha * T) of the Gaussians in one camera, summed over pixels with `weights` [H, W, C].
 
-    The weight of a Gaussian at a pixel is what the pixel gains by the Gaussian's colour: a gradient gathers it.
+    A pixel's gradient with respect to a Gaussian's colour is that blending weight, so one backward pass computes the
+    sums.
     """
     held = {name: value.detach() for name, value in state.items()}
     with torch.enable_grad():

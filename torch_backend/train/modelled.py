@@ -1,4 +1,4 @@
-"""What a run says of itself in the end: what was modelled, what it cost, what it bought."""
+"""Table at the end of a run: modelled components with their cost and gain."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from .trainer import Trainer
 
 
 def modelled(trainer: Trainer) -> list[dict[str, Any]]:
-    """Rows of the end-of-run table: what was modelled, what it cost, what it bought.
+    """Rows of the end-of-run table, one per modelled component.
 
-    seconds of training, ms_per_step, bytes of parameters, gain_db on the probe frames: None where it was not measured.
+    Columns: seconds of training, ms_per_step, bytes of parameters and gain_db on the probe frames; None where not
+    measured.
     """
     model, c, policy, facts = trainer.model, trainer.config, trainer.policy, trainer.policy.facts
     count = len(model.gaussians)

@@ -1,7 +1,8 @@
-"""Movers by the shot's motion mattes, and the gate's decisions from them.
+"""Moving pixels by the shot's motion mattes, and the gate's decisions based on them.
 
-Flow finds movers that a photometric trial does not: on real clips the trial alone opened window reflections, and left
-waving hands closed. Unknown counts as still. A shot without mattes is trained by the trial alone.
+Mattes from optical flow find movers that a photometric trial misses. On real clips, the trial alone opened window
+reflections and left waving hands closed. Matte pixels marked unknown count as still. Without mattes, the gate uses the
+trial alone.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ from .model import DynamicModel, gathered
 from .run_view import RunView
 
 MOMENTS = 16
-"""Times and cameras at which it is asked whether a Gaussian moves."""
+"""Number of times and cameras at which a Gaussian's motion is sampled."""
 _COVERED = 0.25
-"""Share of a training pixel that has to move before the pixel does: at rims the matte is a pixel off."""
+"""Moving share of a training pixel above which the pixel counts as moving; edges of mattes are off by about a pixel."""
 
 Mattes = Callable[[int], NDArray[np.uint8] | None]
-"""Frame number -> what moves in it, [h, w] uint8: 0 still, 128 unknown, 255 moving; None where there is none."""
+"""Frame number -> motion matte [h, w] uint8 (0 still, 128 unknown, 255 moving); None without a matte."""
 
 
 def load_movers(mattes: Mattes, scene: Scene, indices: list[int], width: int, height: int) -> Tensor | None:
-    """bool [I, height, width]: what moves in frames `indices` of the scene; None if no frame has a matte.
+    """bool [I, height, width] moving pixels in frames `indices` of the scene; None if no frame has a matte.
 
-    A frame without one stands still. JobError if a matte is damaged.
+    A frame without a matte has no moving pixels. JobError if a matte is damaged.
     """
     movers, found = torch.zeros(len(indices), height, width, dtype=torch.bool, device="cpu"), False
     for n, index in enumerate(indices):
@@ -49,10 +50,10 @@ def load_movers(mattes: Mattes, scene: Scene, indices: list[int], width: int, he
 
 @torch.no_grad()
 def moving_frames(run: RunView, share: float) -> Tensor:
-    """int [N]: in how many trained frames each Gaussian lies in what moves, by what it paints there.
+    """int [N] number of training frames in which each Gaussian lies on moving pixels.
 
-    It counts where it is really seen, in front of what it stands before: at least `share` of its alpha * T over the
-    frame's pixels falls on movers. Each frame is asked at its own time; those kept back or unusable are not.
+    A frame counts if more than `share` of the Gaussian's blending weights (alpha * T) in it fall on moving pixels, so
+    occluded Gaussians do not count. Each frame is rendered at its time. Excluded frames are skipped.
     """
     if run.movers is None:
         raise ValueError("the shot has no motion mattes")
@@ -71,8 +72,11 @@ def moving_frames(run: RunView, share: float) -> Tensor:
 
 
 def on_trial(run: RunView) -> Tensor:
-    """bool [N]: Gaussians that the gate opens on trial: all that contribute or, with motion mattes, those that lie on
-    moving pixels in several frames and in a large share of the frames that show them."""
+    """bool [N] Gaussians that the gate opens on trial.
+
+    Without motion mattes these are all that contribute. With mattes they must also lie on moving pixels in several
+    frames, and in a large share of the frames that show them.
+    """
     gate: GateConfig = run.config.gate
     candidates = painted(run.model.gaussians)
     if run.movers is None:
@@ -84,11 +88,12 @@ def on_trial(run: RunView) -> Tensor:
 
 @torch.no_grad()
 def harden(run: RunView) -> bool:
-    """Closes for good what did not move; its mean change stays. False while nothing moves at all: the trial goes on."""
+    """Closes the Gaussians that did not move; they keep their mean change. Returns False and closes none if nothing
+    moves before `give_up`."""
     model, config = run.model, run.config.gate
     rows = model.open_rows()
     change, mean = _changes(model, rows, pixels_per_unit(run, rows), config)
-    # Gaussians on trial by their matte all move, so their stillest quarter cannot measure the noise.
+    # Gaussians opened by mattes all move, so the quarter that moves least cannot measure the noise.
     noise = config.noise if run.movers is None else 0.0
     stays = stays_open(model.gaussians, rows, change, config, noise)
     if not bool(stays.any()) and run.progress < config.give_up:
@@ -99,9 +104,9 @@ def harden(run: RunView) -> bool:
 
 @torch.no_grad()
 def close_strays(run: RunView) -> None:
-    """In a long run, closes Gaussians that hardly contribute to movers any more; they keep their mean change.
+    """In a long run, closes Gaussians that hardly contribute to moving pixels any more; they keep their mean change.
 
-    Splits of open Gaussians are open, and many of them paint still surfaces next to a mover.
+    Splits of open Gaussians are open as well, and many of them end up on still surfaces next to a mover.
     """
     model, (share, frames) = run.model, GateConfig.STRAY
     rows = model.open_rows()
@@ -112,7 +117,7 @@ def close_strays(run: RunView) -> None:
 
 
 def _close(model: DynamicModel, rows: Tensor, strays: Tensor, mean: Deltas) -> None:
-    """Closes those of `rows` [M] that are `strays`, bool [M], as they are with their `mean` change."""
+    """Closes the Gaussians of `rows` [M] that are `strays`, bool [M], after applying their `mean` change."""
     closed, moved = rows[strays], model.moved(rows, mean)
     for name, param in model.gaussians.params.items():
         if name in moved:
@@ -122,7 +127,7 @@ def _close(model: DynamicModel, rows: Tensor, strays: Tensor, mean: Deltas) -> N
 
 @torch.no_grad()
 def mean_of(model: DynamicModel, rows: Tensor) -> dict[str, Tensor]:
-    """Parameters of open Gaussians `rows` [M] at the mean of what they are when somebody sees them."""
+    """Parameters of open Gaussians `rows` [M] after their mean change over the times at which they are seen."""
     _, mean = _changes(model, rows, torch.zeros(len(rows), device=model.device), GateConfig())
     return {name: value.detach()[rows] for name, value in model.moved(rows, mean).items()}
 
@@ -137,9 +142,10 @@ def _changes(model: DynamicModel, rows: Tensor, pixels: Tensor, config: GateConf
 
 
 def pixels_per_unit(run: RunView, rows: Tensor) -> Tensor:
-    """[M] pixels of pictures `GateConfig.WIDTH` wide per scene unit, where a camera that saw each of `rows` is nearest.
+    """[M] pixels per scene unit of the Gaussians `rows`, in the nearest camera that sees them.
 
-    0 for what no asked camera saw.
+    Pixels are those of images `GateConfig.WIDTH` wide. Fewer than 2 * `MOMENTS` cameras, evenly spaced, are sampled; 0
+    if none of them sees the Gaussian.
     """
     means = run.model.gaussians.params["means"].detach()[rows]
     nearest = torch.full((len(rows),), torch.inf, device=run.device)

@@ -1,4 +1,4 @@
-"""The optimiser of a run: which tensors in which groups, and the rates they are trained at."""
+"""Optimiser of a run: parameter groups and learning rates."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from .model import DynamicModel
 from .poses import Poses
 
 _USUAL = GateConfig().start
-"""Share of the run at which a field joins, unless the run is long."""
+"""Published share of the run at which the field is added, for which the hosts' learning rates are tuned."""
 _LOG_SCALE_RANGE = (math.log(1e-5), math.log(50.0))
 
 
 def optimizer_of(model: DynamicModel, poses: Poses, config: TrainConfig) -> FusedAdam:
-    """Adam over the Gaussians, the exposure and, where they are refined, the poses; a field joins by `add_field`."""
+    """Adam over the Gaussians, the exposure and, if they are refined, the poses. `add_field` adds a field later."""
     c, p = config, model.gaussians.params
     rates = {
         "means": (c.lr_means, c.lr_means_end),
@@ -46,10 +46,11 @@ def optimizer_of(model: DynamicModel, poses: Poses, config: TrainConfig) -> Fuse
 
 
 def add_field(optimizer: FusedAdam, field: Deformation, model: Gaussians, config: TrainConfig, share: float) -> None:
-    """Adds a field's parameters, at a `share` of its rates, and those of its own that each Gaussian has.
+    """Adds the parameters of a field, at a `share` of its learning rates, and the parameters it owns per Gaussian.
 
-    Rates fall over the run, and a host's are good from a third of it on: a field that joins sooner starts at what they
-    are by then. At 1.7 times that it may come apart (docs/decisions.md, "Gate and field").
+    Rates fall over the run, and the hosts' schedules are tuned for a field that is added after a third of it. A field
+    that is added earlier starts at the rate of that point. At 1.7 times this rate, the field may become unstable
+    (docs/decisions.md, "Gate and field").
     """
     joins = config.gate.start if config.method == "auto" else _USUAL
     for group in field.parameter_groups():
@@ -65,7 +66,7 @@ def add_field(optimizer: FusedAdam, field: Deformation, model: Gaussians, config
 
 
 def schedule_rates(optimizer: FusedAdam, progress: float) -> None:
-    """Log-linear learning rates from start to end over the run or a host's part of it (3DGS get_expon_lr_func)."""
+    """Sets log-linear learning rates between `since` and `until` of each group (3DGS get_expon_lr_func)."""
     for group in optimizer.param_groups:
         since, until = group.get("since", 0.0), group.get("until", 1.0)
         share = min(max((progress - since) / (until - since), 0.0), 1.0)
@@ -73,7 +74,7 @@ def schedule_rates(optimizer: FusedAdam, progress: float) -> None:
 
 
 def limit_harmonics(model: Gaussians, optimizer: torch.optim.Optimizer, degree: int) -> None:
-    """Drops the harmonics above `degree` from shN, with their moments."""
+    """Removes the SH coefficients above `degree` from shN, with their moments."""
     old, bases = model.params["shN"], sh_bases(degree) - 1
     new = nn.Parameter(old.detach()[:, :bases].contiguous())
     state = optimizer.state.pop(old, None)

@@ -1,5 +1,4 @@
-"""The paper's anchoring terms in a training step: detects hidden and defective Gaussians in two frames, and adds the
-loss."""
+"""The paper's anchoring terms in a training step, for hidden and defective Gaussians in two frames."""
 
 from __future__ import annotations
 
@@ -16,28 +15,28 @@ from .run_view import RunView
 
 
 class RenderedRun(RunView, Protocol):
-    """A run that can render more pictures within a step; `Trainer` is one."""
+    """A run that can render further frames within a step; `Trainer` implements it."""
 
     generator: torch.Generator
-    """Source of every random draw."""
+    """Random number generator of the run."""
 
     def render_trained(self, state: dict[str, Tensor], frame: int, **options: Any) -> RasterOutput:
-        """Renders the parameters `state` from the camera of the trained frame at position `frame`."""
+        """Renders the parameters `state` from the camera of the training frame at position `frame`."""
         ...
 
     def image_of(self, frame: int) -> Tensor:
-        """[H, W, 3] float32, that frame, on the device."""
+        """[H, W, 3] float32 image of the training frame at position `frame`, on the device."""
         ...
 
 
 def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> int | None:
-    """Adds the paper's terms for this frame and another one drawn at random; their gradients add to the step's.
+    """Adds the gradients of the paper's terms for this frame and another random frame to those of the step.
 
     Args:
-        frame: position of the step's frame among the trained ones.
-        rows: [M] the Gaussians that move.
-        state: all parameters at the frame's time; means hold their gradient.
-        out: its picture, after the backward pass.
+        frame: position of the step's frame among the training frames.
+        rows: [M] Gaussians that move.
+        state: all parameters at the frame's time; `means` must hold its gradient.
+        out: render of the frame, after the backward pass.
 
     Returns the position of the other frame; None if it has the same time or is excluded.
     """
@@ -68,7 +67,7 @@ def paper_step(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tens
 
 
 def _supervised(run: RenderedRun, frame: int, rows: Tensor, state: dict[str, Tensor], out: RasterOutput) -> Tensor:
-    """bool [M]: which of `rows` the frame supervises well. Call it after the backward pass of `out` and `state`."""
+    """bool [M] Gaussians of `rows` that the frame supervises well. Call it after the backward pass."""
     index, pull = run.train_ids[frame], state["means"].grad
     if pull is None or out.weight_sum is None:
         raise RuntimeError("the frame was rendered without gradients or contributions")
@@ -86,8 +85,7 @@ def _view(run: RenderedRun, state: dict[str, Tensor], frame: int, rows: Tensor, 
 
 
 def inside_frustum(means: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:
-    """bool [M]: centres [M, 3] in front of the camera and inside its image; the others are the paper's *hidden*
-    ones."""
+    """bool [M] True for `means` [M, 3] in front of the camera and inside its image. The paper calls others *hidden*."""
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = camera[:, 2].clamp_min(1e-6)
     x = camera[:, 0] / depth * K[0, 0] + K[0, 2]

@@ -1,7 +1,7 @@
-"""The pictures that a run is trained on: the shot's working frames, or where it asks for more the source's own.
+"""Training images of a run: the shot's working frames, or plates if the run needs a higher resolution.
 
-Working frames have 720 lines at most unless the import was told otherwise: enough for a processor. Training on a card
-may use plates: undistorted frames of the source's size, on the working frames' display.
+Working frames have at most 720 lines by default, which is enough for training on the CPU. Training on a GPU may use
+plates: undistorted frames of the source's size, with the display transform of the working frames.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from .config import TrainConfig
 
 @dataclass(frozen=True)
 class Pictures:
-    """Pictures of a run's frames, which are not read yet."""
+    """Training images of a run that are read on demand."""
 
     scene: Scene
-    """Whose frames they are."""
+    """Scene that the frames belong to."""
     size: tuple[int, int]
     """Width and height in pixels."""
     plates: Plates | None
-    """Where they are read from; None: the working frames."""
+    """Source of the images; None: the working frames."""
 
     def load(self, indices: list[int], report: Reporter | None = None, beside: Path | None = None) -> Tensor:
-        """Frames `indices` of the scene, as `scene.load_images` has them. JobError too if a plate cannot be read."""
+        """Loads frames `indices` of the scene as `scene.load_images` does. JobError also if a plate cannot be read."""
         plates, frames = self.plates, self.scene.frames
         if plates is None:
             return load_images(self.scene, indices, *self.size, report, beside)
@@ -45,9 +45,10 @@ class Pictures:
 
 
 def pictures_of(shot: Shot, scene: Scene, config: TrainConfig, report: Reporter) -> Pictures:
-    """Pictures of the size that a run asks for, of plates if it may have them and they are finer than working frames.
+    """Training images at the size that `config` requests.
 
-    A warning says why the working frames have to do, if the footage is not there any more.
+    They are read from plates if `config` allows it and plates are larger than the working frames. If the footage is
+    missing, a warning says why the working frames are used.
     """
     if config.plates and not 0 < config.width <= scene.width:
         plates = Plates(shot)
@@ -61,6 +62,6 @@ def pictures_of(shot: Shot, scene: Scene, config: TrainConfig, report: Reporter)
 
 
 def training_size(scene: Scene, requested_width: int) -> tuple[int, int]:
-    """(width, height) of the training images: the working frames' shape, never larger; as large if 0 is requested."""
+    """(width, height) of the training images: the working frames' shape, at most their size; 0: their size."""
     width = min(requested_width or scene.width, scene.width)
     return width, max(16, round(scene.height * width / scene.width))

@@ -1,12 +1,12 @@
-"""Pose refinement: a small rigid correction per trained frame, found while everything is still static, then frozen.
+"""Pose refinement: a small rigid correction per training frame, optimised while the model is static, then frozen.
 
-A corrected camera is viewmat @ exp(correction): the correction moves the world as that frame's camera sees it, so a
-part that all frames share would move the world itself. It is taken out after every step (the gauge): the Gaussians
-stay where the solve put the world, and corrections say only how frames disagree. Frames that are not trained on get
-what lies between their neighbours in time.
+A corrected camera is viewmat @ exp(correction). The correction moves the world as seen by that frame's camera, so the
+mean correction of all frames would move the world itself. It is subtracted after every step (the gauge): the Gaussians
+stay in the solve's frame, and corrections only describe how frames disagree. Frames that are not trained on get
+corrections interpolated in time.
 
-Corrections serve training alone: they are not part of a run's cameras. Takes are rendered from the solve's cameras,
-or an artist's own, which Blender has too; refined ones would part from everything that stands in the scene there.
+Corrections are used in training only. Takes are rendered from the solve's cameras or from the user's, which are the
+cameras in Blender; renders from refined cameras would not align with other objects of the Blender scene.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from ..torch_types import from_numpy, matrix_exp, unflatten
 
 @dataclass
 class PosesConfig:
-    """Whether and how far cameras are corrected. Shares are of the run's length."""
+    """Settings of pose refinement. Shares are of the run's length."""
 
     on: bool = False
-    """Are they? Off: see docs/architecture.md for what it did to the clips it was tried on."""
+    """Whether cameras are refined. Off by default; docs/architecture.md has its effect on test clips."""
     start: float = 0.1
-    """Share of the run at which it begins: before, geometry is too coarse to hold a camera to."""
+    """Share of the run at which refinement begins. Before, the geometry is too coarse to align a camera to."""
     until: float = 1.0 / 3.0
-    """Share at which corrections are frozen: a camera must not follow what moves."""
+    """Share at which corrections are frozen, so that cameras do not follow moving objects."""
     lr: float = 2e-4
-    """Learning rate, in radians and in scene units alike."""
+    """Learning rate, in radians for rotations and in scene units for translations."""
     small: float = 1.0
-    """Weight of the mean squared correction: what the images do not ask for goes back to the solve."""
+    """Weight of the mean squared correction. It keeps cameras that the images do not constrain close to the solve."""
 
 
 class Poses:
-    """Corrections of I trained frames; `times` [I] normalised, ascending. Both ends may move."""
+    """Corrections of I training frames; `times` [I] normalised, ascending. The first and last may be corrected too."""
 
     def __init__(self, times: list[float], config: PosesConfig, device: torch.device) -> None:
         self.config, self._times = config, np.asarray(times)
         self.values = torch.nn.Parameter(torch.zeros(len(times), 6, device=device))
-        """[I, 6]: turn in radians about the scene's axes through its origin, and shift in scene units."""
+        """[I, 6]: rotation vector in radians about the scene's origin, and translation in scene units."""
         self._gauge = _Gauge(self._times, set(), device)
 
     def at(self, times: np.ndarray, held: set[int] | None = None) -> Tensor:
-        """Corrections [T, 6] at normalised times [T], linear between the trained frames that are not in `held`."""
+        """Corrections [T, 6] at normalised times [T], interpolated between training frames that are not in `held`."""
         keep = [n for n in range(len(self._times)) if n not in (held or ())]
         known = self.values.detach().cpu().numpy()[keep]
         columns = [np.interp(times, self._times[keep], known[:, n]) for n in range(6)]
@@ -54,7 +54,7 @@ class Poses:
 
     @torch.no_grad()
     def fix_gauge(self, held: set[int]) -> None:
-        """After a step: takes the mean correction out, and puts frames in `held` between their neighbours."""
+        """Subtracts the mean correction after a step, and interpolates the corrections of frames in `held`."""
         if self._gauge.held != held:
             self._gauge = _Gauge(self._times, set(held), self.values.device)
         gauge = self._gauge
@@ -67,12 +67,13 @@ class Poses:
             self.values[gauge.rows] = torch.lerp(self.values[gauge.left], self.values[gauge.right], gauge.share)
 
     def regularisation(self) -> Tensor:
-        """No larger than needed."""
+        """Weighted mean squared correction, 0-dim."""
         return self.config.small * self.values.square().mean()
 
 
 class _Gauge:
-    """Indices into the frames, on the device: made where frames are held back anew, so that no step waits for them."""
+    """Indices and interpolation weights on the device. They are rebuilt only when the held-back frames change, so that
+    no step waits for a transfer."""
 
     def __init__(self, times: np.ndarray, held: set[int], device: torch.device) -> None:
         keep = np.asarray([n for n in range(len(times)) if n not in held])
@@ -89,16 +90,17 @@ class _Gauge:
 
 
 _HALVED = 4
-"""A twist is halved so often before its series: a turn of a radian has 1/16 of one left, and float32 needs 6 terms."""
+"""Number of halvings of a twist before the series (scaling and squaring): 1 radian becomes 1/16, for which 6 terms
+reach float32 accuracy."""
 
 
 def _exponential(twist: Tensor) -> Tensor:
-    """exp of twists [..., 4, 4]. On a GPU by its series: torch's own has the host wait for one."""
+    """Matrix exponential of twists [..., 4, 4]. On a GPU by its series, since `torch.matrix_exp` synchronises."""
     return matrix_exp(twist) if twist.device.type == "cpu" else _series(twist)
 
 
 def _series(twist: Tensor) -> Tensor:
-    """exp of twists [..., 4, 4] of at most a radian or a unit."""
+    """Matrix exponential of twists [..., 4, 4] of at most 1 radian and 1 unit, by a truncated series."""
     small, one = twist / 2.0**_HALVED, torch.eye(4, dtype=twist.dtype, device=twist.device)
     total = one
     for n in range(6, 0, -1):
@@ -109,7 +111,7 @@ def _series(twist: Tensor) -> Tensor:
 
 
 def corrected(viewmats: Tensor, corrections: Tensor) -> Tensor:
-    """viewmats [..., 4, 4] world-to-camera after corrections [..., 6] of SE(3), differentiable in both."""
+    """World-to-camera matrices [..., 4, 4] after SE(3) corrections [..., 6]; differentiable in both arguments."""
     x, y, z = corrections[..., :3].unbind(-1)
     o = torch.zeros_like(x)
     twist = unflatten(torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1), -1, (3, 3))

@@ -1,13 +1,15 @@
-"""Steps on a card as one launch each: recorded once as a CUDA graph, then carried out again on other numbers.
+"""Records training steps on a GPU as CUDA graphs, and replays them with other inputs.
 
-A step of a small run is a few hundred kernels of microseconds, and its host takes six times as long to ask for them as
-the card to do them (docs/benchmarks.md, "GPU"). Between two events of a run (growth, the gate, a repair) all steps of
-one kind are the same work on tensors at the same places, so from the second on they are replayed.
+A step of a small run consists of a few hundred kernels of microseconds; the CPU takes six times as long to launch them
+as the GPU to run them (docs/benchmarks.md, "GPU"). Between two events of a run (growth, the gate, a repair), all steps
+of one kind run the same operations on tensors at the same addresses. From the second step on they are replayed.
 
-What is replayed is what a step would have done: `Trainer.carry_out` is one body for both. It is taken launch by launch
-where its kind has not been seen (what is compiled or made at first use is then there), where its work asks the card
-something, where the card has little memory free (a recording holds as much as a step), and for some steps after one
-that was left out, so that its gradients can be looked into.
+Launched and replayed steps run the same code, `Trainer.carry_out`. A step is launched
+
+- if its kind has not been seen, so that first uses compile and allocate outside of a recording;
+- if it reads values back from the GPU;
+- if little GPU memory is free, since a recording holds as much memory as a step;
+- for some steps after a skipped step, so that the gradients of a failing step can be inspected.
 """
 
 from __future__ import annotations
@@ -30,80 +32,81 @@ from .soundness import INSPECT_EVERY, Soundness
 from .step_facts import StepFacts, StepKind
 
 refused = ""
-"""Why the card's self-test forbids recorded steps (`device`); each kernel is then launched singly. Process-wide."""
+"""Why the self-test forbids recorded steps (set by `device`, for the whole process); empty if they are allowed."""
 _SPARE = 1.5
-"""Free memory that a recording needs, as a multiple of a step's peak."""
+"""Free memory that a recording needs, as a multiple of a step's peak memory."""
 _TRIES = 4
-"""Attempts without enough free memory after which recording is given up."""
+"""Number of recordings that may run out of memory before recording is switched off."""
 
 
 class RecordedRun(Protocol):
-    """A run whose steps are recorded; `Trainer` is one."""
+    """A run whose steps are recorded; `Trainer` implements it."""
 
     soundness: Soundness
-    """What is known of its steps."""
+    """Record of failed steps and repairs."""
     optimizer: FusedAdam
-    """Of everything that is learnt."""
+    """Optimiser of all trained parameters."""
     width: int
-    """Pixels."""
+    """Width of the images in pixels."""
     height: int
-    """Pixels."""
+    """Height of the images in pixels."""
 
     def carry_out(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
-        """One step; its photometric loss (0-dim)."""
+        """Runs one step and returns its photometric loss (0-dim)."""
         ...
 
     def layout(self) -> tuple[object, ...]:
-        """What steps read and write: while all of it is the same, it lies where it lay."""
+        """The objects that steps read and write. While they are unchanged, recorded steps stay valid."""
         ...
 
 
 class Recording(Protocol):
-    """How work on a device is recorded."""
+    """Method of recording work on a device."""
 
     def watched(self) -> contextlib.AbstractContextManager[None]:
-        """Takes measure of the memory that the work in here needs."""
+        """Context that measures the peak memory of the work in it."""
         ...
 
     def fits(self) -> bool:
-        """Is there memory to record the like?"""
+        """True if there is enough memory to record the measured work."""
         ...
 
     def record(self, work: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
-        """Does not carry the work out: (what carries it out, from then on, whenever it is called; the tensor that the
-        work then leaves its result in)."""
+        """Records `work` without carrying it out. Returns (function that replays it, tensor that then receives its
+        result)."""
         ...
 
     def drop(self) -> None:
-        """Gives back what recordings that are gone have held."""
+        """Frees the memory of recordings that were dropped."""
         ...
 
 
 @dataclass
 class _Recorded:
     facts: StepFacts
-    """Where the step reads them."""
+    """Tensors from which the step reads its inputs."""
     table: StepTable
-    """Where its optimiser does."""
+    """Table from which the optimiser reads its inputs."""
     replay: Callable[[], None]
     loss: Tensor
     listed: int
-    """Hits that its rasteriser has room for."""
+    """Number of hits for which the rasteriser allocated memory."""
 
 
 class Recorder:
-    """Carries out the steps of a run, recorded where they can be."""
+    """Runs the steps of a run, and replays recordings where possible."""
 
     def __init__(self, run: RecordedRun, device: torch.device, recording: Recording | None = None) -> None:
-        """`recording`: CUDA graphs, unless told otherwise."""
+        """`recording`: recording method (default: CUDA graphs)."""
         self.run: RecordedRun = weakref.proxy(run)
-        """It holds this recorder; a cycle would keep a finished run on the card until Python looks for cycles."""
+        """Weak, because the run refers to this recorder. A cycle would keep a finished run's GPU memory until the next
+        garbage collection."""
         self.device = device
         self.recording = recording or CudaGraphs(device)
         self.replayed = 0
-        """Steps that were carried out from a recording."""
+        """Number of replayed steps."""
         self.refused = refused
-        """Why nothing is recorded any more; empty if it is."""
+        """Why recording is switched off; empty if it is on."""
         self._recorded: dict[StepKind, _Recorded] = {}
         self._seen: set[tuple[StepKind, int]] = set()
         self._layout: tuple[object, ...] = ()
@@ -112,26 +115,26 @@ class Recorder:
         self._short = 0
 
     def forget(self) -> None:
-        """Drops the recordings, and their memory: all at once, for with one graph goes the cuBLAS workspace of the
-        stream that it was recorded on, which others would go on writing to."""
+        """Drops all recordings and frees their memory. Single graphs cannot be dropped: they share the cuBLAS workspace
+        of their stream, which is freed with the first graph while others still write to it."""
         self._layout = ()
         if self._recorded:
             self._recorded.clear()
             self.recording.drop()
 
     def give_up(self) -> bool:
-        """The card's memory ended: nothing is recorded any more. Was there a recording, whose memory is free now?"""
+        """Switches recording off after GPU memory ran out. Returns True if this freed the memory of a recording."""
         held, self.refused = bool(self._recorded), "the memory of the graphics card ended"
         self.forget()
         return held
 
     def step(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
-        """One step of a kind; its photometric loss (0-dim), which the next step may overwrite."""
+        """Runs one step and returns its photometric loss (0-dim), which the next step may overwrite."""
         run, seen = self.run, (kind, self.run.soundness.mended)
         if self.refused:
             return self._launched(kind, facts, frame)
         layout, wanted = run.layout(), outgrown(self.device, 1, run.width, run.height)
-        outgrew = wanted > self._wanted  # a launched call has the rasteriser make its list larger
+        outgrew = wanted > self._wanted  # the rasteriser enlarges its hit list only in a launched step
         if outgrew or not _same(layout, self._layout):
             self.forget()
             self._layout = layout
@@ -142,11 +145,11 @@ class Recorder:
             self._seen.add(seen)
             with self.recording.watched():
                 return self._launched(kind, facts, frame)
-        if self._gradients:  # of a step before, which a look would take for this one's
+        if self._gradients:  # gradients of an earlier launched step, which an inspection would attribute to this step
             run.optimizer.zero_grad(set_to_none=True)
             self._gradients = False
         recorded = self._recorded.get(kind)
-        if recorded is not None and recorded.listed < self._listed():  # a call that is no step wanted more
+        if recorded is not None and recorded.listed < self._listed():  # a render outside of steps enlarged the list
             self.forget()
             self._layout, recorded = layout, None
         recorded = recorded or self._record(kind, facts, frame)
@@ -168,7 +171,7 @@ class Recorder:
         return self.run.carry_out(kind, facts.on(self.device), frame)
 
     def _record(self, kind: StepKind, facts: StepFacts, frame: int) -> _Recorded | None:
-        """None if there is no room for it; or if it cannot be recorded after all: then nothing is any more."""
+        """Records a step. None if memory is too small, or if recording fails, which switches recording off."""
         if not self.recording.fits():
             return None
         room = facts.room(self.device)
@@ -176,18 +179,18 @@ class Recorder:
         try:
             with self.run.optimizer.recording(self.device) as table:
                 replay, loss = self.recording.record(lambda: self.run.carry_out(kind, room, frame))
-        except torch.OutOfMemoryError:  # there was less room than a step took: the next launched one is measured anew
+        except torch.OutOfMemoryError:  # the peak memory was underestimated: the next launched step is measured again
             self._seen.clear()
             self._short += 1
             if self._short == _TRIES:
                 self.refused = "the graphics card has too little memory for it"
-        except Exception as error:  # whatever a driver or torch comes up with: the step can be taken without
+        except Exception as error:  # after any error of a driver or torch, steps can still be launched
             self.refused = (str(error).strip().splitlines() or [type(error).__name__])[0]
         else:
-            self.run.optimizer.zero_grad(set_to_none=True)  # the recording's own, which others write over
+            self.run.optimizer.zero_grad(set_to_none=True)  # memory of the recording, which other recordings overwrite
             made = self._recorded[kind] = _Recorded(room, table, replay, loss, self._listed())
             return made
-        # Out here the error is gone, and with its frames the graph that was begun and the tensors of its step.
+        # Outside of the handler, the traceback no longer keeps the unfinished graph and the step's tensors alive.
         self.run.optimizer.zero_grad(set_to_none=True)
         self._recorded.clear()
         self._layout = ()
@@ -196,13 +199,13 @@ class Recorder:
 
 
 def _same(one: tuple[object, ...], two: tuple[object, ...]) -> bool:
-    """Are they the same objects, or equal numbers?"""
+    """True if all items are the same objects or equal integers."""
     pairs = zip(one, two, strict=False)
     return len(one) == len(two) and all(a is b or (isinstance(a, int) and a == b) for a, b in pairs)
 
 
 class CudaGraphs:
-    """`Recording` as CUDA graphs, which share one pool of memory: they are replayed one after the other."""
+    """`Recording` as CUDA graphs. They share one memory pool, because only one is replayed at a time."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -212,27 +215,27 @@ class CudaGraphs:
 
     @contextlib.contextmanager
     def watched(self) -> Generator[None]:
-        """As `Recording` says, of what torch allocates."""
+        """See `Recording.watched`; measures memory allocated by torch."""
         before = torch.cuda.memory_allocated(self.device)
         torch.cuda.reset_peak_memory_stats(self.device)
         yield
         self._took = torch.cuda.max_memory_allocated(self.device) - before
 
     def fits(self) -> bool:
-        """As `Recording` says; recordings share what they hold, so one that is there has made room for the next."""
+        """See `Recording.fits`. Recordings share their memory, so there is room once the first one exists."""
         if self._pool is not None:
             return True
         if free_bytes(self.device) <= _SPARE * self._took:
             return False
-        torch.cuda.empty_cache()  # a recording is given nothing of what torch keeps for launched steps
+        torch.cuda.empty_cache()  # a recording cannot use memory that torch has cached for launched steps
         return True
 
     def record(self, work: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
-        """As `Recording` says."""
+        """See `Recording.record`."""
         self._pool = self._pool or torch.cuda.graph_pool_handle()
         self._stream = self._stream or torch.cuda.Stream(self.device)
         graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
-        gc.disable()  # what it would free of another stream cannot be freed meanwhile
+        gc.disable()  # memory of other streams must not be freed during the capture
         try:
             with torch.cuda.stream(self._stream):
                 warp_stream(self.device)
@@ -250,6 +253,6 @@ class CudaGraphs:
         return graph.replay, result
 
     def drop(self) -> None:
-        """As `Recording` says."""
+        """See `Recording.drop`."""
         self._pool = None
         torch.cuda.empty_cache()

@@ -1,23 +1,23 @@
-"""Repairs of a run: what is not finite is dropped or mended between steps, named in a warning, and training goes on.
+"""Repairs of a run between steps: values that are not finite are dropped or replaced, with a warning.
 
-A step that is not finite changes nothing (`FusedAdam`), and the rasteriser culls what is not finite; so one bad number
-does no harm at once. But it stays: a NaN in an opacity leaves out every further step, and one in a position is never
-seen again in any loss. So
+A step that is not finite changes nothing (`FusedAdam`), and the rasteriser culls Gaussians that are not finite. Without
+a repair, however, a NaN in an opacity makes every later step fail, and a Gaussian with a NaN in its position stays
+invisible to every loss. Values are repaired as follows:
 
-- a Gaussian with a parameter that is not finite is dropped: its neighbours and the next round of growth fill the hole;
-- a quaternion without length, whose Gaussian is culled and gets no gradient, becomes the identity;
-- a number of a host's own per Gaussian becomes what a new Gaussian starts with;
-- a number of the field becomes what it was when the field was last seen in order; where that is not known, the median
-  of its tensor: 0 among weights, the neutral 1 in planes of time, a usual radius among radii;
-- a number of the exposure or the poses becomes 0, which is no correction;
-- a field that throws what it moves out of its place goes back to what it was as a whole, at half the learning rates: a
-  Gaussian outside the picture gets no gradient that would bring it back;
-- Gaussians that a sound field throws out of place are dropped at every round of growth. The field hides them so from
-  all frames but the few that they fit; in a long run they would become the tenth for which the field is reset, again
-  and again;
-- Adam's moments start at 0 wherever a number was mended, and wherever they are not finite themselves.
+- A Gaussian with a parameter that is not finite is dropped. Its neighbours and the next densification fill the hole.
+- A quaternion of zero length, whose Gaussian is culled and gets no gradient, is set to the identity.
+- A host's parameter per Gaussian is set to its initial value.
+- A parameter of the field is set to its last stored finite value. If there is none, it is set to the median of its
+  tensor: near 0 for weights, the neutral 1 for time planes, a typical radius for radii.
+- A parameter of the exposure or the poses is set to 0, which is no correction.
+- A field that displaces many Gaussians too far is restored as a whole, at half the learning rates. Gaussians outside
+  the image get no gradient that would bring them back.
+- Gaussians that a stable field displaces too far are dropped at every round of densification. The field moves them out
+  of view except in the few frames that they fit. In a long run, they would reach the tenth at which the field is
+  restored, again and again.
+- Adam's moments are set to 0 where a value was repaired, and where they are not finite.
 
-What would leave less than half of the Gaussians is no repair: the run ends in words.
+If a repair would leave less than half of the Gaussians, the run ends with an error.
 """
 
 from __future__ import annotations
@@ -40,22 +40,23 @@ from .model import DynamicModel
 from .movers import MOMENTS
 
 _FEW = 0.01
-"""Share of the Gaussians up to which a gradient that is not finite is their own fault, and not the frame's or field's.
-"""
+"""Largest share of Gaussians with a gradient that is not finite for which the Gaussians are dropped. A larger share
+indicates a fault of the frame or the field."""
 _THROWN = 0.1
-"""Share of the moving Gaussians that a field in order may throw at any instant..."""
+"""Largest share of the moving Gaussians that a stable field may displace too far at any time."""
 _FAR, _LEAST_FAR = 6.0, 1.0
-"""...by more than this many times their median distance from their middle, and scene units, or than the scene's extent:
-somebody may walk as far as what moves reaches, and an apple swing by many times its own size. In a healthy run of a
-preview the upper tenth moves by at most 0.05 of that distance; one that came apart threw it hundreds of times as far
-at some instants, and that extent, in which far background counts, was no bound (docs/decisions.md)."""
+"""A Gaussian is displaced too far if it moves by more than 6 times the moving Gaussians' median distance from their
+median position. This bound is at least 1 scene unit and at most the scene's extent. A person may walk across the whole
+moving region, and an apple may swing by many times its size. In a stable preview run, the 90 % quantile of the
+displacement is at most 0.05 of that distance; in an unstable run, it was hundreds of times as large at some times. The
+scene's extent alone, which includes far background, did not detect that run (docs/decisions.md)."""
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 _STATE = "memory."
-"""What its names in a checkpoint begin with."""
+"""Prefix of the tensors of `FieldMemory` in a checkpoint."""
 
 
 def unstable(step: int) -> JobError:
-    """What is said when a run cannot go on."""
+    """Error for a run that cannot continue because it is unstable at `step`."""
     return JobError(
         f"Training became unstable at step {step} (the loss, its gradient or the model is not finite).",
         "The last good checkpoint is kept; train again with a smaller width or another seed.",
@@ -64,29 +65,29 @@ def unstable(step: int) -> JobError:
 
 
 class FieldMemory:
-    """A field's parameters as they were when it was last seen in order, and the time before, on its device.
+    """Copies of a field's parameters at the last two inspections that found it stable, on the field's device.
 
-    Between two looks it heeds every step: a field that comes apart does so at some instants first, and a look sees the
-    last step's instant alone. Only good for as long as the field has the same nodes and box: `keep` it anew when they
-    change.
+    Between inspections, it checks the displacement at every step. An unstable field fails at some times first, and an
+    inspection would only see the time of the last step. Copies are valid while the field has the same nodes and bounds;
+    call `keep` when they change.
     """
 
     def __init__(self, extent: float, device: torch.device) -> None:
         self.extent = extent
-        """Of the scene, in its units: farther than this is always out of place."""
+        """Extent of the scene in scene units; a larger displacement is always too far."""
         self._kept: list[dict[str, Tensor]] = []  # the newest last
-        # They stay where they lie: a recorded step reads the one and writes the other (`recorder`).
+        # Never reallocated, since recorded steps read `_reach` and write `_worst` (`recorder`).
         self._reach = torch.full((), math.inf, device=device)
         self._worst = torch.zeros((), device=device)
         self.rates = 1.0
-        """Share of the learning rates it began with that a field has after it was put back."""
+        """Factor of the field's learning rates, halved each time that the field is restored."""
 
     @torch.no_grad()
     def keep(self, field: Deformation | None, means: Tensor) -> None:
-        """Copies the parameters of a field that is in order, and takes measure of what it moves, means [M, 3]."""
+        """Copies the parameters of a stable field, and sets the bound from the means [M, 3] of the moving Gaussians."""
         named = {} if field is None else dict(field.named_parameters())
         if not self._kept or {n: p.shape for n, p in named.items()} != {n: p.shape for n, p in self._kept[-1].items()}:
-            # Both at once: what a card holds later does not grow by them.
+            # Both copies are allocated at once, so that GPU memory does not grow later.
             self._kept = [{name: p.detach().clone() for name, p in named.items()} for _ in range(2)]
         else:
             self._kept.append(self._kept.pop(0))
@@ -99,13 +100,13 @@ class FieldMemory:
             self._reach.copy_((_FAR * around).clamp(min(_LEAST_FAR, self.extent), self.extent))
 
     def state(self) -> dict[str, Tensor]:
-        """Tensors of a checkpoint: with them a run that was resumed puts back and drops what an unbroken one does."""
+        """Tensors for a checkpoint, with which a resumed run makes the same repairs as an uninterrupted one."""
         kept = {f"{_STATE}kept.{n}.{name}": p for n, one in enumerate(self._kept) for name, p in one.items()}
         return {f"{_STATE}reach": self._reach, f"{_STATE}worst": self._worst, **kept}
 
     @torch.no_grad()
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Takes over what `state` told."""
+        """Inverse of `state`."""
         own = {name.removeprefix(_STATE): t for name, t in tensors.items() if name.startswith(_STATE)}
         self._reach.copy_(own["reach"])
         self._worst.copy_(own["worst"])
@@ -118,25 +119,25 @@ class FieldMemory:
 
     @torch.no_grad()
     def heed(self, shift: Tensor) -> None:
-        """A step's `shift` [M, 3] of the means it moves, scene units; what is not finite is for `repair`."""
+        """Checks a step's displacement `shift` [M, 3] of the moving means, in scene units. NaNs do not count."""
         if len(shift):
             self._worst.copy_(torch.maximum(self._worst, self.thrown(shift).float().mean()))
 
     def thrown(self, shift: Tensor) -> Tensor:
-        """bool [M]: Gaussians that the field moves out of place, by `shift` [M, 3] in scene units."""
+        """bool [M] Gaussians whose displacement `shift` [M, 3], in scene units, is too far."""
         return shift.abs().amax(1) > self._reach
 
     def of(self, name: str, p: Tensor) -> Tensor | None:
-        """What parameter `name` was; None if not known."""
+        """Stored value of parameter `name`; None if it is missing or its shape is not that of `p`."""
         kept = self._kept[-1].get(name) if self._kept else None
         return kept if kept is not None and kept.shape == p.shape else None
 
     @torch.no_grad()
     def put_back(self, field: Deformation, optimizer: torch.optim.Optimizer) -> str:
-        """Puts the field back if at some step since the last look it threw too much of what it moves too far.
+        """Restores the field if it displaced too many Gaussians too far at any step since the last inspection.
 
-        It goes back to the look before the last: what was kept last may have begun to come apart. Halves the learning
-        rates of what the field owns. Returns what was done, in words.
+        The older of the two copies is restored, because the newer one may already be unstable. Halves the learning
+        rates of the field's parameters. Returns a description for the user; empty if nothing was done.
         """
         if not self._kept:
             return ""
@@ -164,10 +165,10 @@ class FieldMemory:
 def repair(
     model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, memory: FieldMemory, step: int
 ) -> str:
-    """Drops or mends what is not finite in the model and in Adam's moments.
+    """Drops Gaussians, and replaces values of the model and of Adam's moments, that are not finite.
 
-    Returns what was done, in words; nothing if all was sound (asked on the device, one answer read back). JobError if
-    too few Gaussians are left.
+    Returns a description for the user; empty if all values are finite. This check runs on the device and reads back one
+    value. JobError if too few Gaussians are left.
     """
     if _sound(model, optimizer):
         return ""
@@ -194,7 +195,8 @@ def repair(
 
 @torch.no_grad()
 def drop_offenders(model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier) -> str:
-    """Drops the Gaussians whose own gradient was not finite in the step that was left out, in words; none if many."""
+    """Drops the Gaussians whose gradient was not finite in a skipped step, unless they are too many (`_FEW`). Returns a
+    description for the user; empty if none was dropped."""
     names = {n: _bad_rows(p.grad) for n, p in model.gaussians.params.items() if p.grad is not None}
     if not names:
         return ""
@@ -210,7 +212,7 @@ def drop_offenders(model: DynamicModel, optimizer: torch.optim.Optimizer, densif
 def drop_thrown(
     model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Densifier, memory: FieldMemory
 ) -> int:
-    """Drops the Gaussians that the field throws out of their place at one of `MOMENTS` times; returns how many."""
+    """Drops the Gaussians that the field displaces too far at any of `MOMENTS` times. Returns their number."""
     rows = model.open_rows()
     dropped = torch.zeros(len(model.gaussians), dtype=torch.bool, device=model.device)
     for n in evenly_spaced(len(model.centres), MOMENTS):
@@ -230,7 +232,7 @@ def _sound(model: DynamicModel, optimizer: torch.optim.Optimizer) -> bool:
     turned = (model.gaussians.params["quats"].abs().amax(1) > QUAT_MIN).all()
     if all(t.device.type == "cpu" for t in values):
         return bool(turned) and all_finite(values)
-    # The norm of the largest number: NaN and infinity stay what they are, in one pass and without copies.
+    # The infinity norm propagates NaN and infinity, in one pass and without copies.
     return bool(torch.isfinite(torch.nn.utils.get_total_norm(values, math.inf)) & turned)
 
 
@@ -269,7 +271,7 @@ def _drop(model: DynamicModel, optimizer: torch.optim.Optimizer, densifier: Dens
 
 
 def _mend(p: Tensor, mask: Tensor, value: float | Tensor, optimizer: torch.optim.Optimizer) -> None:
-    """Puts `value` where `mask` [as p] is set, and starts Adam's moments anew there."""
+    """Sets `p` to `value`, and Adam's moments to 0, where `mask` (same shape as `p`) is set."""
     p.copy_(torch.where(mask, value, p))
     for key in _MOMENTS:
         if key in optimizer.state.get(p, {}):
@@ -277,7 +279,7 @@ def _mend(p: Tensor, mask: Tensor, value: float | Tensor, optimizer: torch.optim
 
 
 def _clear_moments(optimizer: torch.optim.Optimizer, p: Tensor) -> int:
-    """Starts both moments anew where one is not finite; returns at how many numbers."""
+    """Sets both moments to 0 where one of them is not finite; returns the number of values."""
     moments = [value for key, value in optimizer.state.get(p, {}).items() if key in _MOMENTS]
     if not moments:
         return 0
@@ -288,7 +290,7 @@ def _clear_moments(optimizer: torch.optim.Optimizer, p: Tensor) -> int:
 
 
 def _bad_rows(values: Tensor) -> Tensor:
-    """bool [N]: rows of [N, ...] with a number that is not finite."""
+    """bool [N] rows of `values` [N, ...] with a value that is not finite."""
     return ~torch.isfinite(values.detach()).reshape(len(values), math.prod(values.shape[1:])).all(1)
 
 

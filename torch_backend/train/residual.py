@@ -1,4 +1,4 @@
-"""How fast things move, before anything is let move: from what the static model gets wrong, frame by frame."""
+"""Estimates the speed of motion from the residual of the static model in each frame, before a field exists."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from .model import render
 from .run_view import RunView
 
 _LOOKED_AT = 48
-"""Most frames whose residual is examined."""
+"""Maximum number of frames whose residual is examined."""
 
 
 def correlation_of_movers(run: RunView) -> float | None:
-    """`correlation_frames` of what the static model lacks at the open Gaussians that are likely to move."""
+    """Result of `correlation_frames` for the static model's residual at open Gaussians that are likely to move."""
     residual, weight = signed_residual(run, torch.nonzero(run.model.gaussians.open).flatten())
     likely = likely_movers(residual, weight)
     return correlation_frames(residual[:, likely], weight[:, likely])
 
 
 def signed_residual(run: RunView, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Residual of the static model at the Gaussians `rows` [M], per frame, at half the size.
+    """Residual of the static model at the Gaussians `rows` [M], per frame, at half resolution.
 
-    Returns (residual [I, M], weight [I, M]): mean of image - render over the pixels that a Gaussian paints, by
-    alpha * T, grey, and the sum of those weights; 0 for frames that were not looked at.
+    Returns (residual [I, M], weight [I, M]): mean over the channels and pixels of image - render, weighted by the
+    Gaussian's blending weights (alpha * T), and the sum of these weights. Both are 0 for frames that are not examined.
     """
     excluded = run.excluded_frames
     frames = [n for n in range(len(run.train_ids)) if n not in excluded]
-    if len(frames) > _LOOKED_AT:  # two stretches of neighbours: sparse frames would not show what is fast
+    if len(frames) > _LOOKED_AT:  # two ranges of consecutive frames, because sparse frames would miss fast motion
         half = _LOOKED_AT // 2
         first, second = len(frames) // 4, 3 * len(frames) // 4
         frames = frames[first - half // 2 :][:half] + frames[second - half // 2 :][:half]
@@ -62,9 +62,10 @@ def signed_residual(run: RunView, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def likely_movers(residual: Tensor, weight: Tensor) -> Tensor:
-    """Indices of the tenth of M Gaussians whose residual [I, M] is most alike two frames apart (least 64 of them).
+    """Indices of the tenth of the M Gaussians (at least 64) whose residual [I, M] correlates most two frames apart.
 
-    Noise is not alike, and what a static model merely fits badly is the same in all frames.
+    Noise does not correlate. The mean residual over the frames, which is that of badly fitted static surfaces, is
+    subtracted.
     """
     seen = (weight > 0.5).float()
     value = (residual - (residual * seen).sum(0) / seen.sum(0).clamp_min(1.0)) * seen
@@ -74,11 +75,11 @@ def likely_movers(residual: Tensor, weight: Tensor) -> Tensor:
 
 
 def correlation_frames(residual: Tensor, weight: Tensor) -> float | None:
-    """How many frames it takes until half of a residual's agreement with itself one frame before is gone.
+    """Lag in frames at which the residual's autocorrelation falls to half of its value at lag 1; at most I / 2.
 
-    Of residual [I, M] of M Gaussians over I frames, where weight [I, M] > 0.5, pooled. For a swing of period P it is
-    near P / 6: linear interpolation between nodes that far apart misses 14 % of the swing at most. None where frames
-    next to each other have nothing in common: no node would be too many. At most I / 2.
+    The correlation is pooled over the residual [I, M] of M Gaussians in I frames, where weight [I, M] > 0.5. For an
+    oscillation of period P, the lag is near P / 6: linear interpolation between nodes at this distance misses at most
+    14 % of the amplitude. None if neighbouring frames do not correlate: then as many nodes as possible are useful.
     """
     seen = (weight > 0.5).double()
     mean = (residual.double() * seen).sum(0) / seen.sum(0).clamp_min(1.0)

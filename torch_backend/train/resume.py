@@ -1,4 +1,4 @@
-"""A run in training into its checkpoint, and out of it again."""
+"""Saves a run in training to its checkpoint, and restores it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .trainer import Trainer
 
 
 def save_run(trainer: Trainer, path: Path | None) -> None:
-    """Writes everything that `restore_run` needs; nothing to no path."""
+    """Writes everything that `restore_run` needs to `path`; None: writes nothing."""
     if path is None:
         return
     tensors = {**trainer.model.gaussians.state(), **optimizer_state(trainer.named_tensors(), trainer.optimizer)}
@@ -55,7 +55,7 @@ def save_run(trainer: Trainer, path: Path | None) -> None:
 
 
 def restore_run(trainer: Trainer, path: Path) -> None:
-    """Goes on where `save_run` was called. JobError if the checkpoint is of other frames, or does not fit."""
+    """Restores the state saved by `save_run`. JobError if the checkpoint has other frames or does not fit."""
     tensors, meta = load_checkpoint(path)
     try:
         _restore(trainer, tensors, meta)
@@ -70,7 +70,7 @@ def _restore(trainer: Trainer, tensors: dict[str, Tensor], meta: dict[str, Any])
             ExitCode.TRAIN,
         )  # fmt: skip
     trainer.model = restore_model(tensors, meta, trainer.config, trainer.device)
-    trainer.recorder = trainer.new_recorder()  # what the one before has seen was of other tensors
+    trainer.recorder = trainer.new_recorder()  # the old recorder refers to other tensors
     trainer.optimizer = optimizer_of(trainer.model, trainer.poses, trainer.config)
     if trainer.model.field is not None:
         rates = trainer.soundness.memory.rates = float(meta.get("field_rates", 1.0))

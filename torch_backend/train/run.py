@@ -1,4 +1,4 @@
-"""The training station: a solved shot and a request in, a run folder out."""
+"""Training stage: trains a run for a solved shot and writes its folder."""
 
 from __future__ import annotations
 
@@ -49,23 +49,23 @@ from .trainer import Trainer
 from .verdict import warn_if_poor
 
 _FIELD_BYTES = 14e6
-"""Of a field with its moments, and of a run's small things (a preview's HexPlane: 4.4 MB)."""
+"""Bytes of a field with its moments, and of a run's small tensors (a preview's HexPlane has 4.4 MB)."""
 
 
 @dataclass(frozen=True)
 class _Prepared:
-    """A training that may begin."""
+    """A training that is ready to start."""
 
     trainer: Trainer
     test: list[int]
-    """Indices of the frames that are held out."""
+    """Scene indices of the held-out frames."""
     held_out: Tensor
-    """[T, H, W, 3] their images."""
+    """[T, H, W, 3] images of the held-out frames."""
 
     def trained(self, shot: Shot, run: str, folder: Path, checkpoint: Path, begun_at: int) -> dict[str, Any]:
-        """Trains to the end, with checkpoints in a file; returns the summary of the run named so.
+        """Trains to the end, saving to the file `checkpoint`; returns the summary of the run named `run`.
 
-        begun_at: iteration that an earlier process had reached; -1: none.
+        begun_at: iteration at which the run is resumed; -1: a new run.
         """
         metrics = Metrics(folder, self.trainer.report, begun_at)
         train_to_end(self.trainer, checkpoint, lambda trainer: metrics.add(trainer, self.test, self.held_out))
@@ -74,14 +74,15 @@ class _Prepared:
 
 
 def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
-    """Trains one run; resumes its checkpoint if asked to and the settings are the same; or extends a finished one.
+    """Trains one run. With `params.resume` it continues a checkpoint with the same settings; with `params.extend` it
+    extends a finished run.
 
-    A run of other settings, or one that is to begin anew, stays as it is until this one is done (see `anew`).
-    Returns the run's figures, also written to runs/<name>/summary.json. JobError in words if it cannot be done.
+    An existing run that is trained with other settings, or from the start, is kept until the new one is done (`anew`).
+    Returns the run's figures, which are also written to runs/<name>/summary.json. JobError if it cannot be trained.
     """
     if params.extend:
         return extend_run(shot, params, report)
-    config_from_params(params)  # refuses what does not exist before anything is searched for
+    config_from_params(params)  # raises for invalid options before any work starts
     device = choose_device(params.device, report, "Training")
     run = shot.own(shot.run(params.run))
     shot.own(run / PREVIEWS_FOLDER)
@@ -92,7 +93,8 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     done = finished(run, key)
     if done is not None and params.resume:
         if sequence is not None:
-            fitted_depth(sequence, scene, depth_key(sequence, solve_key(shot)), run, report)  # it may have been removed
+            # The stored depth maps may have been removed.
+            fitted_depth(sequence, scene, depth_key(sequence, solve_key(shot)), run, report)
         drop_begun(run, key)
         report.progress("training", 1, 1, "already trained")
         return done
@@ -114,7 +116,7 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
     prepared = _prepared(shot, scene, config, folder, identity, depth, device, report)
     checkpoint = folder / CHECKPOINT_FILE
     resumed = _resume(prepared.trainer, checkpoint, params.resume, report)
-    for name in (SUMMARY_FILE, EXTENSION_FILE):  # they speak of the checkpoint that is about to be replaced
+    for name in (SUMMARY_FILE, EXTENSION_FILE):  # both belong to the checkpoint that is about to be replaced
         remove_file(folder / name)
     write_json(folder / CONFIG_FILE, {"version": 1, **identity, "config": config_to_json(config)})
     begun_at = prepared.trainer.iteration if resumed else -1
@@ -126,10 +128,10 @@ def train_shot(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
 
 
 def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, Any]:
-    """Adds `params.extend` steps to a finished run, with the run's own settings; goes on with them if they were begun.
+    """Adds `params.extend` steps to a finished run, with the run's settings; continues an interrupted extension.
 
-    The run stays as it is, for whoever freezes from it, until the last step is done. Returns its new figures.
-    JobError in words if there is nothing to extend.
+    The run stays unchanged and usable for freezing until the last step is done. Returns its new figures. JobError if
+    there is no run to extend.
     """
     if params.extend < 0:
         raise UserError(f"extend is {params.extend}: it is a number of steps to add")
@@ -147,7 +149,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
         identity["depth"], depth = facts["depth"], load_fitted(folder, str(facts["depth"]["key"]))
     prepared = _prepared(shot, scene, config, folder, identity, depth, device, report, int(before["gaussians"]))
     trainer, begun = prepared.trainer, pending(folder, facts) if params.resume else None
-    if before["iterations"] != facts["iteration"]:  # it was killed between its last two files: only figures are missing
+    if before["iterations"] != facts["iteration"]:  # killed after the checkpoint: only the summary is missing
         restore_run(trainer, checkpoint)
     elif begun is not None and begun.steps == params.extend:
         restore_run(trainer, beside)
@@ -166,7 +168,7 @@ def extend_run(shot: Shot, params: TrainParams, report: Reporter) -> dict[str, A
 
 
 def _extendable(shot: Shot, run: str, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(facts of the checkpoint, summary) of a run that can be extended; else JobError."""
+    """(facts of the checkpoint, summary) of a run that can be extended. JobError if it cannot."""
     again, checkpoint = "Train it without --extend first.", folder / CHECKPOINT_FILE
     facts = read_meta(checkpoint) if checkpoint.is_file() else {}
     if not facts:
@@ -180,8 +182,8 @@ def _extendable(shot: Shot, run: str, folder: Path) -> tuple[dict[str, Any], dic
     if of_other_pictures(shot, facts):
         message = f"The run {run!r} was trained on other pictures than the shot has now: it cannot be extended."
         raise JobError(message, "Train it again.", ExitCode.TRAIN)
-    motion = facts.get("motion")  # None too if it was trained before mattes counted
-    # A freeze finds mattes where the solve did not: what was trained with painted ones alone can still be extended.
+    motion = facts.get("motion")  # also None for runs of versions that did not use mattes
+    # A freeze may add mattes that the solve did not find. Runs trained with painted mattes only can still be extended.
     if motion and motion not in (motion_key(shot), motion_key(shot, with_found=False)):
         message = f"The run {run!r} was trained with other motion mattes than the shot has now."
         raise JobError(message, "Train it again: it cannot be extended.", ExitCode.TRAIN)
@@ -192,7 +194,7 @@ def _prepared(
     shot: Shot, scene: Scene, config: TrainConfig, folder: Path, identity: dict[str, Any], depth: FittedDepth | None,
     device: torch.device, report: Reporter, gaussians: int = 0,
 ) -> _Prepared:  # fmt: skip
-    """A trainer with its images and masks, of a run that begins or, with so many Gaussians, goes on."""
+    """Creates the trainer with images and masks. gaussians: number of Gaussians of a run to extend; 0: a new run."""
     warm_up(config, device)
     if depth is not None and device.type == "cpu":
         raster_cpu.warm_up(channels=2)
@@ -217,16 +219,16 @@ def _prepared(
 
 
 def _told(summary: dict[str, Any], report: Reporter) -> dict[str, Any]:
-    """A summary, once it was reported."""
+    """Reports a summary and warns of a poor run; returns the summary."""
     report.metric("train", summary)
     warn_if_poor(summary, report)
     return summary
 
 
 def warm_up(config: TrainConfig, device: torch.device) -> None:
-    """Sets the threads and compiles what a run on that device needs."""
+    """Sets the number of threads and compiles the kernels that a run on `device` needs."""
     torch.set_num_threads(default_threads())
-    if device.type == "cpu":  # kernels compile from the main thread, before the clock of the first step
+    if device.type == "cpu":  # kernels are compiled in the main thread, before the first step is timed
         for module in (raster_cpu, ssim, adam):
             module.warm_up()
         if config.method != "static":
@@ -237,8 +239,14 @@ def planned(
     config: TrainConfig, size: tuple[int, int], frames: int, images: Tensor, device: torch.device, report: Reporter,
     gaussians: int = 0,
 ) -> MemoryPlan | None:  # fmt: skip
-    """How a run of so many trained frames of `size` px, whose images with those held out are `images`, fits its card;
-    said if it is smaller than requested. None on the processor. gaussians: how many a run has that only goes on."""
+    """Memory plan of a run on a GPU; None on the CPU. Warns if the run is reduced.
+
+    Args:
+        size: (width, height) of the images in pixels.
+        frames: number of training frames.
+        images: training and held-out images.
+        gaussians: number of Gaussians of a run to extend; 0: a new run.
+    """
     if device.type == "cpu":
         return None
     plan = plan_memory(config, size, frames, images.nbytes, free_bytes(device), gaussians)
@@ -248,7 +256,7 @@ def planned(
 
 
 def place_images(images: Tensor, device: torch.device, plan: MemoryPlan | None) -> Tensor:
-    """Images [I, H, W, 3] on the device if they are to lie there, else in host memory: pinned, unless too many."""
+    """Images [I, H, W, 3] on the device if the plan says so, otherwise in host memory (pinned, unless too large)."""
     if plan is None:
         return images
     if plan.on_card:
@@ -257,8 +265,8 @@ def place_images(images: Tensor, device: torch.device, plan: MemoryPlan | None) 
 
 
 def checkpoint_bytes(config: TrainConfig) -> float:
-    """Bytes that a run's checkpoints may need on disk, at most: one is written while the one before is still there."""
-    numbers = 11 + 3 * (config.sh_degree + 1) ** 2  # of a Gaussian; with two moments each, and what saw it
+    """Maximum bytes of a run's checkpoints on disk; a new one is written while the previous one still exists."""
+    numbers = 11 + 3 * (config.sh_degree + 1) ** 2  # values per Gaussian, each with two moments
     return 2.0 * (config.densify.budget * (3 * 4 * numbers + 40) + _FIELD_BYTES)
 
 

@@ -1,4 +1,4 @@
-"""Attributes of a run in training that its measurements read."""
+"""Interface of a run in training, as its measurements see it."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from .model import DynamicModel
 
 
 class RunView(Protocol):
-    """A run in training; `Trainer` is one. Nothing of it is changed through this, but for the model's Gaussians."""
+    """A run in training; `Trainer` implements it. Only the model's Gaussians may be changed through this interface."""
 
     config: TrainConfig
-    """Every number of the run."""
+    """Configuration of the run."""
     model: DynamicModel
-    """What is trained."""
+    """Model in training."""
     report: Reporter
-    """Receives progress, and says when the run is cancelled."""
+    """Receives progress and signals cancellation."""
     device: torch.device
-    """Where it trains."""
+    """Device of the training."""
     images: Tensor
-    """[I, H, W, 3] float16 display-referred, the trained frames; on the device or in host memory."""
+    """[I, H, W, 3] float16 display-referred training frames, on the device or in host memory."""
     movers: Tensor | None
     """bool [I, H, W], pixels that the motion mattes mark as moving; None without mattes."""
     train_ids: list[int]
-    """[I] indices of them into the scene's frames."""
+    """[I] indices of the training frames in the scene's frames."""
     times: list[float]
-    """[I] their normalised times."""
+    """[I] normalised times of the training frames."""
     viewmats: Tensor
     """[F, 4, 4] world-to-camera of the scene's frames."""
     Ks: Tensor
     """[F, 3, 3] intrinsics in pixels of the images."""
     width: int
-    """Pixels."""
+    """Width of the images in pixels."""
     height: int
-    """Pixels."""
+    """Height of the images in pixels."""
 
     @property
     def progress(self) -> float:
@@ -47,18 +47,18 @@ class RunView(Protocol):
 
     @property
     def excluded_frames(self) -> set[int]:
-        """Positions of the trained frames that are not trained on now: kept back, or unusable."""
+        """Positions among the training frames that are currently excluded: probe frames and unusable frames."""
         ...
 
     @property
     def background(self) -> Tensor:
-        """[3] what shows where nothing covers when a frame is measured or shown."""
+        """[3] background colour for measurements and previews."""
         ...
 
     def ignored_at(self, index: int) -> Tensor | None:
-        """bool [H, W] which pixels of frame `index` of the scene teach nothing, on the device; None: all do."""
+        """bool [H, W] ignored pixels of the scene's frame `index`, on the device; None: no pixel is ignored."""
         ...
 
     def bin_of_frame(self, frame: int) -> int:
-        """Time bin of the support bitmap for the trained frame at position `frame`."""
+        """Time bin of the support bitmap for the training frame at position `frame`."""
         ...

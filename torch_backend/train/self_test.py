@@ -1,10 +1,9 @@
-"""The self-test of a card: a small frame and its gradients, a loss, a step of Adam, the planes of a field, against the
-processor's bodies.
+"""Self-test of a GPU. It compares a small frame with gradients, a loss, Adam steps and the field's planes with the CPU.
 
-It runs in a process of its own (`python -m torch_backend doctor --gpu`), because what a kernel breaks on a card stays
-broken for the process that launched it, and because a driver may hang. What it found is kept beside Warp's compiled
-kernels, for one driver, card and version of ours, Warp's and torch's: so it runs once, and again after an update. Only
-two tests in a row that fail alike speak against a card for good: one may have been killed, or met a full disk.
+It runs in a separate process (`python -m torch_backend doctor --gpu`), because a faulty kernel leaves the CUDA context
+of its process unusable, and because a driver may hang. The result is stored beside Warp's compiled kernels, for one
+driver, GPU and versions of this package, Warp and torch, so the test runs once and again after an update. A failure is
+stored only if two consecutive tests fail in the same way, since one may have been killed, or met a full disk.
 """
 
 from __future__ import annotations
@@ -39,71 +38,72 @@ from .recorder import CudaGraphs
 
 SELF_TEST_VERSION = 4
 _SECONDS = 240.0
-"""Seconds after which a card counts as hanging: without a cache the kernels take tens of seconds to compile."""
+"""Timeout in seconds. Without a cache, the kernels take tens of seconds to compile."""
 _GAUSSIANS, _WIDTH, _HEIGHT = 300, 64, 48
 _FLIPPED = 0.01
-"""Share of pixels that may differ by more than `_PIXEL`: at the alpha cut one may fall on either side."""
+"""Largest share of pixels that may differ by more than `_PIXEL`: rounding can move a hit across the alpha threshold."""
 _PIXEL = 3e-4
 _GRADIENT = 2e-2
-"""Largest relative L2 error of a gradient, including hits that flip at the alpha cut (1e-4 to 4e-3 with fibers)."""
+"""Largest relative L2 error of a gradient, including hits that cross the alpha threshold (1e-4 to 4e-3 on fibers)."""
 _CTRL_C_EXIT = 0xC000013A
-"""Exit code of a process on Windows that Ctrl-C ended, or a closed console."""
+"""Windows exit code of a process that was ended by Ctrl-C or by closing its console."""
 _NO_NUMBER = 1e9
+"""Error reported for values that are not finite."""
 _EXACT = 1e-4
-"""Relative L2 of what has no cut."""
+"""Largest relative L2 error of results without a threshold."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was compared."""
+    """Result of one comparison between GPU and CPU."""
 
     what: str
-    """In words."""
+    """Description of the compared result."""
     error: float
-    """By how much the card differs."""
+    """Measured error."""
     bound: float
-    """By how much it may."""
+    """Largest allowed error."""
 
 
 @dataclass
 class SelfTest:
-    """What a self-test found."""
+    """Result of a self-test."""
 
     version: int = SELF_TEST_VERSION
-    """Of this record."""
+    """Format version of this record."""
     key: str = ""
-    """Driver, card and versions that it speaks of."""
+    """Driver, GPU and versions that were tested (`self_test_key`)."""
     problem: str = ""
-    """What is wrong, in a sentence; empty if nothing is."""
+    """The fault that makes the GPU unusable, as a sentence; empty if there is none."""
     planes: str = ""
-    """The same of the kernels of the field's planes alone, for which torch's own operators can stand in on the card."""
+    """The fault of the plane kernels; empty if there is none. PyTorch operators on the GPU can replace the kernels."""
     recording: str = ""
-    """The same of steps that are recorded as CUDA graphs; launched one by one they serve as well."""
+    """The fault of steps recorded as CUDA graphs; empty if there is none. Steps can be launched unrecorded instead."""
     lasting: bool = True
-    """Will it be so the next time, too? Not if the card or the disk was full, or the test was ended before it told."""
+    """True if another test would give the same result. False if GPU memory or disk was full, or the test was killed."""
     seconds: float = 0.0
-    """How long it took, compiling included."""
+    """Duration of the test in seconds, including compilation."""
     checks: list[Check] = field(default_factory=list[Check])
-    """What was compared."""
+    """Results of the comparisons."""
 
     @property
     def failed(self) -> tuple[str, ...]:
-        """Names of the parts that failed."""
+        """Names of the fields that report a fault."""
         return tuple(name for name in ("problem", "planes", "recording") if getattr(self, name))
 
 
 def self_test_key() -> str:
-    """Identifies driver, card and versions."""
+    """Key of the driver, the GPU and the versions of this package, torch and Warp."""
     cards = [dataclasses.astuple(card) for card in nvidia_cards()[0]]
     name = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
     return content_key(SELF_TEST_VERSION, cards, name, __version__, torch.__version__, wp.config.version)
 
 
 def run_self_test(device: torch.device, key: str = "") -> SelfTest:
-    """Tests the kernels on `device`; on 'cpu' the CUDA kernels run on fibers, for tests. Never raises for a failure."""
+    """Tests the kernels on `device`. On 'cpu', CUDA kernels run on fibers (for unit tests). Failures do not raise."""
     found, since = SelfTest(key=key), time.perf_counter()
     found.problem = _problem(found, lambda: [*_frame(device), *_loss(device), *_adam(device)])
-    if not found.problem:  # last: a kernel that breaks the card breaks it for the process
+    if not found.problem:  # optional kernels last, since a faulty kernel breaks the CUDA context of the process
         found.planes = _problem(found, lambda: _planes(device))
         if device.type == "cuda":
             found.recording = _problem(found, lambda: _recording(device))
@@ -112,16 +112,16 @@ def run_self_test(device: torch.device, key: str = "") -> SelfTest:
 
 
 def _problem(found: SelfTest, compare: Callable[[], list[Check]]) -> str:
-    """Notes what `compare` finds; what is wrong with it, in a sentence."""
+    """Runs `compare` and adds its checks to `found`. Returns the fault as a sentence; empty if there is none."""
     try:
         checks = compare()
     except torch.OutOfMemoryError:
         found.lasting = False
         return "its memory is taken by other programs"
-    except (OSError, MemoryError, JobError) as error:  # of this machine's disk or memory, not of the card
+    except (OSError, MemoryError, JobError) as error:  # caused by disk or main memory, not by the GPU
         found.lasting = False
         return f"it could not be tested ({str(error) or type(error).__name__})"
-    except Exception as error:  # whatever a driver, a compiler or a kernel comes up with is what this test is for
+    except Exception as error:  # any error of a driver, compiler or kernel is a result of the test
         words = (str(error).strip().splitlines() or [type(error).__name__])[0]
         return f"a kernel does not build or run on it ({words})"
     found.checks += checks
@@ -132,11 +132,11 @@ def _problem(found: SelfTest, compare: Callable[[], list[Check]]) -> str:
 
 
 def card_verdict(folder: Path | None = None, test: Callable[[str], SelfTest] | None = None) -> SelfTest:
-    """What a self-test found of this machine's card. Tests it if it was not yet; twice if it fails.
+    """Stored self-test result of this machine's GPU. Runs the test if there is none; a failing test runs twice.
 
     Args:
-        folder: where the verdict is kept (default: beside Warp's kernels).
-        test: makes a self-test for a key (default: in a child process).
+        folder: folder of the stored result (default: that of Warp's kernels).
+        test: runs a self-test for a key (default: in a child process).
     """
     place, key = (folder or kernel_folder()) / "splannequin-card.json", self_test_key()
     found = _kept(place)
@@ -150,8 +150,7 @@ def card_verdict(folder: Path | None = None, test: Callable[[str], SelfTest] | N
 
 
 def keep(found: SelfTest, folder: Path, confirmed: bool = False) -> None:
-    """Notes a verdict; one that may be another the next time is forgotten, and the one before with it. So is a failure
-    that no other test has confirmed."""
+    """Stores a result. If it is not `lasting`, or is an unconfirmed failure, deletes the stored result instead."""
     place = folder / "splannequin-card.json"
     try:
         if found.lasting and (confirmed or not found.failed):
@@ -159,11 +158,11 @@ def keep(found: SelfTest, folder: Path, confirmed: bool = False) -> None:
         else:
             place.unlink(missing_ok=True)
     except OSError:
-        pass  # a folder that cannot be written: it is tested again the next time
+        pass  # the folder is not writable, so the GPU is tested again next time
 
 
 def kernel_folder() -> Path:
-    """Where Warp keeps compiled kernels."""
+    """Folder in which Warp stores compiled kernels."""
     return Path(str(initialised_warp().config.kernel_cache_dir))
 
 
@@ -177,7 +176,7 @@ def _kept(place: Path) -> SelfTest | None:
 
 
 def tested_apart(key: str) -> SelfTest:
-    """The self-test in a process of its own."""
+    """Runs the self-test in a child process."""
     command = python_child(sys.executable, "torch_backend", "doctor", "--gpu")
     root = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join(part for part in (root, os.environ.get("PYTHONPATH", "")) if part)
@@ -203,7 +202,7 @@ def tested_apart(key: str) -> SelfTest:
 
 
 def _crashed(code: int) -> bool:
-    """True of the exit code of a process that the system ended for what it did. Others were killed, or gave up."""
+    """True for the exit code of a process that crashed, as opposed to one that was killed or exited."""
     if os.name == "nt":
         return code & 0xC0000000 == 0xC0000000 and code & 0xFFFFFFFF != _CTRL_C_EXIT
     return -code in {getattr(signal, name) for name in ("SIGSEGV", "SIGBUS", "SIGABRT", "SIGILL", "SIGFPE")}
@@ -213,14 +212,14 @@ def _crashed(code: int) -> bool:
 
 
 def _relative(value: Tensor, truth: Tensor) -> float:
-    """L2 of the difference over that of the truth; `_NO_NUMBER` if something is not finite."""
+    """Relative L2 error of `value` against `truth`; `_NO_NUMBER` if it is not finite."""
     value, truth = value.detach().cpu().double(), truth.detach().cpu().double()
     error = float(norm_of_all(value - truth) / norm_of_all(truth).clamp_min(1e-12))
     return min(error, _NO_NUMBER) if error == error else _NO_NUMBER
 
 
 def _scene() -> dict[str, Tensor]:
-    """Gaussians before the camera: some large, some faint, with harmonics of the first degree."""
+    """Gaussians in front of the camera, of various sizes and opacities, with SH of degree 1."""
     g, n = torch.Generator(device="cpu").manual_seed(11), _GAUSSIANS
 
     def normal(*shape: int) -> Tensor:
@@ -234,13 +233,13 @@ def _scene() -> dict[str, Tensor]:
 
 
 def _camera(device: torch.device) -> dict[str, Any]:
-    """Where the scene is seen from."""
+    """Camera of the test scene, as arguments of `rasterize`."""
     K = torch.tensor([[[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]], device="cpu")
     return {"viewmats": torch.eye(4, device=device)[None], "Ks": K.to(device)}
 
 
 def _rendered(device: torch.device, backend: str) -> tuple[RasterOutput, dict[str, Tensor]]:
-    """The scene's frame, and the gradients of a weighted sum of its colours and depths by every input."""
+    """Render of the test scene, and gradients of a weighted sum of its colours and depths by all inputs."""
     leaves: dict[str, Any] = {name: value.to(device).requires_grad_() for name, value in _scene().items()}
     out = rasterize(
         **leaves, **_camera(device), width=_WIDTH, height=_HEIGHT,
@@ -256,11 +255,11 @@ def _rendered(device: torch.device, backend: str) -> tuple[RasterOutput, dict[st
 
 
 def _frame(device: torch.device) -> list[Check]:
-    """Projection, tiles and blending, forward and back."""
+    """Compares projection, tiling and blending, forward and backward."""
     truth, true_gradients = _rendered(torch.device("cpu"), "cpu")
     seen, gradients = _rendered(device, "cuda")
     off = (seen.colors.detach().cpu() - truth.colors.detach()).abs().amax(-1)
-    flipped = float((~(off <= _PIXEL)).float().mean())  # NaN counts
+    flipped = float((~(off <= _PIXEL)).float().mean())  # counts NaN as different
     checks = [Check("a frame", flipped, _FLIPPED)]
     checks += [
         Check(f"the gradient of {name}", _relative(gradients[name], value), _GRADIENT)
@@ -270,7 +269,7 @@ def _frame(device: torch.device) -> list[Check]:
 
 
 def _loss(device: torch.device) -> list[Check]:
-    """SSIM, the loss that it is part of, and their gradients."""
+    """Compares SSIM, the photometric loss and their gradients."""
     g = torch.Generator(device="cpu").manual_seed(4)
     image, target = torch.rand(2, 40, 56, 3, generator=g, device="cpu")
     ignored = torch.rand(40, 56, generator=g, device="cpu") > 0.9
@@ -294,7 +293,7 @@ def _loss(device: torch.device) -> list[Check]:
 
 
 def _adam(device: torch.device) -> list[Check]:
-    """Two steps of Adam, of rows that are near and far."""
+    """Compares two Adam steps with a `reach`, on rows at different distances."""
     g = torch.Generator(device="cpu").manual_seed(5)
     start, *gradients = torch.randn(3, 5000, 3, generator=g, device="cpu")
     found: list[Tensor] = []
@@ -309,7 +308,7 @@ def _adam(device: torch.device) -> list[Check]:
 
 
 def _recording(device: torch.device) -> list[Check]:
-    """Three steps of Adam on a frame, two of them replayed, against three that are launched."""
+    """Compares three Adam steps on a render: one launched and two replayed, against three launched."""
     start = {name: value.to(device) for name, value in _scene().items()}
     camera = _camera(device)
     found: list[Tensor] = []
@@ -340,7 +339,7 @@ def _recording(device: torch.device) -> list[Check]:
 
 
 def _planes(device: torch.device) -> list[Check]:
-    """Samples of a field's planes and their product, the penalty, and the gradients of both."""
+    """Compares plane features (products of samples), the smoothness penalty and the gradients of both."""
     g = torch.Generator(device="cpu").manual_seed(6)
     sizes = [(9, 11), (9, 7), (11, 7), (5, 9), (5, 11), (5, 7)]
     at = 2.4 * torch.rand(257, 4, generator=g, device="cpu") - 1.2

@@ -1,9 +1,9 @@
-"""Trains movers on softened pictures in the first steps of their field.
+"""Trains moving pixels on low-resolution images during the first steps of the field.
 
-A hand that is farther from where the field has it than Gaussians are wide has nothing that pulls it there, and stays
-where it is most of the time. In pictures of large pixels it overlaps with itself. What stands still is learnt from
-whole pictures all the while, and so is everything before there is a field: a run that began on coarse pictures
-altogether lost 0.2 to 0.9 dB of what stands still (docs/decisions.md, "Gate and field").
+If a hand's true position is farther from its Gaussians than their width, no gradient pulls them there, and they stay at
+the most frequent position. At low resolution, both positions overlap. Still pixels are always trained at full
+resolution, and so are all pixels before a field exists: a run that started with low-resolution images lost 0.2 to
+0.9 dB in still regions (docs/decisions.md, "Gate and field").
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from ..torch_types import integers
 from .losses import photometric
 
 _LENGTHS_OF = 640.0
+"""Image width in pixels to which lengths refer."""
 _MARGIN = 4.0
-"""Pixels of pictures 640 wide around what moves that are softened with it."""
+"""Width of the margin around moving pixels that is included, in pixels of an image 640 wide."""
 
 
 class SoftenedMovers:
-    """The photometric loss of a run, in which what moves is soft for a while."""
+    """Photometric loss of a run, which compares moving pixels at low resolution during a part of the run."""
 
     def __init__(self, movers: Tensor | None, width: int, span: tuple[float, float], block: float) -> None:
         """
         Args:
-            movers: bool [I, H, W], moving pixels of each trained frame; None: unknown, and nothing is softened.
+            movers: bool [I, H, W] moving pixels of each training frame; None: all pixels have full resolution.
             width: W.
-            span: start and end of the softening, as shares of the run.
-            block: pixels of pictures 640 wide along the side of a softened one.
+            span: start and end of training at low resolution, as shares of the run.
+            block: side of a low-resolution pixel, in pixels of an image 640 wide.
         """
         self.block, self.margin = round(block * width / _LENGTHS_OF), max(1, round(_MARGIN * width / _LENGTHS_OF))
         self.span = span if self.block > 1 else (0.0, 0.0)
@@ -37,25 +38,25 @@ class SoftenedMovers:
 
     @property
     def until(self) -> float:
-        """Share of the run at which the last softened picture was learnt from; 0: none is."""
+        """Share of the run at which training at low resolution ends; 0: it is not used."""
         return 0.0 if not any(self._any) else self.span[1]
 
     def movers_at(self, frame: int, progress: float) -> Tensor | None:
-        """bool [H, W] what moves in the trained frame at position `frame`, if that is softened once a share `progress`
-        of the run is done."""
+        """bool [H, W] moving pixels of the training frame at position `frame`; None if they have full resolution at
+        `progress` (share of the run)."""
         due = self.movers is not None and self.span[0] <= progress < self.span[1] and self._any[frame] > 0
         return self.movers[frame] if due and self.movers is not None else None
 
     def loss(
         self, image: Tensor, target: Tensor, dssim: float, ignored: Tensor | None, movers: Tensor | None
     ) -> Tensor:
-        """As `photometric`, 0-dim.
+        """Photometric loss, 0-dim; see `photometric`.
 
         Args:
             image, target: [H, W, 3].
-            dssim: weight of structure.
-            ignored: bool [H, W] pixels that teach nothing; None: all do.
-            movers: bool [H, W] what moves, of a frame that is softened; None: it is not.
+            dssim: weight of D-SSIM.
+            ignored: bool [H, W] pixels that are left out; None: no pixel.
+            movers: bool [H, W] pixels that are compared at low resolution; None: no pixel.
         """
         if movers is None:
             return photometric(image, target, dssim, ignored)
@@ -65,9 +66,9 @@ class SoftenedMovers:
         return sharp + photometric(self._soft(image), self._soft(target), dssim, ~self._touched(taught))
 
     def _soft(self, image: Tensor) -> Tensor:
-        """[h, w, 3] means of the blocks of [H, W, 3]; those at the far borders may be smaller."""
+        """[h, w, 3] block means of an image [H, W, 3]; blocks at the right and bottom border may be smaller."""
         return F.avg_pool2d(image.permute(2, 0, 1)[None], self.block, ceil_mode=True)[0].permute(1, 2, 0).contiguous()
 
     def _touched(self, mask: Tensor) -> Tensor:
-        """bool [h, w]: blocks in which a pixel of the mask lies."""
+        """bool [h, w] blocks that contain a pixel of the mask."""
         return F.max_pool2d(mask[None, None].float(), self.block, ceil_mode=True)[0, 0] > 0.0

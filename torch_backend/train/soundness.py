@@ -1,7 +1,7 @@
-"""Keeps a run finite: steps that were left out are counted, what caused them is found and mended, and a run that keeps
-failing ends in words. The repairs themselves are in `repair.py`.
+"""Detects steps with values that are not finite, and repairs their cause. A run that keeps failing ends with an error.
 
-On a GPU a step reads nothing back: what was left out is counted there, and looked at every `INSPECT_EVERY` steps.
+`repair.py` implements the repairs. On a GPU, a step reads nothing back: skipped steps are counted on the GPU, and the
+count is read every `INSPECT_EVERY` steps.
 """
 
 from __future__ import annotations
@@ -19,63 +19,65 @@ from .repair import FieldMemory, drop_offenders, repair, unstable
 from .run_view import RunView
 
 INSPECT_EVERY = 10
-"""Steps between two looks at what a GPU counted, and between two reports of progress."""
+"""Interval in steps of inspections of a GPU's counts, and of progress reports."""
 _MAX_BAD_STEPS = 20
+"""Number of consecutive skipped steps after which the run ends."""
 
 
 class MendedRun(RunView, Protocol):
-    """A run in training that can be mended."""
+    """A run in training that can be repaired."""
 
     scene: Scene
-    """What it is trained on."""
+    """Scene of the run."""
     densifier: Densifier
-    """Drops Gaussians with the model."""
+    """Densifier, whose statistics are kept in step with the Gaussians."""
     iteration: int
-    """Steps that are done."""
+    """Number of finished steps."""
     order: list[int]
-    """Positions of the trained frames that come next, the next one last."""
+    """Positions of the upcoming training frames, the next one last."""
 
     @property
     def optimizer(self) -> torch.optim.Optimizer:
-        """Of everything that is learnt."""
+        """Optimiser of all trained parameters."""
         ...
 
     def image_of(self, frame: int) -> Tensor:
-        """[H, W, 3] float32, the trained frame at position `frame`."""
+        """[H, W, 3] float32 image of the training frame at position `frame`."""
         ...
 
 
 class Soundness:
-    """Bookkeeping of a run's steps, frames and fields that are not finite."""
+    """Keeps track of a run's steps, frames and fields that are not finite."""
 
     def __init__(self, extent: float, device: torch.device) -> None:
-        """`extent`: of the scene, in its units."""
+        """`extent`: extent of the scene in scene units."""
         self.memory = FieldMemory(extent, device)
-        """What the field was when it was in order."""
+        """Stored parameters of the field while it was stable."""
         self.unusable: set[int] = set()
-        """Positions of the trained frames whose pictures are not finite; nobody trains on them again."""
+        """Positions of the training frames whose images are not finite; they are not trained on again."""
         self.mended = 0
-        """How often something was found out of order."""
+        """Number of inspections that found a fault."""
         self.troubled = False
-        """Was the last step before the last look left out? Its successors are taken one launch at a time (`recorder`),
-        so that the next look finds the gradients of one."""
+        """True if the last step before the last inspection was skipped. The following steps are then launched
+        (`recorder`), so that the next inspection finds the gradients of a step."""
         self._in_a_row = 0
         self._counted = torch.zeros(2, dtype=torch.int32, device=device)
         self._recent: deque[int] = deque(maxlen=2 * INSPECT_EVERY)
 
     def trains_on(self, *frames: int) -> None:
-        """Frames, by their positions among the trained ones, that a step looks at."""
+        """Notes the training frames (positions) that a step uses."""
         self._recent.extend(frames)
 
     def count(self, applied: Tensor) -> None:
-        """After a step: `applied` (0-dim bool) says whether it was; on the CPU it was, else see `skipped`."""
+        """Counts a step as applied or skipped, by `applied` (0-dim bool). On the CPU, it is called for applied steps
+        only; `skipped` is called for others."""
         self._in_a_row = 0
         if applied.device.type != "cpu":
             left_out = ~applied
             self._counted.copy_(torch.stack([self._counted[0] + left_out, (self._counted[1] + 1) * left_out]))
 
     def skipped(self, run: MendedRun, frame: int) -> None:
-        """After a step that was left out on the CPU: repairs; a run that keeps failing ends in words."""
+        """Repairs the run after a skipped step on the CPU. JobError if the run keeps failing."""
         self._in_a_row += 1
         if self._in_a_row >= _MAX_BAD_STEPS:
             raise unstable(run.iteration)
@@ -84,21 +86,24 @@ class Soundness:
         self._recover(run, text if self._in_a_row == 1 else "", gradients=True)
 
     def inspect(self, run: MendedRun) -> None:
-        """Repairs what is not finite; reads a GPU's counts of steps left out: since the last look, and in a row."""
+        """Reads a GPU's counts of skipped steps (since the last inspection, and consecutive), and repairs values that
+        are not finite. JobError if the run keeps failing."""
         count, in_a_row = (0, 0) if run.device.type == "cpu" else integers(self._counted)
         self._counted[0] = 0
         if in_a_row >= _MAX_BAD_STEPS:
             raise unstable(run.iteration)
         self.troubled = in_a_row > 0
         if self.troubled and all(p.grad is None for p in run.model.gaussians.params.values()):
-            self._counted.zero_()  # recorded steps leave no gradients to look into: their successors count anew
+            self._counted.zero_()  # recorded steps leave no gradients to inspect, so counting restarts
         text = f"{count} of the steps up to {run.iteration} were skipped: their loss or gradient is not finite."
         self._recover(run, text if count else "", gradients=in_a_row > 0)
 
     def _recover(self, run: MendedRun, skipped: str, gradients: bool) -> None:
-        """Finds what is not finite and drops or mends it; `skipped` says which steps were left out, if any.
+        """Finds and repairs values that are not finite, and warns.
 
-        gradients: the parameters hold those of a step that was left out.
+        Args:
+            skipped: sentence that says which steps were skipped; empty if none.
+            gradients: True if the parameters hold the gradients of a skipped step.
         """
         model = run.model
         done = repair(model, run.optimizer, run.densifier, self.memory, run.iteration)
@@ -123,6 +128,6 @@ class Soundness:
             self.memory.keep(model.field, model.gaussians.params["means"].detach()[model.open_rows()])
 
     def _bad_images(self, run: MendedRun) -> list[int]:
-        """Of the frames trained on lately, those whose image is not finite."""
+        """Positions of the recently used training frames whose image is not finite."""
         frames = sorted({*self._recent} - self.unusable)
         return [frame for frame in frames if not bool(torch.isfinite(run.image_of(frame)).all())]

@@ -1,7 +1,7 @@
-"""What a static model of a clip shows: the clip learnt in a few hundred steps as a world in which nothing moves.
+"""Static baseline: renders of a clip by a static model that is trained for a few hundred steps.
 
-What a frame shows and a static model does not is moving or hard to learn: `motion/misfit.py` tells them apart by other
-frames.
+Where a frame differs from the static model, the content either moves or is hard to fit. `motion/misfit.py` uses other
+frames to distinguish the two.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ from .trainer import Trainer
 
 STAGE = "solve: still world"
 STEPS = 400
-"""Of training, but at most `PER_FRAME[1]` for each frame: a model that looks longer at few frames learns the movers of
-each of them as well, near its camera. Of many frames each is examined `PER_FRAME[0]` times."""
+"""Usual number of training steps."""
 PER_FRAME = 2, 8
+"""Minimum and maximum number of steps per frame. With more steps on few frames, the model would also fit each frame's
+moving objects, by Gaussians near that frame's camera."""
 GAUSSIANS = 20_000
-"""At most: coarse, and soon learnt."""
+"""Maximum number of Gaussians: a coarse model that trains quickly."""
 FRAMES = 600
-"""Frames that are learnt from, at most, evenly over the clip: more are as their neighbours are."""
+"""Maximum number of training frames, evenly spaced over the clip. More would be nearly equal to their neighbours."""
 
 
 def static_views(shot: Shot, report: Reporter) -> StaticViews:
-    """Learns a solved shot as a static world, on the processor; nothing is written.
+    """Trains a static model of a solved shot on the CPU. Nothing is written.
 
-    Returns what it shows at any delivered frame, [h, w, 3] uint8 of a preview's size, with that frame's exposure.
-    JobError if the shot cannot be learnt, Cancelled.
+    Returns a function that renders a delivered frame as [h, w, 3] uint8 at preview size, with that frame's exposure.
+    Raises JobError if the shot cannot be trained, and Cancelled.
     """
     scene = load_scene(shot)
     train = [scene.solved[n] for n in evenly_spaced(len(scene.solved), FRAMES)]
@@ -61,21 +62,21 @@ def static_views(shot: Shot, report: Reporter) -> StaticViews:
 
 
 def steps_for(frames: int) -> int:
-    """Steps in which a static model of so many frames is trained."""
+    """Number of training steps for a static model of `frames` frames."""
     least, most = (each * frames for each in PER_FRAME)
     return min(max(STEPS, least), most)
 
 
 class _Heard(Reporter):
-    """Hands on how far a training is, and that it is to stop; its figures and advice are of no run."""
+    """Forwards progress and cancellation of the training. Its metrics and warnings are dropped."""
 
     def __init__(self, report: Reporter) -> None:
         self._report = report
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        """As a stage of the solve."""
+        """Reports the training's progress as a stage of the solve."""
         self._report.progress(STAGE, done, total, message)
 
     def check_cancelled(self) -> None:
-        """As the one that is told."""
+        """Raises Cancelled if the solve was cancelled."""
         self._report.check_cancelled()

@@ -1,7 +1,7 @@
-"""What one training step is told: which work it is, and the numbers and pictures that are other in each.
+"""Inputs of one training step: the kind of step, and the tensors that change from step to step.
 
-Everything that changes from step to step comes in as a tensor. So a step's work can be recorded once and carried out
-again on other numbers (`recorder`).
+Everything that changes from step to step is a tensor. A step can therefore be recorded once as a CUDA graph and
+replayed on other inputs (`recorder`).
 """
 
 from __future__ import annotations
@@ -17,54 +17,55 @@ from ..supervision import Draws
 
 @dataclass(frozen=True)
 class StepKind:
-    """Which work a step is. Between two events of a run, steps of one kind are the same work on tensors of the same
+    """Kind of a step. Between two events of a run, steps of one kind run the same operations on tensors of the same
     sizes."""
 
     sh_degree: int
-    """Harmonics in use."""
+    """SH degree in use."""
     moves: bool
-    """Is there a field, and something that it moves?"""
+    """True if there is a field that moves at least one Gaussian."""
     detached: bool
-    """Do the images leave the field alone?"""
+    """True if the photometric loss does not train the field."""
     hidden: bool
-    """Does the step mark Gaussians that are hidden in the frame?"""
+    """True if the step marks Gaussians that are hidden in the frame."""
     anchored: bool
-    """Are pairs anchored?"""
+    """True if the step anchors pairs of Gaussian and time."""
     penalised: bool
-    """Does the field pay for not being smooth?"""
+    """True if the step evaluates the field's regularisers."""
     soft: bool
-    """Is what moves learnt from a softened picture?"""
+    """True if moving pixels are compared at low resolution (`softened.py`)."""
     ignored: bool
-    """Are there pixels that teach nothing?"""
+    """True if some pixels are left out of the loss."""
     depth: bool
-    """Is what moves pulled to a depth map?"""
+    """True if moving Gaussians are pulled to a depth map."""
     recordable: bool
-    """Does it ask a GPU nothing, and do its frame's own numbers all come in as `StepFacts`?"""
+    """True if the step reads nothing back from the GPU and takes everything that depends on its frame from
+    `StepFacts`."""
 
 
 @dataclass
 class StepFacts:
-    """What is other in each step. Anywhere, until `on` or `into` brings it to the device."""
+    """Inputs that change from step to step. They may be on any device until `on` or `into` moves them."""
 
     numbers: Tensor
-    """[7] float32: normalised time at which the field is evaluated; the shares of the exposure's two bins; what motion
-    is priced at; the background's colour."""
+    """[7] float32: normalised time at which the field is evaluated; weights of the exposure's two bins; price of
+    motion; background colour [3]."""
     places: Tensor
-    """[3] int64: the frame's time bin; the exposure's two bins."""
+    """[3] int64: time bin of the frame; the exposure's two bins."""
     viewmat: Tensor
-    """[4, 4] the solve's camera."""
+    """[4, 4] world-to-camera matrix of the solve."""
     K: Tensor
-    """[3, 3] px."""
+    """[3, 3] intrinsics in pixels."""
     image: Tensor
-    """[H, W, 3] display-referred, float32 on the device."""
+    """[H, W, 3] display-referred training image, float32 on the device."""
     ignored: Tensor | None
-    """bool [H, W] pixels that teach nothing."""
+    """bool [H, W] pixels that are left out of the loss; None: no pixel."""
     movers: Tensor | None
-    """bool [H, W] what moves in the frame, where that is softened."""
+    """bool [H, W] moving pixels that are compared at low resolution; None: no pixel."""
     draws: Draws | None
-    """What pairs to anchor are drawn by."""
+    """Random numbers that select the pairs to anchor; None: no pairs."""
     depth: Tensor | None = None
-    """[2, H, W] inverse depth that pixels should have, 0 where nothing is asked, and its standard deviation."""
+    """[2, H, W] target inverse depth (0: no target) and its standard deviation; None: no targets."""
 
     @property
     def asked(self) -> Tensor:
@@ -73,44 +74,44 @@ class StepFacts:
 
     @property
     def exposure_shares(self) -> Tensor:
-        """[2] float32 shares of the exposure's two bins."""
+        """[2] float32 weights of the exposure's two bins."""
         return self.numbers[1:3]
 
     @property
     def motion_price(self) -> Tensor:
-        """0-dim float32, what motion is priced at."""
+        """Price of motion, 0-dim float32."""
         return self.numbers[3]
 
     @property
     def background(self) -> Tensor:
-        """[3] float32 colour."""
+        """[3] float32 background colour."""
         return self.numbers[4:]
 
     @property
     def time_bin(self) -> Tensor:
-        """[1] int64, the frame's."""
+        """[1] int64 time bin of the frame."""
         return self.places[:1]
 
     @property
     def exposure_bins(self) -> Tensor:
-        """[2] int64."""
+        """[2] int64 the exposure's two bins."""
         return self.places[1:]
 
     def on(self, device: torch.device) -> StepFacts:
-        """The same on a device."""
+        """Copy of all tensors on `device`."""
         return self._made(lambda t: t.to(device, non_blocking=True))
 
     def room(self, device: torch.device) -> StepFacts:
-        """Tensors of these shapes, on a device, for `into`."""
+        """Uninitialised tensors of the same shapes on `device`, to be filled by `into`."""
         return self._made(lambda t: torch.empty(t.shape, dtype=t.dtype, device=device))
 
     def into(self, room: StepFacts) -> None:
-        """Writes it into the `room` of one of the same kind."""
+        """Copies all tensors into `room`, which was allocated for a step of the same kind."""
         for target, value in zip(room._tensors(), self._tensors(), strict=True):
             target.copy_(value, non_blocking=True)
 
     def _tensors(self) -> list[Tensor]:
-        """All that there are, in one order."""
+        """All tensors that are not None, in a fixed order."""
         found = [self.numbers, self.places, self.viewmat, self.K, self.image]
         found += [t for t in (self.ignored, self.movers, self.depth) if t is not None]
         return [*found, *(() if self.draws is None else self.draws.tensors())]

@@ -1,20 +1,21 @@
-"""Only what a scene needs: what a run of `auto` decides while it trains, from what, and what it says in the end.
+"""Decisions of an `auto` run during training that limit the model and the run to what the scene needs.
 
-A few trained frames are kept back as probes, and every decision reads the PSNR on them: the frames that are reported
-on (`TrainConfig.holdout`) decide nothing. Late in the run the probes are trained on like all others. Decisions depend
-on nothing but the run's numbers, and their state is in the checkpoint: a resumed run decides the same.
+A few training frames are kept back as probes, and every decision is based on their PSNR. Held-out frames
+(`TrainConfig.holdout`), on which results are reported, are never used. Late in the run, the probes become training
+frames. Decisions are deterministic and their state is stored in the checkpoint, so a resumed run decides the same.
 
-- SH degree: a raise is kept if the model beats itself cut to the degree below. When that is asked, harmonics have
-  learnt for a while only; what they gained is scaled by how far their learning rate still lets them go (`lasting`).
-- Growth: PSNR rises by optimisation alone too, and a run cannot be had twice. So growth ends on a bound: when all that
-  the probes gained while the Gaussians grew, optimisation included, falls below a threshold per 10 % more of them,
-  what growth gained is below it as well. It errs on the side of growing.
-- End: when the probes gain nothing more. By then they are trained on, so what they gain is at least what a frame kept
-  back would gain: this too errs on the side of going on.
-- Time nodes: from how long what the static model gets wrong stays the same (`residual.correlation_frames`).
+- SH degree: a higher degree is kept if it improves PSNR over the same model truncated to the degree below. At that
+  time the new coefficients are only partly trained; `lasting` extrapolates their gain to the end of the run.
+- Growth: PSNR also rises by optimisation alone, and the two effects cannot be measured separately in one run. So
+  growth is judged by an upper bound, the total gain while the Gaussians grew. Growth ends when this gain falls below
+  a threshold per 10 % more Gaussians. The bound favours growth.
+- End: the run stops when the probes gain nothing more. By then they are trained on, so their gain is at least that of
+  held-out frames. This favours a longer run.
+- Time nodes: chosen from the time over which the residual of the static model stays correlated
+  (`residual.correlation_frames`).
 
-The policy sees a run through `Probe` and changes nothing of it: the trainer carries out what `decide` yields, and reads
-the rest, which stands until the run is over, from the policy's properties.
+The policy reads a run through `Probe` and does not change it. The trainer carries out the decisions that `decide`
+yields, and reads lasting results from the policy's properties.
 """
 
 from __future__ import annotations
@@ -30,40 +31,42 @@ from torch import Tensor
 
 _LEAST_PROBES, _MOST_PROBES = 3, 12
 _GROWN = 1.5
-"""Growth is judged over measurements between which the Gaussians grew by this factor, at least `_POINTS` of them."""
+"""Least growth factor of the number of Gaussians over the measurements by which growth is judged."""
 _POINTS = 4
+"""Least number of measurements by which growth is judged."""
 _SPAN = 0.1
-"""These measurements span this share of the run. In a long one the schedule doubles the Gaussians in three rounds, and
-judged on those that are as many steps old growth ended at 42,000 of 160,000."""
+"""Least span of these measurements, as a share of the run. In a long run, the schedule doubles the Gaussians in three
+rounds of densification; judged over three rounds only, growth ended at 42,000 of 160,000."""
 
 
 @dataclass
 class StoppingConfig:
-    """What is enough. Gains are dB of mean PSNR on the probe frames, shares are of the run's length."""
+    """Stopping criteria. Gains are in dB of mean PSNR on the probe frames; shares are of the run's length."""
 
     probes: int = 12
-    """Every how many trained frames one is a probe, 3 to 12 in all; 0: none, all is spent."""
+    """Interval, in training frames, of the probe frames (3 to 12 in all); 0: no probes and no early stop."""
     least: int = 48
-    """A clip of fewer trained frames keeps none back: it can spare none (3 of 42 cost 0.1 dB)."""
+    """Least number of training frames of a clip with probes. In a clip of 42 frames, 3 probes cost 0.1 dB."""
     join: float = 0.6
-    """Share of the run at which the probe frames are trained on too; until then they decide."""
+    """Share of the run at which the probe frames become training frames."""
     every: float = 0.025
     """Share of the run between two measurements, rounded to rounds of densification."""
     sh_gain: float = 0.015
-    """Least gain of a higher SH degree by the end of the run, over the model cut to the degree below: measured when
-    the next raise is due, and scaled."""
+    """Least gain of a higher SH degree over the model truncated to the degree below. It is measured when the next
+    raise is due, and extrapolated to the end of the run."""
     growth_gain: float = 0.03
-    """Least gain per 10 % more Gaussians, what optimisation gained meanwhile included, for growth to go on."""
+    """Least total gain (by growth and optimisation) per 10 % more Gaussians for growth to continue."""
     stop_gain: float = 0.05
-    """Least gain over `stop_window`, after the gate has hardened and of whole pictures, for the run to go on."""
+    """Least gain within `stop_window` for the run to continue. It is checked once the gate has hardened and training on
+    low-resolution images has ended."""
     stop_window: float = 0.15
-    """Share of the run over which that gain is searched for."""
+    """Share of the run over which `stop_gain` is measured."""
     anneal: float = 0.1
-    """Share of the run over which a run that has enough brings its learning rates to their end."""
+    """Share of the run over which a stopped run brings its learning rates to their final values."""
 
 
 def probe_frames(frames: int, every: int, least: int = 24) -> list[int]:
-    """Positions among `frames` trained frames of those kept back, evenly spread, never an end; [] for short clips."""
+    """Positions of the probes among `frames` training frames: evenly spaced, without the ends; [] for short clips."""
     if every <= 0 or frames < least:
         return []
     count = min(max(frames // every, _LEAST_PROBES), _MOST_PROBES)
@@ -71,9 +74,10 @@ def probe_frames(frames: int, every: int, least: int = 24) -> list[int]:
 
 
 def growth_gain(measured: list[tuple[int, int, float]], steps: int = 0) -> float | None:
-    """dB per 10 % more Gaussians: slope of PSNR over log count. None if they grew too little to tell.
+    """Gain in dB per 10 % more Gaussians: slope of PSNR over log count. None if the number grew too little.
 
-    Over the newest of the measurements (iteration, Gaussians, PSNR) that span a growth by `_GROWN` and so many `steps`.
+    The slope is fitted to the fewest latest measurements (iteration, Gaussians, PSNR) that span a growth by the factor
+    `_GROWN` and `steps` iterations.
     """
     for first in range(len(measured) - _POINTS, -1, -1):
         iterations, counts, values = zip(*measured[first:], strict=True)
@@ -84,16 +88,22 @@ def growth_gain(measured: list[tuple[int, int, float]], steps: int = 0) -> float
 
 
 def newest_gain(measured: list[tuple[int, int, float]], since: int) -> float | None:
-    """dB by which the best PSNR after iteration `since` exceeds the best until then. None without both."""
+    """Gain in dB of the best PSNR after iteration `since` over the best until then. None if either is missing."""
     before = [value for iteration, _, value in measured if iteration <= since]
     after = [value for iteration, _, value in measured if iteration > since]
     return max(after) - max(before) if before and after else None
 
 
 def lasting(since: float, now: float, rates_end: float) -> float:
-    """How far harmonics that learn since a share of the run will go by its end, over how far they came until `now`.
+    """Expected total change of SH coefficients by the end of the run, relative to their change so far.
 
-    Adam moves a parameter by about a rate per step, and the rate falls to a share `rates_end` over the run.
+    Adam changes a parameter by about the learning rate per step, and the rate decays exponentially to `rates_end` of
+    its initial value. So the change is proportional to the integral of the rate.
+
+    Args:
+        since: share of the run at which the coefficients started training.
+        now: current share of the run.
+        rates_end: final learning rate as a share of the initial one.
     """
     if rates_end >= 1.0:
         return (1.0 - since) / max(1e-6, now - since)
@@ -101,11 +111,11 @@ def lasting(since: float, now: float, rates_end: float) -> float:
 
 
 class Probe(Protocol):
-    """What the policy sees of a run in training."""
+    """Interface through which the policy reads a run in training."""
 
     @property
     def iteration(self) -> int:
-        """Steps that are done."""
+        """Number of finished steps."""
         ...
 
     @property
@@ -115,7 +125,7 @@ class Probe(Protocol):
 
     @property
     def gaussian_count(self) -> int:
-        """Gaussians there are now."""
+        """Current number of Gaussians."""
         ...
 
     @property
@@ -132,41 +142,41 @@ class Probe(Protocol):
         field: bool = True,
         viewmats: Tensor | None = None,
     ) -> float | None:
-        """Mean PSNR in dB on trained frames (positions); None if it is no number.
+        """Mean PSNR in dB on the training frames at positions `frames`; None if it is not finite.
 
-        With another SH degree, without the exposure or the field (None if the run has none), or seen from other cameras
-        [F, 4, 4] of the scene's frames.
+        Options: another SH degree, no exposure correction, no field, or other cameras [F, 4, 4] of the scene's frames.
+        None if the run has no exposure correction or field to switch off.
         """
         ...
 
     def correlation_frames(self) -> float | None:
-        """`residual.correlation_frames` of the static model's residual at open Gaussians."""
+        """Result of `residual.correlation_frames` for the static model's residual at open Gaussians."""
         ...
 
 
 @dataclass(frozen=True)
 class RunSchedule:
-    """What of a run's configuration decisions hang on. Shares are of the run's length."""
+    """The parts of a run's configuration that decisions depend on. Shares are of the run's length."""
 
     iterations: int
-    """Training steps, if nothing ends the run before."""
+    """Configured number of training steps."""
     densify_every: int
     """Steps between two rounds of densification."""
     densify_stop: float
-    """Share at which growth ends of itself."""
+    """Share at which growth ends by schedule."""
     give_up: float
-    """Share at which the gate's trial is over, whatever moved."""
+    """Latest share at which the gate's trial ends."""
     sh_every: float
-    """The SH degree rises by one every this share; 0: it is the highest from the start."""
+    """Share after which the SH degree rises by one; 0: the highest degree is used from the start."""
     rates_end: float
-    """Share of the harmonics' learning rate that is left at the end."""
+    """Final learning rate of the SH coefficients, as a share of the initial one."""
     softened: float = 0.0
-    """Share until which what moves is learnt from softened pictures; 0: never."""
+    """Share until which moving pixels are trained on low-resolution images; 0: never."""
 
 
 @dataclass(frozen=True)
 class LimitHarmonics:
-    """A decision: the harmonics above a degree go, with their moments, and do not come back."""
+    """Decision to remove the SH coefficients above a degree, with their moments, for the rest of the run."""
 
     degree: int
     """Highest SH degree from now on."""
@@ -174,36 +184,36 @@ class LimitHarmonics:
 
 @dataclass(frozen=True)
 class FieldOpened:
-    """When the field was made."""
+    """Time at which the deformation field was created."""
 
     iteration: int
-    """Steps that were done."""
+    """Number of finished steps."""
     seconds: float
-    """Seconds of training until then."""
+    """Training time in seconds."""
 
 
 @dataclass
 class RunFacts:
-    """What a run learnt about itself on the way. None: not measured, or it has not happened (yet)."""
+    """Measurements and events of a run. None: not measured, or not happened yet."""
 
     growth_gain_db: float | None = None
-    """dB per 10 % more Gaussians when growth was judged last, what optimisation gained meanwhile included."""
+    """Total gain in dB per 10 % more Gaussians when growth was last judged, including the gain by optimisation."""
     opened: FieldOpened | None = None
     """The creation of the deformation field; None before it."""
     hardened: int | None = None
-    """Iteration at which the gate closed what did not move."""
+    """Iteration at which the gate closed the Gaussians that did not move."""
     correlation_frames: float | None = None
-    """Lag in frames at which the residual of the static model correlates with itself by half."""
+    """Lag in frames at which the autocorrelation of the static model's residual is half of that at lag 1."""
     time_nodes: int | None = None
     """Number of nodes on the field's time axis, chosen from that lag."""
     poses_gain_db: float | None = None
-    """What refined cameras gained on the probes."""
+    """Gain by refined cameras on the probes."""
     exposure_gain_db: float | None = None
-    """What the exposure is worth on the probes, as they join."""
+    """Gain by the exposure correction on the probes, just before they become training frames."""
     field_gain_db: float | None = None
-    """What motion is worth on them."""
+    """Gain by the deformation field on the probes, at the same time."""
     probe_psnr_db: float | None = None
-    """What the whole model reaches on them."""
+    """PSNR of the whole model on the probes, at the same time."""
 
     @property
     def on_trial(self) -> bool:
@@ -211,7 +221,7 @@ class RunFacts:
         return self.opened is not None and self.hardened is None
 
     def to_json(self) -> dict[str, Any]:
-        """Those that are known."""
+        """All facts that are not None, as JSON-able types."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
     @classmethod
@@ -224,7 +234,7 @@ class RunFacts:
 
 
 class StoppingPolicy:
-    """Probe frames and decisions of one run. `frames`: how many it trains on; 0: it decides nothing."""
+    """Probe frames and decisions of one run. `frames`: number of training frames; 0: nothing is decided."""
 
     def __init__(self, config: StoppingConfig, frames: int, schedule: RunSchedule) -> None:
         self.config, self.frames, self.schedule = config, frames, schedule
@@ -238,7 +248,7 @@ class StoppingPolicy:
         self.facts = RunFacts()
 
     def state(self) -> dict[str, Any]:
-        """JSON-able, for a checkpoint."""
+        """State for a checkpoint, as JSON-able types."""
         return {
             "joined": self.joined, "measured": self.measured, "degrees": list(self.degrees.items()),
             "sh_limit": self.sh_limit, "growth_ended": self.growth_ended, "stopped": self.stopped,
@@ -246,37 +256,37 @@ class StoppingPolicy:
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Inverse of `state`."""
+        """Restores what `state` returned."""
         self.joined, self.sh_limit = state["joined"], state["sh_limit"]
         self.measured = [(int(i), int(n), float(v)) for i, n, v in state["measured"]]
         self.degrees = {int(degree): float(gain) for degree, gain in state["degrees"]}
         self.growth_ended, self.stopped = state["growth_ended"], state["stopped"]
         self.facts = RunFacts.from_json(state["facts"])
 
-    # ------------------------------------------------------------------ what stands, for the trainer
+    # ------------------------------------------------------------------ results, for the trainer
 
     @property
     def held(self) -> set[int]:
-        """Positions of the trained frames that are kept back now."""
+        """Positions of the training frames that are currently kept back as probes."""
         return set() if self.joined else set(self.probes)
 
     def sh_degree(self, configured: int) -> int:
-        """The scheduled SH degree `configured`, or the one that proved enough."""
+        """The scheduled SH degree `configured`, limited to the highest degree that was kept."""
         return configured if self.sh_limit is None else min(configured, self.sh_limit)
 
     @property
     def growing(self) -> bool:
-        """May the Gaussians still become more?"""
+        """True if the number of Gaussians may still grow."""
         return self.growth_ended is None
 
     @property
     def end(self) -> int:
-        """Iterations after which the run is over."""
+        """Iteration at which the run ends."""
         iterations = self.schedule.iterations
         return iterations if self.stopped is None else min(iterations, self.stopped + self._anneal)
 
     def rate_progress(self, iteration: int, iterations: int) -> float:
-        """The progress at which learning rates are looked up: a run that has enough hastens to its end."""
+        """Progress at which learning rates are evaluated. In a stopped run it rises faster, to reach 1 at the end."""
         if self.stopped is None:
             return iteration / iterations
         at = self.stopped / iterations
@@ -284,21 +294,22 @@ class StoppingPolicy:
 
     @property
     def _anneal(self) -> int:
-        """Steps in which a run that has enough brings its learning rates to their end."""
+        """Number of steps in which a stopped run brings its learning rates to their final values."""
         return max(1, round(self.config.anneal * self.schedule.iterations))
 
     # ------------------------------------------------------------------ decisions
 
     def decide(self, probe: Probe) -> Iterator[LimitHarmonics]:
-        """Called between steps; what it yields is carried out before the next is asked for.
+        """Makes the decisions that are due; called between steps.
 
-        A decision interrupted by a cancel is taken again when the run goes on.
+        The caller carries out each yielded decision before it requests the next. A decision interrupted by a
+        cancellation is made again when the run is resumed.
         """
         if not self.probes:
             return
         s = self.schedule
         grid = s.densify_every * max(1, round(self.config.every * s.iterations / s.densify_every))
-        # Before a round of densification, when the splits of the last one have settled.
+        # Measured just before a round of densification, when the splits of the previous round have settled.
         due = probe.iteration > 0 and probe.iteration % grid == 0
         if due and self.stopped is None and (not self.measured or self.measured[-1][0] < probe.iteration):
             self._measure(probe)
@@ -310,11 +321,11 @@ class StoppingPolicy:
                 self._join(probe)
 
     def field_opened(self, iteration: int, seconds: float) -> None:
-        """The trainer made the field."""
+        """Notes that the trainer has created the field."""
         self.facts.opened = FieldOpened(iteration, seconds)
 
     def gate_hardened(self, iteration: int) -> None:
-        """The gate closed what did not move."""
+        """Notes that the gate has closed the Gaussians that did not move."""
         self.facts.hardened = iteration
 
     def _measure(self, probe: Probe) -> None:
@@ -322,14 +333,14 @@ class StoppingPolicy:
         if value is None:
             return
         self.measured.append((probe.iteration, probe.gaussian_count, value))
-        # While a field is on trial probes fall and rise by it: one measured 3 steps after it had opened ended growth.
+        # A new field disturbs the probes' PSNR during the trial. A measurement 3 steps after its creation ended growth.
         if not self.joined and self.growing and not self.facts.on_trial:
             gain = self.facts.growth_gain_db = growth_gain(self.measured, round(_SPAN * self.schedule.iterations))
             if gain is not None and gain < self.config.growth_gain:
                 self.growth_ended = probe.iteration
         s = self.schedule
         hardened = (s.give_up * s.iterations if self.facts.hardened is None else self.facts.hardened) / s.iterations
-        # Softened pictures gain nothing on sharp probes: a run of 9000 steps ended at 5500 by what it had not yet seen.
+        # Training at low resolution gains nothing on sharp probes; without this, a run of 9000 steps ended at 5500.
         sharp = s.softened + self.config.stop_window if s.softened > 0.0 else 0.0
         over = probe.progress > max(hardened, sharp, s.densify_stop if self.growing else 0.0)
         gain = newest_gain(self.measured, probe.iteration - round(self.config.stop_window * s.iterations))
@@ -338,7 +349,7 @@ class StoppingPolicy:
             self.stopped = probe.iteration
 
     def _excess_degree(self, probe: Probe) -> bool:
-        """Is it time to judge the SH degree in use, and does it gain too little?"""
+        """True if the SH degree in use is due to be judged and gains too little."""
         every, degree = self.schedule.sh_every, probe.sh_degree
         if degree == 0 or degree in self.degrees or self.sh_limit is not None or every <= 0:
             return False
@@ -351,14 +362,14 @@ class StoppingPolicy:
         return (whole - cut) * lasting(degree * every, probe.progress, self.schedule.rates_end) <= self.config.sh_gain
 
     def judge_cameras(self, probe: Probe, refined: Tensor) -> None:
-        """Gain by refined cameras [F, 4, 4], measured before they replace those of the run."""
+        """Measures the gain by refined cameras [F, 4, 4] before they replace the run's cameras."""
         if self.joined or self.facts.poses_gain_db is not None:
             return
         without, value = probe.probe_psnr(self.probes), probe.probe_psnr(self.probes, viewmats=refined)
         self.facts.poses_gain_db = _difference(value, without)
 
     def _join(self, probe: Probe) -> None:
-        """The last look at frames that were not trained on: what exposure and motion are worth; then they join."""
+        """Measures the gain by exposure and field on the probes for the last time, then makes them training frames."""
         whole = probe.probe_psnr(self.probes)
         self.facts.exposure_gain_db = _difference(whole, probe.probe_psnr(self.probes, exposure=False))
         self.facts.field_gain_db = _difference(whole, probe.probe_psnr(self.probes, field=False))
@@ -366,7 +377,7 @@ class StoppingPolicy:
         self.joined = True
 
     def time_nodes(self, probe: Probe) -> int:
-        """How many nodes the time axis of a field needs for what the open Gaussians do; 0: nothing is decided."""
+        """Number of nodes that the field's time axis needs for the motion of the open Gaussians; 0: not decided."""
         most = max(4, round(self.frames / 2))
         if not self.probes or most == 4:
             return 0

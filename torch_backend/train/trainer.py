@@ -1,5 +1,8 @@
-"""A run in training: its model, and one step on one image. Schedules are shares of the run: presets differ in
-numbers only. `events.py` has what happens between steps, `loop.py` the way to the end, `resume.py` the checkpoint."""
+"""A run in training: its model, and one optimisation step on one image.
+
+Schedules are shares of the run, so presets differ in numbers only. `events.py` implements the events between steps,
+`loop.py` the training loop, and `resume.py` the checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -48,23 +51,23 @@ from .stopping import RunSchedule, StoppingPolicy
 
 
 class Trainer:
-    """Optimises one run on one device; images [I, H, W, 3] float16 display-referred, on the device or in host memory.
+    """Optimises one run on one device.
 
-    Random numbers are drawn on the CPU whatever the device is: a run is the same experiment everywhere, and its
-    checkpoint goes on anywhere. On a GPU a step reads nothing back; the loop looks every `INSPECT_EVERY` steps.
+    Random numbers are always drawn on the CPU, so that a run is the same experiment on every device and its checkpoint
+    can be resumed on any. On a GPU a step reads nothing back; the loop checks the state every `INSPECT_EVERY` steps.
 
     Args:
         scene: normalised scene, on the CPU.
-        images: the training frames.
-        train: indices into the scene's frames, one per image.
-        config: every number of the run.
-        identity: JSON-able facts that say which run a checkpoint belongs to; stored in it.
-        device: where it trains.
-        movers: bool [I, H, W] what the motion mattes call moving in the training frames; None: there are no mattes.
-        ignored: index of a frame of the scene -> bool [H, W] which of its pixels teach nothing, and are not measured.
-        most: Gaussians that fit the device's memory, where they are fewer than the configuration's.
-        pieces: Gaussians that the field works on at a time; None: all.
-        depth: depth maps of an artist's; what moves by `movers` is pulled to them, and seeds start there.
+        images: [I, H, W, 3] float16 display-referred training frames, on the device or in host memory.
+        train: [I] indices of the training frames in the scene's frames.
+        config: configuration of the run.
+        identity: JSON-able facts that identify the run; stored in its checkpoint.
+        device: device of the training.
+        movers: bool [I, H, W] moving pixels of the training frames by the motion mattes; None: there are no mattes.
+        ignored: index of a scene frame -> bool [H, W] pixels that are left out of training and measurements.
+        most: number of Gaussians that fit the device's memory; None: the configured budget fits.
+        pieces: number of Gaussians per call of the field; None: all in one call.
+        depth: the user's depth maps. Seeds start at them, and Gaussians in `movers` are pulled to them.
     """
 
     def __init__(
@@ -113,7 +116,7 @@ class Trainer:
         self.soundness = Soundness(float(norm_of_all(high - low)), self.device)
         self.poses = Poses(self.times, config.poses, self.device)
         self.refined = False
-        """True once the corrected cameras are the cameras."""
+        """True once the corrected cameras have replaced the solve's cameras."""
         self.optimizer = optimizer_of(self.model, self.poses, config)
         self.mean = ParameterMean()
         self.densifier = Densifier(self.densify_config(), len(gaussians), self.device)
@@ -122,17 +125,17 @@ class Trainer:
     # ------------------------------------------------------------------ the run
 
     def bin_of_frame(self, frame: int) -> int:
-        """Time bin of the support bitmap for the trained frame at position `frame`."""
+        """Time bin of the support bitmap for the training frame at position `frame`."""
         return self._bins[frame]
 
     @property
     def excluded_frames(self) -> set[int]:
-        """Positions of the trained frames that are not trained on now: kept back as probes, or unusable."""
+        """Positions among the training frames that are currently excluded: probe frames and unusable frames."""
         return self.soundness.unusable | self.policy.held
 
     @property
     def gaussian_count(self) -> int:
-        """Gaussians there are now."""
+        """Current number of Gaussians."""
         return len(self.model.gaussians)
 
     @property
@@ -142,29 +145,32 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """Share of the run that is done; an extended one stays at its end, where every schedule has run out."""
+        """Share of the run that is done. 1 for an extended run, in which every schedule has reached its end."""
         return 1.0 if self.extensions else self.iteration / self.config.iterations
 
     @property
     def end(self) -> int:
-        """Iterations after which the run is over: the configured ones, or fewer if it has what the scene needs."""
+        """Iteration at which the run ends: as configured, earlier if the policy stops it, later if it is extended."""
         return self.extensions[-1].end if self.extensions else self.policy.end
 
     def extend(self, steps: int, heldout_psnr_db: float | None) -> None:
-        """Adds steps to a run that has ended; `heldout_psnr_db` is what it was worth on held-out frames until now.
+        """Adds steps to a finished run; `heldout_psnr_db` is its mean PSNR on held-out frames so far.
 
-        The gate stays as it is, nothing grows, anchors and price go on in full, and no early end is searched for.
+        The gate stays unchanged, and Gaussians are not densified. Anchors and the price of motion keep their full
+        weight. The policy does not stop the run early.
         """
         self.extensions.append(Extension(self.iteration, steps, heldout_psnr_db, self.trained_seconds))
-        self.policy.joined = True  # a run that ended early may still hold its probe frames back
+        self.policy.joined = True  # the probe frames of a run that ended early may still be excluded
 
     def densify_config(self) -> DensifyConfig:
-        """As configured, but for what fits; the configuration itself stays as requested: it is the run's key."""
+        """The densification settings, with the budget limited to `most`. `config` itself is not changed, since the
+        run's key is computed from it."""
         config = self.config.densify
         return config if self.most is None else dataclasses.replace(config, budget=min(config.budget, self.most))
 
     def step(self) -> Tensor:
-        """One optimisation step on one training frame; returns its photometric loss (0-dim). Not finite: left out."""
+        """Runs one optimisation step on one training frame and returns its photometric loss (0-dim). A step whose loss
+        or gradients are not finite is not applied."""
         frame = self._next_frame()
         self._schedule_rates()
         kind, facts = self._told(frame)
@@ -173,15 +179,15 @@ class Trainer:
         return self.carry_out(kind, facts.on(self.device), frame)
 
     def _told(self, frame: int) -> tuple[StepKind, StepFacts]:
-        """The inputs of the next step, on the trained frame at position `frame`. All that is drawn for a step that can
-        be recorded is drawn here; others draw in `carry_out`, too."""
+        """Kind and inputs of the next step, on the training frame at position `frame`. All random numbers of a
+        recordable step are drawn in this function; other steps also draw in `carry_out`."""
         model, s, field, c = self.model, self.config.supervision, self.model.field, self.config
         rows, index, time = model.open_rows(), self.train_ids[frame], self.times[frame]
         draws = None
         if field is not None and len(rows) and s.anchors_due(self.iteration, self.progress):
             draws = draw(len(rows), len(self.centres), s, self.generator)
         field_time = time if field is None else field.training_time(time, self.progress, self.generator)
-        # The background colour changes at every step, so that a hole cannot pass for a grey wall.
+        # A random background colour at every step penalises holes, which a fixed colour could hide.
         background = torch.rand(3, generator=self.generator, device="cpu")
         left, right, share = model.exposure.place(time)
         due = self.targets is not None and self.iteration % self.targets.every == 0
@@ -211,10 +217,10 @@ class Trainer:
         return kind, facts
 
     def carry_out(self, kind: StepKind, facts: StepFacts, frame: int) -> Tensor:
-        """A step of a kind on facts that lie on the device; its photometric loss (0-dim).
+        """Runs a step of kind `kind` on inputs `facts` on the device; returns its photometric loss (0-dim).
 
-        One that is recorded is carried out again with other facts: everything in here that is other in two steps of one
-        kind comes from them; `frame` is read by steps alone that are not.
+        Inputs that change between steps of one kind come from `facts`, so that a CUDA graph of the step can be
+        replayed. `frame` is only used by steps that are not recorded.
         """
         supervision, model = self.config.supervision, self.model
         rows = model.open_rows()
@@ -265,7 +271,7 @@ class Trainer:
     def _observe(
         self, facts: StepFacts, rows: Tensor, state: dict[str, Tensor], out: RasterOutput, applied: Tensor
     ) -> None:
-        """After a step, applied or not (0-dim bool): what it tells the densifier and the support bitmap."""
+        """Updates the densifier and the support bitmap after a step. `applied` (0-dim bool): was the step applied?"""
         if out.weight_sum is None:
             raise RuntimeError("the frame was rendered without contributions")
         radii, weight = out.radii[0], out.weight_sum[0]
@@ -278,14 +284,14 @@ class Trainer:
             mark_hidden(self.model.gaussians, rows, facts.time_bin, state, *view)
 
     def new_recorder(self) -> Recorder | None:
-        """Records steps on a card; None on the processor."""
+        """A new recorder of steps on a GPU; None on the CPU."""
         return Recorder(self, self.model.device) if self.device.type == "cuda" else None
 
     def layout(self) -> tuple[object, ...]:
-        """What steps read and write, and how often it was mended: while all of it is the same, it lies where it lay.
+        """The objects that steps read and write, and the repair count. Recorded steps stay valid while it is unchanged.
 
-        Whatever takes the place of one of them (growth, the gate, a repair, another degree of harmonics, a checkpoint)
-        takes that of all their moments in the optimiser, if of any.
+        Densification, the gate, a repair, a change of SH degree or a checkpoint replaces some of these tensors. Moments
+        of the optimiser need not be compared: they are replaced only with these tensors.
         """
         model, growth, field = self.model.gaussians, self.densifier, self.model.field
         return (
@@ -295,8 +301,8 @@ class Trainer:
         )  # fmt: skip
 
     def _deltas(self, rows: Tensor, when: Tensor, pairs: Anchored | None) -> tuple[Deltas | None, Deltas | None]:
-        """The field for the frame's Gaussians at when [1], and for the pairs to anchor, in one call: (of `rows`, of
-        `pairs`)."""
+        """(deltas of `rows` at the frame's time `when` [1], deltas of the anchored `pairs`). One call of the field
+        computes both, unless the field requires separate calls on a GPU (`apart`)."""
         field = self.model.field
         if field is None:
             return None, None
@@ -304,7 +310,7 @@ class Trainer:
             return self.model.deltas(rows, when), None
         times = torch.cat([when.expand(len(rows)), self.centres[pairs.bins]])
         means = self.model.gaussians.params["means"]
-        # Anchors teach the field; a host that moves means through it would have them pull the Gaussians along.
+        # Anchors train the field only: without `detach`, gradients through the field would also move the means.
         where = torch.cat([means[rows], means.detach()[pairs.rows]])
         if field.apart and self.device.type != "cpu":
             anchored = field(where[len(rows) :], times[len(rows) :], self.model.gaussians.own(pairs.rows))
@@ -313,11 +319,11 @@ class Trainer:
         return split_deltas(self.model.ask(field, where, times, own), len(rows))
 
     def image_of(self, frame: int) -> Tensor:
-        """[H, W, 3] float32, the trained frame at position `frame`, on the device."""
+        """[H, W, 3] float32 image of the training frame at position `frame`, on the device."""
         return self.images[frame].to(self.device, torch.float32, non_blocking=True)
 
     def ignored_at(self, index: int) -> Tensor | None:
-        """bool [H, W] which pixels of frame `index` of the scene teach nothing, on the device; None: all do."""
+        """bool [H, W] ignored pixels of the scene's frame `index`, on the device; None: no pixel is ignored."""
         ignored = self.ignored.get(index)
         return None if ignored is None else ignored.to(self.device, non_blocking=True)
 
@@ -328,13 +334,13 @@ class Trainer:
         return c.on and c.start <= self.progress < c.until
 
     def freeze_poses(self) -> None:
-        """From here on the corrected cameras are the cameras; a frame's that is not trained on too."""
+        """Replaces the cameras of all frames, including frames that are not trained on, by the corrected cameras."""
         refined = corrected(self.viewmats, self.poses.at(self.scene.times))
         self.policy.judge_cameras(self, refined)
         self.viewmats, self.refined = refined, True
 
     def _viewmat(self, index: int, frame: int | None = None) -> Tensor:
-        """[4, 4] of the scene's frame `index`, `frame` among the trained ones, as it is corrected now."""
+        """[4, 4] corrected camera of the scene's frame `index`. `frame`: its position among the training frames."""
         if not self._refines_poses():
             return self.viewmats[index]
         if frame is None:
@@ -345,11 +351,11 @@ class Trainer:
 
     @property
     def background(self) -> Tensor:
-        """[3] what shows where nothing covers when a frame is measured or shown: mid grey."""
+        """[3] background colour for measurements and previews: mid grey."""
         return torch.full((3,), 0.5, device=self.device)
 
     def render_trained(self, state: dict[str, Tensor], frame: int, **options: Any) -> RasterOutput:
-        """Parameters `state` as the camera of the trained frame at position `frame` sees them, as training goes."""
+        """Renders parameters `state` from the current camera of the training frame at position `frame`."""
         index = self.train_ids[frame]
         options.setdefault("background", self.background)
         options.setdefault("with_contributions", True)
@@ -386,13 +392,16 @@ class Trainer:
         return s.support_every * loss
 
     def inspect_nonfinite(self) -> None:
-        """Repairs what is not finite, and says so; JobError if the run keeps failing."""
+        """Repairs parameters that are not finite, and warns. JobError if the run keeps failing."""
         self.soundness.inspect(self)
 
     # ------------------------------------------------------------------ optimiser
 
     def average(self, length: int) -> None:
-        """After a step of a run, or an extension, of so many: its last ones count, and in the end it is their mean."""
+        """Averages the parameters over the last steps, and sets them to the mean after the last one.
+
+        length: steps of the run, or of the extension. Called after each step.
+        """
         if self.iteration > self.end - round(self.config.average * length):
             self.mean.add(self.named_tensors())
         if self.iteration == self.end:
@@ -409,9 +418,9 @@ class Trainer:
         self, index: int, *, sh_degree: int | None = None, exposure: bool = True, field: bool = True,
         viewmats: Tensor | None = None,
     ) -> Tensor:  # fmt: skip
-        """Frame `index` of the scene at its own time, [H, W, 3], not clamped.
+        """[H, W, 3] render of the scene's frame `index` at its time, not clamped.
 
-        With another SH degree, without exposure or field, or from other cameras [F, 4, 4] than the run's.
+        Options: another SH degree, no exposure correction, no field, or other cameras [F, 4, 4].
         """
         model, time = self.model, float(self.scene.times[index])
         state = model.state_at(time) if field else model.moved(model.open_rows(), None)
@@ -423,7 +432,7 @@ class Trainer:
         return model.exposure.apply(out.colors[0], time) if exposure else out.colors[0]
 
     def frame_psnrs(self, indices: list[int], images: Tensor | list[Tensor], **options: Any) -> list[float]:
-        """PSNR in dB of each frame `indices` of the scene at its own time against images [I, H, W, 3].
+        """PSNR in dB of the renders of frames `indices` of the scene against images [I, H, W, 3].
 
         `options` go to `render_frame`.
         """
@@ -435,14 +444,14 @@ class Trainer:
         return values
 
     def heldout_psnr(self, indices: list[int], images: Tensor) -> float | None:
-        """Mean PSNR in dB over held-out frames at their own times, of which something counts; None if none does."""
+        """Mean PSNR in dB over held-out frames, without frames that are ignored entirely; None if none is left."""
         values = [value for value in self.frame_psnrs(indices, images) if math.isfinite(value)]
         return sum(values) / len(values) if values else None
 
     def probe_psnr(
         self, frames: list[int], *, exposure: bool = True, field: bool = True, **options: Any
     ) -> float | None:  # fmt: skip
-        """As `stopping.Probe` says; `options` go to `render_frame`."""
+        """See `stopping.Probe.probe_psnr`; `options` go to `render_frame`."""
         if not (exposure or self.config.exposure.on) or not (field or self.model.field is not None) or not frames:
             return None
         indices, options = [self.train_ids[n] for n in frames], {**options, "exposure": exposure, "field": field}
@@ -451,13 +460,13 @@ class Trainer:
         return value if math.isfinite(value) else None
 
     def correlation_frames(self) -> float | None:
-        """As `stopping.Probe` says."""
+        """See `stopping.Probe.correlation_frames`."""
         return correlation_of_movers(self)
 
-    # ------------------------------------------------------------------ what is learnt
+    # ------------------------------------------------------------------ trained parameters
 
     def named_tensors(self) -> dict[str, Tensor]:
-        """Everything that is learnt, by its name in a checkpoint."""
+        """All trained parameters by their names in a checkpoint."""
         named: dict[str, Tensor] = {**self.model.gaussians.params, "exposure": self.model.exposure.values}
         if self.config.poses.on:
             named["poses"] = self.poses.values

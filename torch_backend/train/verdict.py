@@ -1,4 +1,4 @@
-"""A run in words: does it hold, where not, and what to do. Figures in, sentences out; `evidence` has the figures."""
+"""Verdict on a run: its quality, where it fails and what to do, as sentences. `evidence` measures the figures."""
 
 from __future__ import annotations
 
@@ -16,76 +16,75 @@ from .evidence import GRID, FrameEvidence
 
 @dataclass(frozen=True)
 class RunLimits:
-    """Where a run stops being good. Tuned on preview runs of three Mannequin Challenge clips in which people hold still
-    (`sitting`, `kitchen`, `hall`), and of one synthetic scene each with a walker and a still world (docs/synthetic.md).
-    """
+    """Thresholds of the verdict. They were tuned on preview runs of three Mannequin Challenge clips in which people
+    hold still (`sitting`, `kitchen`, `hall`), and of two synthetic scenes, one with a walker and one without motion
+    (docs/synthetic.md). Fields below call the three clips "the clips"."""
 
     poor_median_db: float = 21.5
-    """PSNR of the median frame below which a run is poor. Presets' runs of clips whose people hold still give 24.6 to
-    28.8 dB on held-out frames (docs/benchmarks.md); the bundled clip, the hardest of them, 24.4 and 22.8 dB (median,
-    worst tenth) there and 25.7 and 23.4 dB on the frames that it trained on. With a figure painted in that walks across
-    all of it, 1200 preview steps left it at 18.9 and 17.6 dB (training frames: 19.7 and 17.9)."""
+    """PSNR of the median frame below which a run is poor. Runs of the presets on clips of people holding still reach
+    24.6 to 28.8 dB on held-out frames (docs/benchmarks.md). The bundled clip, the hardest of them, has 24.4 and 22.8 dB
+    (median, worst tenth) on held-out frames, and 25.7 and 23.4 dB on training frames. With a painted figure that walks
+    through the whole clip, 1200 preview steps reached 18.9 and 17.6 dB (training frames: 19.7 and 17.9)."""
     poor_tenth_db: float = 18.0
-    """The same of the worst tenth of the frames."""
+    """PSNR of the worst tenth of the frames below which a run is poor."""
     lost: float = 0.3
-    """Share of a cell of the picture that may be unexplained; the clips have at most 0.18 in any cell of any frame."""
+    """Share of a cell of the image above which the cell counts as lost; the clips have at most 0.18 in any cell."""
     poor_lost: float = 0.5
-    """Share of the frames with such a cell above which a run is poor."""
+    """Share of frames with a lost cell above which a run is poor."""
     far: float = 0.05
-    """Travel as a share of the width, over which something does not sway but goes somewhere: the clips' farthest pixel
-    travels 0.04."""
+    """Travel, as a share of the width, above which an object walks instead of swaying. The clips' maximum is 0.04."""
     far_share: float = 0.002
-    """Least share of the picture that travels that far, on average over the frames, to be told."""
+    """Mean share of the image that must travel that far for the verdict to report it."""
     still_lost: float = 0.05
-    """Share of what the motion mattes call still that may be unexplained: above it the camera is to blame; the clips
-    have at most 0.01."""
+    """Unexplained share of still pixels (by the motion mattes) above which the camera solve is blamed. The clips have
+    at most 0.01."""
     still: float = 0.008
-    """Sway, as a share of the width, below which nothing moves: 0.004 in a world in which nothing does, 0.016 to 0.021
-    in the clips."""
+    """Sway, as a share of the width, below which nothing moves: 0.004 in a scene without motion, 0.016 to 0.021 in the
+    clips."""
     unlearnt: float = 0.01
-    """Share of the frames that the motion mattes may call moving in a run in which nothing moves: an empty room's have
-    less, the clips' 0.056 to 0.087."""
+    """Moving share of the pixels (by the motion mattes) above which a run without motion has missed motion. An empty
+    room has less; the clips have 0.056 to 0.087."""
 
 
 @dataclass(frozen=True)
 class RunFigures:
-    """What a run's verdict is based on."""
+    """Figures on which a run's verdict is based."""
 
     width: int
-    """Width in pixels of the working frames, in which travel is told."""
+    """Width in pixels of the working frames, in which travel is reported."""
     frames: list[int]
-    """[F] numbers of the frames that were examined, ascending."""
+    """[F] numbers of the examined frames, ascending."""
     unexplained: NDArray[np.floating]
-    """[F, GRID, GRID] as in `FrameEvidence`."""
+    """[F, GRID, GRID], see `FrameEvidence.unexplained`."""
     travel: NDArray[np.floating]
-    """[F, GRID, GRID] as in `FrameEvidence`."""
+    """[F, GRID, GRID], see `FrameEvidence.travel`."""
     sway: float
-    """95th percentile of the travel of what moves, as a share of the width."""
+    """95th percentile of the travel of moving pixels, as a share of the width."""
     far: float
-    """Share of the picture that travels more than `RunLimits.far`, on average."""
+    """Share of the image that travels more than `RunLimits.far`, averaged over the frames."""
     farthest: float
-    """99th percentile of the travel of what moves."""
+    """99th percentile of the travel of moving pixels, as a share of the width."""
     median_db: float
-    """PSNR of the median frame of those held out; of all that were examined if none is."""
+    """Median PSNR over the held-out frames, or over all examined frames if none is held out."""
     tenth_db: float
-    """PSNR that all but the worst tenth of them reach."""
+    """10th percentile of PSNR over the same frames."""
     held_out: bool
-    """Those are frames that were held out."""
+    """True if the PSNRs are those of held-out frames."""
     still_unexplained: float | None = None
-    """Share of what the motion mattes call still that is not explained; None without mattes."""
+    """Mean unexplained share of still pixels (by the motion mattes); None without mattes."""
     matte_moving: float | None = None
-    """Share of the frames that the motion mattes call moving; None without mattes."""
+    """Mean share of pixels that the motion mattes mark as moving; None without mattes."""
 
     def learnt_no_motion(self, limits: RunLimits) -> bool:
-        """True if nothing moves in the run although, by the motion mattes, something moves in the clip."""
+        """True if nothing moves in the run although the motion mattes mark motion in the clip."""
         return self.sway < limits.still and (self.matte_moving or 0.0) > limits.unlearnt
 
 
 def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int) -> RunFigures:
-    """A run's figures from its frames; `width` of the working frames, `pixels` of a frame as it was trained on."""
+    """Figures of a run. `width`: width of the working frames; `pixels`: number of pixels of a training image."""
     known = [one for one in seen if math.isfinite(one.psnr_db)]
     kept = [one for one in known if one.held_out]
-    values = [one.psnr_db for one in kept or known] or [0.0]  # a clip that is all mask was refused
+    values = [one.psnr_db for one in kept or known] or [0.0]  # clips that are masked entirely are rejected earlier
     moving = np.concatenate([one.moving for one in seen])
     whole = len(seen) * pixels / 16  # `moving` has every 16th pixel
     still = [one.still_unexplained for one in seen if one.still_unexplained is not None]
@@ -121,8 +120,8 @@ def judge(figures: RunFigures, limits: RunLimits | None = None) -> Verdict:
     sentences = _sentences(figures, limits, dim, places, walks)
     span = _longest_good(figures.frames, np.asarray(bad)) if places or walks else None
     advice = _advice(figures, dim, span, places, walks, limits)
-    # Only where the run does not show the clip is an instant a bad one. Somebody who walks, and is shown, stands still
-    # at any instant. A dim run is advised to be trained anew: no span of it is recommended.
+    # A span is recommended only if some frames are unexplained: a walker that the run shows can be frozen at any
+    # instant. No span is recommended for a dim run, which should be trained again.
     advised = [*span] if span is not None and places and not dim else []
     return Verdict(word, sentences, [*places, *walks], advice, advised)
 
@@ -130,7 +129,7 @@ def judge(figures: RunFigures, limits: RunLimits | None = None) -> Verdict:
 def _sentences(
     figures: RunFigures, limits: RunLimits, dim: bool, places: list[dict[str, Any]], walks: list[dict[str, Any]]
 ) -> list[str]:
-    """What is so: how well it fits, what moves and how far, where it does not hold."""
+    """Findings as sentences: how well the run fits, where it fails, what moves and how far."""
     width, sentences = figures.width, list[str]()
     if dim:
         on = "held-out frames" if figures.held_out else "training frames"
@@ -158,7 +157,7 @@ def _advice(
     figures: RunFigures, dim: bool, span: tuple[int, int] | None, places: list[dict[str, Any]],
     walks: list[dict[str, Any]], limits: RunLimits,
 ) -> list[str]:  # fmt: skip
-    """What to do about it. `span`: first and last frame of the longest span in which nothing is lost or walks."""
+    """Advice as sentences. `span`: first and last frame of the longest span without lost cells or walkers."""
     if figures.learnt_no_motion(limits) and not places and not dim:
         return ["Train with more steps; where the mattes are wrong, paint over them."]
     if figures.sway < limits.still and not places and not dim:
@@ -195,7 +194,7 @@ _REGIONS = (
 
 
 def region_words(cells: NDArray[np.floating]) -> str:
-    """Where in the picture the weight of cells [GRID, GRID] lies, rows from above: "lower left", "top", "middle"."""
+    """Region of the image where the weight of cells [GRID, GRID] (top row first) is centred, such as "lower left"."""
     weights = np.asarray(cells, np.float64)
     total = weights.sum()
     if not total > 0.0 or (weights > 0.25 * weights.max()).mean() > 0.6:
@@ -209,18 +208,18 @@ def region_words(cells: NDArray[np.floating]) -> str:
 def spans_of(
     frames: Sequence[int], cells: NDArray[np.floating], lost: NDArray[np.bool_], most: int = 3
 ) -> list[dict[str, Any]]:
-    """Where something is lost: `first` and `last` frame of a span and the `region` of the picture; worst first.
+    """Spans of frames with lost cells, worst first: `first` and `last` frame and `region` of the image.
 
     Args:
-        frames: [F] ascending numbers.
-        cells: [F, GRID, GRID] how much is.
-        lost: [F, GRID, GRID] which of them are too large.
-        most: how many spans are told.
+        frames: [F] frame numbers, ascending.
+        cells: [F, GRID, GRID] values of the cells.
+        lost: [F, GRID, GRID] True for cells whose value is too large.
+        most: maximum number of spans.
     """
     bad = np.flatnonzero(lost.any(axis=(1, 2)))
     if not len(bad):
         return []
-    gaps = np.asarray(np.diff(bad), np.int64) > 2  # one good frame between does not part them
+    gaps = np.asarray(np.diff(bad), np.int64) > 2  # a single good frame does not split a span
     groups: list[NDArray[np.int64]] = np.split(bad, np.flatnonzero(gaps) + 1)
     weights: list[NDArray[np.float64]] = [(cells[group] * lost[group]).sum(axis=0) for group in groups]
     worst = sorted(range(len(groups)), key=lambda n: -float(weights[n].sum()))[:most]
@@ -235,14 +234,14 @@ def spans_of(
 
 
 def where_words(place: dict[str, Any]) -> str:
-    """'frames 10 to 30, lower left'."""
+    """A span of `spans_of` in words, for instance 'frames 10 to 30, lower left'."""
     if place["first"] == place["last"]:
         return f"frame {place['first']}, {place['region']}"
     return f"frames {place['first']} to {place['last']}, {place['region']}"
 
 
 def _longest_good(frames: Sequence[int], bad: NDArray[np.bool_], least: int = 4) -> tuple[int, int] | None:
-    """First and last number of the longest row of good frames; None if it has fewer than `least`."""
+    """First and last number of the longest sequence of good frames; None if it is shorter than `least`."""
     groups: list[NDArray[np.int64]] = np.split(np.arange(len(bad)), np.flatnonzero(bad))
     good = max(([int(n) for n in group if not bad[n]] for group in groups), key=len)
     return (int(frames[good[0]]), int(frames[good[-1]])) if len(good) >= least else None
@@ -252,7 +251,7 @@ def _longest_good(frames: Sequence[int], bad: NDArray[np.bool_], least: int = 4)
 
 
 def verdict_fields(figures: RunFigures) -> dict[str, Any]:
-    """A run's verdict and the figures behind it, for its summary."""
+    """Verdict of a run and its figures, for summary.json."""
     verdict = judge(figures)
     return {
         "quality": verdict.word.capitalize(),
@@ -267,7 +266,7 @@ def verdict_fields(figures: RunFigures) -> dict[str, Any]:
 
 
 def warn_if_poor(summary: dict[str, Any], report: Reporter) -> None:
-    """Warns of a poor run, from its summary."""
+    """Warns if the summary's verdict is poor."""
     verdict = Verdict(**summary["verdict"])
     if verdict.word == "poor":
         report.warning(verdict.lines()[0], " ".join([*verdict.sentences[1:], *verdict.advice]))

@@ -1,4 +1,4 @@
-// The points nearest to each query, nearest first.
+// Nearest points of each query, nearest first.
 
 // queries: [count][D]; points: [D][padded], the padding far away; index: [count][K].
 const long long D = P.dims, K = P.neighbours, Q = P.count, N = P.padded;

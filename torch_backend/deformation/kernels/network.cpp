@@ -1,4 +1,4 @@
-// The HexPlane's network, a trunk and heads of two layers, forward (0), backward (1), and the sums of its gradients (2).
+// HexPlane network: a trunk and two-layer heads. Stages: forward (0), backward (1), sums of the gradients (2).
 
 // IN features, WIDTH units. x, dx: [M][IN]. Weights as torch has them, [outputs][inputs], and turned, [inputs][outputs]:
 // trunk [WIDTH][IN], trunk_t; a head's layer hidden [HEADS][WIDTH][WIDTH], hidden_t; its last one out

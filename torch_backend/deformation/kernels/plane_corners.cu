@@ -1,4 +1,4 @@
-// Where a point falls on a plane: the beginning of the GPU's kernels that sample (`planes_cuda.py`).
+// Corners and weights of a point on a plane; included by the GPU kernels that sample (`planes_cuda.py`).
 
 const int C = @CHANNELS@;
 const int AXES[6][2] = {{0, 1}, {0, 2}, {1, 2}, {0, 3}, {1, 3}, {2, 3}};

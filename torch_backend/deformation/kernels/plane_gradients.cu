@@ -1,4 +1,4 @@
-// Gradient of the planes on a GPU, samples made anew. A thread is one channel of one level at one point.
+// Gradient of the planes on a GPU, with recomputed samples. One thread per channel, level and point.
 
 // A point's channels are neighbours, so that what a warp adds at a node is one piece of memory.
 #if defined(__CUDA_ARCH__)

@@ -1,4 +1,4 @@
-// Smoothness of feature planes and its gradient.
+// Smoothness penalty of feature planes and its gradient.
 
 // rows: [rows] of (plane, row); a unit is one row of one plane.
 const long long C = @CHANNELS@;

@@ -1,4 +1,4 @@
-// Smoothness of feature planes and its gradient on a GPU. A thread is one value of one plane.
+// Smoothness penalty of feature planes and its gradient on a GPU. One thread per value of a plane.
 
 const int C = @CHANNELS@;
 const long long* table = (const long long*)tables;

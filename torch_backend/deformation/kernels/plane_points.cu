@@ -1,4 +1,4 @@
-// Gradient of the points on a GPU, samples made anew. A thread is one point, so that nothing is added by two.
+// Gradient of the points on a GPU, with recomputed samples. One thread per point, so that no atomics are needed.
 
 #include "plane_corners.cu"
 const float* pull = (const float*)pulls + (long long)tid * levels * C;

@@ -1,4 +1,4 @@
-// Samples of feature planes and their product, and both gradients.
+// Products of feature plane samples, and gradients of planes and points.
 
 // planes: [levels * 6] addresses of [H][W][C]; sizes: H, W of each; where: [M][4] in [-1, 1];
 // samples: [levels * 6][M][C]; pulls: [M][4], the gradient in `where`.

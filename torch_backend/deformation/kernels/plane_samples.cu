@@ -1,4 +1,4 @@
-// Product of the samples of a level's six planes on a GPU. A thread is WIDTH channels of one level at one point.
+// Product of the samples of a level's six planes on a GPU. One thread per WIDTH channels, level and point.
 
 #include "plane_corners.cu"
 const int WIDTH = @WIDTH@, PARTS = C / WIDTH;

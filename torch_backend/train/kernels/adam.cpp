@@ -1,4 +1,4 @@
-// Adam on the CPU, in chunks; `adam.py` says what the columns of the two tables are.
+// Adam on the CPU, in chunks. `adam.py` documents the columns of the two tables.
 
 const long long CHUNK = @CHUNK@;
 auto root = FN(F x) -> F { return __builtin_elementwise_sqrt(x); };

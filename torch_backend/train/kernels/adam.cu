@@ -1,4 +1,4 @@
-// Adam on a GPU, an element a thread; `adam.py` says what the columns of the two tables are.
+// Adam on a GPU, one thread per element. `adam.py` documents the columns of the two tables.
 
 // stage 0: check one gradient; 1: advance one segment's step count; 2: update one element.
 const wp::int64* whole = (const wp::int64*)wholes; float* real = (float*)reals; int* bad = (int*)flag;
