@@ -9,5 +9,5 @@ if sys.argv[1:2] == ["farm-task"]:
     told = main()
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(told)  # taking torch's modules apart takes longer than a frame, and a farm pays it for every task
+    os._exit(told)  # unloading torch takes longer than a frame, and every farm task would pay for it
 sys.exit(main())

@@ -1,5 +1,5 @@
 # pyright: reportMissingTypeStubs=false
-"""Types for what NumPy and SciPy leave without any: each function is that call and a cast, as in `torch_types`."""
+"""Typed wrappers for untyped functions of NumPy and SciPy: each is one call and a cast, as in `torch_types`."""
 
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -20,7 +20,8 @@ class SparseMatrix(Protocol):
 def sparse_rows(
     weights: NDArray[np.float32], columns: NDArray[np.integer[Any]], starts: NDArray[np.integer[Any]], width: int
 ) -> SparseMatrix:
-    """A matrix by its rows: row r has `weights` [starts[r]:starts[r + 1]] at those `columns`, and is `width` wide."""
+    """Sparse matrix from its rows: row r has `weights[starts[r]:starts[r + 1]]` in the columns that the same slice of
+    `columns` names. Each row is `width` wide."""
     return cast(Any, sparse).csr_array((weights, columns, starts), shape=(len(starts) - 1, width))
 
 
@@ -30,13 +31,13 @@ def sparse_entries(
     columns: NDArray[np.integer[Any]],
     shape: tuple[int, int],
 ) -> SparseMatrix:
-    """A matrix by its entries, in any order; those at one place add up."""
+    """Sparse matrix from its entries, in any order. Entries at the same position are added."""
     library = cast(Any, sparse)
     return library.csr_array(library.coo_array((weights, (rows, columns)), shape=shape))
 
 
 def pieces(ends: NDArray[np.integer[Any]], others: NDArray[np.integer[Any]], count: int) -> NDArray[np.int32]:
-    """Labels [count] from 0 of the pieces of a graph of `count` nodes. Its edges join `ends` [E] with `others` [E]."""
+    """Connected component of each node of a graph, [count] labels from 0. Edges join `ends` [E] with `others` [E]."""
     from scipy.sparse import csgraph
 
     graph = sparse_entries(np.ones(len(ends), np.float32), ends, others, (count, count))
@@ -54,20 +55,21 @@ def between_nodes(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Values [len(y), len(x)] between those of a grid, by a cubic spline: `nodes` are the grid's x and y, ascending,
-    four at least, `values` [y, x]."""
-    from scipy import interpolate  # a second of every start, for the lens of an ST map alone
+    """Cubic spline interpolation of the grid `values` [y, x] at the coordinates `x` and `y`: [len(y), len(x)].
+
+    `nodes`: x and y coordinates of the grid, ascending, at least four each."""
+    from scipy import interpolate  # takes a second to import; only the lens of an ST map needs it
 
     spline = cast(Any, interpolate).RectBivariateSpline(nodes[1], nodes[0], values)
     return np.asarray(spline(y, x), np.float64)
 
 
 def save_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """`np.savez` of a dictionary: a type checker takes its keys for any of that function's own parameters."""
+    """`np.savez` of a dictionary, whose keys a type checker would take for parameters of `np.savez`."""
     entries: Any = arrays
     np.savez(path, **entries)
 
 
 def linear_solution(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`np.linalg.solve`: x of matrix [K, K] @ x = right [K, M]. LinAlgError if there is no single one."""
+    """Solution x of matrix [K, K] @ x = right [K, M], as `np.linalg.solve`. LinAlgError if the matrix is singular."""
     return np.asarray(cast(Any, np.linalg).solve(matrix, right))

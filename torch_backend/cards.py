@@ -1,6 +1,6 @@
-"""The NVIDIA cards of this machine, as nvidia-smi lists them, and what keeps one from being used.
+"""NVIDIA cards of this machine, as nvidia-smi lists them, and reasons why a card cannot be used.
 
-Standard library only: the launcher asks before there is a backend.
+Standard library only: the launcher imports this file before the backend is installed.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from .contract import program
 NEEDED_DRIVER = 580
 """Oldest NVIDIA driver branch for the CUDA 13 builds of Warp and torch pinned here."""
 NEEDED_COMPUTE = 7.5
-"""Oldest CUDA compute capability of the same."""
+"""Lowest CUDA compute capability that these builds support."""
 _ANSWER_SECONDS = 30.0
 
 
 @dataclass(frozen=True)
 class Card:
-    """A card as its driver tells it."""
+    """An NVIDIA card, as its driver describes it."""
 
     name: str
-    """What NVIDIA calls it."""
+    """Product name."""
     driver: str
     """Version of the driver, such as 580.65.06."""
     compute: str
@@ -32,17 +32,17 @@ class Card:
 
     @property
     def old_driver(self) -> bool:
-        """True if the driver is older than what is needed. ValueError if its version is no number."""
+        """True if the driver is too old. ValueError if its version is not a number."""
         return int(self.driver.split(".")[0]) < NEEDED_DRIVER
 
     @property
     def old(self) -> bool:
-        """True if no driver makes it usable. ValueError if its compute capability is no number."""
+        """True if the card is too old for any driver. ValueError if its compute capability is not a number."""
         return bool(self.compute) and float(self.compute) < NEEDED_COMPUTE
 
     @property
     def fits(self) -> bool:
-        """True if it and its driver are what is needed."""
+        """True if the card and its driver are new enough."""
         try:
             return not self.old_driver and not self.old
         except ValueError:
@@ -50,9 +50,9 @@ class Card:
 
 
 def nvidia_cards() -> tuple[list[Card], str]:
-    """The cards of this machine, and what nvidia-smi complains of if it lists none; nothing where it is not installed.
+    """Cards of this machine, and the complaint of nvidia-smi if it lists none. Both are empty if it is not installed.
 
-    Asked once per process.
+    nvidia-smi runs once per process.
     """
     tool = program("nvidia-smi")
     return _listed(tool) if tool else ([], "")
@@ -61,7 +61,7 @@ def nvidia_cards() -> tuple[list[Card], str]:
 @functools.cache
 def _listed(tool: str) -> tuple[list[Card], str]:
     output = ""
-    for fields in ("name,driver_version,compute_cap", "name,driver_version"):  # old drivers do not know the third
+    for fields in ("name,driver_version,compute_cap", "name,driver_version"):  # old drivers do not know compute_cap
         command = [tool, f"--query-gpu={fields}", "--format=csv,noheader"]
         try:
             ran = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=_ANSWER_SECONDS)
@@ -78,9 +78,9 @@ def _listed(tool: str) -> tuple[list[Card], str]:
 
 
 def why_unused(torch_cuda: str | None) -> tuple[str, str] | None:
-    """What keeps the machine's NVIDIA card from being used by a torch that sees none, and what to do about it.
+    """Why torch sees no NVIDIA card on this machine, and what to do about it.
 
-    None without a card, or where CUDA_VISIBLE_DEVICES hides it: that was somebody's wish.
+    None without a card, or if CUDA_VISIBLE_DEVICES hides it, because that is done on purpose.
 
     Args:
         torch_cuda: CUDA version that torch was built for; None for its CPU build.

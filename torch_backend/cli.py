@@ -1,6 +1,6 @@
 """The command line of the backend: `python -m torch_backend COMMAND`, installed as `splannequin`.
 
-Every station is run as a job in the shot's folder, by the same code that serves Blender, with the console listening.
+Each station runs as a job in the shot's folder, with the same code as for Blender. The console prints its events.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Console:
         self.error: dict[str, Any] | None = None
         self._way: contract.WholeWay | None = None
         self._job = ("", 0.0)
-        """Kind of the job at work, and when it began, seconds since the epoch."""
+        """Kind of the running job, and its start in seconds since the epoch."""
 
     def __call__(self, event: Event) -> None:
         if event.type == "error":
@@ -52,11 +52,11 @@ class Console:
             self._line("Cancelled. Start the same command again to go on: finished work is kept.")
 
     def begins(self, kind: str, way: contract.WholeWay | None) -> None:
-        """A job of a kind begins, `way` the jobs that it is one of."""
+        """Notes that a job of `kind` begins. `way`: progress of the sequence of jobs to which the job belongs."""
         self._job, self._way = (kind, time.time()), way
 
     def _of_all(self, event: Event) -> str:
-        """How far all jobs are, in words; empty if nobody knows."""
+        """Progress of all jobs together, in words; empty if there is no estimate."""
         if self._way is None:
             return ""
         kind, since = self._job
@@ -89,7 +89,7 @@ class Console:
 
 
 def run_station(shot: Shot, kind: str, params: Any, console: Console) -> Any:
-    """Runs one station as a job of `shot`; returns its result. SystemExit with the job's code if it did not finish."""
+    """Runs one station as a job of `shot` and returns its result. SystemExit with the job's exit code if it fails."""
     from .job import new_job, run_job
 
     contract.check_params(params)
@@ -106,7 +106,7 @@ def run_station(shot: Shot, kind: str, params: Any, console: Console) -> Any:
 
 
 def _begun(folder: str) -> Shot:
-    """The shot of an import, made if it is not there. Ends the command, in one sentence, if it cannot be."""
+    """The shot for an import, created if missing. Ends the command with a message if it cannot be created."""
     try:
         return Shot.create(folder)
     except OSError as error:
@@ -139,7 +139,7 @@ def one_step(args: argparse.Namespace, console: Console) -> int:
 
 
 def freeze_clip(args: argparse.Namespace, console: Console) -> int:
-    """`freeze CLIP`: import, solve, train, freeze; leaves OUTPUT/summary.json."""
+    """`freeze CLIP`: import, solve, train, freeze; writes OUTPUT/summary.json."""
     output = Path(args.output).absolute()
     started = time.perf_counter()
     requests = _requests(args)
@@ -161,7 +161,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
             print_reading(results[kind], console)
             way = _rest_of_the_way(shot, requests, stages[kind])
         info = shot.info()
-        if args.t_star is not None and not info.first <= args.t_star <= info.last:  # said before hours of training
+        if args.t_star is not None and not info.first <= args.t_star <= info.last:  # reported before hours of training
             raise contract.UserError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
     summary = contract.summarise(str(shot.root), shot.info().source, results, stages, time.perf_counter() - started)
     write_json(output / contract.SUMMARY_FILE, summary)
@@ -170,7 +170,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
 
 
 def _rest_of_the_way(shot: Shot, requests: dict[str, Any], spent: float) -> contract.WholeWay | None:
-    """The jobs after the import, which took `spent` seconds; None if their time cannot be estimated."""
+    """Time estimate of the jobs after the import, which took `spent` seconds; None if there is none."""
     try:
         size, pace = contract.ShotSize.of(shot), contract.paces(Path(sys.prefix))
     except (OSError, ValueError):
@@ -180,7 +180,7 @@ def _rest_of_the_way(shot: Shot, requests: dict[str, Any], spent: float) -> cont
 
 
 def _refuse_anothers(root: Path, asked: contract.ImportParams) -> None:
-    """JobError if a shot folder holds the shot of a clip that is neither the one asked for nor a copy of it."""
+    """Raises JobError if the shot in a folder comes from another clip than the requested one or a copy of it."""
     if contract.is_imported_from(root, asked.source) is False:
         from .footage.importing import holds_footage
 
@@ -189,7 +189,7 @@ def _refuse_anothers(root: Path, asked: contract.ImportParams) -> None:
 
 
 def _requests(args: argparse.Namespace) -> dict[str, Any]:
-    """Kind of job -> parameters of `freeze CLIP`. ValueError or JobError on what cannot be, before any work is done."""
+    """Parameters of each job of `freeze CLIP`, by kind. Raises ValueError or JobError before any work is done."""
     requests = contract.requested_params(args)
     for params in requests.values():
         contract.check_params(params)
@@ -201,7 +201,7 @@ def _requests(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:
-    """The closing lines: what came out, how good, how long, where to look."""
+    """Prints the closing lines: results, quality, duration and paths."""
     if console.as_json:
         return
     psnr = summary["heldout_psnr_db"]
@@ -218,14 +218,14 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
 
 
 def print_places(take: dict[str, Any], console: Console) -> None:
-    """Where the files of a take lie."""
+    """Prints the paths of a take's files."""
     if not console.as_json:
         for name, key in (("EXR frames:", "exr_dir"), ("Contact sheet:", "contact_sheet"), ("Video:", "video")):
             print(f"{name:<14} {take[key]}", file=console.stream, flush=True)
 
 
 def print_mattes(made: dict[str, Any], console: Console) -> None:
-    """Where the mattes of a take lie."""
+    """Prints the paths of a take's mattes."""
     if not console.as_json:
         for name, folder in made["mattes"].items():
             print(f"Matte {name}: {folder}", file=console.stream, flush=True)
@@ -233,21 +233,21 @@ def print_mattes(made: dict[str, Any], console: Console) -> None:
 
 
 def print_verdict(facts: dict[str, Any], console: Console) -> None:
-    """What an artist should know of a run or a take, line by line."""
+    """Prints what an artist should know of a run or a take, line by line."""
     if not console.as_json:
         for line in contract.verdict_lines(facts):
             print(line, file=console.stream, flush=True)
 
 
 def print_reading(facts: dict[str, Any], console: Console) -> None:
-    """How an import read the footage, and what of that was assumed."""
+    """Prints how an import read the footage, and which settings were assumed."""
     if not console.as_json:
         for line in facts["read_as"]:
             print(f"  {contract.printable(line)}", file=console.stream, flush=True)
 
 
 def modelled_table(rows: list[dict[str, Any]]) -> str:
-    """What a run modelled (rows of its summary), what it cost and bought, aligned; "-" where nothing was measured."""
+    """Table of what a run modelled, its cost and its gain, from rows of the summary; "-" where nothing was measured."""
     head = ["modelled", "", "s", "ms/step", "kB", "gain dB"]
     lines = [head]
     for row in rows:
@@ -292,7 +292,10 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
 
 
 def card_facts(refusal: str) -> dict[str, Any]:
-    """The card, tested now in this process, and where its kernels are compiled; `refusal`: why it cannot be used."""
+    """Facts of the card: a self-test in this process, and the folder of its compiled kernels.
+
+    `refusal`: why the card cannot be used; empty if it can.
+    """
     import platform
 
     import torch
@@ -309,21 +312,21 @@ def card_facts(refusal: str) -> dict[str, Any]:
         "cards": [dataclasses.asdict(card) for card in cards], "driver_trouble": trouble,
         "kernels": str(kernel_folder()),
     }  # fmt: skip
-    if not refusal and not tested.problem:  # what a kernel broke stays broken for the rest of this process
+    if not refusal and not tested.problem:  # after a failed kernel, all later CUDA calls of this process fail
         free, total = torch.cuda.mem_get_info()
         facts["memory_gb"] = {"free": round(free / 1e9, 2), "total": round(total / 1e9, 2)}
     return facts
 
 
 def run_job(args: argparse.Namespace, console: Console) -> int:
-    """`run-job FOLDER`: what the job says goes to its folder, and with --json here too."""
+    """`run-job FOLDER`: writes the job's events to its folder and, with --json, to the standard output."""
     from .job import run_job
 
     return run_job(args.folder, console if console.as_json else None)[0]
 
 
 def live(args: argparse.Namespace, console: Console) -> int:
-    """`live SHOT`: frames as they are requested on the standard input."""
+    """`live SHOT`: draws the frames that are requested on the standard input."""
     from .live import run_live
 
     return run_live(args.shot, args.run, args.device)
@@ -364,7 +367,7 @@ def export(args: argparse.Namespace, console: Console) -> int:
 
 
 def stmaps(args: argparse.Namespace, console: Console) -> int:
-    """`stmaps SHOT`: ST maps of the lens into SHOT/solve."""
+    """`stmaps SHOT`: writes ST maps of the lens into SHOT/solve."""
     from .lens.stmap import write_maps
 
     facts = write_maps(Shot.open(args.shot), args.width)
@@ -382,7 +385,7 @@ def stmaps(args: argparse.Namespace, console: Console) -> int:
 
 
 def farm(args: argparse.Namespace, console: Console) -> int:
-    """`farm export SHOT... --output DIR`: a job for a render farm; `farm measure`: what tasks took, as rates."""
+    """`farm export SHOT... --output DIR`: writes a render farm job. `farm measure`: writes rates of past tasks."""
     from .farm import cost, export, rates, records
 
     words: contract.FarmWords = contract.words_of(args)
@@ -394,7 +397,7 @@ def farm(args: argparse.Namespace, console: Console) -> int:
         write_json(output / export.RATES_FILE, rates.to_json(found))
         print(output / export.RATES_FILE, file=console.stream)
         return ExitCode.OK
-    args.t_star = None  # instants are takes of their own; see `FarmWords`
+    args.t_star = None  # each instant is a separate take; see `FarmWords`
     summary, files = export.export(words, contract.requested_params(args), contract.trains_anew(args))
     if console.as_json:
         print(json.dumps({"written": [str(p) for p in files], **dataclasses.asdict(summary)}), file=console.stream)
@@ -405,14 +408,14 @@ def farm(args: argparse.Namespace, console: Console) -> int:
 
 
 def farm_task(args: argparse.Namespace, console: Console) -> int:
-    """`farm-task STEP --shot SHOT --request FILE ...`: one task of a farm's job; words of its own go to the engine."""
+    """`farm-task STEP --shot SHOT --request FILE ...`: runs one task of a farm's job, with messages for the engine."""
     from .farm_task import run_task
 
     return run_task(args)
 
 
 def _give_up(error: OSError, where: Path, hint: str = "Choose another --output folder.") -> NoReturn:
-    """Ends the command on a folder that cannot be written, in one sentence."""
+    """Ends the command with a message that a folder cannot be written."""
     refusal = path_error(error) or contract.JobError(
         f"Cannot write to {where}: {error.strerror or error}.", hint, ExitCode.USAGE
     )
@@ -421,7 +424,7 @@ def _give_up(error: OSError, where: Path, hint: str = "Choose another --output f
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line's grammar."""
+    """Argument parser of the command line."""
     return contract.command_line("splannequin", contract.BACKEND)[0]
 
 
@@ -430,7 +433,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Spinning OpenMP threads made a frame four times slower when a core was busy; must be set before torch loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a narrow Windows code page must not end a job over a file's name
+        if isinstance(stream, io.TextIOWrapper):  # a file name outside the Windows code page must not end a job
             stream.reconfigure(errors="backslashreplace")
     args = parser().parse_args(argv)
     console = Console(as_json=contract.as_json(args))
@@ -459,7 +462,7 @@ def _dispatch(args: argparse.Namespace, console: Console) -> int:
 
 
 def _is_whole(args: argparse.Namespace) -> bool:
-    """True of the whole way from a clip; False of one step on a shot."""
+    """True if the command runs all steps from a clip; False if it runs one step on a shot."""
     return args.command == "freeze" and not contract.freezes_a_shot(args)
 
 
@@ -467,4 +470,4 @@ _OTHERS = {
     "status": status, "doctor": doctor, "export": export, "stmaps": stmaps, "run-job": run_job, "live": live,
     "farm": farm, "farm-task": farm_task,
 }  # fmt: skip
-"""Verb -> what it does, of those that start no job of a shot."""
+"""Functions of the verbs that start no job of a shot."""

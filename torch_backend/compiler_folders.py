@@ -1,10 +1,10 @@
-"""Folders that Warp's compilers can open: on Windows those whose names are ASCII.
+"""Folders that Warp's compilers can open. On Windows, the paths of these folders must be ASCII.
 
-Warp hands its compilers paths as UTF-8, and Clang and NVRTC open them as Windows' own code page: from a profile such as
-`C:\\Users\\Jörg` neither the headers in `warp/native` nor the folder of compiled kernels can be read, and nothing
-compiles, for the processor no more than for a card. Short (8.3) names do not help: Warp makes the long ones of them. So
-both move to a folder whose name is ASCII, where every user may make one. Files in it are loaded as libraries, so this
-user must own the folder and no other user may write to it. Standard library only.
+Warp passes paths as UTF-8, but Clang and NVRTC read them in the Windows code page. With a profile such as
+`C:\\Users\\Jörg` they cannot read the headers in `warp/native` or the folder of compiled kernels, and no kernel
+compiles, for the processor or for a card. Short (8.3) names do not help, because Warp expands them. Both folders
+therefore move to a folder with an ASCII path, in a place where every user may create folders. Files in this folder are
+loaded as libraries, so this user must own it and no other user may write to it. Standard library only.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from .shot import is_disk_full, locked, replace_file
 
 _FOLDER = "Splannequin"
 _KERNEL_BYTES = 1 << 20
-"""Room that one compiled kernel may need."""
+"""Upper bound of the size of one compiled kernel, in bytes."""
 
 
 @dataclass(frozen=True)
 class CompilerFolders:
-    """Where Warp compiles; None leaves a folder as Warp has it."""
+    """Folders in which Warp compiles; None keeps Warp's default."""
 
     kernels: Path | None = None
-    """Compiled kernels."""
+    """Folder of the compiled kernels."""
     headers: Path | None = None
-    """Holds `native`, Warp's headers."""
+    """Folder that contains `native`, the folder of Warp's headers."""
     precompiled: bool = True
-    """May headers be compiled ahead? That goes to the temporary folder."""
+    """True if Warp may precompile headers, which it does in the temporary folder."""
 
 
 def compiler_folders(
     package: Path, version: str, environ: Mapping[str, str], kernels: Path, windows: bool = os.name == "nt"
 ) -> CompilerFolders:
-    """Folders for a Warp of this version that is installed as `package`; copies its headers where they have to move.
+    """Folders for the Warp that is installed in `package`. Copies Warp's headers if they have to move.
 
     Args:
         package: folder of the package warp.
@@ -52,7 +52,7 @@ def compiler_folders(
         kernels: where Warp would keep compiled kernels.
         windows: whether paths have to be ASCII.
 
-    JobError if they have to move and there is nowhere to.
+    JobError if a folder has to move and no suitable place is found.
     """
     if not windows:
         return CompilerFolders()
@@ -83,14 +83,14 @@ def need_room(kernels: Path) -> None:
 
 
 def kernel_refusal(kernels: Path, error: Exception) -> JobError | None:
-    """The sentence for a kernel that could not be compiled for the disk's sake; None if the disk was not the reason.
+    """Error for a kernel that could not be compiled because of the disk; None if the disk was not the reason.
 
-    Not every compiler says why it could not write, so free space of the disk is checked.
+    Not every compiler says why it could not write, so the free space of the disk is checked.
     """
     if isinstance(error, JobError):
         return None
     full = isinstance(error, OSError) and is_disk_full(error)
-    with contextlib.suppress(OSError):  # a folder that cannot be asked
+    with contextlib.suppress(OSError):  # the free space of the folder cannot be read
         full = full or _room(kernels) < _KERNEL_BYTES
     if full:
         return _no_room(kernels)
@@ -113,7 +113,7 @@ def _no_room(kernels: Path) -> JobError:
 
 def _room(folder: Path) -> int:
     """Bytes that this user may still write."""
-    with tempfile.TemporaryFile(dir=folder) as probe:  # a quota is no matter of the disk's
+    with tempfile.TemporaryFile(dir=folder) as probe:  # disk_usage does not know quotas of users
         try:
             probe.write(bytes(_KERNEL_BYTES))
             probe.flush()
@@ -125,10 +125,10 @@ def _room(folder: Path) -> int:
 
 
 def _writable(environ: Mapping[str, str]) -> Path | None:
-    """A folder of this user's with an ASCII name that can be written; None if there is none."""
+    """Writable folder with an ASCII path that belongs to this user; None if there is none."""
     user = hashlib.sha256(environ.get("USERPROFILE", environ.get("USERNAME", "")).encode()).hexdigest()[:8]
     for base in _bases(environ):
-        # Not inside a folder that users share: its owner could replace this folder by another.
+        # Not inside a folder shared by users: the owner of the shared folder could replace this one.
         folder = base / f"{_FOLDER}-{user}"
         try:
             base.mkdir(parents=True, exist_ok=True)
@@ -169,7 +169,7 @@ if sys.platform == "win32":
     def make_private(folder: Path) -> None:
         """Makes a folder that only its owner, administrators and the system may open. OSError if it cannot be made.
 
-        `mkdir` gives it what %PROGRAMDATA% hands down: every user may put files there.
+        A folder made by `mkdir` inherits the rights of %PROGRAMDATA%, so every user could write files into it.
         """
         descriptor = ctypes.c_void_p()
         rules = "D:P(A;OICI;FA;;;SY)(A;OICI;FA;;;BA)(A;OICI;FA;;;OW)"
@@ -183,14 +183,14 @@ if sys.platform == "win32":
             _kernel.LocalFree(descriptor)
 
     def is_private(folder: Path) -> bool:
-        """True if a folder, and no link to one, is this user's, or an administrator's."""
+        """True for a folder (not a link) that belongs to this user or to the administrators."""
         if is_link(folder) or not folder.is_dir():
             return False
         owner, descriptor, token, size = ctypes.c_void_p(), ctypes.c_void_p(), wintypes.HANDLE(), wintypes.DWORD()
         if _advapi.GetNamedSecurityInfoW(str(folder), 1, 1, byref(owner), None, None, None, byref(descriptor)):
             return False
         try:
-            if _advapi.IsWellKnownSid(owner, 26):  # administrators: who has their rights may do anything
+            if _advapi.IsWellKnownSid(owner, 26):  # administrators can change any folder anyway
                 return True
             if not _advapi.OpenProcessToken(_kernel.GetCurrentProcess(), 0x0008, byref(token)):
                 return False
@@ -218,7 +218,7 @@ else:
 
 
 def _bases(environ: Mapping[str, str]) -> Iterator[Path]:
-    """Where all users may write, with ASCII names; the first is the usual one."""
+    """Folders with ASCII paths in which all users may write; the first is the usual one."""
     drive = environ.get("SYSTEMDRIVE", "")
     for named in (environ.get("PROGRAMDATA", ""), environ.get("PUBLIC", ""), f"{drive}{os.sep}" if drive else ""):
         if named and named.isascii() and os.path.isabs(named):
@@ -226,7 +226,7 @@ def _bases(environ: Mapping[str, str]) -> Iterator[Path]:
 
 
 def _copied(native: Path, home: Path) -> Path:
-    """`home` with a whole copy of the folder `native` in it: made beside its name and renamed."""
+    """`home`, after the folder `native` was copied into it. A copy is renamed into place once it is complete."""
     if not (home / "native").is_dir():
         home.mkdir(parents=True, exist_ok=True)
         with locked(home / "copying.lock"):

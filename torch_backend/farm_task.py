@@ -1,9 +1,9 @@
-"""One task of a render farm's job: `python -m torch_backend farm-task STEP ...`, as a template asks for it.
+"""One task of a render farm's job: `python -m torch_backend farm-task STEP ...`, the command in a job template.
 
-It speaks Open Job Description: lines `openjd_progress: PERCENT`, `openjd_status: TEXT` and, of a task that failed,
-`openjd_fail: TEXT` on the standard output. Every task may run twice, also at once, and after it was killed: import,
-solve and training wait for each other by the shot's lock and find what is done done; a take is made in parts
-(`freeze/take/parts.py`); what is baked is renamed into its place whole.
+A task reports to the engine in Open Job Description: lines `openjd_progress: PERCENT` and `openjd_status: TEXT` on the
+standard output, and `openjd_fail: TEXT` if it fails. Every task may run twice, even at the same time or after it was
+killed. Import, solve and training wait for each other through the shot's lock and skip finished work. A take is made in
+parts (`freeze/take/parts.py`). A baked file is renamed into place once it is complete.
 """
 
 from __future__ import annotations
@@ -33,23 +33,24 @@ from .job import new_job, run_job
 from .shot import Shot, disk_error, is_disk_full, path_error
 
 BLENDER_VARIABLE = "SPLANNEQUIN_BLENDER_COMMAND"
-"""JSON list: what runs a script of the add-on on this host, up to the script; of the job's environment."""
+"""Environment variable of the job: JSON list of the command that runs an add-on script on this host, without the
+script."""
 _STATUS_SECONDS = 5.0
 
 
 class EngineReporter(Reporter):
-    """A reporter that speaks to the engine that runs the farm; also the listener of a job."""
+    """Reporter that writes to the engine of the farm, and listener of a job."""
 
     def __init__(self, what: str) -> None:
         self.what = what
-        """What is being done, for sentences."""
+        """Name of the task, for messages."""
         self.error = ""
-        """What a job said of its failure."""
+        """Message and hint of the failed job; empty if none failed."""
         self._cancelled = False
         self._last = ("", 0.0, -1.0)
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
-        """Tells the engine, every few seconds and at the end of a stage."""
+        """Reports progress to the engine, every few seconds and at the end of a stage."""
         share = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
         now, (before, since, last_share) = time.monotonic(), self._last
         if stage == before and ((now - since < _STATUS_SECONDS and share < 1.0) or share == last_share):
@@ -59,11 +60,11 @@ class EngineReporter(Reporter):
         self._say("openjd_status", f"{self.what}: {stage} {100 * share:.0f}% {message}")
 
     def image(self, label: str, path: str | Path) -> None:
-        """A line of the log."""
+        """Prints a line to the log."""
         print(contract.printable(f"{label}: {path}", 400), flush=True)
 
     def warning(self, message: str, hint: str = "") -> None:
-        """A line of the log: the engine shows only the last status."""
+        """Prints a line to the log, because the engine shows only the last status."""
         print(contract.printable(f"note: {message} {hint}".rstrip(), 1000), flush=True)
 
     def check_cancelled(self) -> None:
@@ -72,11 +73,11 @@ class EngineReporter(Reporter):
             raise Cancelled
 
     def cancel(self, number: int = 0, frame: FrameType | None = None) -> None:
-        """Handler of the signals by which an engine cancels."""
+        """Handler of the signals with which an engine cancels a task."""
         self._cancelled = True
 
     def __call__(self, event: Event) -> None:
-        """Hears a job."""
+        """Handles one event of a job."""
         data = event.data
         if event.type == "progress":
             self.progress(data["stage"], data["done"], data["total"], data["message"])
@@ -96,8 +97,8 @@ class EngineReporter(Reporter):
 
 
 def run_task(args: argparse.Namespace) -> int:
-    """Runs one task, arguments as `contract.verbs.TaskWords`; returns an `ExitCode`. Says why if it failed."""
-    began = time.time() - time.process_time()  # what was imported counts
+    """Runs one task, with the arguments of `contract.verbs.TaskWords`. Reports a failure; returns an `ExitCode`."""
+    began = time.time() - time.process_time()  # includes the time of imports
     reporter = EngineReporter(f"{Path(args.shot).name}, {args.step}")
     with contract.working_on(Path(args.shot).absolute()), _cancelling(reporter):
         try:
@@ -130,7 +131,7 @@ def run_task(args: argparse.Namespace) -> int:
 
 
 def _amount(args: argparse.Namespace, request: dict[str, Any]) -> float:
-    """How much a task has to do, as `farm.work` counts."""
+    """Amount of work of a task, in the units of `farm.work`."""
     return float(request["amounts"].get(str(args.first) if args.frames else "0", 0.0))
 
 
@@ -149,9 +150,9 @@ def _cancelling(reporter: EngineReporter) -> Generator[None]:
 
 
 def asked_of(args: argparse.Namespace, request: dict[str, Any], kind: str) -> Any:
-    """The parameters of a kind of job as a task has them: the request's, with paths of this computer.
+    """Parameters of one kind of job for a task: those of the request, with the paths of this computer.
 
-    ValueError names an invalid parameter.
+    ValueError names the invalid parameter.
     """
     values = dict(request[kind])
     for setting in args.paths or ():
@@ -165,7 +166,7 @@ def asked_of(args: argparse.Namespace, request: dict[str, Any], kind: str) -> An
 
 
 def _station(args: argparse.Namespace, request: dict[str, Any], reporter: EngineReporter) -> int:
-    """import, solve or train: a job of the shot, which waits for its turn."""
+    """Runs import, solve or train as a job of the shot. The job waits while another one writes to the shot."""
     params = asked_of(args, request, args.step)
     shot = Shot.create(args.shot, request["name"]) if args.step == "import" else Shot.open(args.shot)
     code, _ = run_job(new_job(shot, args.step, params), reporter, patient=True)
@@ -177,7 +178,7 @@ def _station(args: argparse.Namespace, request: dict[str, Any], reporter: Engine
 
 
 def _take(args: argparse.Namespace, request: dict[str, Any], reporter: EngineReporter) -> int:
-    """open, freeze or finish: a part of a take, which waits for nobody."""
+    """Runs open, freeze or finish: a part of a take, without the shot's lock."""
     from .freeze import finish_take, freeze_part, open_take
 
     shot, params = Shot.open(args.shot), _freezing(args, request)
@@ -201,7 +202,7 @@ def _freezing(args: argparse.Namespace, request: dict[str, Any]) -> FreezeParams
 
 
 def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineReporter) -> int:
-    """bake or deliver: Blender, as this host has it."""
+    """Runs bake or deliver in the Blender of this host."""
     blender = os.environ.get(BLENDER_VARIABLE, "")
     if not blender:
         raise JobError(
@@ -211,14 +212,14 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
     first, last = params.first or 0, params.last or 0
     if args.frames:
         first, last = args.first, min(args.first + args.frames - 1, last)
-    folder = str(request.get("output") or shot_name(Path(args.shot)))  # earlier templates tell no folder
+    folder = str(request.get("output") or shot_name(Path(args.shot)))  # requests of earlier versions have no `output`
     output = Path(args.output).absolute() / folder / params.take
     part = "frames" if args.step == "bake" else "file"
     script = Path(__file__).resolve().parent.parent / "splannequin_addon" / "run_in_bpy.py"
     command: list[str] = json.loads(blender)
     words = ["bake", "--json", "--tied", "--shot", args.shot, "--take", params.take, "--output", str(output)]
     words += [f"--first={first}", f"--last={last}", "--step", "1", "--part", part]
-    apart = ["--"] if len(command) > 2 else []  # a Blender takes what is before it for its own
+    apart = ["--"] if len(command) > 2 else []  # Blender reads arguments before `--` as its own options
     environ = {**os.environ, "SPLANNEQUIN_BACKEND_PYTHON": sys.executable}
     child = subprocess.Popen(
         [*command, str(script), *apart, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -239,7 +240,7 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
                 reporter.check_cancelled()
     finally:
         if child.stdin is not None:
-            child.stdin.close()  # it ends with us
+            child.stdin.close()  # a tied child ends when its input is closed
     code = child.wait()
     if code:
         reporter.fail(message or f"Blender ended with exit code {code}: see the log.")
@@ -247,7 +248,7 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
 
 
 def _event(line: str) -> Event | None:
-    """An event that Blender's side printed; None of any other line."""
+    """Event in a line that Blender's side printed; None for any other line."""
     if not line.startswith("{"):
         return None
     try:
@@ -268,4 +269,4 @@ _STEPS = {
     "bake": _bake,
     "deliver": _bake,
 }
-"""Step of a template -> what does it."""
+"""Function of each step of a template."""

@@ -1,7 +1,7 @@
-"""Runs one station as a job: typed events out, cancellation in, a status that is true even after a crash.
+"""Runs one station as a job, with typed events, cancellation, and a status that stays correct after a crash.
 
 The same code runs a job for Blender (a child process, `python -m torch_backend run-job DIR`), for the command line
-(in this process, with the console listening) and for tests.
+(in this process, with the console as the listener) and for tests.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from .writer import only_writer, patient_writer
 _CANCEL_POLL_SECONDS = 0.2
 _PROGRESS_SECONDS = 0.1
 _MISSED_BEATS = 3
-"""A job ends when its shot's folder was not there for this many beats: a network disk may be away for a moment."""
+"""A job ends after this many heartbeats in a row without its folder. A network disk may be missing for a moment."""
 
 Listener = Callable[[Event], None]
 
 
 class JobReporter:
-    """The reporter of a job folder: appends events, keeps status.json fresh, notices the cancel file and Ctrl-C."""
+    """Reporter of a job folder: appends events, updates status.json, notices the cancel file and Ctrl-C."""
 
     def __init__(self, folder: Path, kind: str, listener: Listener | None = None) -> None:
         self.folder = folder
@@ -50,7 +50,7 @@ class JobReporter:
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
         self.from_nothing = False
-        """The job's first stage began at its beginning: nothing of it had been done before."""
+        """True if the job's first stage began at its start, so the job reused no earlier work."""
         self._foretold = ("", 0.0)
         now = time.time()
         pid, host = os.getpid(), contract.computer_name()
@@ -94,7 +94,7 @@ class JobReporter:
     def check_cancelled(self) -> None:
         if self._missed >= _MISSED_BEATS:
             raise contract.MissingError(f"{self.folder} is gone")
-        if self._taken_by is not None:  # nothing more is written: it is another's now
+        if self._taken_by is not None:  # another job owns the shot now, so this one writes no more
             message = f"The shot was taken over by {self._taken_by.host}: this computer had fallen silent."
             raise JobError(message, "It goes on there.", ExitCode.USAGE)
         now = time.monotonic()
@@ -105,20 +105,20 @@ class JobReporter:
             raise Cancelled
 
     def waiting(self, why: str) -> None:
-        """The job has not begun, and waits for its turn. Raises `Cancelled` as `check_cancelled`."""
+        """Reports that the job waits for its turn. Raises `Cancelled` as `check_cancelled` does."""
         self.progress("waiting", 0, 1, why)
         self.check_cancelled()
 
     def holds(self, mine: Writer) -> None:
-        """The job is the shot's only writer, as `mine` in its lock says: it ends if that comes to name another."""
+        """Notes that the shot's lock contains `mine`. The job ends if the lock later names another writer."""
         self._mine = mine
 
     @property
     def heard(self) -> bool:
-        """True if somebody listens to the events as they come."""
+        """True if a listener receives the events."""
         return self._listener is not None
 
-    # -- the job's own end
+    # -- end of the job
 
     def cancel(self) -> None:
         """Asks the job to stop at its next `check_cancelled`. Safe in a signal handler."""
@@ -142,12 +142,12 @@ class JobReporter:
         with contextlib.suppress(OSError):
             self._events.close()
 
-    # -- inside
+    # -- internal
 
     def _eta(self, now: float, fraction: float) -> float | None:
         stage, since, at_fraction = self._stage_started
         of, until = self._foretold
-        if of == stage and now < until and fraction < 1.0:  # by whoever knows what grows; longer than that nobody does
+        if of == stage and now < until and fraction < 1.0:  # the station's forecast, while it lasts
             return round(until - now, 1)
         gained = fraction - at_fraction
         if gained <= 0.02 or now - since < 1.0:
@@ -158,7 +158,7 @@ class JobReporter:
         with self._lock:
             event = Event(kind, self._seq, time.time(), data)
             self._seq += 1
-            # A full disk must not keep a job from saying so in its status and to its listener.
+            # With a full disk, the job still reports the error in its status and to its listener.
             with contextlib.suppress(OSError):
                 if not self._events.closed:
                     self._events.write(json.dumps(dataclasses.asdict(event)) + "\n")
@@ -166,9 +166,9 @@ class JobReporter:
         if self._listener:
             try:
                 self._listener(event)
-            except OSError as error:  # its terminal is gone, or its disk is full: no work is to be lost by that
+            except OSError as error:  # the terminal is closed or the disk is full: the job goes on
                 self._listener = None
-                if isinstance(error, BrokenPipeError):  # as `| head` does: nobody wants to know how it goes on
+                if isinstance(error, BrokenPipeError):  # the reader closed the pipe, as `| head` does
                     self.cancel()
 
     def _heartbeat(self) -> None:
@@ -199,10 +199,10 @@ def run_job(
 
     Args:
         folder: the job's folder.
-        listener: hears every event.
-        alone: be the shot's only writer, and fail in words if there is one. Without, several may train runs of
-            different names at once: the caller sees to it that nothing else is written.
-        patient: wait for another writer instead, and take the shot from one that died on another computer.
+        listener: receives every event.
+        alone: hold the shot's lock, and fail with a message if another job holds it. If false, several jobs may train
+            runs of different names at once; the caller must prevent other writes.
+        patient: wait for another writer instead of failing, and take the lock from one that died on another computer.
     """
     folder = Path(folder).absolute()
     try:
@@ -214,7 +214,7 @@ def run_job(
         return ExitCode.USAGE, None
     with working_on(Path(request.shot).absolute(), folder.parent.parent):
         reporter = JobReporter(folder, request.kind, listener)
-        with contextlib.ExitStack() as held, _signals_cancel(reporter):  # held until the last status is written
+        with contextlib.ExitStack() as held, _signals_cancel(reporter):  # keeps the lock until the last status
             return _run(request, reporter, held if alone else None, patient)
 
 
@@ -245,12 +245,12 @@ def _run(
     except JobError as error:
         state, code, message, hint = "failed", error.exit_code, error.message, error.hint
         _log(reporter.folder, "\n".join([message, hint, *getattr(error, "__notes__", ())]) + "\n")
-    except Exception as error:  # nobody foresaw it: whatever it is, it is no mistake of the user's
+    except Exception as error:  # unexpected, so not the user's mistake
         _log(reporter.folder, traceback.format_exc())
         known, text = _about_a_path(error, request.shot) or _about_a_module(error), str(error).lower()
         known = known or unexpected(f"The {request.kind} step", error, reporter.folder / contract.LOG_FILE)
         state, code = "failed", known.exit_code
-        if type(error).__name__ == "OutOfMemoryError":  # torch's own, of a card
+        if type(error).__name__ == "OutOfMemoryError":  # torch raises it for a card
             message = "The graphics card is out of memory."
             hint = (
                 "Close other programs that use it, choose a smaller width or fewer Gaussians, or the processor as the "
@@ -262,12 +262,12 @@ def _run(
             message, hint = known.message, known.hint
     reporter.finish(state, code, message, hint, result)
     if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
-        print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log goes with the shot's folder, the status does not
+        print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log moves with the folder
     return code, result
 
 
 def _learn_pace(shot: Shot, kind: str, params: Any, seconds: float) -> None:
-    """Notes how fast this machine was, for the estimates of later jobs."""
+    """Records how fast this machine was, for the estimates of later jobs."""
     with contextlib.suppress(OSError, ValueError):
         expected = contract.expected_seconds(kind, params, contract.ShotSize.of(shot))
         if expected is not None:
@@ -276,7 +276,7 @@ def _learn_pace(shot: Shot, kind: str, params: Any, seconds: float) -> None:
 
 @contextlib.contextmanager
 def _kept_in_place(shot: Shot, kind: str) -> Generator[None]:
-    """JobError, whatever else was wrong, if the shot's folder was moved or deleted in the meantime."""
+    """Raises JobError if the shot's folder was moved or deleted during the block, in place of any other error."""
     try:
         yield
     except (Cancelled, KeyboardInterrupt):
@@ -295,27 +295,27 @@ def _exists(shot: Shot) -> bool:
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError:
-        pass  # a disk that does not answer: the shot may be there
+        pass  # the disk does not answer: the shot may still exist
     return True
 
 
 def _about_a_path(error: Exception, shot: str) -> JobError | None:
-    """The sentence for a full disk, or for a file that the system refuses; None for any other error."""
+    """JobError for a full disk, or for a file that the system refuses; None for any other error."""
     if not isinstance(error, OSError):
         return None
     return disk_error(shot) if is_disk_full(error) else path_error(error)
 
 
 def _about_a_module(error: Exception) -> JobError | None:
-    """The sentence for a package that is missing or broken; None for any other error, and for a module of ours."""
+    """JobError for a missing or broken package; None for any other error, and for a module of this package."""
     if not isinstance(error, ImportError) or (error.name or "").partition(".")[0] == __package__:
         return None
     return contract.incomplete(str(error))
 
 
 def _log(folder: Path, text: str) -> None:
-    """Adds to the job's log, which *Open Log* shows: what a sentence leaves out."""
-    name = folder / contract.LOG_FILE  # names of files on Linux need not be text: they are written as well as may be
+    """Appends details that the message leaves out to the job's log, which *Open Log* shows."""
+    name = folder / contract.LOG_FILE  # file names on Linux may be invalid text: "backslashreplace" writes them
     with contextlib.suppress(OSError), open(name, "a", encoding="utf-8", errors="backslashreplace") as log:
         log.write(text)
 
@@ -342,7 +342,8 @@ def _signals_cancel(reporter: JobReporter) -> Generator[None]:
 
 
 # ------------------------------------------------------------------------------------------------- stations
-# Imported inside, so that a job loads only what it needs: torch takes seconds to import, an import job needs none.
+# Each function imports its station, so that a job loads only what it needs. Importing torch takes seconds, and an
+# import job does not need torch.
 
 
 def _import(shot: Shot, params: contract.ImportParams, report: Reporter) -> Any:
@@ -359,7 +360,7 @@ def _solve(shot: Shot, params: contract.SolveParams, report: Reporter) -> Any:
     config = SolveConfig(**{name: value for name, value in vars(params).items() if name != "cameras"})
     one_bar = OneBar(report, weights_of(load_frames(shot)))
     solved = solve_shot(shot, config, one_bar, params.cameras)
-    from .motion_search import motion_after_solve  # loads torch, which nobody should wait for before the cameras
+    from .motion_search import motion_after_solve  # imports torch, which would delay the cameras
 
     result = {**solved, **(motion_after_solve(shot, one_bar) or {})}
     one_bar.metric("solve", result)
@@ -371,7 +372,7 @@ def _train(shot: Shot, params: contract.TrainParams, report: Reporter) -> Any:
     from .motion_search import find_motion
     from .train import train_shot
 
-    if is_outdated(shot) and not params.extend:  # without mattes what moves would be guessed
+    if is_outdated(shot) and not params.extend:  # without mattes, training would guess what moves
         find_motion(shot, report, with_points=True)
     return train_shot(shot, params, report)
 
@@ -416,4 +417,4 @@ RUNNERS: dict[str, Callable[[Shot, Any, Reporter], Any]] = {
     "light": _light,
     "combine": _combine,
 }
-"""Kind of job -> the station that does it: (shot, typed params, reporter) -> JSON-able result."""
+"""Station of each kind of job: (shot, typed params, reporter) -> JSON-able result."""

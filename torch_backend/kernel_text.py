@@ -1,9 +1,9 @@
-"""Text of a kernel file: `kernels/*.cpp` and `*.cu` beside the modules that use them.
+"""Text of kernel files: `kernels/*.cpp` and `*.cu` next to the modules that use them.
 
-A kernel file is a body of C++ for `warp.func_native`, or a part of one. Its head, the lines of `//` before the first
-other line, says what it is and is not compiled; everything after it is, to the letter, because Warp's cache of compiled
-kernels goes by the text. A line `#include "PATH"` stands for such a file, seen from the folder of the line, without its
-head. The module that uses the file replaces names between @ signs (`@LOW_PASS@`).
+A kernel file is a C++ body for `warp.func_native`, or a part of one. It begins with a head of `//` lines, which
+describe the kernel and are not compiled. The rest is compiled unchanged, because Warp's cache of compiled kernels is
+keyed by the text. A line `#include "PATH"` inserts another kernel file without its head; PATH is relative to the folder
+of the including file. The module that uses the file replaces names between @ signs (`@LOW_PASS@`).
 """
 
 import functools
@@ -16,7 +16,7 @@ _INCLUDE = re.compile(r'^#include "([\w./]+)"\n', re.MULTILINE)
 
 @functools.cache
 def kernel_text(path: Path) -> str:
-    """What is compiled of a file and of those it includes. ValueError if one has no head, OSError if one is missing."""
+    """Text of a file and its includes, without heads. ValueError if a file has no head, OSError if one is missing."""
     text = path.read_text(encoding="utf-8")
     head = _HEAD.match(text)
     if head is None:

@@ -1,14 +1,14 @@
-"""The live station: a warm run that draws frozen views as fast as they are requested.
+"""The live station: a loaded run that draws frozen views as fast as they are requested.
 
-It speaks through its own standard input and output, which belong to the process that started it: nothing listens, and
-when that process ends, so does this one. Messages are those of `contract.write_message`:
+The process reads requests from its standard input and answers on its standard output. It opens no port, and it ends
+when the process that started it ends. Messages have the format of `contract.write_message`:
 
 | header | from | means |
 |---|---|---|
-| `ready` | backend | the run is loaded: its frames, frames good as instants, size; `note`: a warning or empty |
-| a `LiveView` | Blender | draw this; a newer one for the same view replaces one that waits or is being made of plates |
+| `ready` | backend | the run is loaded: its frames, suggested instants, size; `note`: a warning or empty |
+| a `LiveView` | Blender | a request; a newer one for the same view replaces one that waits or is being made of plates |
 | `frame` | backend | a view: float32 premultiplied display-referred RGBA, then float32 depth of splats in solve units |
-| `error` | backend | message and hint; after one without `seq` the session ends |
+| `error` | backend | message and hint; an error without `seq` ends the session |
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ from .train import LoadedRun, load_run
 from .train.device import decide_device, unused_words
 
 _INSTANTS_KEPT = 8
-"""Frozen scenes that are kept: going back and forth between keys costs no evaluation of the field."""
+"""Number of frozen scenes kept in memory, so that a return to an instant needs no evaluation of the field."""
 _COARSER = 1.25
-"""Factor by which plates may be coarser than a view that is made of them."""
+"""Largest factor by which plates may be coarser than the view that is made of them."""
 _DETAIL = CompositeConfig(sources=4, source_views=VisibilityConfig(width=320))
-"""A take looks at more plates, more finely: there a plate serves a frame and its neighbours, here perhaps one view."""
+"""Fewer and smaller plates than for a take, in which neighbouring frames share the work done for a plate."""
 _TINT, _TINTED = (1.0, 0.15, 0.55), 0.75
 """Display-referred tint of guessed pixels, and its opacity where no frame supports the pixel at all."""
 
 
 class Superseded(Exception):
-    """A view that was being made of plates, which takes a while, gave way to something newer."""
+    """Raised to abandon a view that is being made of plates, which is slow, when a newer request arrives."""
 
 
 class _LivePlates:
-    """Plates as `Compositor` reads them, between whose reads a view can be given up."""
+    """Plates as `Compositor` reads them. Each read raises Superseded if the view should be abandoned."""
 
     def __init__(self, shot: Shot, size: tuple[int, int]) -> None:
         self._plates, self._moving = Plates(shot, size), motion_mattes(shot)
@@ -90,7 +90,7 @@ class _LivePlates:
 
 
 class _Details:
-    """Makes views of plates. What is computed of a plate serves all views of about one scale."""
+    """Makes views of plates. All views of about the same scale share what is computed from a plate."""
 
     def __init__(self, shot: Shot, run: LoadedRun, scene: Scene) -> None:
         self._shot, self._run, self._scene = shot, run, scene
@@ -100,11 +100,11 @@ class _Details:
     def frame(
         self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, stop: Callable[[], bool]
     ) -> CompositeFrame:
-        """A view of plates at its own scale. JobError if a plate cannot be read; Superseded once `stop` is true."""
+        """A view made of plates, at its own scale. JobError if a plate cannot be read; Superseded once `stop` is true."""
         height, width = image.alpha.shape
         size = self._size(output)
         if self._made is None or self._made[0] != size:
-            self._made = None  # before the next takes its room
+            self._made = None  # frees memory before the next one is made
             plates = _LivePlates(self._shot, size)
             self._made = size, plates, Compositor(self._run, self._scene, plates, _DETAIL, plates.moving)
         _, plates, compositor = self._made
@@ -112,7 +112,7 @@ class _Details:
         return compositor.frame(output, frozen, image, width, height)
 
     def _size(self, output: OutputFrame) -> tuple[int, int]:
-        """Width and height of plates that are about as fine as a view: the source's own, halved as often as it can."""
+        """Width and height of plates about as fine as a view: the source's size, halved as often as possible."""
         if self._whole is None:
             whole = Plates(self._shot)
             self._whole = whole.width, whole.height
@@ -157,8 +157,8 @@ class LiveSession:
     def draw(self, view: LiveView, stop: Callable[[], bool] = lambda: False) -> tuple[dict[str, Any], bytes]:
         """Header and body of the `frame` message for a view. t* snaps to the nearest trained frame.
 
-        Made of plates it raises Superseded once `stop` is true, which is asked now and then, and JobError if a plate
-        cannot be read.
+        While a view is made of plates, `stop` is called between reads. Superseded once it returns True; JobError if a
+        plate cannot be read.
         """
         since = time.perf_counter()
         at = min(self.run.train_frames, key=lambda frame: abs(frame - view.t_star))
@@ -192,7 +192,7 @@ class LiveSession:
         return header, body
 
     def _output(self, view: LiveView, at: int) -> OutputFrame:
-        """The frame that a view is: one of the clip's own where it is seen as the clip's camera saw it."""
+        """Output frame of a view. A view from a clip frame's camera gets that frame's exact camera matrix."""
         like = at if view.exposed_like is None else view.exposed_like
         fx, fy, cx, cy = view.K
         viewmat = self.scene.from_solve(np.reshape(view.viewmat, (4, 4)))
@@ -200,13 +200,13 @@ class LiveSession:
         frame = round(like)
         if frame == like and frame in self.scene.frames:
             i = self.scene.frames.index(frame)
-            # Blender's matrices are off by rounding.
+            # Blender's matrices have rounding errors.
             if torch.allclose(viewmat, self.scene.viewmats[i], atol=1e-4):
                 viewmat = self.scene.viewmats[i]
         return OutputFrame(frame, viewmat, K, float(at), float(like))
 
     def _at(self, frame: int, develop: bool) -> FrozenGaussians:
-        """The scene at a trained frame, developed if it has been by now, and is wanted so."""
+        """The frozen scene at a trained frame. It is the developed instant if `develop` is true and one exists."""
         file = _file_of(developed_path(self.run, frame)) if develop else None
         key = frame, file
         if key not in self._frozen:
@@ -223,7 +223,8 @@ class LiveSession:
 
 
 def _file_of(path: Path) -> tuple[int, ...] | None:
-    """Inode, bytes and time (ns) of a file, None if there is none: it is read again when one of them changes."""
+    """Inode, size in bytes and modification time (ns) of a file; None if it is missing. A change of any of them means
+    that the file has to be read again."""
     try:
         found = path.stat()
     except OSError:
@@ -232,9 +233,9 @@ def _file_of(path: Path) -> tuple[int, ...] | None:
 
 
 class _Waiting:
-    """Requests that wait: the newest of each view, oldest view first, those of plates after all others.
+    """Queue of requests: the newest one of each view, oldest view first, views made of plates after all others.
 
-    Filled by a thread, emptied by the session.
+    A thread fills the queue, and the session empties it.
     """
 
     def __init__(self) -> None:
@@ -244,7 +245,7 @@ class _Waiting:
         self._change = threading.Condition()
 
     def read(self, stream: BinaryIO) -> None:
-        """Takes requests in until the stream ends or makes no sense."""
+        """Reads requests until the stream ends or is malformed."""
         try:
             while (message := read_message(stream)) is not None:
                 header = dict(message[0])
@@ -267,7 +268,7 @@ class _Waiting:
             self._change.notify()
 
     def next(self) -> LiveView | dict[str, Any] | None:
-        """What to answer next, waiting for it: a view, a refusal to pass on, or None when there will be nothing."""
+        """Waits for the next item: a view to draw, a refusal to send, or None at the end of the session."""
         with self._change:
             self._change.wait_for(lambda: self._ended or self._views or self._refused)
             if self._ended:
@@ -278,19 +279,20 @@ class _Waiting:
             return self._views.pop(first)
 
     def better_than(self, view: LiveView) -> bool:
-        """True if something waits that a view of plates should give way to, or nobody waits for it any more."""
+        """True if a view made of plates should be abandoned: a faster or newer request waits, or the session ended."""
         with self._change:
             waits = any(not other.detail or other.view == view.view for other in self._views.values())
             return self._ended or bool(self._refused) or waits
 
     def put_back(self, view: LiveView) -> None:
-        """Has a view wait again, unless a newer one for the same view does."""
+        """Queues a request again, unless a newer one for the same view waits."""
         with self._change:
             self._views.setdefault(view.view, view)
 
 
 def serve(session: LiveSession, requests: BinaryIO, answers: BinaryIO) -> None:
-    """Answers until `requests` ends. A view that cannot be drawn is an `error` with its `seq`; the session goes on."""
+    """Answers requests until their stream ends. If a view cannot be drawn, the answer is an `error` with its `seq`, and
+    the session goes on."""
     waiting = _Waiting()
     threading.Thread(target=waiting.read, args=(requests,), name="live requests", daemon=True).start()
     try:
@@ -315,7 +317,7 @@ def serve(session: LiveSession, requests: BinaryIO, answers: BinaryIO) -> None:
 
 def run_live(shot: str | Path, run: str, device: str = "auto") -> int:
     """The process behind `python -m torch_backend live`; returns an exit code."""
-    # Whatever a library prints would stand between two messages: what was the standard output is ours alone.
+    # Text that a library prints would corrupt the messages, so it goes to the standard error from now on.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     requests = os.fdopen(own_input(), "rb")

@@ -1,4 +1,4 @@
-"""The search for what moves: motion mattes of every frame, and points of what stands still."""
+"""Motion search: writes a motion matte of every frame, and points of still surfaces."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ from .shot import Shot, make_folder, need_disk, write_json
 from .train.static_world import static_views
 
 StaticModel = Callable[[Shot, Reporter], StaticViews]
-"""Learns the clip as a world that stands still, of the cameras that it has. JobError if that cannot be done."""
+"""Trains a static model of the clip with its solved cameras. JobError if that fails."""
 
 
 class MotionResult(TypedDict):
     """What `find_motion` returns."""
 
     motion_pixels_share: float
-    """Share of the frames' pixels that move by themselves."""
+    """Share of the pixels of all frames that are labelled moving, 0 to 1."""
     unknown_share: float
-    """Share of them of which nothing is known."""
+    """Share of the pixels of all frames that are labelled unknown, 0 to 1."""
 
 
 def find_motion(
     shot: Shot, report: Reporter, with_points: bool = False, static_model: StaticModel | None = static_views
 ) -> MotionResult:
-    """Writes the motion matte of every delivered frame, from optical flow against the camera's own motion and from what
-    a static model of the clip cannot show; and points of what stands still.
+    """Writes the motion matte of every delivered frame, and points of still surfaces. A pixel moves if its optical flow
+    does not fit the camera's motion, or if a static model of the clip cannot reproduce it.
 
-    Mattes that are there and belong to these cameras are left alone; a run that was stopped is gone on with. JobError
-    if the shot is not solved or a frame is damaged, and Cancelled.
+    Existing mattes of the same cameras are kept, and an interrupted search is resumed. Raises JobError if the shot is
+    not solved or a frame is damaged, and Cancelled.
 
     Args:
-        with_points: mattes without points, of a solve before those were kept, are found once more.
-        static_model: makes that model; None: flow alone tells, and misses arms.
+        with_points: repeat the search if an older version stored mattes without points.
+        static_model: makes the static model. None: use optical flow alone, which misses arms.
     """
     config = FlowConfig()
     key = solve_key(shot, config)
@@ -89,7 +89,7 @@ def _is_whole(shot: Shot, frame: int) -> bool:
 
 
 def _static_views(shot: Shot, static_model: StaticModel | None, report: Reporter) -> StaticViews | None:
-    """What a static model shows; None without one, or if a clip cannot be learnt: flow has to do then."""
+    """Views of the static model. None without a model or if its training fails; flow is used alone then."""
     if static_model is None:
         return None
     try:
@@ -102,8 +102,8 @@ def _static_views(shot: Shot, static_model: StaticModel | None, report: Reporter
 def _keep_surface(
     shot: Shot, clip: Clip, n: int, found: KeyEvidence, labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None
 ) -> None:
-    """Writes the points of a key frame's still surfaces, frame `n`: of what its matte [H, W] calls still, away from all
-    else. Some matches of a mover fit a still point by chance, at a depth where there is no surface."""
+    """Writes the points of still surfaces in key frame `n`: pixels that the matte `labels` [H, W] calls still, at some
+    distance from all others. Some matches of a mover fit a still point by chance, at a depth without a surface."""
     apart = (labels != STILL).astype(np.uint8)
     reach = 2 * round(AWAY * clip.width / 640) + 1
     apart = cv2.dilate(apart, np.ones((reach, reach), np.uint8)) > 0
@@ -113,20 +113,20 @@ def _keep_surface(
 
 
 def _begin(folder: Path, key: str) -> None:
-    """Empties the folder of mattes that are not of this key, before the first one is written."""
+    """Deletes mattes of other keys, before the first matte of this key is written."""
     make_folder(folder)
     names = MOTION_FILE, MOTION_UNFINISHED_FILE
     if all(record_of(folder / name).get("key") != key for name in names):
-        for name in names:  # while neither is there, the mattes belong to nothing
+        for name in names:  # without both records, the mattes belong to no key
             (folder / name).unlink(missing_ok=True)
         for file in (*folder.glob("*" + PICTURE), *folder.glob("*" + SURFACE)):
-            file.unlink(missing_ok=True)  # another task may be at the same
+            file.unlink(missing_ok=True)  # another task may delete the same files
     write_json(folder / MOTION_UNFINISHED_FILE, {"version": MOTION_VERSION, "key": key})
     (folder / MOTION_FILE).unlink(missing_ok=True)
 
 
 def _shares(labels: NDArray[np.uint8]) -> tuple[float, float, float]:
-    """How much of a matte is still, unknown and moving."""
+    """Shares of a matte that are still, unknown and moving, 0 to 1."""
     still, unknown, moving = (float((labels == value).mean()) for value in (STILL, UNKNOWN, MOVING))
     return still, unknown, moving
 
@@ -134,12 +134,12 @@ def _shares(labels: NDArray[np.uint8]) -> tuple[float, float, float]:
 def motion_after_solve(
     shot: Shot, report: Reporter, static_model: StaticModel | None = static_views
 ) -> MotionResult | None:
-    """`find_motion`; None with a warning where it fails. Cameras took minutes: nothing keeps them from the artist."""
+    """Result of `find_motion`. If the search fails, warns and returns None, so that the artist keeps the cameras."""
     try:
         found = find_motion(shot, report, with_points=True, static_model=static_model)
     except Cancelled:
         raise
-    except Exception as error:  # OpenCV raises its own kinds
+    except Exception as error:  # OpenCV raises its own exception classes
         report.warning(
             f"What moves by itself could not be told from the pictures: {' '.join(str(error).split())[:300]}",
             "The cameras are whole; solve again to try once more.",

@@ -1,11 +1,11 @@
-"""C++ snippets: compiled by Warp at first use (seconds, cached on disk), run by Python threads over units of work.
+"""C++ snippets that Warp compiles at first use (seconds, cached on disk) and that Python threads run in parallel.
 
-A launch runs on the calling thread and releases the GIL, so workers are Python threads. A snippet sees its parameter
-block as `P` and hands itself units by `take()`, an atomic counter; what a unit writes belongs to it alone, so results
-do not depend on the number of threads. `PRELUDE` gives 16-lane float vectors.
+A launch runs on the calling thread and releases the GIL, so workers are Python threads. A snippet accesses its
+parameter block as `P` and gets its next unit of work from `take()`, an atomic counter. No two units write to the same
+memory, so results do not depend on the number of threads. `PRELUDE` defines 16-lane float vectors.
 
-The environment variable OMP_WAIT_POLICY=passive should be set before torch is imported (`cli.main` does): spinning
-OpenMP threads would take the cores.
+The environment variable OMP_WAIT_POLICY=passive should be set before torch is imported, as `cli.main` does. Otherwise
+spinning OpenMP threads occupy the cores.
 """
 
 import contextlib
@@ -33,18 +33,18 @@ from .kernel_text import kernel_text
 Launch = Callable[[int, int, int], None]
 """A compiled snippet, called as f(address of the block, stage, worker)."""
 _raw_stream: Any = getattr(importlib.import_module("torch._C"), "_cuda_getCurrentRawStream", None)
-"""The handle of torch's current stream of a card, without an object around it: what torch's own compiler asks."""
+"""Private function of torch for the raw handle of a card's current stream, as torch's compiler uses it; or None."""
 _CPU = torch.device("cpu")
 _recorded = threading.local()
-"""A thread's launches, by kernel, device and threads of a block."""
+"""Recorded launches of each thread, by kernel, device and threads per block."""
 
 PRELUDE = kernel_text(Path(__file__).with_name("kernels") / "prelude.cpp")
 POINTER, INTEGER = (ctypes.c_uint64, "float*"), (ctypes.c_int64, "long long")
-"""Kinds of a block's fields: (ctypes, C)."""
+"""Types of a parameter block's fields: (ctypes type, C type)."""
 
 
 PROCESSOR_VARIABLE = "SPLANNEQUIN_MARCH"
-"""Environment variable: compile kernels for this processor (as Clang names it: x86-64-v3) instead of this one."""
+"""Environment variable: processor to compile kernels for, as Clang names it (x86-64-v3). Default: this machine's."""
 
 
 def cores() -> int:
@@ -53,24 +53,24 @@ def cores() -> int:
 
 
 def default_threads() -> int:
-    """Number of worker threads used unless told otherwise: all cores that this process may use, at most 16, or as many
-    as OMP_NUM_THREADS names, which torch obeys as well."""
+    """Default number of worker threads: the cores that this process may use, but at most 16, and at most
+    OMP_NUM_THREADS, which torch obeys as well."""
     setting = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, min(cores(), 16, int(setting) if setting.isdecimal() else 16))
 
 
 _WORTH_A_THREAD = 460_000
 _LOOK_SECONDS = 1.0
-"""A caller looks so often whether its workers have ended, if nothing tells it: nobody may wait for a word for ever."""
+"""Interval in seconds at which a caller checks whether its helpers have ended, in case a notification is lost."""
 
 
 @contextlib.contextmanager
 def torch_threads(values: int) -> Generator[None]:
-    """Meanwhile torch's own operators, on tensors of so many numbers, run on as many threads as are worth waking, and
-    on no more than they had.
+    """Limits torch's operators to as many threads as pay off for tensors of `values` numbers. Does not raise their
+    current number.
 
-    Between two operators torch's threads sleep (OMP_WAIT_POLICY): where each works on little, waking them takes longer
-    than they save (docs/decisions.md, "Processor, cards, Blender"). Compiled snippets have threads of their own.
+    Torch's threads sleep between two operators (OMP_WAIT_POLICY). For small tensors, waking them takes longer than they
+    save (docs/decisions.md, "Processor, cards, Blender"). Compiled snippets use separate threads.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(max(1, min(before, round(values / _WORTH_A_THREAD))))
@@ -82,7 +82,7 @@ def torch_threads(values: int) -> Generator[None]:
 
 @contextlib.contextmanager
 def _without_notice() -> Generator[None]:
-    """Hold back what C code writes to standard error meanwhile; pass on all but Warp's notice of a missing GPU."""
+    """Holds back what C code writes to the standard error. Then prints all of it but Warp's notice of a missing GPU."""
     try:
         saved = os.dup(2)
     except OSError:  # a detached process may have no standard error at all
@@ -103,9 +103,9 @@ def _without_notice() -> Generator[None]:
 
 @functools.cache
 def initialised_warp() -> Any:
-    """The module warp, initialised once without a word on the terminal.
+    """The module warp, initialised once, without output on the terminal.
 
-    JobError where its compilers cannot read the folders that it is in (`compiler_folders`).
+    JobError if Warp's compilers cannot read its folders (`compiler_folders`).
     """
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     usual = os.environ.get("WARP_CACHE_PATH") or os.environ.get("LOCALAPPDATA") or Path.home()
@@ -114,7 +114,7 @@ def initialised_warp() -> Any:
         wp.config.kernel_cache_dir = str(folders.kernels)
     wp.config.use_precompiled_headers = wp.config.use_precompiled_headers and folders.precompiled
     processor = os.environ.get(PROCESSOR_VARIABLE)
-    if processor:  # its kernels lie beside the others: Warp's cache tells them apart by the flags
+    if processor:  # Warp's cache distinguishes kernels by the flags
         wp.config.cpu_compiler_flags = f"-target-cpu {processor}"
     with _without_notice():
         wp.init()
@@ -125,7 +125,7 @@ def initialised_warp() -> Any:
 
 @contextlib.contextmanager
 def compiling(folder: Path | None = None) -> Generator[None]:
-    """JobError, in a sentence, if a kernel cannot be compiled meanwhile because there is no room for it.
+    """Raises JobError if a kernel cannot be compiled during the block because of the disk (`kernel_refusal`).
 
     `folder`: where the compiled kernel is stored. LLVM ends the process if it cannot write, so free space is checked
     first.
@@ -142,12 +142,12 @@ def compiling(folder: Path | None = None) -> Generator[None]:
 
 
 def func_native(text: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """`warp.func_native`: gives a function without a body, called as it says, the body `text`."""
+    """`warp.func_native`: decorator that gives a function without a body the C++ body `text`."""
     return cast(Any, wp).func_native(text)
 
 
 def build(name: str, text: str) -> Launch:
-    """Compile C++ `text` as a module of its own, or load it from Warp's cache."""
+    """Compiles C++ `text` as a separate module, or loads it from Warp's cache."""
     initialised_warp()
 
     def run(block: wp.uint64, stage: wp.int32, worker: wp.int32): ...
@@ -160,7 +160,7 @@ def build(name: str, text: str) -> Launch:
 
     module = f"{__name__}.{name}"
     kernel = wp.Kernel(entry, key=name, module=wp.get_module(module), options={"enable_backward": False})
-    identifier = cast(Any, wp.get_module(module)).get_module_identifier(1)  # of blocks of one thread, as on a processor
+    identifier = cast(Any, wp.get_module(module)).get_module_identifier(1)  # for blocks of one thread, as on a CPU
     folder = Path(str(wp.config.kernel_cache_dir)) / identifier
     with compiling(folder):
         wp.load_module(module, device="cpu")
@@ -172,8 +172,8 @@ def build(name: str, text: str) -> Launch:
 
 
 class _Ask:
-    """One launch of a kernel: lists record which workers began and ended, since no interrupt leaves an append half
-    done."""
+    """One launch of a kernel. Lists record which workers began and ended, because an interrupt cannot leave an append
+    half done."""
 
     def __init__(self, run: Launch, address: int, stage: int, workers: int) -> None:
         self._run, self._address, self._stage = run, address, stage
@@ -185,7 +185,7 @@ class _Ask:
         """Exceptions of workers that failed."""
 
     def help(self) -> None:
-        """Runs one pending worker on a thread of the crew, if there is one left."""
+        """Runs one pending worker, if any is left, on a thread of the crew."""
         self._entered.append(None)
         try:
             self._take(self._pending.pop)
@@ -194,11 +194,11 @@ class _Ask:
             self._told.put(None)
 
     def carry_out(self, crew: "_Crew", helpers: int) -> None:
-        """Runs on the calling thread: asks for helpers, carries out all pending workers, then waits for the helpers.
-        Returns only when no thread works on the block, also after a Ctrl-C.
+        """Carries out the launch on the calling thread: requests helpers, runs pending workers, then waits for the
+        helpers. Returns only when no thread works on the block, even after a Ctrl-C.
 
-        Helpers are asked in here, and the loop that waits is another function's: Python looks for a Ctrl-C as a
-        function begins and as a loop turns, and that has to be within `try`.
+        Python checks for a Ctrl-C when a function begins and when a loop repeats. The request for helpers and the
+        waiting loop (`_finish`) are therefore inside `try`.
         """
         while True:
             try:
@@ -207,14 +207,14 @@ class _Ask:
                     crew.ask(self, wanted)
                 self._finish()
                 return
-            except BaseException as raised:  # Ctrl-C: raised once the block is nobody's
+            except BaseException as raised:  # Ctrl-C: raised again once no thread uses the block
                 self.errors.append(raised)
 
     def _finish(self) -> None:
         while True:
             while self._take(self._pending.popleft):
                 pass
-            left = len(self._left)  # read before `_entered`, so that a helper that enters meanwhile is waited for
+            left = len(self._left)  # read before `_entered`, so that a helper that enters in between counts
             if left == len(self._entered):
                 return
             with contextlib.suppress(Empty):
@@ -233,14 +233,14 @@ class _Ask:
 
 
 class _Crew:
-    """Threads that carry out what they are asked to. A pool of futures takes several times as long."""
+    """Pool of helper threads. A launch through a pool of futures takes several times as long."""
 
     def __init__(self) -> None:
         self._lock, self._threads = threading.Lock(), 0
         self._asked: SimpleQueue[_Ask] = SimpleQueue()
 
     def ask(self, ask: _Ask, helpers: int) -> None:
-        """Has so many threads help, or as many as the system lets us have."""
+        """Requests `helpers` threads for a launch, or as many as the system allows."""
         if self._threads < helpers:
             with self._lock:
                 while self._threads < helpers:
@@ -270,8 +270,8 @@ if hasattr(os, "register_at_fork"):
 
 
 def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
-    """Run one stage of a block (a ctypes structure with a field `counter`) as so many workers, on as many threads as
-    come in time, the caller's among them: a stage must not have one worker wait for another."""
+    """Runs one stage of a block (a ctypes structure with a field `counter`), split among `workers` workers. They run on
+    the calling thread and on the helper threads that start in time, so no worker may wait for another."""
     block.counter = 0
     address = ctypes.addressof(block)
     if workers == 1:
@@ -284,7 +284,7 @@ def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
 
 
 class Snippet:
-    """One compiled body. `fields` are those of its parameter block in order, name -> kind; `counter` is added."""
+    """One compiled snippet. `fields`: name -> type of each field of its parameter block, in order; not `counter`."""
 
     def __init__(self, name: str, fields: dict[str, tuple[Any, str]], source: str) -> None:
         self.name, self._lock = name, threading.Lock()
@@ -295,13 +295,13 @@ class Snippet:
         self._source = f"struct Block {{ {struct} }};\nBlock& P = *(Block*)block;\n{PRELUDE}{source}"
 
     def warm_up(self) -> None:
-        """Compile, or load from the cache; threads that ask at once wait for one compilation."""
+        """Compiles the snippet, or loads it from the cache. Threads that call this at once wait for one compilation."""
         with self._lock:
             if self._launch is None:
                 self._launch = build(self.name, self._source)
 
     def run(self, threads: int | None = None, stage: int = 0, **values: Any) -> None:
-        """Runs the body on `threads` workers (default: all cores) with the block's fields as given."""
+        """Runs the snippet on `threads` workers (default: `default_threads()`); `values`: the fields of its block."""
         if self._launch is None:
             self.warm_up()
         block: Any = self._block(**values)
@@ -316,7 +316,7 @@ def _stream(device: str, handle: int) -> Any:
 
 
 def warp_stream(device: torch.device) -> Any:
-    """Warp's name for torch's current stream of a CUDA device; kept for good, as torch keeps its streams."""
+    """Warp stream of torch's current stream on a CUDA device. It is cached for good, as torch keeps its streams too."""
     device_index: Any = device.index  # None for plain "cuda"
     index: int = torch.cuda.current_device() if device_index is None else device_index
     if _raw_stream is not None:
@@ -327,15 +327,15 @@ def warp_stream(device: torch.device) -> Any:
 def launch_on(
     kernel: Any, dim: int, inputs: list[Any], device: torch.device, block: int | None = None, stream: Any = None
 ) -> None:
-    """Launches a Warp kernel where a torch tensor's `device` is; on CUDA behind torch's work, on its current stream.
+    """Launches a Warp kernel on a torch device; on CUDA in torch's current stream, after the work that is queued there.
 
-    Warp looks at kernel, module and arguments anew in each launch, which takes the host longer than a small kernel
-    takes a card. So a thread has it recorded once, and from then on says only what is other.
+    A plain Warp launch examines kernel, module and arguments each time, which takes the host longer than the card needs
+    for a small kernel. Each thread therefore records a launch once, and later changes only its arguments and threads.
 
     Args:
-        dim: threads.
+        dim: number of threads.
         inputs: numbers, or ctypes structures in the layout of a Warp structure.
-        block: threads of a block (default: Warp's).
+        block: threads per block (default: Warp's).
         stream: result of `warp_stream(device)`, for callers with several launches.
     """
     if not dim:
@@ -347,8 +347,8 @@ def launch_on(
 
 
 def current_card(device: torch.device) -> AbstractContextManager[Any]:
-    """Makes a card the current one, for Warp leaves its device current, and the caller's may be another one. Nothing
-    on a machine without a second card: to ask takes longer than to launch."""
+    """Context in which `device` is the current card. It restores the caller's card, which a Warp launch would change.
+    Does nothing on a machine with one card, where the switch would take longer than the launch."""
     return torch.cuda.device(device) if device.type == "cuda" and _cards() > 1 else contextlib.nullcontext()
 
 

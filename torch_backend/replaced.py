@@ -1,7 +1,7 @@
-"""What an import of other frames replaces: kept in SHOT/replaced/NNN, a shot folder that can be opened by itself.
+"""Keeps what an import of other frames replaces, in SHOT/replaced/NNN, a shot folder that can be opened by itself.
 
-The new frames take their place first, with the order for the rest in `frames/unpublished.json`. A process that is
-killed before all is moved leaves that order, and the next job of the shot carries on.
+The new frames are put in place first, with a record of the remaining moves in `frames/unpublished.json`. If the process
+is killed before all moves are done, the next job of the shot completes them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .contract import (
 
 
 def next_name(shot: ShotFolder) -> str:
-    """A name in SHOT/replaced that is not taken."""
+    """Unused folder name in SHOT/replaced."""
     number = 1
     while (shot.replaced / f"{number:03d}").exists():
         number += 1
@@ -37,14 +37,14 @@ def next_name(shot: ShotFolder) -> str:
 
 
 def keep_replaced(shot: ShotFolder, name: str, same: Sequence[int]) -> None:
-    """Moves everything that belongs to the previous frames to SHOT/replaced/NAME; carries on where it was killed.
+    """Moves everything that belongs to the previous frames to SHOT/replaced/NAME. A second call completes a killed one.
 
     For `Shot.publish_frames`, while shot.json still describes those frames.
 
     Args:
-        shot: its new frames are in place, the previous ones are where `replacing_folder` left them.
-        name: of `next_name`.
-        same: frames that show the same picture as before. Paint and masks drawn over them hold, and are copied back.
+        shot: a shot with its new frames in place, and the previous ones where `replacing_folder` left them.
+        name: result of `next_name`.
+        same: frames that show the same picture as before. Paint and masks drawn over them are copied back.
     """
     kept = ShotFolder(shot.replaced / checked_name(name, "folder"))
     make_folder(kept.root)

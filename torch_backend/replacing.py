@@ -1,10 +1,9 @@
-"""A new solve in the place of the old one: prepared beside it, then moved in file by file.
+"""Replaces a solve by a new one, which is written to a separate folder and then moved in file by file.
 
-Until all of the new solve is written, nothing of the old one is touched. Then one rename, of `solve/next.partial` to
-`solve/next`, says that the new one holds, and its files are moved to where readers look for them. Between the first of
-these renames and the last (a millisecond for a clip of 75 frames) a reader may see new frames with old cameras; a
-process that is killed in between leaves `solve/next`, and the next process that opens the shot moves the rest. That is
-why this stands below `shot` and not in the solve's own folder.
+The old solve stays untouched until the new one is complete. Renaming `solve/next.partial` to `solve/next` then commits
+the new solve, and its files are moved to where readers look for them. During the moves (a millisecond for a clip of 75
+frames) a reader may see new frames with old cameras. If a process is killed during the moves, the next process that
+opens the shot moves the rest. `Shot.open` therefore needs this module, which is why it is not part of `sfm`.
 """
 
 from __future__ import annotations
@@ -32,29 +31,29 @@ from .contract import (
 
 _NEXT, _PARTIAL = "next", "next.partial"
 _LAST = (SOLVE_FILE, CAMERAS_FILE, POINTS_FILE)
-"""What is moved after all others, the last one first here: they tell a reader that there is a solve."""
+"""Files that are moved after all others, in reverse order: they tell a reader that there is a solve."""
 _WHOLE = (COLMAP_FOLDER, *MASK_KINDS)
-"""Folders of the solve that hold nothing else: what the new one has not goes."""
+"""Folders that only a solve writes to. Files in them that the new solve lacks are removed."""
 _TARGETS = (Path(FRAMES_FOLDER), Path(SOLVE_FOLDER), *(Path(SOLVE_FOLDER, name) for name in _WHOLE))
-"""Folders of the shot that a solve has files in; to no other one anything is moved."""
+"""Folders of the shot that hold files of a solve. Nothing is moved to any other folder."""
 
 
 @dataclass
 class Staged:
-    """Where the files of a new solve are written: below these as below the shot's own folders."""
+    """Folders for the files of a new solve, laid out as the shot's `frames` and `solve`."""
 
     frames: Path
-    """Takes NNNNNN.png."""
+    """Folder for NNNNNN.png."""
     solve: Path
-    """Takes cameras.json, points.npz, solve.json and colmap/."""
+    """Folder for cameras.json, points.npz, solve.json and colmap/."""
 
 
 @contextlib.contextmanager
 def replacing_solve(shot: ShotFolder) -> Generator[Staged]:
-    """Yields folders for the files of a whole new solve, which take the place of the old one's if the block ends well.
+    """Yields folders for the files of a complete new solve, which replace the old files if the block succeeds.
 
-    If it fails or is killed, the old solve stays as it was. OSError if a file cannot be moved (on Windows: it is held
-    open elsewhere): the new solve is kept, and moved when the shot is opened again.
+    If the block fails or is killed, the old solve stays unchanged. OSError if a file cannot be moved (on Windows:
+    because another program has it open). The new solve is kept then, and moved when the shot is opened again.
     """
     partial = shot.solve / _PARTIAL
     staged = Staged(partial / FRAMES_FOLDER, partial / SOLVE_FOLDER)
@@ -65,21 +64,21 @@ def replacing_solve(shot: ShotFolder) -> Generator[Staged]:
         yield staged
         for name in _WHOLE:
             _drop_stale(shot.solve / name, staged.solve / name)
-        for name in STMAP_FILES:  # they are of the previous lens
+        for name in STMAP_FILES:  # maps of the previous lens: an empty file marks them for removal
             if (shot.solve / name).is_file():
                 (staged.solve / name).touch()
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    replace_file(partial, shot.solve / _NEXT)  # a scanner may be at hundreds of new pictures
+    replace_file(partial, shot.solve / _NEXT)  # waits while a virus scanner reads the new pictures
     settle_solve(shot)
 
 
 def settle_solve(shot: ShotFolder) -> None:
-    """Moves what `replacing_solve` had finished, but not moved, to its place. Does nothing if there is none.
+    """Moves the files of a complete new solve into place. Does nothing if no new solve waits.
 
-    Two processes may do so at once: each file is moved by one of them. Nothing is moved through a link: a folder from
-    elsewhere could have it replace any file.
+    Two processes may call this at once; each file is moved by one of them. Nothing is moved through a link, because
+    links in a shot from elsewhere could point to any file.
     """
     ready, root = shot.solve / _NEXT, shot.root.resolve()
     within = ready.relative_to(shot.root)
@@ -100,7 +99,7 @@ def settle_solve(shot: ShotFolder) -> None:
 
 
 def _drop_stale(old: Path, new: Path) -> None:
-    """An empty file in `new` for each in `old` that it has not got: that one goes when the others come."""
+    """Makes an empty file in `new` for each file that only `old` has. It marks the old file for removal."""
     if old.is_dir():
         for name in {p.name for p in old.iterdir() if p.is_file()}:
             if not (new / name).exists():

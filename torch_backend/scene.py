@@ -1,8 +1,8 @@
 """One normalised scene from a solved shot: cameras, sparse points, training images, time.
 
-Everything after this file lives in scene units: the cameras' median centre is the origin and their extent (95th
-percentile of the distance from it) is 1, so learning rates, near planes and thresholds mean the same in every shot.
-`Scene.scale` and `Scene.centre` lead back to solve units: x_solve = x_scene / scale + centre.
+All later stages work in scene units. The origin is the median of the camera centres, and the 95th percentile of their
+distance from it is 1. Learning rates, near planes and thresholds therefore mean the same in every shot. `Scene.scale`
+and `Scene.centre` convert back to solve units: x_solve = x_scene / scale + centre.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Scene:
     height: int
     """Height in pixels of the working frames."""
     solved: list[int]
-    """Indices into `frames` whose pose is registered and which the step keeps for training, ascending."""
+    """Indices into `frames`, ascending, of frames with a registered pose that the step keeps for training."""
     points: Tensor
     """[P, 3] float32 sparse points, scene units."""
     colors: Tensor
@@ -62,10 +62,10 @@ class Scene:
     folder: Path
     """Folder of the undistorted working frames."""
     display: Display = PLAIN
-    """What they are shown on: how their numbers mean light."""
+    """Display of the working frames: how pixel values relate to light."""
 
     def image_path(self, index: int) -> Path:
-        """Undistorted working frame of delivered frame `index`."""
+        """Path of the undistorted working frame at `index` into `frames`."""
         return self.folder / frame_file(self.frames[index], ".png")
 
     def time_of_frame(self, frame: float) -> float:
@@ -73,15 +73,15 @@ class Scene:
         return float(np.interp(frame, self.frames, self.times))
 
     def nearest(self, frame: float) -> int:
-        """Index of the frame whose number is nearest to a (possibly fractional) one; of two as near the earlier."""
+        """Index of the frame nearest to a (possibly fractional) frame number; the earlier of two equally near ones."""
         return int(np.abs(np.asarray(self.frames, np.float64) - frame).argmin())
 
     def camera_centres(self) -> Tensor:
-        """Where the cameras stand, [F, 3]."""
+        """Camera centres [F, 3] in scene units."""
         return -(self.viewmats[:, :3, :3].mT @ self.viewmats[:, :3, 3:])[..., 0]
 
     def from_solve(self, viewmats: np.ndarray) -> Tensor:
-        """World-to-camera matrices [..., 4, 4] of solve units, in scene units, float32."""
+        """World-to-camera matrices [..., 4, 4] converted from solve units to scene units, float32."""
         return from_numpy(_in_scene(viewmats, self.scale, self.centre)).float()
 
     def camera_at(self, width: int, height: int) -> Tensor:
@@ -90,7 +90,7 @@ class Scene:
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """Up to `most` of the numbers 0 to count - 1, ascending, the first and the last among them."""
+    """Up to `most` evenly spaced integers from 0 to count - 1, ascending, with both ends."""
     numbers = np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
     return sorted({int(number) for number in numbers})
 
@@ -137,9 +137,8 @@ def load_scene(shot: Shot) -> Scene:
 
 
 def surface_of(scene: Scene) -> tuple[Tensor, Tensor, list[int]]:
-    """(points [S, 3] scene units, colours [S, 3] as `Scene.colors`, frame number of each) of what stands still, dense.
-
-    Of a shot that was solved before such points were kept, none.
+    """Dense points of still surfaces: (points [S, 3] scene units, colours [S, 3] as `Scene.colors`, frame number of
+    each). Empty for a shot that was solved before such points were stored.
     """
     found = load_surface(Shot(scene.folder.parent))
     points = (found.xyz.astype(np.float64) - scene.centre) * scene.scale
@@ -147,7 +146,7 @@ def surface_of(scene: Scene) -> tuple[Tensor, Tensor, list[int]]:
 
 
 def frame_table(shot: Shot) -> dict[int, dict[str, Any]]:
-    """Frame number -> its row of frames.json. JobError if that is missing or damaged."""
+    """Frame number -> its row of frames.json. JobError if the file is missing or damaged."""
     return {int(row["frame"]): row for row in load_frames(shot)["frames"]}
 
 
@@ -159,7 +158,7 @@ def _in_scene(viewmats: np.ndarray, scale: float, centre: np.ndarray) -> np.ndar
 
 
 def _normalisation(viewmats: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray]:
-    """Scale and centre of the cameras [S, 4, 4]. The extent is robust: one wild camera must not shrink the scene."""
+    """Scale and centre of the cameras [S, 4, 4]. A percentile keeps an outlier camera from shrinking the scene."""
     centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     centre = np.median(centres, axis=0)
     extent = float(np.percentile(np.linalg.norm(centres - centre, axis=1), 95))
@@ -185,9 +184,9 @@ def split_frames(solved: list[int], holdout: int, phase: int = 0) -> tuple[list[
 
 
 _DECODERS = 8
-"""Frames that are decoded at a time, at most: each holds some tens of megabytes meanwhile."""
+"""Most frames that are decoded at the same time. Each one needs some tens of megabytes."""
 HELD_BYTES = 1 << 30
-"""Bytes of training images that are held in memory; more lie in a file, of which the system holds what is in use."""
+"""Most bytes of training images to hold in memory. Larger sets are mapped from a file."""
 
 
 def load_images(
@@ -201,12 +200,12 @@ def load_images(
 ) -> Tensor:
     """Working frames `indices` at a training size, [I, height, width, 3] float16 in [0, 1] of the scene's display.
 
-    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `HELD_BYTES` of them are
-    mapped from a nameless file in the folder `beside`, if there is one: however the process ends, nothing stays.
-    JobError if the disk has no room for that.
+    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `HELD_BYTES` of images
+    are mapped from an unnamed file in the folder `beside`, unless that is None. The file vanishes with the process.
+    JobError if the disk has no room for it.
 
-    Several are decoded at a time, unless `read` makes them, one after the other and in the clip's order: index of a
-    frame of the scene -> [height, width, 3] in [0, 1].
+    Several frames are decoded at a time. A function `read` (index into `Scene.frames` -> [height, width, 3] in [0, 1])
+    replaces the decoder, and is called for one frame after the other in the clip's order.
     """
     shape = len(indices), height, width, 3
     if beside is None or 2 * math.prod(shape) <= HELD_BYTES:
@@ -235,18 +234,18 @@ def load_images(
 
 
 def _mapped(folder: Path, shape: tuple[int, ...]) -> Tensor:
-    """A tensor of float16 in a file that has no name, or loses it with the process where a file must have one."""
+    """float16 tensor mapped from a temporary file in `folder`, which vanishes with the process."""
     size = 2 * math.prod(shape)
     make_folder(folder)
     need_disk(folder, size, "Frames for the training, which are too many for the memory,")
     with tempfile.TemporaryFile(dir=folder, prefix="frames-") as file:
-        if hasattr(os, "posix_fallocate"):  # a disk that fills up later would kill the process, without a word
+        if hasattr(os, "posix_fallocate"):  # a disk that fills up later would kill the process
             os.posix_fallocate(file.fileno(), 0, size)
         return from_numpy(np.memmap(file, dtype=np.float16, mode="r+", shape=shape))
 
 
 def read_image(path: Path, width: int, height: int, display: Display = PLAIN) -> Tensor:
-    """One image of a display resized to [height, width, 3] float32 in [0, 1]. Raises what `read_frame` does."""
+    """One image, in values of `display`, resized to [height, width, 3] float32 in [0, 1]. Errors as `read_frame`."""
     pixels = read_frame(path)
     limit = 65535.0 if pixels.dtype == np.uint16 else 255.0
     values = pixels.astype(np.float32) / limit

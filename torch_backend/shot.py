@@ -1,4 +1,4 @@
-"""The shot as the backend works on it: `contract.ShotFolder` says where everything lies, this what shot.json tells."""
+"""The shot as the backend uses it: adds the content of shot.json to the paths of `contract.ShotFolder`."""
 
 from __future__ import annotations
 
@@ -45,27 +45,27 @@ __all__ = [
     "locked", "make_folder", "need_disk", "path_error", "remove_file", "replace_file", "replacing_folder",
     "restore_folder", "try_lock", "working_on", "write_atomic", "write_json",
 ]  # fmt: skip
-"""With what of the contract the stations write into a shot."""
+"""Includes the functions of `contract` with which stations write into a shot."""
 
 SHOT_VERSION = 1
 IMPORTED = ("source", "first", "last", "step", "fps", "width", "height", "colour")
-"""Of shot.json, what an import tells."""
+"""Fields of shot.json that an import sets."""
 
 
 @dataclass
 class ShotInfo:
-    """shot.json."""
+    """Content of shot.json."""
 
     name: str
     """What the artist calls the shot."""
     source: str = ""
-    """Footage it was imported from, as given (absolute)."""
+    """Absolute path of the footage that was imported, as the user entered it."""
     first: int = 0
     """First frame number of the range, 0 before import."""
     last: int = 0
     """Last frame number of the range, inclusive."""
     step: int = 1
-    """Every how many frames are solved and trained on."""
+    """Stride between the frames that are solved and trained on."""
     fps: float = 0.0
     """Frames per second of the source."""
     width: int = 0
@@ -97,7 +97,7 @@ class Shot(ShotFolder):
 
     @classmethod
     def create(cls, root: str | Path, name: str = "") -> Shot:
-        """Opens the shot at `root`, or makes an empty one there. JobError where other files lie there."""
+        """Opens the shot at `root`, or makes an empty one there. JobError if the folder holds other files."""
         shot = cls(root)
         if shot.info_path.is_file():
             return cls.open(root)
@@ -107,15 +107,15 @@ class Shot(ShotFolder):
         return shot
 
     def publish_frames(self) -> None:
-        """Ends an import: moves work on the frames that it replaced to SHOT/replaced, and updates shot.json.
+        """Completes an import: moves work on the replaced frames to SHOT/replaced, and updates shot.json.
 
-        UNPUBLISHED_FILE orders it. For the shot's only writer: an import that was killed between its two last steps is
-        ended by the next job.
+        Does nothing unless an import left UNPUBLISHED_FILE. Only the shot's writer may call this. If an import is
+        killed before its last step, the next job completes it.
         """
         news = self.frames / UNPUBLISHED_FILE
         if not news.is_file():
             return
-        with contextlib.suppress(ValueError, KeyError, TypeError):  # damaged by no hand of ours: frames.json holds
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # damaged by another program: frames.json holds
             record = read_json(news)
             info = from_dict(ShotInfo, {**dataclasses.asdict(self.info()), **{name: record[name] for name in IMPORTED}})
             if record.get("replaced"):
@@ -125,7 +125,7 @@ class Shot(ShotFolder):
         remove_file(news)
 
     def info(self) -> ShotInfo:
-        """shot.json as it is now."""
+        """Current content of shot.json."""
         data = read_json(self.info_path)
         check_version(data, str(self.info_path), SHOT_VERSION)
         return from_dict(ShotInfo, data)

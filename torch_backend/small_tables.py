@@ -1,4 +1,4 @@
-"""Small tables of numbers that stay the same for a run, on the device that reads them: sent once."""
+"""Small constant tables of numbers on a device, each sent there once."""
 
 import functools
 
@@ -8,9 +8,9 @@ from torch import Tensor
 
 @functools.lru_cache(maxsize=4096)
 def small_table(rows: tuple[tuple[float, ...], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """[rows, columns] on the device, the same tensor for the same numbers: not to be written to.
+    """Tensor [rows, columns] on the device. Equal numbers share one tensor, so it must not be written to.
 
-    Kept for thousands of others: a recorded step reads them where they lie (`train.recorder`).
+    The cache keeps thousands of tables, because a recorded step reads a table at its address (`train.recorder`).
     """
     values = torch.tensor(rows, dtype=dtype, device="cpu", pin_memory=device.type == "cuda")
     return values.to(device, non_blocking=True)

@@ -1,4 +1,4 @@
-"""`python -m torch_backend.tied MODULE ARGUMENTS...`: `python -m MODULE` that ends when whoever started it does.
+"""`python -m torch_backend.tied MODULE ARGUMENTS...`: runs MODULE, and ends when the process that started it ends.
 
 The launcher starts the backend, venv and pip this way, so that none of them outlives a launcher that is killed.
 Blender's jobs are not tied to Blender. Standard library only: any Python of the machine may run it.

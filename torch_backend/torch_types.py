@@ -1,7 +1,7 @@
-"""Types for what torch itself leaves without any: each function is that call and one cast.
+"""Typed wrappers for untyped functions of torch: each is one call and a cast.
 
-torch's annotations end where its Python meets C++ (`linalg`, `Tensor.norm`, `Tensor.tolist`, an autograd context). A
-type checker that reads `x.norm(dim=1)` then knows nothing of the whole expression, and neither does an editor.
+Torch does not annotate what it implements in C++ (`linalg`, `Tensor.norm`, `Tensor.tolist`, an autograd context). Type
+checkers and editors therefore know nothing of an expression such as `x.norm(dim=1)`.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,14 +18,14 @@ _Result = TypeVar("_Result")
 
 
 class AutogradContext(Protocol):
-    """What autograd hands to `forward` and `backward` of a `torch.autograd.Function`; functions add what they keep."""
+    """Context of `forward` and `backward` of a `torch.autograd.Function`. Functions may add attributes."""
 
     needs_input_grad: tuple[bool, ...]
-    """For each input of `forward` whether its gradient is wanted."""
+    """For each input of `forward`, whether its gradient is needed."""
 
     @property
     def saved_tensors(self) -> tuple[Any, ...]:
-        """What `save_for_backward` was given: tensors, and None where that was None."""
+        """Arguments of `save_for_backward`: tensors or None."""
         ...
 
     def save_for_backward(self, *tensors: Tensor | None) -> None:
@@ -33,7 +33,7 @@ class AutogradContext(Protocol):
         ...
 
     def mark_non_differentiable(self, *tensors: Tensor) -> None:
-        """Says which outputs have no gradient."""
+        """Marks outputs that have no gradient."""
         ...
 
     def set_materialize_grads(self, value: bool) -> None:
@@ -42,7 +42,7 @@ class AutogradContext(Protocol):
 
 
 def applied(autograd_function: type[torch.autograd.Function], *inputs: Any) -> Any:
-    """Output of an autograd function; the caller says what that is."""
+    """Output of an autograd function; the caller declares its type."""
     return cast(Any, autograd_function).apply(*inputs)
 
 
@@ -52,7 +52,8 @@ def once_differentiable(backward: _Backward) -> _Backward:
 
 
 def checkpoint(body: Callable[..., _Result], *inputs: Any) -> _Result:
-    """body(*inputs), which the backward pass runs once more instead of keeping what is between. No random draws."""
+    """body(*inputs). The backward pass runs `body` again instead of storing intermediates; `body` must not draw random
+    numbers."""
     run = cast(Callable[..., _Result], cast(Any, _checkpoint).checkpoint)
     return run(body, *inputs, use_reentrant=False, preserve_rng_state=False)
 
@@ -63,16 +64,16 @@ def backward(loss: Tensor, retain_graph: bool | None = None) -> None:
 
 
 def weighted_gradient(values: Tensor, leaf: Tensor, weights: Tensor) -> Tensor:
-    """The gradient of the sum of `values` times `weights`, of one shape, with regard to `leaf`, in its shape.
+    """Gradient of sum(values * weights) with respect to `leaf`, in the shape of `leaf`.
 
-    As `torch.autograd.grad` with `grad_outputs`, which imports sympy to compare two shapes: 0.6 s in every process.
+    Same as `torch.autograd.grad` with `grad_outputs`, but that imports sympy to compare two shapes: 0.6 s per process.
     """
     (found,) = torch.autograd.grad((values * weights).sum(), leaf)
     return found
 
 
 def on_gradient(values: Tensor, hook: Callable[[Tensor], None]) -> None:
-    """Calls `hook` with the gradient of `values` whenever a backward pass has it."""
+    """Calls `hook` with the gradient of `values` whenever a backward pass has computed it."""
     cast(Any, values).register_hook(hook)
 
 
@@ -102,12 +103,12 @@ def singular_values(matrices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def split(values: Tensor, sizes: int | Sequence[int], dim: int = 0) -> tuple[Tensor, ...]:
-    """Views of so many rows each (the last may have fewer), or of these sizes."""
+    """Views of `sizes` rows each along `dim` (the last may have fewer), or of the sizes in a sequence."""
     return cast(Any, values).split(sizes, dim)
 
 
 def unflatten(values: Tensor, dim: int, sizes: tuple[int, ...]) -> Tensor:
-    """A view with the axis `dim` as several of these sizes."""
+    """A view in which the axis `dim` is split into axes of these sizes."""
     return cast(Any, values).unflatten(dim, sizes)
 
 

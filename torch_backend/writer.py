@@ -1,7 +1,7 @@
 """One writer per shot: the lock that a job holds while its station works.
 
-The lock is a file in the shot, so that it holds between computers that share a disk. It names its process: what a
-killed one left is taken over on the same computer, by one of all that try.
+The lock is a file in the shot, so that it works between computers that share a disk. It names its process. If that
+process was killed, one other process on the same computer takes the lock over.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from .contract import ExitCode, JobError, Writer
 from .shot import is_disk_full, try_lock
 
 _SECONDS = 5.0
-"""How long the lock is tried for while others come and go."""
+"""Seconds for which taking the lock is retried while other processes take and release it."""
 _LENGTH = 1024
-"""Bytes of every lock: it is taken over in its place, by one write of as many."""
+"""Size of every lock file in bytes. A lock is taken over in place, by one write of this size."""
 SILENCE_SECONDS = 180.0
-"""A writer on another computer that has told nothing for so long is dead: three times as long as network disks keep
-what they were told."""
+"""A writer on another computer counts as dead after this time without a new heartbeat: three times as long as network
+disks cache files."""
 _BARE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 @contextlib.contextmanager
 def only_writer(root: Path, kind: str, job: str) -> Generator[Writer]:
-    """Holds the shot in `root` for a job. JobError if another one does, or if the shot cannot be written."""
+    """Holds the lock of the shot in `root`. JobError if another job holds it, or if the shot cannot be written."""
     pid = os.getpid()
     mine = Writer(contract.computer_name(), pid, contract.process_start(pid), kind, job, time.time())
     try:
@@ -58,7 +58,7 @@ def patient_writer(
     """`only_writer` that waits while another process holds the lock, and takes over the lock of a process that died on
     another computer.
 
-    For render farms, which restart killed tasks on other computers, where no user is there to delete the lock.
+    For render farms, which restart killed tasks on other computers, without a user who could delete the lock.
 
     Args:
         waiting: called regularly with a sentence that names the process waited for; an exception from it ends the
@@ -98,7 +98,7 @@ def _read_writer(root: Path) -> Writer | None:
 
 
 def _heartbeat(root: Path, holder: Writer) -> object:
-    """What a writer's job told last; None if that cannot be read. It is compared with itself, not with a clock."""
+    """Last heartbeat of a writer's job; None if it cannot be read. Compared with earlier ones, not with a clock."""
     try:
         job = contract.ShotFolder(root).jobs / contract.checked_name(holder.job, "job")
         return contract.read_json(job / contract.STATUS_FILE, contract.SHORT_JSON).get("heartbeat")
@@ -107,13 +107,13 @@ def _heartbeat(root: Path, holder: Writer) -> object:
 
 
 def _bury(root: Path, dead: Writer) -> None:
-    """Takes away the lock of a writer that gave no sign of life. One that was made meanwhile is put back."""
+    """Removes the lock of a dead writer. Puts the lock back if a new writer took it in between."""
     path = contract.ShotFolder(root).lock
     partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
     try:
         os.rename(path, partial)
     except OSError:
-        return  # another one was faster
+        return  # another process was faster
     try:
         with contextlib.suppress(OSError, ValueError):
             if contract.from_dict(Writer, contract.read_json(partial, _LENGTH)) != dead:
@@ -127,14 +127,14 @@ def _take(root: Path, mine: Writer) -> None:
     while not _make(path, mine):
         try:
             holder = contract.read_writer(root)
-        except (OSError, ValueError) as error:  # being written just now, or by no hand of ours
+        except (OSError, ValueError) as error:  # being written just now, or by another program
             if time.monotonic() > until:
                 hint = f"If nothing works on this shot, delete {path}."
                 raise JobError(f"Whether a step works on {root.name} cannot be told: {error}.", hint, ExitCode.USAGE) \
                     from error  # fmt: skip
             time.sleep(0.05)
             continue
-        if holder is None:  # given back in between, or a link to nowhere
+        if holder is None:  # released in between, or a dangling link
             if time.monotonic() > until:
                 what = f"{path} cannot be made, and names nobody who works on {root.name}."
                 raise JobError(what, "Delete it, then start again.", ExitCode.USAGE)
@@ -158,23 +158,24 @@ def _text(writer: Writer) -> bytes:
 
 
 def _make(path: Path, mine: Writer) -> bool:
-    """Puts a lock where there is none, whole at once; False if there is one.
+    """Creates a complete lock file in one step; False if there is one already.
 
-    A link is made or refused by the server of a network disk itself; where a disk knows none, an exclusive open is.
+    The server of a network disk creates hard links atomically. On a disk without hard links, the lock is opened
+    exclusively.
     """
     partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
     try:
         _write(partial, mine)
         if sys.platform == "win32":
             try:
-                os.rename(partial, path)  # which refuses to replace, there
-            except PermissionError:  # a virus scanner holds it, or the previous writer is removing it: checked again
+                os.rename(partial, path)  # does not replace a file on Windows
+            except PermissionError:  # a virus scanner holds it, or the previous writer removes it: the caller retries
                 return False
         else:
             try:
                 os.link(partial, path)
             except FileExistsError:
-                return os.stat(partial).st_nlink == 2  # NFS asked twice, and was told of its own success
+                return os.stat(partial).st_nlink == 2  # NFS sent the request twice, and the first one succeeded
             except OSError:  # no links on this disk
                 _write(path, mine)
     except FileExistsError:
@@ -185,7 +186,7 @@ def _make(path: Path, mine: Writer) -> bool:
 
 
 def _write(path: Path, mine: Writer) -> None:
-    """Makes a file of its own. FileExistsError if there is one."""
+    """Creates a new lock file. FileExistsError if there is one."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BARE)
     try:
         os.write(handle, _text(mine))
@@ -198,14 +199,14 @@ def _write(path: Path, mine: Writer) -> None:
 
 
 def _take_over(path: Path, dead: Writer, mine: Writer) -> bool:
-    """Puts us in the place of a dead process of this computer; False if another one was faster: look again.
+    """Replaces the entry of a dead process of this computer with `mine`; False if another process was faster.
 
-    All who may do so are on this computer, where the system lets one of them at a time hold the file.
+    Only processes of this computer try this, and the system lets one of them at a time lock the file.
     """
     try:
         handle = os.open(path, os.O_RDWR | _BARE)
     except OSError:
-        return False  # given back in between, or a link
+        return False  # released in between, or a link
     with os.fdopen(handle, "r+b") as lock:
         if not try_lock(handle):
             return False
@@ -224,7 +225,7 @@ def _take_over(path: Path, dead: Writer, mine: Writer) -> bool:
 
 
 def _release(root: Path, mine: Writer, folder: int | None) -> None:
-    """Takes our lock away, also from a shot that was renamed meanwhile (`folder`, a handle of it). Another's stays."""
+    """Removes the lock if it is `mine`. `folder`, a handle of the shot folder, finds a lock even in a renamed shot."""
     path = Path(contract.WRITER_FILE) if folder is not None else root / contract.WRITER_FILE
     for _ in range(40):
         try:
@@ -234,6 +235,6 @@ def _release(root: Path, mine: Writer, folder: int | None) -> None:
             os.unlink(path, dir_fd=folder)
             return
         except PermissionError:
-            time.sleep(0.05)  # Windows: somebody reads it
+            time.sleep(0.05)  # Windows: another process reads it
         except OSError:
             return
