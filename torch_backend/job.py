@@ -262,7 +262,8 @@ def _run(
             message, hint = known.message, known.hint
     reporter.finish(state, code, message, hint, result)
     if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
-        print(f"{message} {hint}".rstrip(), file=sys.stderr)  # the log moves with the folder
+        # In Blender, the standard error is the open log file, which moves with the shot's folder.
+        print(f"{message} {hint}".rstrip(), file=sys.stderr)
     return code, result
 
 

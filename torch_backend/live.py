@@ -100,7 +100,7 @@ class _Details:
     def frame(
         self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, stop: Callable[[], bool]
     ) -> CompositeFrame:
-        """A view made of plates, at its own scale. JobError if a plate cannot be read; Superseded once `stop` is true."""
+        """A view of plates, at its own scale. JobError if a plate cannot be read; Superseded once `stop` is true."""
         height, width = image.alpha.shape
         size = self._size(output)
         if self._made is None or self._made[0] != size:

@@ -1,46 +1,46 @@
-"""What crosses the wall between Blender and the backend. Standard library only: both sides read this package.
+"""Interface between Blender and the backend. Standard library only, because both sides import this package.
 
-    errors          exit codes, and the failure that an artist reads
-    options         what each step may be asked for (train_options, take_options; option_choices): option_table makes
-                    panel and reference of it
-    verbs           the words of the command lines; command_line makes both of them of it
+    errors          exit codes, and errors with messages for artists
+    options         parameters of each step (train_options, take_options; option_choices): option_table makes panel and
+                    reference from them
+    verbs           verbs of the command lines; command_line makes both parsers from them
     jobs            a job's folder: request, status, events
-    processes       children, and which process lives
+    processes       starting child processes, and checking which process lives
     pace            how long jobs take on this machine
     lock            one writer per shot
-    path_rules      where files of another computer lie on this one
-    shot_folder     where everything of a shot lies
-    shot_work       what of it belongs to its present frames
-    clip_shot       which shot folder is a clip's
+    path_rules      paths of another computer mapped to this one
+    shot_folder     paths in a shot folder
+    shot_work       work in a shot that depends on its present frames
+    clip_shot       the shot folder of a clip
     unborn          what a failed import leaves behind
-    files, typed    reading what may come from anywhere, and plain JSON into dataclasses
-    identity        what a file is known by: its content
+    files, typed    reading files from anywhere, and plain JSON into dataclasses
+    identity        identity of a file by its content
     picture_files   whether a picture, a movie or a .blend is whole
     writing         atomic files and folders
     camera_path     a pinhole camera over frames
-    placement       where a solve stands in Blender's scene
+    placement       transform of a solve into Blender's scene
     ply_header      the header of a file of splats
     surface_header  the header of a file of a take's surface
-    light_facts     what is said of a panorama of a take's light
-    live_messages   what Blender and a live session say to each other
-    colour          a colour by which two programs know that they mean the same space, and the display of light
+    light_facts     facts of a panorama of a take's light
+    live_messages   messages between Blender and a live session
+    colour          a probe colour that identifies a colour space, and the display of light
     frame_names     frame numbers in file names
     timecode        SMPTE timecode: the footage's start, and the code of each frame after it
-    frame_layers    what the layers of a frozen frame hold
-    checkpoint_header   what a checkpoint says of itself
-    torch_source    which PyTorch a set-up takes
+    frame_layers    content of the layers of a frozen frame
+    checkpoint_header   facts in the header of a checkpoint
+    torch_source    the PyTorch build that a set-up installs
     installed       what a set-up installed, and whether it is unchanged
     results         verdicts and the figures of a run
 
-Their public names are this package's own. Everything that is written carries a version; a newer one than ours is
-refused in words.
+This package re-exports the public names of these modules. Every file that is written has a version. A file with a newer
+version is refused with a message.
 
-Frames of reference, here as everywhere: camera axes OpenCV (x right, y down, z forward), `viewmat` world-to-camera,
+Frames of reference, throughout the project: camera axes OpenCV (x right, y down, z forward), `viewmat` world-to-camera,
 row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame numbers are those of the clip.
 """
 
 # pyright: reportUnusedImport=false
-# Every name here is imported from here.
+# Other modules import every name below from this package.
 
 from .camera_path import OWN_FACTS, SCENE_WORLD, CameraFrame, CameraPath
 from .checkpoint_header import checkpoint_facts

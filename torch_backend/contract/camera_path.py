@@ -14,11 +14,11 @@ from .files import read_json
 from .typed import CONTRACT_VERSION, check_version, from_dict
 
 OWN_FACTS = "splannequin"
-"""Key of a transforms.json under which Blender says of cameras what nerfstudio's format has no words for: `world`;
-`is_numbered_as_shot`, true if the number of a picture is that of the shot's frame for certain; `notes`, a list of
+"""Key of a transforms.json for facts from Blender that nerfstudio's format does not have: `world`;
+`is_numbered_as_shot`, true if the numbers of pictures are certainly frame numbers of the shot; `notes`, a list of
 [sentence, hint] for the artist."""
 SCENE_WORLD = "scene"
-"""The `world` of cameras that are in the axes and units of a Blender scene."""
+"""Value of `world` for cameras in the axes and units of a Blender scene."""
 
 
 @dataclass
@@ -32,7 +32,7 @@ class CameraFrame:
     K: list[float]
     """fx, fy, cx, cy in pixels of the path's width and height."""
     source: str = "registered"
-    """registered (by the mapper, or given), localised (against the model), interpolated, or blender."""
+    """registered (by the mapper, or imported), localised (against the model), interpolated, or blender."""
 
     def __post_init__(self) -> None:
         if len(self.viewmat) != 16 or len(self.K) != 4:
@@ -43,7 +43,7 @@ class CameraFrame:
 
 @dataclass
 class CameraPath:
-    """A pinhole camera over frames: the solve's answer, or a path that Blender sends."""
+    """A pinhole camera over frames: the result of a solve, or a path from Blender."""
 
     width: int
     """Image width in pixels."""

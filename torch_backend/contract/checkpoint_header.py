@@ -1,4 +1,4 @@
-"""What a checkpoint says of itself, read without torch: the facts in the header of a safetensors file."""
+"""Reads the facts in the header of a checkpoint, a safetensors file, without torch."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 from .files import is_json_object, open_regular
 
 _LONGEST = 1 << 22
-"""Bytes of a header that are read."""
+"""Largest header that is read, in bytes."""
 
 
 def checkpoint_facts(path: Path) -> dict[str, Any]:
-    """The facts that a run stored with its checkpoint; empty if the file is none of ours.
+    """Facts that a run stored with its checkpoint; empty if the file is not a checkpoint of Splannequin.
 
-    OSError if it is not there or cannot be opened, ValueError if something else than a file is.
+    OSError if the file is missing or cannot be opened, ValueError if the path is not a file.
     """
     with open_regular(path) as source:
         try:

@@ -1,4 +1,4 @@
-"""Which shot folder is a clip's: a folder that holds another clip's shot is never used for it."""
+"""Finds the shot folder of a clip. A folder with the shot of another clip is not used."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ def is_imported_from(
 ) -> bool | None:
     """True if the shot in a folder was imported from a clip, False if from another one; None if unknown.
 
-    What lies where the shot's footage lay, seen from the shot, is its own: both were moved or copied together.
+    A clip at the path of the shot's footage relative to the shot counts as that footage, because both were moved or
+    copied together.
 
     Args:
         folder: shot folder.
         clip: absolute path.
-        told: (file, name, most bytes) -> what a JSON file says under a name; empty if it cannot be read.
+        told: (file, name, most bytes) -> value under a name in a JSON file; empty if the file cannot be read.
     """
     told = told or told_by
     source = told(ShotFolder(folder).info_path, "source", SHORT_JSON)
@@ -47,7 +48,7 @@ def is_imported_from(
 
 
 def refuse_anothers(folder: Path, clip: str | Path) -> None:
-    """JobError if the shot in a folder was imported from another clip than this one."""
+    """Raises JobError if the shot in a folder was imported from another clip than this one."""
     if is_imported_from(folder, clip) is False:
         source = told_by(ShotFolder(folder).info_path, "source", SHORT_JSON)
         raise JobError(
@@ -58,7 +59,7 @@ def refuse_anothers(folder: Path, clip: str | Path) -> None:
 
 
 def told_by(file: Path, name: str, longest: int) -> str:
-    """What a JSON file of at most `longest` bytes says under a name; empty if it cannot be read."""
+    """Value under a name in a JSON file of at most `longest` bytes; empty if the file cannot be read."""
     try:
         return str(read_json(file, longest).get(name, ""))
     except (OSError, ValueError):
@@ -66,8 +67,8 @@ def told_by(file: Path, name: str, longest: int) -> str:
 
 
 def shot_beside(clip: Path, is_of: Callable[[Path, Path], bool | None] = is_imported_from) -> Path:
-    """The shot folder of a clip for which none was chosen, beside it: called as the clip; with the clip's ending, or a
-    digest of its path, where another clip's shot is called so."""
+    """Default shot folder of a clip, next to the clip and with its name. If another clip's shot has that name, the
+    clip's ending or a digest of its path is added."""
     names = clip.stem, clip.name if clip.suffix else f"{clip.name} 2", f"{clip.stem}-{path_digest(clip)}"
     places = [clip.with_name(name + SHOT_SUFFIX) for name in names]
     owned = [is_of(place, clip) for place in places]
@@ -78,23 +79,23 @@ def shot_beside(clip: Path, is_of: Callable[[Path, Path], bool | None] = is_impo
 
 
 def path_digest(path: str | Path, letters: int = _DIGEST_LETTERS) -> str:
-    """Hexadecimal digest of an absolute path: names that read alike are told apart by it, in every run."""
+    """Hexadecimal digest of an absolute path, the same in every run, to distinguish files of the same name."""
     return hashlib.sha256(_place(path).encode("utf-8", "surrogatepass")).hexdigest()[:letters]
 
 
 def readable_stem(name: str, is_numbered: bool) -> str:
-    """A file's name without its ending, and without the number of a frame if it has one: plate.v001.mp4 is plate.v001,
-    kitchen.0001.png is kitchen."""
+    """A file's name without its ending and, if `is_numbered`, without its frame number: plate.v001 of plate.v001.mp4,
+    kitchen of kitchen.0001.png."""
     stem, dot, ending = name.rpartition(".")
     stem = stem if dot and stem and ending.isalnum() else name
     return (_NUMBER.sub("", stem) if is_numbered else stem) or stem
 
 
 def same_name(name: str) -> str:
-    """What names have in common that are one file on some disk: case and accents count there as written otherwise."""
+    """Key that is the same for names that some disk takes for one file: without case, and with normalised accents."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 
 def _place(path: str | Path) -> str:
-    """What two ways to write the path of one file have in common; nothing is looked up."""
+    """Normalised path, without access to the disk."""
     return os.path.normcase(os.path.normpath(path))

@@ -1,4 +1,4 @@
-"""Both command lines, made of the table of verbs: the backend's and Blender's have the same options for a verb."""
+"""Builds both command lines, the backend's and Blender's, from the table of verbs: a verb has the same options."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ _JSON = "print events as JSON lines instead of text"
 def command_line(
     prog: str, side: str, unset: Mapping[str, str] | None = None
 ) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The grammar of one side's command line, and the parsers of its verbs.
+    """Argument parser of one side's command line, and the parsers of its verbs.
 
     Args:
-        prog: what starts it.
+        prog: name of the program, for help texts.
         side: `verbs.BACKEND` or `verbs.BLENDER`.
-        unset: field -> in words, what this side takes for it where nothing is said; its value is "" then. See `asked`.
+        unset: field -> description of this side's default. If the option is not passed, its value is "", which
+            `requested_params` replaces.
     """
     top = argparse.ArgumentParser(
         prog=prog, description="Freeze time in a handheld clip of people holding still.", epilog=CODES
@@ -46,12 +47,12 @@ def command_line(
 
 
 def as_json(args: argparse.Namespace) -> bool:
-    """--json was said, before the verb or after it."""
+    """True if --json was passed, before or after the verb."""
     return bool(args.json or args.json_before)
 
 
 class _Noted(argparse.Action):
-    """Stores a value, or turns a switch over, and remembers that it was said: a default says nothing."""
+    """Stores a value or turns a switch, and notes in `said` that the option was passed and is not a default."""
 
     def __call__(
         self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: str | None = None
@@ -62,7 +63,7 @@ class _Noted(argparse.Action):
 
 
 def options_for(name: str, cls: type, side: str = "") -> list[tuple[Any, Option]]:
-    """(field, option) of a dataclass that a verb has on a side's command line; `side` empty: on either."""
+    """(field, option) pairs of a dataclass that a verb has on one side's command line; `side` empty: on any."""
     return [
         (one, spec)
         for one, spec in options_of(cls)
@@ -71,7 +72,7 @@ def options_for(name: str, cls: type, side: str = "") -> list[tuple[Any, Option]
 
 
 def _add_options(parser: argparse.ArgumentParser, name: str, verb: Verb, side: str, unset: Mapping[str, str]) -> None:
-    """Gives a verb its options; one that several of its dataclasses have, once."""
+    """Adds the options of a verb to its parser. An option that several dataclasses have is added once."""
     added: set[str] = set()
     for cls in (verb.words, *verb.jobs.values()):
         hints = typing.get_type_hints(cls)
@@ -98,14 +99,14 @@ def _add_options(parser: argparse.ArgumentParser, name: str, verb: Verb, side: s
 
 
 def requested_params(args: argparse.Namespace, unset: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Kind of job -> its parameters, as parsed arguments ask for them; none of a verb that starts no job.
+    """Parameters that parsed arguments request, by kind of job; empty for a verb that starts no job.
 
     Args:
         args: parsed by a `command_line`.
-        unset: field -> value where nothing was said of what the command line was given as `unset`.
+        unset: field -> value if the option was not passed, for fields in `unset` of `command_line`.
 
     Raises:
-        JobError: an option was said that makes no sense for what the verb was given.
+        JobError: an option does not apply to the input of the verb.
     """
     name = args.command
     kinds = VERBS[name].jobs
@@ -130,18 +131,18 @@ def _values(args: argparse.Namespace, name: str, cls: type, unset: Mapping[str, 
 
 
 def _absolute(path: str) -> str:
-    """A path as an absolute one; an address, and none, as it is."""
+    """`path` as an absolute path. An address (with ://) and an empty text stay unchanged."""
     return path if not path or "://" in path else str(Path(path).absolute())
 
 
 def words_of(args: argparse.Namespace) -> Any:
-    """What a verb was told besides the parameters of its jobs: an object of its `words`, from parsed arguments."""
+    """Arguments of a verb besides the parameters of its jobs: an object of its `words`, from parsed arguments."""
     verb = VERBS[args.command]
     return verb.words(**_values(args, args.command, verb.words, {}))
 
 
 def said_of(words: Any) -> list[str]:
-    """The arguments, without the verb's name, that `words_of` makes such an object of."""
+    """Inverse of `words_of`: command-line arguments for an object of a verb's `words`, without the verb's name."""
     found: list[str] = []
     for one, spec in options_of(words.__class__):
         value: Any = getattr(words, one.name)
@@ -153,22 +154,22 @@ def said_of(words: Any) -> list[str]:
 
 
 def is_shot(path: str | Path) -> bool:
-    """True of a shot folder, and of what is called like one: any other folder may hold the pictures of a clip."""
+    """True for a shot folder, or a path with its suffix. Any other folder may hold the pictures of a clip."""
     place = Path(path)
     return place.suffix == SHOT_SUFFIX or (place / INFO_FILE).is_file()
 
 
 def freezes_a_shot(args: argparse.Namespace) -> bool:
-    """True of `freeze SHOT`, which is the step alone; False of `freeze CLIP` and every other verb."""
+    """True for `freeze SHOT`, which runs one step only; False for `freeze CLIP` and every other verb."""
     return args.command == "freeze" and "://" not in args.clip and is_shot(args.clip)
 
 
 _RANGE = ("first", "last", "step")
-"""Of a clip, the frames that are read; of a shot, those that are frozen."""
+"""Options of the frame range: frames to read of a clip, or frames to freeze of a shot."""
 
 
 def _refuse_what_a_clip_wants(args: argparse.Namespace) -> None:
-    """JobError if `freeze SHOT` was told what only the steps before it can heed."""
+    """Raises JobError if `freeze SHOT` has options that only apply to earlier steps."""
     known = {*_RANGE, *(spec.dest for _, spec in options_for("freeze", FreezeParams))}
     lost = {dest: flag for dest, flag in getattr(args, "said", {}).items() if dest not in known}
     if lost:
@@ -182,18 +183,18 @@ def _refuse_what_a_clip_wants(args: argparse.Namespace) -> None:
 
 
 def _dests_of(name: str) -> set[str]:
-    """Where a verb keeps what its jobs are told."""
+    """Names, among parsed arguments, of the options for the jobs of a verb."""
     return {spec.dest for cls in VERBS[name].jobs.values() for _, spec in options_for(name, cls)}
 
 
 def trains_anew(args: argparse.Namespace) -> bool:
-    """True if an option was said that only a training heeds: a finished run is not what is wanted."""
+    """True if an option was passed that only applies to training, so that a finished run may not do."""
     dests = {spec.dest for _, spec in options_for(args.command, TrainParams)} - {"run", "device"}
     return bool(dests & set(getattr(args, "said", {})))
 
 
 def notes(args: argparse.Namespace) -> list[str]:
-    """Sentences on what a command line says in vain, or in an old word."""
+    """Notes on options without effect, and on a deprecated verb."""
     verb, explicit = VERBS[args.command], getattr(args, "said", {})
     found: list[str] = []
     if verb.now:
@@ -220,14 +221,14 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _parser_of(spec: Option, hint: Any) -> Callable[[str], Any]:
-    """What makes a value of the text on a command line."""
+    """Function that converts the text of an option to its value."""
     if spec.parse is not None:
         return _in_words(spec.parse)
     return next(kind for kind in (int, float, str) if kind is hint or kind in typing.get_args(hint))
 
 
 def _in_words(parse: Callable[[str], Any]) -> Callable[[str], Any]:
-    """argparse shows the sentence of one kind of error only."""
+    """`parse` with its ValueError as an ArgumentTypeError, the only error whose message argparse shows."""
 
     def wrapped(text: str) -> Any:
         try:

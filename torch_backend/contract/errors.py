@@ -1,4 +1,4 @@
-"""How a command ends: its exit codes, and the failure that an artist reads."""
+"""Exit codes of commands, and errors with messages for artists."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ExitCode(enum.IntEnum):
 
 
 class JobError(Exception):
-    """A failure that an artist reads: what was wrong and where, in one sentence, and what to do about it."""
+    """An error that an artist reads: `message` is one sentence on what was wrong and where, `hint` what to do."""
 
     def __init__(self, message: str, hint: str = "", exit_code: int = ExitCode.INTERNAL) -> None:
         super().__init__(message)
@@ -37,37 +37,37 @@ class JobError(Exception):
 
 
 class UserError(JobError, ValueError):
-    """A value, a name or a file that a user can put right. Whoever merely tries a value may catch the ValueError."""
+    """An invalid value, name or file that a user can correct. Code that only tries a value may catch ValueError."""
 
     def __init__(self, message: str, hint: str = "", exit_code: int = ExitCode.USAGE) -> None:
         super().__init__(message, hint, exit_code)
 
 
 class UnreadableFile(UserError):
-    """A path that holds no file to read: a pipe, a device, a folder, or a file too large to be what it should."""
+    """A path that is not a readable file: a pipe, a device, a folder, or a file too large for its kind."""
 
     def __init__(self, path: str | Path, why: str) -> None:
         super().__init__(f"{path} {why}: replace or remove it")
 
 
 class MissingError(UserError, FileNotFoundError):
-    """A file or folder that a user named and that is not there."""
+    """A file or folder that a user named and that does not exist."""
 
 
 def unexpected(what: str, error: BaseException, log: str | Path) -> JobError:
-    """The error for a bug of ours: `what` failed, and `log` has the details."""
+    """JobError for a bug of Splannequin: `what` failed, and `log` has the details."""
     text = " ".join(str(error).split())[:300]
     message = f"{what} broke: {type(error).__name__}{': ' if text else ''}{text}"
     return JobError(message, f"This is a bug; its details are in {log}.", ExitCode.INTERNAL)
 
 
 def broke(what: str, error: BaseException) -> JobError:
-    """`unexpected` of an error at hand, outside of a job: its details go into a file of the temporary folder."""
+    """`unexpected` for an error outside a job. Writes the details to a file in the temporary folder."""
     log = Path(tempfile.gettempdir()) / f"splannequin-{os.getpid()}.log"
     try:
         log.write_text("".join(traceback.format_exception(error)), encoding="utf-8", errors="backslashreplace")
     except OSError:
-        traceback.print_exception(error)  # nothing can be written: the details are to be somewhere
+        traceback.print_exception(error)  # the file cannot be written, so print the details
         return unexpected(what, error, "what stands above")
     return unexpected(what, error, log)
 
@@ -77,7 +77,7 @@ class Cancelled(Exception):
 
 
 def disk_error(folder: str | Path, detail: str = "the disk is full, or limits the size of a file") -> JobError:
-    """The one sentence for a full disk."""
+    """JobError for a full disk."""
     return JobError(
         f"No space left in {folder}: {detail}.",
         "Free some space or choose another output folder, then start again: finished work is kept.",
@@ -86,8 +86,8 @@ def disk_error(folder: str | Path, detail: str = "the disk is full, or limits th
 
 
 def incomplete(lacks: str) -> JobError:
-    """The one sentence for an environment with a package that is missing or broken. lacks: what Python says of it."""
-    what = (lacks.strip().splitlines() or ["a package cannot be loaded"])[-1]  # numpy's advice fills a page before that
+    """JobError for an environment with a missing or broken package. `lacks`: Python's message."""
+    what = (lacks.strip().splitlines() or ["a package cannot be loaded"])[-1]  # numpy prints a page of advice before it
     return JobError(
         f"The backend's environment is incomplete: {what.rstrip('.')}.",
         "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",
@@ -115,7 +115,7 @@ _REFUSED = {
 
 
 def path_error(error: OSError) -> JobError | None:
-    """The sentence for a file or folder that the system refuses, or for a full disk; None if it is about no path."""
+    """JobError for a file or folder that the system refuses, or for a full disk; None if the error has no path."""
     where = error.filename2 or error.filename
     if is_disk_full(error):
         return disk_error(where or "the output folder")

@@ -1,4 +1,4 @@
-"""Files that may come from anywhere: read without waiting, never endless, never through a link unseen."""
+"""Reads files that may come from anywhere, without blocking and with limits on their size, and detects links."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from .errors import UnreadableFile, UserError
 T = TypeVar("T")
 
 LONGEST_JSON = 1 << 28
-"""Bytes of a JSON file that are read; the listing of a clip of 100,000 frames takes a tenth."""
+"""Largest JSON file that is read, in bytes. The listing of a clip of 100,000 frames takes a tenth."""
 SHORT_JSON = 1 << 20
-"""Bytes of a file that Blender reads between two turns of its timer: a status, a run's figures."""
+"""Largest JSON file that Blender reads in a timer callback, in bytes: a status, a run's figures."""
 LONGEST_PICTURE = 1 << 33
-"""Bytes of a picture that are read: 16K, twenty channels of 32 bits, uncompressed take 10 GB; EXRs are compressed."""
+"""Largest picture that is read, in bytes. 16K with twenty 32-bit channels takes 10 GB, but EXRs are compressed."""
 LONGEST_ARRAYS = 1 << 32
-"""Bytes of arrays (.npz) that are read, unpacked: 100 million points take 2 GB."""
+"""Largest unpacked size of arrays (.npz) that are read, in bytes. 100 million points take 2 GB."""
 LONGEST_CHECKPOINT = 1 << 34
-"""Bytes of a checkpoint that are read; a million Gaussians with what their optimiser keeps take 1 GB."""
+"""Largest checkpoint that is read, in bytes. A million Gaussians with the state of their optimiser take 1 GB."""
 LONGEST_LINE = 1 << 20
-"""Bytes of a line of events.jsonl or metrics.jsonl that are read."""
+"""Longest line of events.jsonl or metrics.jsonl that is read, in bytes."""
 
 
 MOST_PIXELS = 1 << 27
-"""Of a picture that people give: 16384 x 8192. A few kilobytes of PNG may announce a hundred times that."""
+"""Most pixels of a user's picture: 16384 x 8192. A PNG of a few kilobytes may announce a hundred times as many."""
 
 
 def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, windows: bool = os.name == "nt") -> T:
-    """What `act` gives, tried anew where Windows refuses: for a moment somebody else may hold the file open, a reader,
-    a virus scanner, or whoever renames another one over it. Two seconds long, unless told otherwise.
+    """Result of `act`, which is retried while Windows refuses access, by default for two seconds. A reader, a virus
+    scanner or a process that renames another file may hold the file open for a moment.
 
-    PermissionError if it was refused to the last.
+    PermissionError if the last try fails.
     """
     while True:
         tries -= 1
@@ -53,23 +53,23 @@ def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, window
 
 
 def open_regular(path: str | Path, longest: int | None = None) -> BinaryIO:
-    """Opens a regular file (or a link to one) for reading, without ever waiting for it.
+    """Opens a regular file (or a link to one) for reading, without blocking.
 
-    A shot folder may come from anywhere: a pipe would hold up Blender's main thread, a device would fill its memory.
-    FileNotFoundError or another OSError of the system's; UnreadableFile, a ValueError, names a path that holds
-    something else, or a file of more than `longest` bytes, as a sparse one may have without taking any disk.
+    A shot folder may come from anywhere: a pipe would block Blender's main thread, a device would fill its memory.
+    FileNotFoundError or another OSError from the system. UnreadableFile, a ValueError, if the path is not a regular
+    file, or if the file has more than `longest` bytes, which a sparse file may have without using disk space.
     """
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
     def opened() -> BinaryIO:
-        # One owner of the handle from the start: closed twice, by us and by a file object that goes, an interrupt
-        # between the two would read as a fault of the disk.
+        # The file object owns the handle from the start. With a second owner, an interrupt could close the handle
+        # twice, which would look like an error of the disk.
         return open(path, "rb", opener=lambda name, _: os.open(name, flags))
 
     try:
-        source = patiently(opened, 4, 0.01)  # no longer than Blender may wait
+        source = patiently(opened, 4, 0.01)  # 0.04 s, as long as Blender may wait
     except (IsADirectoryError, PermissionError) as error:
-        if isinstance(error, PermissionError) and not os.path.isdir(path):  # what Windows says of a folder
+        if isinstance(error, PermissionError) and not os.path.isdir(path):  # Windows raises it for a folder
             raise
         raise UnreadableFile(path, "is not a file") from None
     try:
@@ -85,7 +85,7 @@ def open_regular(path: str | Path, longest: int | None = None) -> BinaryIO:
 
 
 def png_size(path: str | Path) -> tuple[int, int]:
-    """Width and height that the header of a PNG announces; (0, 0) if it is none. OSError or ValueError as
+    """Width and height in the header of a PNG; (0, 0) if the file is not a PNG. OSError or ValueError as
     `open_regular`."""
     with open_regular(path) as source:
         head = source.read(24)
@@ -95,7 +95,7 @@ def png_size(path: str | Path) -> tuple[int, int]:
 
 
 def regular_file(path: str | Path, longest: int | None = LONGEST_PICTURE) -> str:
-    """The path, for a library that opens files by itself: one that `open_regular` opens, of at most `longest` bytes.
+    """`path`, checked by `open_regular` with `longest`, for a library that opens files itself.
 
     Errors as `open_regular`.
     """
@@ -105,7 +105,7 @@ def regular_file(path: str | Path, longest: int | None = LONGEST_PICTURE) -> str
 
 @contextlib.contextmanager
 def open_arrays(path: str | Path) -> Generator[BinaryIO, None, None]:
-    """Opens an .npz for NumPy, if what is packed in it is not endless. ValueError for whatever is wrong in it while it
+    """Opens an .npz for NumPy, if its unpacked size is within the limit. ValueError for any fault in the file while it
     is read; OSError or ValueError as `open_regular`."""
     with open_regular(path, LONGEST_ARRAYS) as source:
         try:
@@ -117,7 +117,7 @@ def open_arrays(path: str | Path) -> Generator[BinaryIO, None, None]:
             yield source
         except UnreadableFile:
             raise
-        # zipfile, zlib and NumPy raise a dozen kinds, in words for programmers.
+        # zipfile, zlib and NumPy raise a dozen exception classes, with messages for programmers.
         except Exception as error:
             raise UserError(f"{path} is damaged: {error}") from error
 
@@ -125,16 +125,16 @@ def open_arrays(path: str | Path) -> Generator[BinaryIO, None, None]:
 def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
     """A JSON object from a file of at most `longest` bytes.
 
-    FileNotFoundError, or ValueError naming the file and what is wrong in it.
+    FileNotFoundError if there is no file; ValueError names the file and its fault.
     """
     with open_regular(path) as source:
         is_long = os.fstat(source.fileno()).st_size > longest
-        text = b"" if is_long else source.read(longest + 1)  # it may have grown since
+        text = b"" if is_long else source.read(longest + 1)  # the file may have grown since
     if is_long or len(text) > longest:
         raise UserError(f"{path} is longer than {longest >> 20} MB: nothing of ours is")
     try:
         data = json.loads(text, parse_constant=_no_number)
-    except (ValueError, RecursionError) as error:  # ValueError: no JSON, no UTF-8, or a number of too many digits
+    except (ValueError, RecursionError) as error:  # ValueError: invalid JSON or UTF-8, or too many digits
         raise UserError(f"{path} is not valid JSON: {error}") from error
     if not is_json_object(data):
         raise UserError(f"{path} should hold a JSON object, found {type(data).__name__}")
@@ -142,7 +142,7 @@ def read_json(path: str | Path, longest: int = LONGEST_JSON) -> dict[str, Any]:
 
 
 def is_json_object(value: object) -> TypeGuard[dict[str, Any]]:
-    """True if what was read from JSON is an object: a dictionary, whose keys are text then."""
+    """True if a value read from JSON is an object: a dictionary with text keys."""
     return isinstance(value, dict)
 
 
@@ -153,24 +153,25 @@ def _no_number(name: str) -> float:
 def read_lines(
     path: str | Path, start: int = 0, longest: int = LONGEST_LINE
 ) -> Generator[tuple[bytes, int], None, None]:
-    """Whole lines of a file that grows, from a byte on: (line, where the next one begins).
+    """Complete lines of a growing file, from byte `start` on: (line, offset of the next line).
 
-    One longer than `longest` bytes is passed over: (b"", where it goes on). OSError or ValueError as `open_regular`.
+    A line longer than `longest` bytes is skipped as pieces (b"", offset of the next piece). OSError or ValueError as
+    `open_regular`.
     """
     with open_regular(path) as source:
         source.seek(start)
-        inside = False  # of a line that is too long
+        inside = False  # True within a line that is too long
         while line := source.readline(longest):
             start += len(line)
             whole = line.endswith(b"\n")
             if not whole and len(line) < longest:
-                return  # half written: it is read with the next call
+                return  # half written: the next call reads it
             yield (line if whole and not inside else b""), start
             inside = not whole
 
 
 def printable(text: str, longest: int = 2000) -> str:
-    """Text from a file as it may be shown or printed: no escape codes or other control characters, and not endless."""
+    """Text from a file, safe to show or print: at most `longest` characters, with spaces for control characters."""
     return "".join(c if c.isprintable() else " " for c in text[:longest])
 
 
@@ -188,7 +189,7 @@ _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{n}" for port in ("COM", "LPT"
 
 
 def frame_number(stem: str) -> int | None:
-    """Number of a frame's file by its name without suffix; None if it is no such file."""
+    """Frame number in a file name without suffix; None if the name is not a frame number."""
     return int(stem) if _NUMBER.fullmatch(stem) else None
 
 
@@ -205,7 +206,7 @@ def is_link(path: Path) -> bool:
 
 
 def remove_link(path: Path) -> None:
-    """Removes a link, never what it leads to."""
+    """Removes a link, but not its target."""
     if sys.platform == "win32" and path.is_dir():
         os.rmdir(path)  # how Windows removes a link to a folder
     else:
@@ -213,7 +214,7 @@ def remove_link(path: Path) -> None:
 
 
 _JUNCTION = 0xA0000003
-"""stat.IO_REPARSE_TAG_MOUNT_POINT, which only Windows has: its link between folders."""
+"""stat.IO_REPARSE_TAG_MOUNT_POINT, which Python defines on Windows only: tag of a junction, a link to a folder."""
 
 
 def frame_file(frame: int, suffix: str) -> str:

@@ -1,32 +1,33 @@
-"""The layers of a frozen frame and of its mattes, in one table: EXR writers, compositor and manual read it."""
+"""Table of the layers of a frozen frame and of its mattes, for EXR writers, compositor and manual."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 NO_DEPTH = 1e10
-"""Depth of a pixel that nothing covers (what Blender's own Z pass says)."""
+"""Depth of a pixel that nothing covers, as in Blender's Z pass."""
 
 
 @dataclass(frozen=True)
 class FrameLayer:
-    """One layer of takes/NAME/NNNNNN.exr, or of a file of mattes beside it."""
+    """One layer of takes/NAME/NNNNNN.exr, or of a take's file of mattes."""
 
     name: str
-    """Socket of Blender's Image node, 4.2 to 5.2."""
+    """Name of the layer's socket on Blender's Image node, 4.2 to 5.2."""
     channels: tuple[str, ...]
-    """Channels of the file, in order. One letter after the dot makes a value, R G B A a colour (freeze/exr.py)."""
+    """Channels of the file, in order. Blender reads a single one such as Support.V as a value, R G B A as a colour
+    (freeze/exr.py)."""
     stored: str
-    """half or float."""
+    """Number format in the file: half or float."""
     shown: str
-    """Its channels as the reference writes them."""
+    """Its channels as docs/reference.md writes them."""
     content: str
-    """What it holds, for docs/reference.md."""
+    """Description of its content, for docs/reference.md."""
     part: str = ""
-    """Empty: every frame has it; grain, detail: those frames that were made with it. A name of its own: those whose
-    writer was handed it as `more`; it goes by this row alone."""
+    """Group of layers. Empty: in every frame; grain, detail: in frames with grain or detail. Other groups are only in
+    frames whose writer gets them as `more`; this table alone defines how they are stored."""
     output: str = ""
-    """Output of the compositor group that gives it; empty: none does. Of passes only where a take has them."""
+    """Output of the compositor group with this layer; empty: none. Outputs of passes exist only if a take has passes."""
     tip: str = ""
     """Tooltip of that output."""
     socket: str = "NodeSocketFloat"
@@ -34,7 +35,7 @@ class FrameLayer:
 
     @property
     def is_colour(self) -> bool:
-        """True if the file has it in the light of its header; numbers such as positions stay as they are."""
+        """True if the layer holds light in the primaries of the file's header. False for numbers such as positions."""
         return len(self.channels) > 1 and self.channels[0].endswith("R")
 
 
@@ -114,7 +115,7 @@ FRAME_LAYERS = (
     FrameLayer(
         "Source",
         ("Source.V",),
-        "float",  # a half counts frames up to 2048 only
+        "float",  # a half is exact for integers up to 2048 only
         "Source.V",
         "number of the frame whose plate gives most of the pixel; 0 where none does",
         part="detail",
@@ -133,7 +134,7 @@ FRAME_LAYERS = (
         tip="Motion by the camera's move in pixels of the frozen frames, for the node Vector Blur",
         socket="NodeSocketColor",  # keeps all four numbers in 4.2 to 5.2
     ),
-    # Nuke's names. Blender has Vector: 4.2 and 5.2 show sockets of two channels, and no values of theirs.
+    # Names of Nuke's layers. Blender uses Vector: 4.2 and 5.2 show sockets for two channels, but without values.
     FrameLayer(
         "forward",
         ("forward.u", "forward.v"),
@@ -173,10 +174,10 @@ FRAME_LAYERS = (
         socket="NodeSocketVector",
     ),
 )
-"""In the order of the file."""
+"""Layers of a frozen frame, in the order of the file."""
 
 CRYPTOMATTE = "Mattes"
-"""Name of the Cryptomatte of a take's mattes, and part of its layers."""
+"""Name of the Cryptomatte of a take's mattes, and `part` of its layers."""
 MATTE_LAYERS = tuple(
     FrameLayer(
         f"{CRYPTOMATTE}{n:02d}",
@@ -187,9 +188,9 @@ MATTE_LAYERS = tuple(
         part=CRYPTOMATTE,
         socket="NodeSocketColor",
     )
-    for n in range(3)  # six mattes in a pixel, what other programs write too
+    for n in range(3)  # six mattes per pixel, as other programs write
 )
-"""Of takes/NAME/mattes/cryptomatte/NNNNNN.exr, in the order of the file: Cryptomatte specification 1.2.0."""
+"""Layers of takes/NAME/mattes/cryptomatte/NNNNNN.exr, in the order of the file (Cryptomatte specification 1.2.0)."""
 
 
 def layers_of(part: str) -> tuple[FrameLayer, ...]:

@@ -1,7 +1,7 @@
-"""Frame numbers in file names: the one reading for footage, masks and cameras.
+"""Finds frame numbers in file names, for footage, masks and cameras alike.
 
-The frame number is the run of digits that varies between names which are otherwise alike. A version or a date is
-constant, so it is none. A dash before a number is a separator, never a minus.
+The frame number is the run of digits that varies between otherwise equal names. A version or a date is constant, so it
+is not the frame number. A dash before a number is a separator, not a minus sign.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import TypeVar
 _RUN = re.compile(r"[0-9]+")
 _ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]*$")
 _MARK = re.compile(r"#+|@+|%0?[0-9]*d(?![A-Za-z])")
-"""What stands for the number in a pattern: `####`, `@@@@`, `%04d`, `%d`."""
+"""Placeholder of the number in a pattern: `####`, `@@@@`, `%04d`, `%d`."""
 _WILDCARD = {"*": ".*", "?": "."}
 _ALIKE = {".jpeg": ".jpg", ".tiff": ".tif"}
-"""Endings that cameras and programs use for the same format."""
+"""Alternative ending of a format -> its usual ending."""
 Item = TypeVar("Item")
 
 
@@ -26,7 +26,7 @@ class NumberedFiles:
     """Names that differ in their frame number."""
 
     pattern: str
-    """As people write it: `shot_v2.####.exr`; other numbers that vary are `*`."""
+    """Pattern as users write it, such as `shot_v2.####.exr`; `*` for other numbers that vary."""
     files: dict[int, str]
     """Frame number -> name, ascending."""
     twice: tuple[str, str] | None = None
@@ -36,10 +36,10 @@ class NumberedFiles:
 
 
 def numbered_files(names: Iterable[str]) -> list[NumberedFiles]:
-    """The sequences among names, in the order of their patterns; also those of a single name.
+    """The sequences among names, sorted by pattern. A single name can be a sequence.
 
-    Names without digits belong to none. Names where two numbers could count the frames, in different orders, are
-    returned once for each of the two.
+    Names without digits are left out. If two numbers could be the frame number, and they order the names differently,
+    the names are returned once for each of them.
     """
     shapes = _grouped(names, lambda name: (ending(name), *_RUN.split(_stem(name))))
     found = [s for members in shapes for part in _without_twins(members) for s in _sequences(part)]
@@ -47,9 +47,10 @@ def numbered_files(names: Iterable[str]) -> list[NumberedFiles]:
 
 
 def matching_files(names: Iterable[str], pattern: str) -> list[NumberedFiles]:
-    """The sequences among names that a pattern means: `shot.####.exr`, `shot.%04d.png`, `*_left.jpg`.
+    """The sequences among names that match a pattern: `shot.####.exr`, `shot.%04d.png`, `*_left.jpg`.
 
-    A mark stands for a number of any width. `*` and `?` are wildcards. A pattern without a mark only chooses names.
+    A placeholder matches a number of any width. `*` and `?` are wildcards. A pattern without a placeholder only filters
+    names.
     """
     names, wanted = list(names), ending(pattern)
     stem = _stem(pattern)
@@ -59,7 +60,7 @@ def matching_files(names: Iterable[str], pattern: str) -> list[NumberedFiles]:
     if not marks:
         rule = re.compile(_rule(stem))
         return numbered_files(name for name in names if rule.fullmatch(_stem(name)))
-    for other in (None, "[0-9]+"):  # a second mark is a part of the name (`take#2.####`), else a number
+    for other in (None, "[0-9]+"):  # a second placeholder is literal (`take#2.####`), else a number
         for mark in reversed(marks):
             rule = _marked_rule(stem, marks, mark, other)
             found = [(match, name) for name in names if (match := rule.fullmatch(_stem(name)))]
@@ -81,9 +82,9 @@ def ending(name: str) -> str:
 
 
 def file_as_blender_counts(name: str, number: int) -> str:
-    """The file that Blender shows at a frame of a sequence of which it was given one file.
+    """File that Blender shows at frame `number` of the image sequence of the file `name`.
 
-    Blender replaces the last digits before the ending, in their width.
+    Blender replaces the last digits before the ending, and keeps their width.
     """
     runs = list(_RUN.finditer(_stem(name)))
     if not runs:
@@ -104,33 +105,33 @@ def _grouped(items: Iterable[Item], key: Callable[[Item], object]) -> list[list[
 
 
 def _without_twins(names: list[str]) -> list[list[str]]:
-    """Names of one shape; by their exact ending if some differ in nothing else (`f_1.jpg`, `f_1.JPG`)."""
+    """`names` as one group; grouped by exact ending if some names differ only in that (`f_1.jpg`, `f_1.JPG`)."""
     if len({_stem(name) for name in names}) == len(names):
         return [names]
     return _grouped(names, lambda name: name[len(_stem(name)) :])
 
 
 def _sequences(names: list[str]) -> list[NumberedFiles]:
-    """The sequences among names that are alike but for their digits."""
+    """The sequences among names that differ only in their digits."""
     columns = list(zip(*([int(run) for run in _RUN.findall(_stem(name))] for name in names), strict=True))
     if not columns:
         return []
     varying = [n for n, column in enumerate(columns) if len(set(column)) > 1]
     telling = [n for n in varying if len(set(columns[n])) == len(names)]
-    if telling:  # of an index and a time, the index: it has the fewest gaps
+    if telling:  # of an index and a time, take the index, which has the fewest gaps
         spans = [max(columns[n]) - min(columns[n]) for n in telling]
         closest = [n for n, span in zip(telling, spans, strict=True) if span == min(spans)]
         orders = {tuple(sorted(range(len(names)), key=columns[n].__getitem__)) for n in closest}
         places = closest if len(orders) > 1 else closest[-1:]
-    else:  # several versions, eyes or cameras: what varies most counts their frames
+    else:  # several versions, eyes or cameras: the number that varies most is the frame
         places = [max(varying, key=lambda n: (len(set(columns[n])), n))] if varying else [len(columns) - 1]
     return [s for place in places for s in _counted(names, columns, place, telling)]
 
 
 def _counted(names: list[str], columns: list[tuple[int, ...]], place: int, telling: list[int]) -> list[NumberedFiles]:
-    """The sequences among names whose frame number is the one at `place`."""
+    """The sequences among names with the frame number in the column `place` of their numbers."""
     order = sorted(range(len(names)), key=columns[place].__getitem__)
-    # A time or a date that goes along with the number does not part a sequence; a version does.
+    # A time or a date that rises or falls with the frame number does not split a sequence; a version does.
     parting = [
         n
         for n, column in enumerate(columns)
@@ -159,7 +160,7 @@ def _numbered(names: list[str], numbers: list[int], place: int) -> NumberedFiles
 
 
 def _table(names: list[str], numbers: list[int]) -> tuple[dict[int, str], tuple[str, str] | None]:
-    """Number -> name, ascending, and two names that have the same number, if there are any."""
+    """Number -> name, ascending, and two names with the same number, if there are any."""
     files: dict[int, str] = {}
     twice = None
     for number, name in sorted(zip(numbers, names, strict=True)):
@@ -170,12 +171,13 @@ def _table(names: list[str], numbers: list[int]) -> tuple[dict[int, str], tuple[
 
 
 def _rule(text: str) -> str:
-    """Regular expression of a piece of a pattern without marks."""
+    """Regular expression for a part of a pattern without placeholders."""
     return "".join(_WILDCARD.get(letter) or re.escape(letter) for letter in text)
 
 
 def _marked_rule(stem: str, marks: list[re.Match[str]], number: re.Match[str], other: str | None) -> re.Pattern[str]:
-    """What stems of names have to be, the number as a group. `other`: what other marks stand for, None: themselves."""
+    """Regular expression for stems of names, with `number` as a group. `other`: expression for the other placeholders,
+    None: literal."""
     parts: list[str] = []
     at = 0
     for mark in marks:
@@ -186,7 +188,7 @@ def _marked_rule(stem: str, marks: list[re.Match[str]], number: re.Match[str], o
 
 
 def _by_mark(found: list[tuple[re.Match[str], str]], pattern: str) -> list[NumberedFiles]:
-    """The sequences among names that a pattern's rule found: several if wildcards leave numbers twice."""
+    """The sequences among names that match a pattern; several if different names have the same number."""
     groups = _grouped(found, lambda one: (one[0].string[: one[0].start(1)], one[0].string[one[0].end(1) :]))
     numbers = [int(match[1]) for match, _ in found]
     if len(groups) > 1 and len(set(numbers)) == len(numbers):
@@ -195,7 +197,7 @@ def _by_mark(found: list[tuple[re.Match[str], str]], pattern: str) -> list[Numbe
 
 
 def _of_mark(members: list[tuple[re.Match[str], str]]) -> list[NumberedFiles]:
-    """Names that are alike but for the number of a mark."""
+    """The sequences among names that differ only in the number of the placeholder."""
     found: list[NumberedFiles] = []
     of_name = {name: match for match, name in members}
     for names in _without_twins(list(of_name)):

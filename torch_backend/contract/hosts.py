@@ -1,4 +1,4 @@
-"""The hosts of the deformation, by their files: help and the panel need no torch to name them."""
+"""Names of the deformation hosts, read from their source files, so that help and panel need not import torch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _FOLDER = Path(__file__).resolve().parents[1] / "deformation"
 
 @functools.cache
 def host_names(folder: Path = _FOLDER) -> tuple[str, ...]:
-    """Names of the hosts in a folder: what each module's `HOST = HostSpec(...)` calls itself, first or as `name=`."""
+    """Names of the hosts in a folder: first argument or `name=` of the `HOST = HostSpec(...)` of each module."""
     found: set[str] = set()
     for file in folder.glob("*.py"):
         source = file.read_text(encoding="utf-8")
@@ -21,7 +21,7 @@ def host_names(folder: Path = _FOLDER) -> tuple[str, ...]:
 
 
 def _name_of(node: ast.stmt) -> str:
-    """The name in a statement that makes a module's HOST; empty for any other one."""
+    """Host name in a statement that assigns a module's HOST; empty for any other statement."""
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
     call = getattr(node, "value", None)
     if not any(isinstance(t, ast.Name) and t.id == "HOST" for t in targets) or not isinstance(call, ast.Call):

@@ -1,4 +1,4 @@
-"""What a file is known by: its content, so that a copy is the same file, wherever it lies and whatever its time."""
+"""Identity of a file by its content, so that a copy with another path and time counts as the same file."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pathlib import Path
 from .files import open_regular
 
 BLOCKS, BLOCK_BYTES = 64, 1 << 14
-"""Blocks of a large file that are read, spread evenly from its first to its last byte, and their size. A block is a row
-of an uncompressed picture 4K wide; in a compressed file a change moves everything behind it."""
+"""Number and size in bytes of the blocks that are read of a large file, spread evenly over the file. A block is about
+one row of an uncompressed 4K picture. In a compressed file, a change alters everything after it."""
 _READERS = 8
-"""Files read at once: on a network disk most of the time is waiting."""
+"""Number of files read at once, because reading from a network disk is mostly waiting."""
 
 
 def file_digest(path: str | Path) -> str:
-    """Hash of a file's size and content; of more than 1 MB, of `BLOCKS` blocks of it. OSError or ValueError as
-    `files.open_regular`.
+    """Hash of a file's size and content; for a file over 1 MB, of `BLOCKS` blocks of its content. OSError or ValueError
+    as `files.open_regular`.
 
-    Read again only when the file's size, time or inode have changed since this process read it last.
+    Cached in this process until the file's size, time or inode changes.
     """
     with open_regular(path) as source:
         state = os.fstat(source.fileno())
@@ -50,7 +50,7 @@ def _or_nothing(path: Path) -> str:
 
 @functools.lru_cache(maxsize=1 << 14)
 def _digest(path: str, size: int, *_state: int) -> str:
-    """`file_digest` of a file in the state that it is in."""
+    """`file_digest` of a file, cached by its path, size and state."""
     digest = hashlib.sha256(str(size).encode())
     with open_regular(path) as source:
         if size <= BLOCKS * BLOCK_BYTES:

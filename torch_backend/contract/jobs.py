@@ -24,30 +24,30 @@ from .typed import CONTRACT_VERSION, from_dict
 from .writing import write_json
 
 STATUS_VERSION = 2
-"""Of status.json: 2 has the host."""
+"""Version of status.json; version 2 added the host."""
 REQUEST_FILE = "request.json"
 STATUS_FILE = "status.json"
 EVENTS_FILE = "events.jsonl"
 LOG_FILE = "log.txt"
 CANCEL_FILE = "cancel"
 FORECAST = "forecast"
-"""Stage of a metric that says how long the stage `of` will take from then on: `seconds_left`."""
+"""Stage of a metric that forecasts the remaining time of the stage `of`: `seconds_left`."""
 CAMERAS_KNOWN = "cameras known"
-"""Stage of a metric that says that a running solve has written the shot's cameras: from then on they can be shown."""
+"""Stage of a metric that a running solve sends when it has written the shot's cameras, so that they can be shown."""
 STEP_FILE = "step"
-"""Name of the panel's step that asked for the job; Blender's own."""
+"""File with the name of the panel's step that started the job; only Blender uses it."""
 SCENE_FILE = "scene"
-"""Name of the scene from which Blender started the job."""
+"""File with the name of the scene from which Blender started the job."""
 BLEND_FILE = "blend"
-"""Name of the .blend from which Blender started the job, without its folder; missing for an unsaved file."""
+"""File with the name of the .blend, without its folder, from which Blender started the job; missing if unsaved."""
 JOB_COMMAND = "-m torch_backend run-job"
-"""How the process of a job was called, but for its Python and the job's folder."""
+"""Arguments that start the process of a job, between the Python executable and the job's folder."""
 HEARTBEAT_SECONDS = 2.0
 """How often a living job rewrites status.json."""
 
 
 class Reporter(Protocol):
-    """How a station speaks while it works. Implemented by `job.JobReporter`; a class of it says nothing by itself."""
+    """Interface through which a station reports, implemented by `job.JobReporter`. By default, nothing is reported."""
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
         """`done` of `total` units of `stage` are finished."""
@@ -67,7 +67,7 @@ class Reporter(Protocol):
 
 @dataclass
 class JobRequest:
-    """What Blender asks for: one station, on one shot."""
+    """Request for one station on one shot."""
 
     kind: str
     """import, solve, train, freeze, mattes, combine, surface or light."""
@@ -79,7 +79,7 @@ class JobRequest:
     """Version of this contract."""
 
     def typed_params(self) -> Any:
-        """The parameters as their dataclass. ValueError names an unknown kind or field, or a value that cannot be."""
+        """The parameters as their dataclass. ValueError names an unknown kind or field, or an invalid value."""
         if self.kind not in PARAMS:
             raise UserError(f"unknown job kind {self.kind!r}: expected one of {', '.join(PARAMS)}")
         params = from_dict(PARAMS[self.kind], self.params)
@@ -94,7 +94,7 @@ class Event:
     type: str
     """progress, metric, image, warning, error or done."""
     seq: int
-    """Counts from 0 within the job."""
+    """Number of the event within the job, from 0."""
     time: float
     """Seconds since the epoch."""
     data: dict[str, Any]
@@ -106,7 +106,7 @@ class Event:
 
 @dataclass
 class Status:
-    """status.json: where a job stands. Rewritten whole, at least every `HEARTBEAT_SECONDS` while it lives."""
+    """status.json: state of a job. Rewritten as a whole, at least every `HEARTBEAT_SECONDS` while the job lives."""
 
     kind: str
     """Kind of job."""
@@ -121,19 +121,19 @@ class Status:
     heartbeat: float
     """Last sign of life, seconds since the epoch."""
     stage: str = ""
-    """Stage at work."""
+    """Current stage."""
     fraction: float = 0.0
     """Share of that stage that is finished, 0 to 1."""
     message: str = ""
-    """What it is doing, or the error's sentence."""
+    """Current activity, or the message of the error."""
     hint: str = ""
     """What to do about the error."""
     eta_seconds: float | None = None
-    """Seconds left in this stage, if it can be told."""
+    """Seconds left in this stage; None if unknown."""
     exit_code: int | None = None
     """Exit code once it has ended."""
     host: str = ""
-    """Computer that the job runs on, as `computer_name` says; empty in files from before version 2."""
+    """Computer that the job runs on, as `computer_name` returns; empty in files before version 2."""
     version: int = STATUS_VERSION
     """Version of this file."""
 
@@ -153,7 +153,7 @@ WORK = {
     "light": "The job of the light",
     "combine": "The job that combines takes",
 }
-"""Kind of job -> what a sentence calls it."""
+"""Kind of job -> its name in messages."""
 
 
 def gone(shot: Path, kind: str) -> JobError:
@@ -166,9 +166,9 @@ def gone(shot: Path, kind: str) -> JobError:
 
 
 def runs_job(pid: int, started: float, folder: Path) -> bool:
-    """True if a process is the job of a folder beyond doubt: its start, and a command line that runs that job.
+    """True if a process is certainly the job of a folder: it has this start, and its command line runs that job.
 
-    A process is never ended because a file names it: the author of the file could have any process ended.
+    The process id in a file is not enough to end a process: the author of the file could name any process.
     """
     found = process(pid) if pid > 1 else None
     if found is None or not started or found.started != started:
@@ -184,10 +184,10 @@ def new_job(shot: ShotFolder | Path, kind: str, params: Any) -> Path:
     """Makes a job folder with its request in a shot; returns it.
 
     Args:
-        shot: the shot folder. OSError, FileNotFoundError among them, if it cannot be written or is gone; JobError if
-            its jobs would go through a link to elsewhere.
-        kind: of `PARAMS`.
-        params: the kind's dataclass; a dict of its fields as a request holds them.
+        shot: the shot folder. OSError if it cannot be written, FileNotFoundError if it is gone; JobError if its folder
+            of jobs is a link.
+        kind: a key of `PARAMS`.
+        params: an object of the kind's dataclass, or a dict of its fields as in a request.
     """
     if not isinstance(params, (PARAMS[kind], dict)):
         raise ValueError(f"a {kind} job takes {PARAMS[kind].__name__}, not {type(params).__name__}")

@@ -1,4 +1,4 @@
-"""What is said of a panorama of a take's light: takes/NAME/panorama/KEY.json beside KEY.exr. Both sides read it."""
+"""Facts of a panorama of a take's light: takes/NAME/panorama/KEY.json next to KEY.exr. Both sides read them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class LightFacts:
     """A panorama: where it was rendered from, and how much of it is filled."""
 
     picture: str
-    """`file_digest` of the panorama: another file beside these facts is not believed."""
+    """`file_digest` of the panorama. The facts do not apply to a file with another digest."""
     position: list[float]
-    """The point that it shows the frozen scene from, x, y and z in the axes and units of Blender's scene."""
+    """Point from which the panorama is rendered: x, y and z in the axes and units of Blender's scene."""
     filled: float
-    """Share of the sphere's solid angle that no splat covers, 0 to 1: it is filled smoothly."""
+    """Share of the sphere's solid angle, 0 to 1, that no splat covers. This part is filled smoothly."""
     placement: dict[str, Any] = field(default_factory=dict[str, Any])
-    """The `Placement` that says how the solve stood in that scene: the panorama's directions are the scene's."""
+    """The `Placement` of the solve in that scene. The panorama's directions are in the scene's axes."""
     version: int = CONTRACT_VERSION
     """Version of this contract."""
 
@@ -51,7 +51,7 @@ class LightFacts:
 
 
 def light_of_take(take: TakeFolder, key: str) -> LightFacts | None:
-    """The facts of a take's panorama of this key, None if it is not there, or is not whole."""
+    """Facts of the take's panorama with this key; None if a file is missing, damaged or does not match the other."""
     try:
         facts = LightFacts.from_json(read_json(take.light_facts(key), SHORT_JSON))
         return facts if facts.picture == file_digest(take.light(key)) else None
@@ -60,7 +60,7 @@ def light_of_take(take: TakeFolder, key: str) -> LightFacts | None:
 
 
 def point_of(text: str) -> tuple[float, float, float]:
-    """The point that a text X,Y,Z names. ValueError, in a sentence, if it names none."""
+    """The point in a text X,Y,Z. ValueError if the text is not a point."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -71,11 +71,11 @@ def point_of(text: str) -> tuple[float, float, float]:
 
 
 def point_text(text: str) -> str:
-    """`text` itself if it names a point. ValueError as `point_of`."""
+    """`text` unchanged, if it is a point. ValueError as `point_of`."""
     point_of(text)
     return text
 
 
 def is_place(value: object) -> bool:
-    """True of a number that single precision holds, with room to square it."""
+    """True for a float whose square fits single precision."""
     return isinstance(value, float) and abs(value) < 1e15

@@ -1,4 +1,4 @@
-"""One writer per shot: what its lock says, and what the second one who would write is told."""
+"""One writer per shot: the content of its lock, and the error for a second writer."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from .typed import CONTRACT_VERSION, check_version, from_dict
 
 @dataclass
 class Writer:
-    """lock.json of a shot: who writes into it. There is none while nobody does."""
+    """lock.json of a shot: the process that writes into it. The file exists only while a process writes."""
 
     host: str
-    """Computer that it runs on, as `computer_name` says."""
+    """Computer on which the process runs, as `computer_name` returns."""
     pid: int
-    """Its process."""
+    """Process id."""
     process_started: float
-    """`Process.started` of it."""
+    """`Process.started` of the process."""
     kind: str
     """Kind of job."""
     job: str
     """Name of the job's folder."""
     since: float
-    """When it took the shot, seconds since the epoch."""
+    """Time at which the process took the lock, seconds since the epoch."""
     version: int = CONTRACT_VERSION
     """Version of this contract."""
 
     def works(self) -> bool:
-        """True if its process lives, stopped or not. That of another computer is never said not to."""
+        """True if the process lives, even if it is suspended. A process on another computer counts as alive."""
         return self.host != computer_name() or runs_still(self.pid, self.process_started)
 
 
 def read_writer(shot: Path) -> Writer | None:
-    """Who writes into a shot, as its lock says, dead or alive; None without a lock. ValueError on a damaged one."""
+    """Content of a shot's lock, even of a dead process; None without a lock. ValueError if the lock is damaged."""
     path = ShotFolder(shot).lock
     try:
         data = read_json(path, SHORT_JSON)
@@ -50,7 +50,7 @@ def read_writer(shot: Path) -> Writer | None:
 
 
 def gives_back(shot: Path, writer: Writer) -> bool:
-    """True if the job that holds the shot has told its end: it lets go of the lock in a moment."""
+    """True if the job that holds the lock has reported its end, so that it is about to release the lock."""
     try:
         status = read_json(ShotFolder(shot).jobs / checked_name(writer.job, "job") / STATUS_FILE, SHORT_JSON)
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""What options may be chosen from, and what several of them share."""
+"""Values of options, and entries that several options share."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ LAST_FRAME = 1_048_574
 PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 """Training steps of each preset."""
 PRESET_WIDTHS = {"preview": 320, "standard": 960, "final": 0}
-"""Width in pixels of each preset's training images, never above the working frames'; 0: theirs."""
+"""Width in pixels of each preset's training images, at most that of the working frames; 0: the same."""
 CARD_WIDTH, CARD_GAUSSIANS = 1920, 1_000_000
-"""Of `final` on a graphics card: width in pixels of its images, never above the source's, and most Gaussians."""
+"""`final` on a graphics card: width in pixels of its images, at most the source's, and most Gaussians."""
 CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
-"""What `SolveParams.camera_model` may be."""
+"""Values of `SolveParams.camera_model`."""
 ST_MAP_WAYS = ("undistort", "redistort")
-"""What `SolveParams.st_map_way` may be."""
+"""Values of `SolveParams.st_map_way`."""
 HOSTS = host_names()
-"""Hosts of the deformation, as their files in deformation/ name themselves."""
+"""Names of the deformation hosts, as the files in deformation/ define them."""
 METHODS = ("auto", *HOSTS, "static")
-"""What `TrainParams.method` may be."""
+"""Values of `TrainParams.method`."""
 HOST_CONFIGS = ("default", "reference")
-"""What `TrainParams.host_config` may be."""
+"""Values of `TrainParams.host_config`."""
 SUPERVISIONS = ("support", "paper", "none")
-"""What `TrainParams.supervision` may be."""
+"""Values of `TrainParams.supervision`."""
 DETECTORS = ("weight", "grad_norm", "grad_signed")
-"""What `TrainParams.detector` may be."""
+"""Values of `TrainParams.detector`."""
 QUERIES = ("nearest", "plain")
-"""What `FreezeParams.query` may be."""
+"""Values of `FreezeParams.query`."""
 MATTE_FORMATS = ("exr", "png")
-"""What `MatteParams.matte_format` may be: suffixes of the files."""
+"""Values of `MatteParams.matte_format`: suffixes of the files."""
 DEVICES = ("auto", "cpu", "cuda")
-"""Where a run may train and freeze."""
+"""Devices on which a run may train and freeze."""
 
 FRAMES = ((1 << 31) - 1) * 1.0
-"""Frame numbers lie between this and its negative."""
+"""Largest absolute value of a frame number."""
 PRESET = {0: "the preset's"}
-"""What 0 means in an option that a preset has a value for."""
+"""Meaning of 0 in an option for which each preset has a value."""
 PLACEMENT: dict[str, Any] = {
     "flag": "--placement",
     "metavar": "FILE",
@@ -46,10 +46,10 @@ PLACEMENT: dict[str, Any] = {
     "help": "JSON that says where the solve stands in the scene for which splats and cameras leave",
     "words": "as Blender wrote it into the shot; without that upright, in solve units",
 }
-"""The option that freezing and exporting have."""
+"""Entries of the option --placement, which freezing and exporting share."""
 DEVICE: dict[str, Any] = {
     "flag": "--device",
     "choices": DEVICES,
     "help": "where to train and freeze: `auto` takes an NVIDIA GPU",
 }
-"""The option that several dataclasses have."""
+"""Entries of the option --device, which several dataclasses share."""

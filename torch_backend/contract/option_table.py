@@ -1,7 +1,7 @@
-"""One table of options: what a field of a step's parameters is on a command line, in the reference and on the panel.
+"""Options of the steps' parameters on the command lines, in the reference and on the panel.
 
-Each field that has a door carries an `Option` in its metadata. Both command lines (`command_line`), Blender's
-properties and docs/reference.md are made from them, so an option is added in one place.
+Each field that users can set has an `Option` in its metadata. Both command lines (`command_line`), Blender's
+properties and docs/reference.md are made from these, so that an option is added in one place.
 """
 
 from __future__ import annotations
@@ -18,96 +18,96 @@ from .errors import UserError
 
 @dataclass(frozen=True)
 class Limit:
-    """What a number among a job's parameters may be."""
+    """Valid range of a number among a job's parameters."""
 
     what: str
-    """What a sentence calls it."""
+    """Name of the number in messages."""
     low: float
-    """Least."""
+    """Smallest valid value."""
     high: float
-    """Most."""
+    """Largest valid value."""
     also: Mapping[int, str] = field(default_factory=dict[int, str])
-    """Values outside of that which have a meaning -> what they are for."""
+    """Valid values outside the range -> their meaning."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """The doors of one field."""
+    """How users set one field, on a command line and on the panel."""
 
     flag: str = ""
-    """On a command line: --name, or a bare name for what stands without one. Empty: no command line has it."""
+    """Name on a command line: --name, or a bare name for a positional argument. Empty: on no command line."""
     help: str = ""
-    """What it does, for --help and the reference; `default` below it is added there."""
+    """Description for --help and the reference, which append `default`."""
     default: str = ""
-    """The default in words, where its value says too little."""
+    """Description of the default, if its value does not explain itself."""
     choices: tuple[str, ...] = ()
-    """What it may be."""
+    """Valid values; empty: any."""
     metavar: str | None = None
     """Placeholder of the value in --help and the reference: its unit or kind."""
     parse: Callable[[str], Any] | None = None
-    """Text to value, ValueError on what cannot be; None: as the field's type."""
+    """Converts text to a value, with ValueError on invalid text; None: conversion to the field's type."""
     switch: bool = False
-    """The flag takes no value, and turns the field over: what is True without it is False with it."""
+    """True if the flag takes no value and inverts the field's default."""
     many: bool = False
-    """It takes one value or several, and is a list; what stands without a flag may be repeated."""
+    """True if the option takes one or more values, as a list."""
     is_path: bool = False
-    """The value is a path, handed on as an absolute one; an address (with ://) as it is."""
+    """True if the value is a path, which is made absolute. An address (with ://) stays unchanged."""
     commands: tuple[str, ...] = ()
-    """Only these commands have it; empty: all that ask for these parameters."""
+    """Verbs that have the option; empty: all verbs with these parameters."""
     side: str = ""
-    """Only the command line of this side has it (`verbs.BACKEND`, `verbs.BLENDER`); empty: both."""
+    """Side whose command line has the option (`verbs.BACKEND`, `verbs.BLENDER`); empty: both."""
     required: bool = False
-    """A command cannot do without it."""
+    """True if the option must be passed."""
     heeded_with: tuple[str, tuple[Any, ...]] | None = None
-    """(field, values): it says nothing unless that other field is one of these."""
+    """(field, values): the option has an effect only if that other field has one of these values."""
     always: Any = None
-    """What the command lines ask for without an option."""
+    """Value that the command lines always set, without an option."""
     limit: Limit | None = None
-    """What a number may be."""
+    """Valid range of a number."""
     label: str = ""
-    """Name on the panel; empty: the panel has it not, or in another form."""
+    """Name on the panel; empty: not on the panel, or in another form."""
     tip: str = ""
     """Tooltip on the panel."""
     items: Mapping[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
-    """On the panel, of choices: value -> (name, tooltip), in the order that .blend files keep: new ones go last."""
+    """Choices on the panel: value -> (name, tooltip). .blend files store their position, so new ones go last."""
 
     @property
     def dest(self) -> str:
-        """Its name among parsed arguments."""
+        """Name among parsed arguments."""
         return self.flag.lstrip("-").replace("-", "_")
 
 
 def option(default: Any, *, words: str = "", **entries: Any) -> Any:
-    """A dataclass field with an `Option` of the words in `entries`; `words` is its default in words."""
+    """A dataclass field with an `Option` of these `entries`; `words` describes the default."""
     return field(default=default, metadata={"option": Option(default=words, **entries)})
 
 
 def options_of(cls: type) -> Iterator[tuple[dataclasses.Field[Any], Option]]:
-    """Fields of a dataclass that have an `Option`, with it, in order."""
+    """(field, `Option`) of each field of a dataclass that has one, in order."""
     for one in dataclasses.fields(cls):
         if "option" in one.metadata:
             yield one, one.metadata["option"]
 
 
 def default_of(one: dataclasses.Field[Any], spec: Option) -> str:
-    """The default of a field in words; empty if it says nothing."""
+    """Description of a field's default; empty if there is nothing to say."""
     if spec.default or one.default in (None, "") or spec.switch:
         return spec.default
     return f"{one.default:g}" if isinstance(one.default, float) else str(one.default)
 
 
 def limits_of(cls: type) -> dict[str, Limit]:
-    """Field -> what the number in it may be."""
+    """Field -> `Limit` of its number."""
     return {one.name: spec.limit for one, spec in options_of(cls) if spec.limit is not None}
 
 
 def panel(cls: type, name: str, default: Any = None) -> dict[str, Any]:
-    """What Blender's property of a field is made with: name, description, default, and items of a choice.
+    """Keyword arguments of the Blender property for a field: name, description, default, and items of a choice.
 
     Args:
         cls: dataclass of parameters.
-        name: the field, which has a `label`.
-        default: what the panel shows until it is set; None: the field's own default.
+        name: a field with a `label`.
+        default: default on the panel; None: the field's default.
     """
     one, spec = next((one, spec) for one, spec in options_of(cls) if one.name == name)
     words: dict[str, Any] = {"name": spec.label, "description": spec.tip}
@@ -120,7 +120,7 @@ def panel(cls: type, name: str, default: Any = None) -> dict[str, Any]:
 
 
 def overscan(text: str) -> float:
-    """`FreezeParams.overscan` as a command line gives it: 0 to 100 percent, or "lens" (-1). ValueError on else."""
+    """`FreezeParams.overscan` from the text of an option: 0 to 100 percent, or "lens" (-1). ValueError on other text."""
     try:
         value = -1.0 if text == "lens" else float(text)
     except ValueError:
@@ -131,22 +131,22 @@ def overscan(text: str) -> float:
 
 
 MASK_ALPHA = "alpha"
-"""Of a mask: the alpha of the footage, in the place of a file."""
+"""Value of a mask option in place of a file: the alpha of the footage."""
 
 
 MASK_FOUND = "found"
-"""Of the mask of what is ignored: what the import found to be burnt into the clip; nothing where it found nothing."""
+"""Value of the ignore mask option: what the import found to be burnt into the clip, if anything."""
 
 
 def mask_path(text: str) -> str:
-    """A mask as a command line gives it: an absolute path, `MASK_ALPHA`, or empty for none."""
+    """Mask from the text of an option: an absolute path, `MASK_ALPHA`, or empty for none."""
     return "" if text == "none" else text if text in ("", MASK_ALPHA) else os.path.abspath(text)
 
 
 def ignored_path(text: str) -> str:
-    """The same, of what is ignored: that may be `MASK_FOUND`."""
+    """`mask_path` for the ignore mask, which may also be `MASK_FOUND`."""
     return text if text == MASK_FOUND else mask_path(text)
 
 
 SWITCH = ("on", "off")
-"""What `FreezeParams.detail` and `FreezeParams.develop` may be."""
+"""Values of `FreezeParams.detail` and `FreezeParams.develop`."""

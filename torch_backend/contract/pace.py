@@ -1,7 +1,7 @@
-"""How long jobs will take on this machine, by how much there is to do and how fast its earlier jobs were.
+"""Estimates how long jobs take on this machine, from their amount of work and the speed of earlier jobs.
 
-Work is counted in megapixels of pictures, to which is added what a picture costs whatever its size. The farm's estimate
-counts in the same unit.
+The unit of work is a megapixel of pictures. The fixed cost of each picture is added in the same unit. The farm's
+estimate uses this unit, too.
 """
 
 from __future__ import annotations
@@ -23,34 +23,35 @@ from .train_options import TrainParams
 from .writing import write_json
 
 PACES_FILE = "paces.json"
-"""In the notes of the backend's environment, which is this machine's: kind of job -> its last paces."""
+"""File in the `SETUP_NOTES` folder of the backend's environment: kind of job -> its last paces on this machine. A
+pace is the ratio of actual to expected seconds."""
 VERSION = 1
 PER_STEP, PER_SOLVED = 0.16, 0.13
 """Fixed cost of a training step and of a solved frame, in megapixels; measured, see docs/farm.md."""
 PER_WORKING, FIRST_FRAMES = 3.6, 3.5
 """Cost of a megapixel of working frames, at whose size masks and visibility are computed, in megapixels of frozen
-frames; and that of a take's first frame, which reads most plates first, in frames. From "What a frame costs" in
+frames; extra cost of a take's first frame, which loads most plates, in frames. From "What a frame costs" in
 docs/benchmarks.md."""
 _SECONDS = {"import": (1.0, 0.18), "solve": (3.0, 1.7), "train": (3.0, 0.116), "freeze": (15.0, 0.28)}
-"""Kind of job -> seconds whatever there is to do, seconds per unit of work: `sitting.mp4` on two cores of an EPYC."""
+"""Kind of job -> (fixed seconds, seconds per unit of work), for `sitting.mp4` on two cores of an EPYC."""
 BEGINS_WITH = {"import": "import", "solve": "solve", "train": "training", "freeze": "developing"}
-"""Kind of job -> the stage by which one that begins from nothing is known: it reports its first percents."""
+"""Kind of job -> the stage of which only a job that starts from nothing reports the first percents."""
 LASTING_STAGES = ("solve", "training", "freezing")
-"""Stages that last until a job's end, so that their estimate is the job's."""
+"""Stages that last until the end of a job, so that their estimate is also the job's."""
 _OVERDUE = 0.1
-"""Share of the time it took so far that a job which has outlasted its expected seconds is expected to take yet."""
+"""A job that exceeds its expected seconds is expected to take this share of its elapsed time in addition."""
 _BEGUN_BEFORE = 0.5
-"""Share of its expected seconds under which a job is taken to have gone on with earlier work: its pace says nothing."""
+"""A job that takes less than this share of its expected seconds has reused earlier work: its pace is ignored."""
 _KEPT, _LEAST_SECONDS, _FACTORS = 8, 5.0, (0.01, 100.0)
-"""Paces that are kept of a kind; expected seconds under which a job says nothing of the machine; paces believed."""
+"""Paces kept per kind; fewest expected seconds of a job whose pace counts; range of plausible paces."""
 
 
 @dataclass(frozen=True)
 class ShotSize:
-    """What the work on a shot depends on."""
+    """Sizes that determine the amount of work on a shot."""
 
     frames: int
-    """Of the clip's range."""
+    """Number of frames in the clip's range."""
     working: tuple[int, int]
     """Width and height of the working frames in pixels."""
     source: tuple[int, int]
@@ -58,7 +59,7 @@ class ShotSize:
 
     @classmethod
     def of(cls, shot: ShotFolder) -> ShotSize:
-        """An imported shot's. OSError or ValueError if there is no listing of frames that can be read."""
+        """Size of an imported shot. OSError or ValueError if its listing of frames cannot be read."""
         listing = read_json(shot.listing)
         try:
             working = int(listing["width"]), int(listing["height"])
@@ -69,7 +70,7 @@ class ShotSize:
 
     @property
     def megapixels(self) -> float:
-        """Of a working frame."""
+        """Megapixels of a working frame."""
         return self.working[0] * self.working[1] / 1e6
 
     def import_work(self) -> float:
@@ -81,30 +82,30 @@ class ShotSize:
         return self.frames * (self.megapixels + PER_SOLVED)
 
     def train_work(self, steps: int, width: int) -> float:
-        """Work of so many training steps on pictures of a width in pixels."""
+        """Work of `steps` training steps on pictures `width` pixels wide."""
         return steps * (width**2 * self.working[1] / self.working[0] / 1e6 + PER_STEP)
 
     def freeze_work(self, frames: int, width: int) -> float:
-        """Work of frozen frames of a width in pixels, in one part."""
+        """Work of one part of a take: `frames` frozen frames, `width` pixels wide."""
         each = width * self.take_height(width) / 1e6
         return frames * each + (frames + FIRST_FRAMES) * PER_WORKING * self.megapixels
 
     def take_height(self, width: int) -> int:
-        """Pixels down a frozen frame that is so wide, without overscan."""
+        """Height in pixels of a frozen frame `width` pixels wide, without overscan."""
         return max(16, round(self.source[1] * width / self.source[0]))
 
     def trained_width(self, width: int, preset: str) -> int:
-        """Width in pixels of a training's pictures; `width`: as configured, 0 for the preset's."""
+        """Width in pixels of the training images; `width`: as configured, 0 for the preset's."""
         return min(width or PRESET_WIDTHS[preset] or self.working[0], self.working[0])
 
 
 def expected_seconds(kind: str, params: Any, size: ShotSize) -> float | None:
-    """Seconds that a job takes at the usual pace, begun from nothing; None of kinds that nothing is known of.
+    """Seconds that a job from nothing takes at the usual pace; None for a kind without an estimate.
 
     Args:
-        kind: of job.
+        kind: kind of job.
         params: its dataclass of parameters.
-        size: the shot's.
+        size: size of the shot.
     """
     if kind not in _SECONDS:
         return None
@@ -122,18 +123,18 @@ def expected_seconds(kind: str, params: Any, size: ShotSize) -> float | None:
 
 
 def learn_pace(environment: Path, kind: str, seconds: float, expected: float) -> None:
-    """Notes in the backend's environment what a job took. A short one teaches nothing, nor does an environment without
-    notes, which was not set up for us."""
+    """Stores the pace of a job in the backend's environment. Does nothing after a short job, or in an environment
+    without a `SETUP_NOTES` folder, which Splannequin did not set up."""
     if expected < _LEAST_SECONDS or not (environment / SETUP_NOTES).is_dir():
         return
     known = _read(environment)
     known[kind] = [*known.get(kind, []), round(seconds / expected, 4)][-_KEPT:]
-    with contextlib.suppress(OSError):  # a full or read-only disk is no reason to fail a job that was done
+    with contextlib.suppress(OSError):  # a full or read-only disk must not fail a finished job
         write_json(environment / SETUP_NOTES / PACES_FILE, {"version": VERSION, "paces": known})
 
 
 def paces(environment: Path) -> dict[str, float]:
-    """Kind of job -> how many times the expected seconds the machine's earlier jobs took, their median."""
+    """Kind of job -> median pace of the machine's earlier jobs (ratio of actual to expected seconds)."""
     return {kind: statistics.median(values) for kind, values in _read(environment).items()}
 
 
@@ -153,25 +154,25 @@ def _read(environment: Path) -> dict[str, list[float]]:
 
 
 class WholeWay:
-    """Jobs that run one after the other, as one bar with one estimate."""
+    """Progress and estimate of several jobs that run one after the other."""
 
     def __init__(self, expected: Mapping[str, float], spent: float = 0.0) -> None:
-        """`expected`: kind of job -> its seconds, in order; `spent`: seconds of what came before them."""
+        """`expected`: kind of job -> its expected seconds, in order; `spent`: seconds spent before these jobs."""
         self._expected, self._earlier = dict(expected), spent
         self._kind, self._spent = "", 0.0
         self._measured = (0.0, 0.0)
-        """Seconds of the jobs that have ended: as expected, and as they were."""
+        """Expected and actual seconds of the jobs that have ended."""
         self._share = 0.0
 
     def at(self, kind: str, spent: float, left: float | None) -> tuple[float, float]:
-        """(share that is done, which never falls; seconds left of all) while a job runs.
+        """(finished share, which never decreases; seconds left) of all jobs while one of them runs.
 
-        What follows is expected at the pace of what was done, so that a busy machine is noticed.
+        Later jobs are expected to run at the pace of the jobs so far, which takes a busy machine into account.
 
         Args:
-            kind: the job's.
-            spent: seconds since it began.
-            left: seconds that it still takes by its own estimate; None where it has none.
+            kind: kind of the running job.
+            spent: seconds since this job began.
+            left: seconds left by the job's own estimate; None if it has none.
         """
         if kind != self._kind:
             self._end_job()

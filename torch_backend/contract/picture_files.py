@@ -1,6 +1,6 @@
-"""Tells whether a picture, a movie or a .blend is whole, without decoding it.
+"""Checks whether a picture, a movie or a .blend is whole, without decoding it.
 
-Blender reports success for a file that was cut off by a full disk, and reads most cut-off files without a word.
+Blender reports success for a file that was cut off by a full disk, and reads most truncated files without an error.
 
 Each format is checked by what its specification says about its end: a trailer, a stated size, or a table of offsets.
 """
@@ -17,13 +17,13 @@ from typing import BinaryIO
 from .files import LONGEST_LINE, open_regular
 
 _LINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
-"""OpenEXR: compression -> scan lines in a chunk."""
+"""OpenEXR: number of the compression -> scan lines in a chunk."""
 
 
 def is_whole_picture(path: Path) -> bool:
-    """True if a file is a whole picture, movie or .blend; False too if it is not there.
+    """True if a file is a whole picture, movie or .blend; False if it is truncated or missing.
 
-    Of a format without a trailer, a stated size or a table, only an empty file is noticed.
+    For a format without a trailer, a stated size or a table, only an empty file is detected.
     """
     try:
         with open_regular(path) as file:
@@ -35,7 +35,7 @@ def is_whole_picture(path: Path) -> bool:
     except FileNotFoundError:
         return False
     except (ValueError, struct.error, IndexError, KeyError, OverflowError):
-        return False  # what it states of itself makes no sense
+        return False  # the file contradicts itself
     except OSError as error:
         if error.errno == errno.EINVAL:  # an offset that no file can have
             return False
@@ -43,7 +43,7 @@ def is_whole_picture(path: Path) -> bool:
 
 
 def _check_of(head: bytes, suffix: str) -> Callable[[BinaryIO, int], bool] | None:
-    """The check for a format, known by the first bytes, or by the suffix of a format that has no mark of its own."""
+    """Check for a file's format, which the first bytes identify, or the suffix if the format has no magic number."""
     for mark, check in _MARKS:
         if head.startswith(mark):
             return check
@@ -55,12 +55,12 @@ def _check_of(head: bytes, suffix: str) -> Callable[[BinaryIO, int], bool] | Non
 
 
 def _damaged(file: BinaryIO, size: int) -> bool:
-    """A file that lacks the mark of its format: its first block was never written."""
+    """False: the file lacks the magic number of its format, because its first block was not written."""
     return False
 
 
 def _compressed_blend(file: BinaryIO, size: int) -> bool:
-    """Frames of Zstandard fill the file up to their seek table."""
+    """True if Zstandard frames fill the file up to their seek table."""
     file.seek(size - 9)
     frames, _, mark = struct.unpack("<IBI", file.read(9))
     table = 8 * frames
@@ -72,7 +72,7 @@ def _compressed_blend(file: BinaryIO, size: int) -> bool:
 
 
 def _png(file: BinaryIO, size: int) -> bool:
-    """Every chunk has the right CRC, and the last one is IEND."""
+    """True if every chunk has the right CRC, and the last one is IEND."""
     at = 8
     while at + 12 <= size:
         file.seek(at)
@@ -97,7 +97,7 @@ def _ends_with(*ends: bytes) -> Callable[[BinaryIO, int], bool]:
 
 
 def _sized(at: int, form: str, more: int = 0) -> Callable[[BinaryIO, int], bool]:
-    """The header states the file's size, less `more`."""
+    """Check for a format whose header states the file's size minus `more`, at offset `at` as struct format `form`."""
 
     def check(file: BinaryIO, size: int) -> bool:
         file.seek(at)
@@ -107,7 +107,7 @@ def _sized(at: int, form: str, more: int = 0) -> Callable[[BinaryIO, int], bool]
 
 
 def _exr(file: BinaryIO, size: int) -> bool:
-    """Every chunk that the offset table names lies in the file, and holds something."""
+    """True if every chunk in the offset table lies within the file and is not empty."""
     flags = struct.unpack("<4xI", file.read(8))[0]
     is_multipart = bool(flags & 0x1000)
     counts: list[int] = []
@@ -119,8 +119,8 @@ def _exr(file: BinaryIO, size: int) -> bool:
         if not is_multipart:
             break
     offsets = struct.unpack(f"<{sum(counts)}Q", file.read(8 * sum(counts)))
-    before = (4 if is_multipart else 0) + (16 if flags & 0x200 else 4)  # part, and line or tile, of a chunk
-    lengths = struct.Struct("<QQ8x" if flags & 0x800 else "<i")  # deep: table of counts, samples, and those unpacked
+    before = (4 if is_multipart else 0) + (16 if flags & 0x200 else 4)  # part number, then line or tile, of a chunk
+    lengths = struct.Struct("<QQ8x" if flags & 0x800 else "<i")  # deep: sizes of counts, samples, unpacked samples
     for start in offsets:
         file.seek(start + before)
         packed = lengths.unpack(file.read(lengths.size))
@@ -130,7 +130,7 @@ def _exr(file: BinaryIO, size: int) -> bool:
 
 
 def read_exr_header(file: BinaryIO) -> dict[str, bytes]:
-    """Attributes of a header, from where the file stands; empty at the end of all headers."""
+    """Attributes of the EXR header at the current position of a file; empty after the last header."""
     found: dict[str, bytes] = {}
     while name := _text(file):
         _text(file)  # its type
@@ -142,7 +142,7 @@ def read_exr_header(file: BinaryIO) -> dict[str, bytes]:
 
 
 def _text(file: BinaryIO) -> str:
-    """Text up to a zero byte. ValueError if it does not end."""
+    """Text up to a zero byte. ValueError if there is no zero byte."""
     found = bytearray()
     while (byte := file.read(1)) != b"\0":
         if not byte or len(found) > 255:
@@ -152,7 +152,7 @@ def _text(file: BinaryIO) -> str:
 
 
 def _exr_chunks(header: dict[str, bytes]) -> int:
-    """Chunks that a part has."""
+    """Number of chunks in a part."""
     if "chunkCount" in header:
         return int(struct.unpack("<i", header["chunkCount"])[0])
     _, top, _, bottom = struct.unpack("<4i", header["dataWindow"])
@@ -161,7 +161,7 @@ def _exr_chunks(header: dict[str, bytes]) -> int:
 
 
 def _tiff(file: BinaryIO, size: int) -> bool:
-    """The directory and all strips or tiles that it names are in the file."""
+    """True if the directory and all its strips or tiles are in the file."""
     order = "<" if file.read(2) == b"II" else ">"
     version = struct.unpack(order + "H", file.read(2))[0]
     big = version == 43
@@ -186,7 +186,7 @@ def _tiff(file: BinaryIO, size: int) -> bool:
 
 
 def _iris(file: BinaryIO, size: int) -> bool:
-    """Silicon Graphics: the table of run-length encoded rows, or the plain rows, end in the file."""
+    """Silicon Graphics: True if the run-length encoded rows of the table, or the plain rows, are in the file."""
     compressed, depth, _, width, height, layers = struct.unpack(">2xBBHHHH", file.read(12))
     if not compressed:
         return size >= 512 + width * height * layers * depth
@@ -198,7 +198,7 @@ def _iris(file: BinaryIO, size: int) -> bool:
 
 
 def _targa(file: BinaryIO, size: int) -> bool:
-    """All pixels are there, packet by packet where they are run-length encoded."""
+    """True if all pixels are in the file; run-length encoded pixels are counted packet by packet."""
     head = file.read(18)
     comment, mapped, kind = head[0], head[1], head[2]
     width, height, bits = struct.unpack("<HHB", head[12:17])
@@ -216,7 +216,7 @@ def _targa(file: BinaryIO, size: int) -> bool:
 
 
 def _radiance(file: BinaryIO, size: int) -> bool:
-    """All rows of an HDR picture are there, run by run."""
+    """True if all rows of an HDR picture are in the file, counted run by run."""
     data = file.read()
     start = data.index(b"\n\n") + 2
     end = data.index(b"\n", start)
@@ -237,7 +237,7 @@ def _radiance(file: BinaryIO, size: int) -> bool:
 
 
 def _boxes(file: BinaryIO, size: int) -> bool:
-    """ISO media (MP4, MOV, JPEG 2000): boxes fill the file, and one holds a movie's index, or the picture."""
+    """ISO media (MP4, MOV, JPEG 2000): True if boxes fill the file, and one is a movie's index or the picture."""
     at, kinds = 0, set[bytes]()
     while at + 8 <= size:
         file.seek(at)
@@ -255,7 +255,7 @@ def _boxes(file: BinaryIO, size: int) -> bool:
 
 
 def _matroska(file: BinaryIO, size: int) -> bool:
-    """The segment's size, which is filled in when the file is closed, is known and fits."""
+    """True if the segment's size, which is filled in when the file is closed, is known and fits the file."""
     head = file.read(256)
     at = head.index(b"\x18\x53\x80\x67") + 4
     length = 9 - head[at].bit_length()
@@ -264,7 +264,7 @@ def _matroska(file: BinaryIO, size: int) -> bool:
 
 
 def _ogg(file: BinaryIO, size: int) -> bool:
-    """The last page ends a stream."""
+    """True if the last page ends a stream."""
     file.seek(max(size - (1 << 17), 0))
     data = file.read()
     at = data.rindex(b"OggS")
@@ -300,4 +300,4 @@ _MARKED = {
     ".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".dpx", ".cin", ".hdr", ".rgb", ".jp2", ".j2c",
     ".mp4", ".mov", ".mkv", ".webm", ".avi", ".ogv", ".blend",
 }  # fmt: skip
-"""Suffixes of formats whose files begin with a mark."""
+"""Suffixes of formats whose files begin with a magic number."""

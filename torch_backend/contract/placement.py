@@ -1,7 +1,8 @@
-"""Where a shot's solve stands in a scene: the similarity by which splats and cameras leave the shot.
+"""Placement of a shot's solve in a scene: the similarity that transforms exported splats and cameras.
 
-Blender writes it into the shot folder when it starts a job, from the shot's root; the backend, which does not know
-Blender's scene, reads it. Without one, things leave upright in solve units (`Placement`'s default).
+Blender writes the placement of the shot's root object into the shot folder when it starts a job. The backend, which
+does not know Blender's scene, reads it. Without a placement, exports are upright in solve units (`Placement`'s
+default).
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from .typed import CONTRACT_VERSION, check_version, from_dict
 UPRIGHT = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 """Row-major [4, 4]: the solve's axes (x right, y down, z forward) to Blender's (x right, y forward, z up)."""
 TOLERANCE = 1e-4
-"""Largest relative departure from a similarity: Blender's matrices are float32 and are multiplied a few times."""
+"""Largest relative deviation from a similarity: Blender multiplies a few float32 matrices."""
 
 
 @dataclass
 class Placement:
-    """The transform from a shot's solve to the scene that everything leaves for."""
+    """Transform from a shot's solve to the scene into which everything is exported."""
 
     scene_from_solve: list[float] = field(default_factory=lambda: list(UPRIGHT))
     """16 floats, row-major: a similarity (rotation, one scale, translation) from solve units and axes to the scene's,
@@ -33,7 +34,7 @@ class Placement:
     metres_per_unit: float = 1.0
     """Length in metres of one unit of the scene."""
     solve: str = ""
-    """`file_digest` of the cameras.json whose solve it places; empty: whichever there is."""
+    """`file_digest` of the cameras.json of the solve to which the placement applies; empty: any solve."""
     version: int = CONTRACT_VERSION
     """Version of this contract."""
 
@@ -41,7 +42,7 @@ class Placement:
         matrix = self.scene_from_solve
         try:
             is_finite = all(math.isfinite(value) for value in matrix)
-        except TypeError:  # a file from anywhere: `from_dict` does not look into lists
+        except TypeError:  # `from_dict` does not check the items of lists
             is_finite = False
         if len(matrix) != 16 or not is_finite:
             raise UserError("The placement's scene_from_solve should be 16 finite numbers, a 4 x 4 matrix by rows.")
@@ -85,9 +86,9 @@ class Placement:
 
 
 def placement_of(facts: Mapping[str, Any]) -> Placement:
-    """The placement in which a take's splats left, from its take.json.
+    """The placement with which a take's splats were exported, from its take.json.
 
-    Takes of earlier versions say none: their splats are in the solve's own axes and units. ValueError if the entry
+    Takes of earlier versions have none: their splats are in the axes and units of the solve. ValueError if the entry
     is damaged.
     """
     placement = facts.get("placement")

@@ -1,4 +1,4 @@
-"""The header of a binary PLY, as both sides of the wall read it: how many vertices there are, and what one holds."""
+"""Reads the header of a binary PLY, for Blender and the backend: number of vertices, and properties of a vertex."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ PLY_TYPES = {
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
-"""Type of a property -> the same as numpy spells it."""
+"""PLY type of a property -> NumPy type."""
 _MAX_HEADER_LINES = 1000
 
 
 def read_ply_header(handle: BinaryIO, path: str | Path) -> tuple[int, list[tuple[str, str]]]:
-    """Number of vertices, and (name, numpy's type) of each property in file order.
+    """Number of vertices, and (name, NumPy type) of each property in file order.
 
-    Leaves the handle at the first vertex. ValueError if it is no binary little-endian PLY that begins with vertices.
+    Leaves the handle at the first vertex. ValueError unless the file is a binary little-endian PLY that begins with
+    vertices.
     """
     if handle.readline(16).strip() != b"ply":
         raise UserError(f"{path}: not a PLY file")

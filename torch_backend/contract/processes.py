@@ -1,4 +1,4 @@
-"""Processes: how a child is started, when it ends with its starter, and which one lives."""
+"""Starts child processes, ends a process with its starter, and checks which process lives."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ GRACE_SECONDS = 30.0
 
 
 def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]:
-    """`args` and `cwd` of the `Popen` that runs a module of ours; paths in `words` should be absolute.
+    """`args` and `cwd` for a `Popen` that runs a module of this project; paths in `words` should be absolute.
 
-    Python takes modules from the folder that it stands in, and a shot folder may come from anywhere: -P says no. The
-    child stands beside its interpreter, where nobody puts files for it: a loader of libraries still looks there
-    (Windows always, Linux with an empty entry in LD_LIBRARY_PATH). It is neither the shot's folder nor the extension's:
-    Windows keeps the folder that a process stands in from being moved or removed.
+    Python imports modules from its working directory unless it gets -P, and a shot folder may come from anywhere. The
+    loader of libraries also searches the working directory (Windows always, Linux with an empty entry in
+    LD_LIBRARY_PATH), so it is the interpreter's folder, where nobody puts files for the child. It must not be the
+    shot's or the extension's folder, because Windows lets nobody move or remove a process's working directory.
     """
     python = os.path.abspath(python)
     return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
 
 
 def child_environment(root: Path) -> dict[str, str]:
-    """Environment for a child of `python_child` that has to import our package from the folder `root`."""
-    # An empty or relative entry would be the folder that the child stands in.
+    """Environment for a child of `python_child` that has to import this package from the folder `root`."""
+    # An empty or relative entry would refer to the child's working directory.
     inherited = [p for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if os.path.isabs(p)]
-    # Threads that spin while they wait take the core from whoever shares it.
+    # Threads that spin while they wait would take a core from other processes.
     environment = {"OMP_WAIT_POLICY": "passive"} | os.environ
     return environment | {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join([str(root), *inherited])}
 
 
 def own_input() -> int:
-    """A handle of the standard input for us alone, to be read from by a thread; in its old place is nothing.
+    """A private handle of the standard input, for a thread that reads it. The null device replaces handle 0.
 
-    Whoever as much as looks at a pipe that somebody reads from waits on Windows until something comes: a child that
-    inherits it as it starts, and a library as it is loaded.
+    On Windows, any access to a pipe blocks while a thread waits to read from it. Otherwise, a child that inherits the
+    pipe would block at its start, and a library while it is loaded.
     """
     standard_input = os.dup(0)
     nothing = os.open(os.devnull, os.O_RDONLY)
@@ -61,9 +61,9 @@ def own_input() -> int:
 
 
 def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
-    """Stops this process, as Ctrl-C does, once its standard input closes: its starter holds that open, however it ends.
+    """Stops this process, as Ctrl-C does, once its standard input closes, which happens when its starter ends.
 
-    A checkpoint may take `grace_seconds`; then the process ends at once, with the group that it leads (POSIX).
+    The process has `grace_seconds` for a checkpoint. Then it is killed, with the process group that it leads (POSIX).
     """
     watch = functools.partial(_stop_when_alone, own_input(), grace_seconds)
     threading.Thread(target=watch, name="end with starter", daemon=True).start()
@@ -75,7 +75,7 @@ def _stop_when_alone(starter: int, grace_seconds: float) -> None:
             pass
     if sys.platform == "win32":
         _thread.interrupt_main()
-    else:  # a signal of its own also ends a wait of the main thread
+    else:  # a real signal also interrupts a wait of the main thread
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
     time.sleep(grace_seconds)
     if sys.platform != "win32" and os.getpgrp() == os.getpid():
@@ -84,9 +84,9 @@ def _stop_when_alone(starter: int, grace_seconds: float) -> None:
 
 
 def program(name: str) -> str | None:
-    """Absolute path of a program on the PATH; None if there is none, or if the folder we stand in has one to offer.
+    """Absolute path of a program on the PATH; None if there is none, or if the working directory has one of this name.
 
-    `shutil.which` looks into that folder first on Windows, and it may be one that came with a .blend or a clip.
+    On Windows, `shutil.which` searches the working directory first, which may have come with a .blend or a clip.
     """
     found = shutil.which(name)
     return found if found and os.path.isabs(found) else None
@@ -94,11 +94,11 @@ def program(name: str) -> str | None:
 
 @functools.cache
 def computer_name() -> str:
-    """This computer as files name it: its name, and in brackets what tells it from another one of the same name.
+    """Name of this computer in files: its host name, with a hash in brackets that distinguishes equal host names.
 
-    On Linux that is a hash of the machine's id and, in a container, of its process ids' namespace; on Windows of the
-    machine's GUID; elsewhere there is none. A Mac is named as its owner has it: what `gethostname` says there comes
-    from the network, another one at home than in the studio.
+    On Linux the hash covers the machine id and the namespace of process ids, which differs between containers. On
+    Windows it covers the machine's GUID. Other systems have no hash. A Mac has its local host name, because the result
+    of `gethostname` depends on the network, such as home or studio.
     """
     marks: list[str] = []
     if sys.platform == "win32":
@@ -118,7 +118,7 @@ def computer_name() -> str:
 
 
 def _name_of_mac() -> str:
-    """A Mac's own name on local networks; empty elsewhere, or if the system does not tell."""
+    """Local host name of a Mac; empty on other systems, or if it is unknown."""
     if sys.platform != "darwin":
         return ""
     try:  # as in `process_of_ps`
@@ -131,49 +131,49 @@ def _name_of_mac() -> str:
 
 @dataclass(frozen=True)
 class Process:
-    """What the system says of a living process."""
+    """A living process, as the system describes it."""
 
     started: float
-    """When it started, in the system's own unit: only to be compared with another answer. 0 if it does not tell."""
+    """Start time in a unit of the system, only for comparison with another `started`; 0 if unknown."""
     command: str
-    """Its command line, arguments separated by spaces; empty if the system does not tell."""
+    """Command line, arguments separated by spaces; empty if unknown."""
 
 
 def process(pid: object) -> Process | None:
-    """A living process of this computer; None if there is none of that id, which may be anything that a file says.
+    """The living process of this computer with an id; None if there is none. `pid` may be any value from a file.
 
-    Standard library, on all three systems.
+    Uses only the standard library, on all three systems.
     """
     if not (isinstance(pid, int) and 0 < pid < 1 << 31):
         return None
     if sys.platform == "win32":
         return _process_of_windows(pid)
     try:
-        os.kill(pid, 0)  # asks only: no signal is sent
+        os.kill(pid, 0)  # signal 0 only checks that the process exists
     except ProcessLookupError:
         return None
     except OSError:
-        pass  # somebody else's, but there
+        pass  # it exists, but belongs to another user
     return _process_of_proc(pid) if Path("/proc/self/stat").exists() else process_of_ps(pid)
 
 
 def process_start(pid: int) -> float:
-    """`Process.started` of a process; 0 if there is none or the system does not tell."""
+    """`Process.started` of a process; 0 if there is none or its start is unknown."""
     found = process(pid)
     return found.started if found is not None else 0.0
 
 
 def runs_still(pid: int, started: float) -> bool:
-    """True if a process of this computer lives that has this id and start; one that is only stopped does.
+    """True if a process of this computer with this id and start lives, even if it is suspended.
 
-    Where the system tells no start, a process of this id is taken for it: a job is not declared dead on a guess.
+    If a start is unknown, the id alone decides, so that a living job is not declared dead.
     """
     found = process(pid)
     return found is not None and (not found.started or not started or found.started == started)
 
 
 def _process_of_proc(pid: int) -> Process | None:
-    """From /proc. Start in clock ticks since boot."""
+    """The process from /proc, with its start in clock ticks since boot."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
         fields = text.rpartition(")")[2].split()
@@ -182,11 +182,11 @@ def _process_of_proc(pid: int) -> Process | None:
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
         return Process(float(fields[19]), " ".join(os.fsdecode(word) for word in words).rstrip(" "))
     except (OSError, ValueError, IndexError):
-        return Process(0.0, "")  # hidden from us, or ending just now
+        return Process(0.0, "")  # hidden from this user, or ending just now
 
 
 def process_of_ps(pid: int) -> Process | None:
-    """From `ps`, on systems without /proc (macOS). Start in seconds since the epoch, whole ones."""
+    """The process from `ps`, on systems without /proc (macOS), with its start in whole seconds since the epoch."""
     command = ["/bin/ps", "-ww", "-o", "stat=,lstart=,command=", "-p", str(pid)]
     environ = {"LC_ALL": "C", "TZ": "UTC0", "PATH": "/usr/bin:/bin"}
     try:
@@ -203,10 +203,10 @@ def process_of_ps(pid: int) -> Process | None:
 
 
 def run_from(folder: Path) -> list[int]:
-    """Ids of this computer's processes whose program lies in a folder, as far as the system tells: their command lines
-    begin with its whole path, as those of our children do.
+    """Ids of processes whose program lies in a folder, as far as the system shows them. Their command lines begin with
+    the absolute path of the program, as those of `python_child` do.
 
-    None on Windows, which itself refuses to move a folder of which a program runs.
+    Empty on Windows, which refuses to move a folder with a running program.
     """
     if sys.platform == "win32":
         return []
@@ -216,7 +216,7 @@ def run_from(folder: Path) -> list[int]:
 
 
 def _commands_of_proc() -> dict[int, str]:
-    """Process id -> its program; what is not ours to read is left out."""
+    """Process id -> its program, for processes that this user may read."""
     found: dict[int, str] = {}
     for entry in os.scandir("/proc"):
         if entry.name.isdecimal():
@@ -242,7 +242,7 @@ _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct",
 
 
 def _process_of_windows(pid: int) -> Process | None:
-    """From the Windows API. Start in units of 100 ns since 1601; the command line since Windows 8.1."""
+    """The process from the Windows API, with its start in units of 100 ns since 1601. Command lines need Windows 8.1."""
     if sys.platform != "win32":
         return None
     import ctypes
@@ -275,9 +275,9 @@ def _process_of_windows(pid: int) -> Process | None:
 
 
 def memory() -> tuple[float, float] | None:
-    """(bytes of physical memory, bytes available without swapping); None where the system does not say.
+    """(bytes of physical memory, bytes available without swapping); None if the system does not report them.
 
-    macOS does not say how much is available: half of all is returned. Limits of a container are not considered.
+    macOS does not report available memory, so half of all is returned. Limits of a container are not considered.
     """
     if sys.platform == "win32":
 

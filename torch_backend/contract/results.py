@@ -1,4 +1,4 @@
-"""What came out of a step: its verdict, and the figures of a whole run."""
+"""Results of a step: its verdict, and the figures of a whole run."""
 
 from __future__ import annotations
 
@@ -12,47 +12,47 @@ from .typed import CONTRACT_VERSION, from_dict
 
 
 def measured(row: Mapping[str, Any]) -> tuple[float, float] | None:
-    """(seconds of training, dB on frames kept out) of a measurement; None if it is none, or holds no plain numbers."""
+    """(seconds of training, dB on held-out frames) of a measurement; None if one of them is missing or not a number."""
     seconds, quality = _plain_number(row.get("seconds")), _plain_number(row.get("heldout_psnr_db"))
     return (seconds, quality) if seconds is not None and quality is not None else None
 
 
 def _plain_number(value: object) -> float | None:
-    """A number that a measurement may hold; None for anything else."""
+    """`value` as a float; None unless it is a number between -1e9 and 1e9."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
         return None
     return float(value)
 
 
 VERDICT_WORDS = {"good": "Good.", "fair": "Fair.", "poor": "Poor."}
-"""Good: it holds. Fair: it holds but for what is named. Poor: it is not worth going on from. As they are shown."""
+"""Word of a verdict -> text shown. Good: usable. Fair: usable except for the named problems. Poor: not usable."""
 _MOST_LINES = 12
 DEPTH_KINDS = ("depth", "inverse depth")
-"""What the maps of a depth sequence may be linear in."""
+"""Quantities in which the maps of a depth sequence may be linear."""
 
 
 @dataclass
 class Verdict:
-    """What an artist should know of a run or a take; stands in a run's summary.json and in a take.json."""
+    """Assessment of a run or a take for the artist, stored in a run's summary.json and in a take.json."""
 
     word: str
     """One of `VERDICT_WORDS`."""
     sentences: list[str]
     """Findings, a sentence each."""
     where: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
-    """Where it will not hold, worst first: `first` and `last` frame number, and `region` of the picture in words."""
+    """Parts that will look wrong, worst first: `first` and `last` frame number, `region` of the picture in words."""
     advice: list[str] = field(default_factory=list[str])
-    """What to do about it."""
+    """What to do about the findings, a sentence each."""
     instants: list[int] = field(default_factory=list[int])
     """First and last frame number of the span that t* should be chosen from; empty if any frame will do."""
 
     def lines(self) -> list[str]:
-        """All of it as it is printed and drawn; the word stands before the first sentence."""
+        """Lines of the verdict as printed and drawn; the word precedes the first sentence."""
         return [f"{VERDICT_WORDS[self.word]} {self.sentences[0]}", *self.sentences[1:], *self.advice]
 
 
 def verdict_of(facts: Mapping[str, Any]) -> Verdict | None:
-    """The verdict in a summary.json or take.json, which may come from anywhere; None if there is none to be shown."""
+    """The verdict in a summary.json or take.json, which may come from anywhere; None if there is no valid one."""
     data = facts.get("verdict")
     if not is_json_object(data):
         return None
@@ -69,15 +69,15 @@ def verdict_of(facts: Mapping[str, Any]) -> Verdict | None:
 
 
 def verdict_lines(*facts: Mapping[str, Any]) -> list[str]:
-    """The lines of the verdicts that summaries or takes hold; none where there is no verdict."""
+    """Lines of all verdicts in summaries or takes, each line once."""
     found = (verdict_of(one) for one in facts)
     lines = (line for verdict in found if verdict is not None for line in verdict.lines())
-    return list(dict.fromkeys(lines))  # a take repeats what its run's verdict found amiss
+    return list(dict.fromkeys(lines))  # a take repeats the findings of its run's verdict
 
 
 def depth_line(facts: Mapping[str, Any]) -> str:
-    """How the depth sequence of a run fits its solve, from the run's summary.json, which may come from anywhere; empty
-    if there is none."""
+    """Sentence on how well the depth sequence of a run fits its solve; empty if there is none. `facts`: the run's
+    summary.json, which may come from anywhere."""
     found = facts.get("depth")
     if not is_json_object(found):
         return ""
@@ -92,11 +92,11 @@ def depth_line(facts: Mapping[str, Any]) -> str:
 
 
 def take_figures(facts: Mapping[str, Any], folder: TakeFolder) -> dict[str, Any]:
-    """What DIR/summary.json says of a take.
+    """Entries of DIR/summary.json for a take.
 
     Args:
-        facts: take.json, or what the job "freeze" answered.
-        folder: where the take lies now: a shot may have been moved since it was frozen.
+        facts: take.json, or the result of the job "freeze".
+        folder: current folder of the take, as the shot may have been moved since it was frozen.
     """
     detail: Mapping[str, Any] = facts.get("detail") or {}
     places = {"exr_dir": folder.root, **{k: getattr(folder, k) for k in ("contact_sheet", "video", "ply")}}
@@ -111,14 +111,14 @@ def take_figures(facts: Mapping[str, Any], folder: TakeFolder) -> dict[str, Any]
 def summarise(
     shot: str, source: str, results: Mapping[str, Mapping[str, Any]], stages: Mapping[str, float], wall_seconds: float
 ) -> dict[str, Any]:
-    """The figures of a whole run as DIR/summary.json holds them; units in the key names.
+    """Figures of a whole run, as in DIR/summary.json; units in the key names.
 
     Args:
         shot: absolute path of the shot folder.
-        source: footage as given.
-        results: what the jobs "solve", "train" and "freeze" answered in their `done` event.
+        source: path of the footage as the user entered it.
+        results: results of the jobs "solve", "train" and "freeze" in their `done` events.
         stages: seconds by kind of job.
-        wall_seconds: seconds in all.
+        wall_seconds: total seconds.
     """
     train, freeze, solve = results["train"], results["freeze"], results["solve"]
     return {

@@ -1,20 +1,20 @@
-"""The shot folder: where everything of a shot lies. No other file of the project spells these names.
+"""The shot folder: paths of all files of a shot. No other file of the project contains these names.
 
-shot.json                        what is told of the shot
-lock.json                        who writes into it
+shot.json                        facts of the shot
+lock.json                        the process that writes into the shot
 frames/NNNNNN.png                undistorted plates
-frames/frames.json, frames/raw/  listing of the imported frames, and themselves
+frames/frames.json, frames/raw/  listing of the imported frames, and these frames
 solve/                           cameras.json, solve.json, points.npz, colmap/, colmap.log, ST maps of the lens
-solve/motion/                    mattes of what moves as found, points of what does not; motion_paint/ as painted
-solve/ignore/, solve/people/     masks that the solve was given, undistorted; masks/ as drawn in Blender
+solve/motion/                    detected motion mattes, points of still surfaces; motion_paint/: painted mattes
+solve/ignore/, solve/people/     masks for the solve, undistorted; masks/: the same as drawn in Blender
 runs/NAME/                       a run: `RunFolder`
 takes/NAME/                      frozen frames: `TakeFolder`
-jobs/ID/                         requests and what became of them: `jobs`
-placement.json                   where the solve stands in Blender's scene
+jobs/ID/                         requests, status and results of jobs: `jobs`
+placement.json                   transform of the solve into Blender's scene
 paths/, tracking/                cameras that Blender sent
-farm/                            what tasks of a render farm took
-trash/                           what was removed and is being deleted
-replaced/NNN/                    what an import of other frames replaced, a whole shot folder
+farm/                            time and memory that render farm tasks took
+trash/                           removed files that are being deleted
+replaced/NNN/                    work that an import of other frames replaced, as a complete shot folder
 """
 
 from __future__ import annotations
@@ -27,45 +27,45 @@ from .errors import ExitCode, JobError
 from .files import checked_name, frame_file, is_link
 
 SHOT_SUFFIX = ".splannequin"
-"""Of a shot folder's own name."""
+"""Suffix of a shot folder's name."""
 INFO_FILE, WRITER_FILE = "shot.json", "lock.json"
 PLACEMENT_FILE = "placement.json"
-"""Where the solve stands in Blender's scene, a `Placement`."""
+"""Transform of the solve into Blender's scene, a `Placement`."""
 FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER = "frames", "solve", "runs", "takes", "jobs"
 FRAMES_FILE, RAW_FOLDER, BURNT_IN_FILE = "frames.json", "raw", "burnt_in.png"
 UNPUBLISHED_FILE = "unpublished.json"
-"""In the frames folder: what shot.json is still to be told of these frames."""
+"""File in the frames folder: facts of these frames that shot.json does not have yet."""
 CAMERAS_FILE, SOLVE_FILE, POINTS_FILE = "cameras.json", "solve.json", "points.npz"
 COLMAP_FOLDER, COLMAP_LOG = "colmap", "colmap.log"
 STMAP_FILES = ("stmap_undistort.exr", "stmap_redistort.exr")
-"""Of the solve: from the distorted frames to the undistorted ones, and back."""
+"""ST maps of the solve: from the distorted frames to the undistorted ones, and back."""
 MOTION_FOLDER, MOTION_FILE, MOTION_UNFINISHED_FILE = "motion", "motion.json", "unfinished.json"
 PAINTED_FOLDER = "motion_paint"
 MASK_KINDS = ("ignore", "people")
-"""Masks that a solve may be given: what is no part of the scene, and what alone may move."""
+"""Kinds of masks for a solve: regions that are not part of the scene, and the only regions that may move."""
 DRAWN_FOLDER = "masks"
 CHECKPOINT_FILE, EXTENSION_FILE = "checkpoint.safetensors", "extension.safetensors"
-"""Of a run: itself, and steps that are added to it and are not done."""
+"""Checkpoints of a run: the run itself, and unfinished steps that are being added to it."""
 CONFIG_FILE, METRICS_FILE, SUMMARY_FILE = "config.json", "metrics.jsonl", "summary.json"
 DEPTH_FILE = "depth.safetensors"
-"""Of a run: the artist's depth sequence, fitted to the solve."""
+"""File in a run's folder: the artist's depth sequence, fitted to the solve."""
 PREVIEWS_FOLDER, NEXT_FOLDER, DEVELOPED_FOLDER = "previews", "next", "developed"
-"""In a run's folder: pictures of the training, trainings that will take the run's place, developed instants."""
+"""Folders in a run's folder: pictures of the training, trainings that will replace the run, developed instants."""
 TAKE_FILE, TAKE_STATE_FILE = "take.json", "state.json"
 TAKE_PREVIEW_FOLDER, WARP_FOLDER, DEEP_FOLDER, TAKE_NEXT_FOLDER = "preview", "warp", "deep", ".next"
 CONTACT_SHEET_FILE, VIDEO_FILE, PLY_FILE = "contact_sheet.png", "video.mp4", "frozen.ply"
 USD_FILE, SURFACE_FILE = "frozen.usdc", "surface.ply"
-"""Of a take: the splats and the animated camera; the frozen scene as a mesh."""
+"""Files of a take: the splats with the animated camera; the frozen scene as a mesh."""
 LIGHT_FOLDER = "panorama"
-"""In a take's folder: panoramas of its light by their keys, and what is said of each."""
+"""Folder in a take's folder: panoramas of its light by their keys, and the facts of each."""
 TAKE_REDISTORT = Path("stmap") / "redistort.exr"
-"""Of a take with overscan: the way back through the lens."""
+"""ST map of a take with overscan that puts the lens distortion back."""
 TAKE_UNDISTORT = Path("stmap") / "undistort.exr"
-"""Of a take: from the footage as it was filmed to the plate without the lens, as large as the footage."""
+"""ST map of a take from the original footage to the undistorted plate, at the size of the footage."""
 MATTES_FOLDER, MATTES_FILE, DRAWN_FILE = "mattes", "mattes.json", "drawn.json"
-"""In a take's folder: mattes that somebody lassoed; their lassos; and those that Blender sent last."""
+"""In a take's folder: mattes of lassoed things, their lassos, and the lassos that Blender sent last."""
 CRYPTOMATTE_FOLDER, MATTE_FOLDER = "cryptomatte", "single"
-"""In a take's mattes: all of them in one sequence, and each in one of its own."""
+"""In a take's folder of mattes: one sequence with all mattes, and a sequence for each matte."""
 LIVE_LOG = "live.log"
 FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER = "farm", "trash", "tracking", "paths"
 REPLACED_FOLDER = "replaced"
@@ -73,13 +73,13 @@ SHOT_NAMES = frozenset({
     INFO_FILE, WRITER_FILE, FRAMES_FOLDER, SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, JOBS_FOLDER, PAINTED_FOLDER,
     DRAWN_FOLDER, FARM_FOLDER, TRASH_FOLDER, TRACKING_FOLDER, PATHS_FOLDER, REPLACED_FOLDER, PLACEMENT_FILE,
 })  # fmt: skip
-"""All that lies in a shot folder."""
+"""Names of all files and folders in a shot folder."""
 PICTURE, LAYERS, SURFACE = ".png", ".exr", ".npz"
 """Suffixes of plates, mattes and previews; of frozen frames; of points of still surfaces."""
 
 
 class ShotFolder:
-    """Paths in a shot folder. Holds no state, and says nothing of what is there."""
+    """Paths in a shot folder. Holds no state; the paths need not exist."""
 
     def __init__(self, root: str | Path) -> None:
         self.root = Path(root).absolute()
@@ -94,7 +94,7 @@ class ShotFolder:
 
     @property
     def listing(self) -> Path:
-        """What was imported."""
+        """Listing of the imported frames."""
         return self.frames / FRAMES_FILE
 
     @property
@@ -104,7 +104,7 @@ class ShotFolder:
 
     @property
     def burnt_in(self) -> Path:
-        """Mask of what is burnt into the clip, a logo for instance; there if the import found something."""
+        """Mask of what is burnt into the clip, such as a logo; exists if the import found something."""
         return self.frames / BURNT_IN_FILE
 
     def plate(self, frame: int) -> Path:
@@ -117,7 +117,7 @@ class ShotFolder:
 
     @property
     def cameras(self) -> Path:
-        """A `CameraPath` of all frames: there is a solve if it is there."""
+        """A `CameraPath` of all frames. If this file exists, the shot is solved."""
         return self.solve / CAMERAS_FILE
 
     @property
@@ -140,11 +140,11 @@ class ShotFolder:
 
     @property
     def motion(self) -> Path:
-        """Mattes of what moves, as found."""
+        """Detected motion mattes."""
         return self.solve / MOTION_FOLDER
 
     def matte(self, frame: int) -> Path:
-        """The found matte of a frame."""
+        """Detected motion matte of a frame."""
         return self.motion / frame_file(frame, PICTURE)
 
     def surface(self, frame: int) -> Path:
@@ -153,11 +153,11 @@ class ShotFolder:
 
     @property
     def painted(self) -> Path:
-        """Mattes of what moves, as painted."""
+        """Painted motion mattes."""
         return self.root / PAINTED_FOLDER
 
     def painted_matte(self, frame: int) -> Path:
-        """The painted matte of a frame."""
+        """Painted motion matte of a frame."""
         return self.painted / frame_file(frame, PICTURE)
 
     def masks(self, kind: str) -> Path:
@@ -169,7 +169,7 @@ class ShotFolder:
         return self.masks(kind) / frame_file(frame, PICTURE)
 
     def drawn_masks(self, kind: str) -> Path:
-        """Masks of one of `MASK_KINDS` as they were drawn in Blender, over the footage as it was filmed."""
+        """Masks of one of `MASK_KINDS` as drawn in Blender, over the original footage."""
         return self.root / DRAWN_FOLDER / kind
 
     @property
@@ -186,12 +186,12 @@ class ShotFolder:
 
     @property
     def live_log(self) -> Path:
-        """What the last live session complained of."""
+        """Log of the last live session."""
         return self.jobs / LIVE_LOG
 
     @property
     def placement(self) -> Path:
-        """Where the solve stands in Blender's scene, as Blender wrote it last."""
+        """Transform of the solve into Blender's scene, as Blender wrote it last."""
         return self.root / PLACEMENT_FILE
 
     @property
@@ -200,17 +200,17 @@ class ShotFolder:
 
     @property
     def farm(self) -> Path:
-        """What tasks of a render farm took."""
+        """Records of render farm tasks."""
         return self.root / FARM_FOLDER
 
     @property
     def trash(self) -> Path:
-        """What was removed, until it is deleted."""
+        """Removed files, until they are deleted."""
         return self.root / TRASH_FOLDER
 
     @property
     def replaced(self) -> Path:
-        """Takes a shot folder for each import that replaced frames on which work had been done."""
+        """Contains a shot folder for each import that replaced frames on which work had been done."""
         return self.root / REPLACED_FOLDER
 
     @property
@@ -231,9 +231,9 @@ class ShotFolder:
         return self.takes / checked_name(name, "take")
 
     def own(self, folder: Path) -> Path:
-        """`folder` of this shot, for those who write or remove files in it: a shot may come from anywhere.
+        """`folder` of this shot, checked before files in it are written or removed: a shot may come from anywhere.
 
-        JobError if it is no folder, or if it or a folder on the way to it is a link: what lies behind is not ours.
+        JobError if `folder` is not a folder, or if it or one of its parents in the shot is a link to elsewhere.
         """
         path = self.root
         for part in folder.relative_to(self.root).parts:
@@ -253,7 +253,7 @@ class ShotFolder:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Paths in the folder of a run, or of a training that will take its place."""
+    """Paths in the folder of a run, or of a training that will replace it."""
 
     root: Path
     """runs/NAME, or runs/NAME/next/KEY."""
@@ -264,7 +264,7 @@ class RunFolder:
 
     @property
     def extension(self) -> Path:
-        """Steps that are added to the run and are not done."""
+        """Checkpoint of unfinished steps that are being added to the run."""
         return self.root / EXTENSION_FILE
 
     @property
@@ -273,17 +273,17 @@ class RunFolder:
 
     @property
     def depth(self) -> Path:
-        """The artist's depth sequence, fitted to the solve; there if the run was trained with one."""
+        """The artist's depth sequence, fitted to the solve; exists if the run was trained with one."""
         return self.root / DEPTH_FILE
 
     @property
     def metrics(self) -> Path:
-        """A measurement per line."""
+        """Measurements, one per line."""
         return self.root / METRICS_FILE
 
     @property
     def summary(self) -> Path:
-        """Figures; written last, so the run is finished if it is there."""
+        """Figures of the run. Written last, so the run is finished if this file exists."""
         return self.root / SUMMARY_FILE
 
     @property
@@ -292,7 +292,7 @@ class RunFolder:
 
     @property
     def next(self) -> Path:
-        """Trainings that will take the run's place when they are done, by key."""
+        """Trainings that will replace the run when they are finished, by key."""
         return self.root / NEXT_FOLDER
 
     @property
@@ -306,21 +306,21 @@ class TakeFolder:
     """Paths in the folder of a take."""
 
     root: Path
-    """takes/NAME, or what `next` is."""
+    """takes/NAME, or its folder `next`."""
 
     @property
     def next(self) -> TakeFolder:
-        """Frames that will take the place of the previous ones when all are done."""
+        """Frames that will replace the previous ones when all of them are finished."""
         return TakeFolder(self.root / TAKE_NEXT_FOLDER)
 
     @property
     def facts(self) -> Path:
-        """What the take is; written last, so it is finished if it is there."""
+        """Facts of the take. Written last, so the take is finished if this file exists."""
         return self.root / TAKE_FILE
 
     @property
     def state(self) -> Path:
-        """Key of what the take is being made of."""
+        """Key of the inputs from which the take is being made."""
         return self.root / TAKE_STATE_FILE
 
     def frame(self, number: int) -> Path:
@@ -332,7 +332,7 @@ class TakeFolder:
         return self.root / TAKE_PREVIEW_FOLDER
 
     def preview(self, number: int) -> Path:
-        """A frozen frame as it looks."""
+        """A frozen frame as displayed, a PNG."""
         return self.previews / frame_file(number, PICTURE)
 
     @property
@@ -340,7 +340,7 @@ class TakeFolder:
         return self.root / WARP_FOLDER
 
     def warp(self, number: int) -> Path:
-        """How the plate of a frame is warped to its frozen frame."""
+        """Warp from the plate of a frame to its frozen frame."""
         return self.warps / frame_file(number, LAYERS)
 
     @property
@@ -353,7 +353,7 @@ class TakeFolder:
 
     @property
     def mattes(self) -> Path:
-        """Mattes of things that somebody lassoed."""
+        """Mattes of lassoed things."""
         return self.root / MATTES_FOLDER
 
     @property
@@ -412,10 +412,10 @@ class TakeFolder:
         return self.root / LIGHT_FOLDER / f"{checked_name(key, 'light')}{LAYERS}"
 
     def light_facts(self, key: str) -> Path:
-        """What is said of a panorama; ValueError as `light`."""
+        """Facts of a panorama; ValueError as `light`."""
         return self.root / LIGHT_FOLDER / f"{checked_name(key, 'light')}.json"
 
     @property
     def redistort(self) -> Path:
-        """The way back through the lens, of a take with overscan."""
+        """ST map that puts the lens distortion back, for a take with overscan."""
         return self.root / TAKE_REDISTORT

@@ -1,4 +1,4 @@
-"""What a shot holds that belongs to its present frames: an import of other frames must not use or remove it."""
+"""Work in a shot that depends on its present frames. An import of other frames must not use or remove it."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from .shot_folder import (
 FOLDERS_OF_FRAMES = (
     SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER, PAINTED_FOLDER, DRAWN_FOLDER, TRACKING_FOLDER, PATHS_FOLDER,
 )  # fmt: skip
-"""Folders of a shot whose content is about its frames: made from them, or painted, drawn or tracked over them."""
+"""Folders of a shot whose content depends on its frames: made from them, or painted, drawn or tracked over them."""
 
 
 def work_words(shot: ShotFolder) -> list[str]:
-    """What a shot holds beside its frames, each as "a solved camera", "2 runs" and so on; [] if nothing."""
+    """Descriptions of the work in a shot besides its frames: "a solved camera", "2 runs" and so on; [] if none."""
     runs = sum(any(_files(run, "*")) for run in _folders(shot.runs))
     takes = sum(any(_files(take, "*" + LAYERS)) or any(_files(take, "*")) for take in _folders(shot.takes))
     found = [

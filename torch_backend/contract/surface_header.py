@@ -15,9 +15,9 @@ from .shot_folder import TakeFolder
 VERTEX_FIELDS = (
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"),
 )  # fmt: skip
-"""(name, numpy's type) of a vertex: its place in the scene's units, its colour as displayed."""
+"""(name, NumPy type) of a vertex's fields: position in the scene's units, display-referred colour."""
 TRIANGLE_FIELDS = (("corners", "u1"), ("a", "<i4"), ("b", "<i4"), ("c", "<i4"), ("people", "u1"))
-"""(name, numpy's type) of a triangle: always 3 corners, its vertices, 1 if it moves in the clip."""
+"""(name, NumPy type) of a triangle's fields: number of corners (3), its vertices, 1 if it moves in the clip."""
 _VERTEX_BYTES, _TRIANGLE_BYTES = 15, 14
 _LONGEST = 1000
 _TEXT = """ply
@@ -39,22 +39,22 @@ end_header
 
 @dataclass(frozen=True)
 class SurfaceHeader:
-    """What the file holds."""
+    """Content of the header."""
 
     take: str
-    """`file_digest` of the take.json of the take that it was made from."""
+    """`file_digest` of the take.json of the take from which the surface was made."""
     vertices: int
     """Number of vertices; they follow the header."""
     triangles: int
     """Number of triangles; they follow the vertices."""
 
     def to_bytes(self) -> bytes:
-        """The header as it stands in the file."""
+        """The header as bytes of the file."""
         return _TEXT.format(self.take, self.vertices, self.triangles).encode("ascii")
 
 
 def surface_of_take(take: TakeFolder) -> SurfaceHeader | None:
-    """The header of a take's surface if it is of the take as it is now, None if it is not, or there is none."""
+    """The header of a take's surface; None if there is no surface, or if the take has changed since."""
     try:
         with open_regular(take.surface, LONGEST_CHECKPOINT) as handle:
             header = read_surface_header(handle, take.surface)
@@ -64,7 +64,7 @@ def surface_of_take(take: TakeFolder) -> SurfaceHeader | None:
 
 
 def read_surface_header(handle: BinaryIO, path: str | Path) -> SurfaceHeader:
-    """The header of an open file; leaves the handle at the first vertex. ValueError if it is not ours, or cut short."""
+    """The header of an open file; leaves the handle at the first vertex. ValueError if it is invalid or truncated."""
     start = handle.read(_LONGEST).partition(b"end_header\n")
     text = (start[0] + start[1]).decode("ascii", errors="replace")
     found = re.fullmatch(re.escape(_TEXT).replace(r"\{\}", r"(\w{1,100})"), text)

@@ -1,4 +1,4 @@
-"""What a take may be asked for: its frozen frames, mattes, several instants in one, a surface, and light."""
+"""Parameters of jobs on a take: frozen frames, mattes, several instants in one take, a surface, and light."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .option_table import SWITCH, Limit, Option, option, overscan
 
 @dataclass
 class FreezeParams:
-    """Frozen frames from a run."""
+    """Parameters of frozen frames from a run."""
 
     run: str = option("main", flag="--run", metavar="NAME", help="name of the run")
     """Run to freeze."""
@@ -45,7 +45,7 @@ class FreezeParams:
     last: int | None = option(None, limit=Limit("last frame", -FRAMES, FRAMES))
     """Last output frame, inclusive; None: the clip's last."""
     step: int = option(1, limit=Limit("step between frozen frames", 1, 1_000_000))
-    """Every how many frames, from `first`, one is rendered. Frames of the take that were rendered before stay."""
+    """Interval of the rendered frames, from `first`. Frames that the take already has are kept."""
     camera_path: str = option(
         "",
         flag="--camera-path",
@@ -61,7 +61,7 @@ class FreezeParams:
         choices=QUERIES,
         help="`nearest`: each Gaussian at its nearest supported time; `plain`: at t* itself",
     )
-    """nearest: each Gaussian is asked at its nearest supported time to t*; plain: at t* itself."""
+    """nearest: each Gaussian is evaluated at its supported time nearest to t*; plain: at t* itself."""
     width: int = option(
         0,
         flag="--freeze-width",
@@ -83,7 +83,7 @@ class FreezeParams:
         tip="Make frozen frames of the plates, where they can be believed: as sharp as the plate. "
         "Off: of the splats alone, soft throughout",
     )
-    """on: frozen frames are made of the plates, where they can be believed; off: of the splats alone."""
+    """on: frozen frames are made of the plates where these are reliable; off: of the splats alone."""
     develop: str = option(
         "on",
         flag="--develop",
@@ -95,8 +95,8 @@ class FreezeParams:
         "there as the plate at t* shows it, and what stands still is sharper. Takes up to a few minutes, once for each "
         "t*. Off: the instant as the training left it",
     )
-    """on: the instant is trained on as the still scene that it is, and kept with the run; off: it stays as the run has
-    it. Of keyed instants, six at most."""
+    """on: the instant is trained further as a static scene, and stored with the run; off: it is rendered as the run has
+    it. At most six keyed instants are developed."""
     overscan: float = option(
         0.0,
         flag="--overscan",
@@ -105,16 +105,16 @@ class FreezeParams:
         help="picture beyond the frame on every side, or `lens`: as much as the way back through the lens needs",
         limit=Limit("overscan in percent", 0, 100, {-1: "what the lens needs"}),
     )
-    """Picture beyond the frame on every side, in percent of its width and height; -1: what the way back through the
-    lens needs. `width` is that of the frame without it."""
+    """Extra picture beyond the frame on every side, in percent of its width and height; -1: as much as redistortion
+    needs. `width` is the width without it."""
     placement: str = option("", **PLACEMENT)
-    """JSON file of a `Placement`, by which frozen.ply and frozen.usdc leave; empty: the shot's own, else upright."""
+    """JSON file of the `Placement` that transforms frozen.ply and frozen.usdc; empty: the shot's, else upright."""
     only_missing: bool = option(False, always=True)
     """Keep frames of the take that are already rendered from the same run, t* and camera."""
     grain: bool = option(
         True, flag="--no-grain", switch=True, help="leave the plate's grain out of the files: a third smaller"
     )
-    """Write the plate's grain, measured and drawn anew for every frame, as a layer of its own beside the picture."""
+    """Write grain as a separate layer: measured in the plate, with a new random pattern for every frame."""
     passes: bool = option(
         False,
         flag="--passes",
@@ -144,7 +144,7 @@ class FreezeParams:
         "camera's 180; a frame takes as many times as long as its blur is pixels long, 33 times at most",
         limit=Limit("shutter in degrees", 0, 360),
     )
-    """Motion blur by the move of `camera_path`, degrees of 360 that the shutter is open around each frame; 0: none."""
+    """Motion blur from the motion of `camera_path`: shutter angle in degrees, centred on each frame; 0: none."""
     debug_terms: str = option(
         "",
         flag="--debug-terms",
@@ -161,7 +161,7 @@ class FreezeParams:
 
 @dataclass
 class MatteParams:
-    """Mattes of things in a take, each lassoed at one frame."""
+    """Parameters of mattes of things in a take, each lassoed at one frame."""
 
     take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
     """Name of the take's folder in takes/."""
@@ -174,16 +174,16 @@ class MatteParams:
         "of the frozen frames from the top left corner; lassos of one name add up",
         words="those of the take's mattes",
     )
-    """JSON file of lassos; empty: the previous ones. An earlier matte keeps its lassos unless the file has its name."""
+    """JSON file of lassos; empty: the previous lassos. An existing matte keeps its lassos unless the file names it."""
     remove: str = option("", flag="--remove", metavar="NAME", help="name of a matte to remove", words="none")
-    """Matte that is removed; empty: none."""
+    """Name of a matte to remove; empty: none."""
     matte_format: str = option(
         "exr",
         flag="--matte-format",
         choices=MATTE_FORMATS,
         help="files of the single mattes: `exr` (half floats) or `png` (16 bits)",
     )
-    """Files of the single mattes: exr or png."""
+    """File format of the single mattes: exr or png."""
     device: str = option("auto", **{**DEVICE, "help": "where to render: `auto` takes an NVIDIA GPU"})
     """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used."""
 
@@ -194,12 +194,12 @@ LIVE_SOURCE = "live"
 
 @dataclass
 class CombineParams:
-    """One take made of several: each thing under a matte from a take of its own."""
+    """Parameters of a take combined from several takes: each thing under a matte comes from a chosen take."""
 
     take: str = option("combined", flag="--take", metavar="NAME", help="name of the take that is made")
     """Name of the new take's folder in takes/."""
     base: str = option("freeze", flag="--base", metavar="TAKE", help="take that shows everything else")
-    """Name of the take that everything else comes from."""
+    """Name of the take that shows everything outside the mattes."""
     things: str = option(
         "",
         flag="--things",
@@ -208,12 +208,12 @@ class CombineParams:
         "the clip has it",
         words="none",
     )
-    """Pairs of matte and take, separated by commas; `LIVE_SOURCE` in place of a take: the clip itself."""
+    """Pairs MATTE=TAKE, separated by commas. `LIVE_SOURCE` in place of a take stands for the clip itself."""
 
 
 @dataclass
 class SurfaceParams:
-    """The frozen scene of a take as a mesh."""
+    """Parameters of the mesh of a take's frozen scene."""
 
     take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
     """Name of the take's folder in takes/."""
@@ -221,7 +221,7 @@ class SurfaceParams:
 
 @dataclass
 class LightParams:
-    """The light of a take's frozen scene at a point, as a panorama."""
+    """Parameters of a panorama of the light at a point of a take's frozen scene."""
 
     take: str = option("freeze", flag="--take", metavar="NAME", help="name of the take")
     """Name of the take's folder in takes/."""

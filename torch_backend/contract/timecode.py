@@ -10,7 +10,7 @@ _TEXT = re.compile(r"(\d\d):(\d\d):(\d\d)([:;.,])(\d\d)")
 
 
 def parse_timecode(text: str) -> str:
-    """The timecode HH:MM:SS:FF, with ";" before FF where frame numbers are dropped; empty if it is invalid."""
+    """The timecode HH:MM:SS:FF, with ";" before FF for drop frame; empty if `text` is invalid."""
     found = _TEXT.fullmatch(text.strip())
     if found is None or int(found[1]) > 23 or int(found[2]) > 59 or int(found[3]) > 59:
         return ""
@@ -18,10 +18,11 @@ def parse_timecode(text: str) -> str:
 
 
 def later(timecode: str, frames: int, fps: float) -> str:
-    """The timecode `frames` after another one (before it if negative), over midnight too. ValueError if it is invalid.
+    """The timecode `frames` frames after another one (before it if negative), wrapped at midnight. ValueError if it is
+    invalid.
 
-    It counts in whole frames: 23.976 as 24, 59.94 as 60. Dropping, at 29.97 and 59.94 alone, leaves out the first
-    numbers of every minute but each tenth.
+    The frame rate is rounded: 23.976 counts as 24, 59.94 as 60. Drop frame, at 29.97 and 59.94 only, skips the first
+    frame numbers of every minute except each tenth.
     """
     found = _TEXT.fullmatch(timecode)
     rate = round(fps)
@@ -42,9 +43,9 @@ def later(timecode: str, frames: int, fps: float) -> str:
 
 
 def smpte_bits(timecode: str) -> tuple[int, int]:
-    """The two words that OpenEXR and DPX store of it: binary coded decimals, bit 6 of the first for drop frame."""
+    """Two words that OpenEXR and DPX store for a timecode: binary-coded decimals; bit 6 of the first is drop frame."""
     found = _TEXT.fullmatch(timecode)
-    if found is None or int(found[5]) > 39:  # two bits for the tens of frames
+    if found is None or int(found[5]) > 39:  # the tens of frames have two bits
         raise UserError(f"this is no timecode that a picture can hold: {timecode!r}")
     fields = [int(found[i]) for i in (5, 3, 2, 1)]
     word = sum((value // 10 << 4 | value % 10) << 8 * i for i, value in enumerate(fields))

@@ -1,4 +1,4 @@
-"""Which PyTorch a set-up takes: the launcher installs it, and Blender says before where it comes from."""
+"""The PyTorch build that a set-up installs. The launcher installs it; Blender shows its source beforehand."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ import re
 from collections.abc import Callable
 
 TORCH_INDEX = "SPLANNEQUIN_TORCH_INDEX"
-"""The variable that names another index."""
+"""Environment variable that names another index."""
 CUDA_INDEX = "https://download.pytorch.org/whl/cu130"
-"""Where torch for NVIDIA cards comes from on Windows, whose PyPI build has no CUDA."""
+"""Index of torch for NVIDIA cards on Windows, where the PyPI build has no CUDA."""
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-"""Where torch without CUDA comes from on Linux, whose PyPI build brings 4 GB for a card that is not there."""
+"""Index of torch without CUDA on Linux, where the PyPI build includes 4 GB for NVIDIA cards."""
 
 
 def torch_index(system: str, driver: bool, fits: Callable[[], bool]) -> str:
-    """Package index, beside pip's own, that torch comes from; empty for none.
+    """Package index of torch in addition to pip's default; empty for none.
 
-    What the variable says; without it, on Windows the one with CUDA where there is a card that can use it, and on Linux
-    the one without where there is no NVIDIA driver.
+    The environment variable takes precedence. Otherwise, Windows with a card that can use CUDA takes the index with
+    CUDA, and Linux without an NVIDIA driver takes the index without CUDA.
 
     Args:
         system: `sys.platform`.
-        driver: `nvidia-smi` is on the PATH.
-        fits: is there a card that CUDA's build can use? Asked only where the answer counts, since it may take seconds.
+        driver: True if `nvidia-smi` is on the PATH.
+        fits: returns True if a card can use the CUDA build. Called only if needed, since it may take seconds.
     """
     if TORCH_INDEX in os.environ:
         return os.environ[TORCH_INDEX]
@@ -33,7 +33,7 @@ def torch_index(system: str, driver: bool, fits: Callable[[], bool]) -> str:
 
 
 def brings_cuda(index: str, system: str) -> bool:
-    """Does torch come with CUDA, of that index beside pip's own? PyPI's own build does on Linux."""
+    """True if torch from this additional index has CUDA. The PyPI build has it on Linux."""
     if re.search(r"\bcu\d+\b", index):
         return True
     return system == "linux" and not re.search(r"\bcpu\b", index)

@@ -1,4 +1,4 @@
-"""What a training may be asked for."""
+"""Parameters of training."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .option_table import Limit, option
 
 @dataclass
 class TrainParams:
-    """One run of the trainer."""
+    """Parameters of one run of the trainer."""
 
     run: str = option(
         "main",
@@ -47,7 +47,7 @@ class TrainParams:
         "(nothing moves), or one model for everything: `hexplane` (4DGaussians), `mlp` (Deformable 3DGS), "
         "`control_points` (SC-GS)",
     )
-    """auto (the host behind the gate), static, or a host whose field moves all: hexplane, mlp, control_points."""
+    """auto (`host`, only where something moves), static, or a host for all Gaussians: hexplane, mlp, control_points."""
     host: str = option(
         "hexplane",
         flag="--host",
@@ -55,7 +55,7 @@ class TrainParams:
         help="motion model that `--method auto` uses",
         heeded_with=("method", ("auto",)),
     )
-    """Which host `auto` puts behind the gate."""
+    """Host that the method `auto` uses."""
     host_config: str = option(
         "default",
         flag="--host-config",
@@ -70,7 +70,7 @@ class TrainParams:
         help="what anchors Gaussians at times at which no frame shows them: `support` (ours), `paper` (the paper's "
         "rule), `none`",
     )
-    """support, paper or none: which anchoring losses hold ill-supervised Gaussians."""
+    """Which losses anchor ill-supervised Gaussians: support, paper or none."""
     detector: str = option(
         "grad_norm",
         flag="--detector",
@@ -79,7 +79,7 @@ class TrainParams:
         "(the published code), `weight`",
         heeded_with=("supervision", ("paper",)),
     )
-    """`paper`, who is ill-supervised: weight, grad_norm, or grad_signed (the published code's signed sum)."""
+    """Detector of ill-supervised Gaussians for `paper`: weight, grad_norm, or grad_signed (as in the published code)."""
     iterations: int = option(
         0,
         flag="--iterations",
@@ -115,7 +115,7 @@ class TrainParams:
         words="`preview` 8, others none",
         limit=Limit("distance between held-out frames", 2, 1_000_000, {0: "none", -1: "the preset's"}),
     )
-    """Every how many frames one is kept out for testing; 0: none, -1: the preset's choice."""
+    """Interval of the frames that are held out for testing; 0: none, -1: the preset's."""
     seed: int = option(0, flag="--seed", metavar="N", help="random seed", limit=Limit("random seed", 0, (1 << 53) - 1))
     """Random seed."""
     depth: str = option(
@@ -133,9 +133,9 @@ class TrainParams:
     )
     """Depth maps of the frames: a folder, one of its files or a pattern; metric, inverse or relative. Empty: none."""
     resume: bool = option(True, flag="--restart", switch=True, help="do not go on from the run's checkpoint")
-    """Go on from the run's checkpoint if there is one."""
+    """Resume from the run's checkpoint if there is one."""
     device: str = option("auto", **DEVICE)
-    """cpu, cuda, or auto: the NVIDIA GPU if there is one that can be used. A run may go on on another device."""
+    """cpu, cuda, or auto: the NVIDIA GPU if there is a usable one. A run may resume on another device."""
     extend: int = option(
         0,
         flag="--extend",
@@ -147,4 +147,4 @@ class TrainParams:
         label="More Steps",
         tip="How many steps Train On adds to a finished run; a third of the preset's at first",
     )
-    """Steps to add to a finished run, whose own settings are kept; 0: none."""
+    """Steps to add to a finished run, which keeps its settings; 0: none."""

@@ -1,4 +1,4 @@
-"""Plain JSON into dataclasses, checked field by field, and versions of files."""
+"""Converts plain JSON to dataclasses, checked field by field, and checks versions of files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CONTRACT_VERSION = 1
 
 
 def check_version(data: Mapping[str, Any], what: str, newest: int = CONTRACT_VERSION) -> None:
-    """ValueError, in words, if `data` was written by a newer Splannequin."""
+    """Raises ValueError if a newer Splannequin wrote `data`."""
     version = data.get("version", 1)
     if not isinstance(version, int) or version > newest:
         raise UserError(
@@ -49,12 +49,12 @@ def _needed(cls: type) -> set[str]:
 
 @functools.cache
 def _hints(cls: type) -> dict[str, Any]:
-    """Asked for once per class: a camera path makes hundreds of frames on Blender's main thread."""
+    """Type hints of a class. Cached, because a camera path makes hundreds of frames on Blender's main thread."""
     return typing.get_type_hints(cls)
 
 
 def _checked(owner: str, name: str, hint: Any, value: Any) -> Any:
-    """`value` if it fits the annotation; ints are taken for floats, bools never for numbers."""
+    """`value` if it fits the annotation, else ValueError. An int may be a float; a bool is not a number."""
     accepted = typing.get_args(hint) if type(None) in typing.get_args(hint) else (hint,)
     for option in accepted:
         base = typing.get_origin(option) or option
@@ -72,11 +72,11 @@ def _checked(owner: str, name: str, hint: Any, value: Any) -> Any:
 
 
 _LARGEST_FLOAT, _LARGEST_INT = 1e300, 1 << 53
-"""Numbers that JSON cannot hold without loss, NaN and infinity are refused: our files never contain them."""
+"""Limits of numbers. Numbers that JSON cannot hold without loss, NaN and infinity are refused."""
 
 
 def _short(value: Any) -> str:
-    """A value as a sentence names it."""
+    """Text of a value for an error message."""
     if isinstance(value, (list, dict)):
         return f"a {'list' if isinstance(value, list) else 'JSON object'}"
     if isinstance(value, int) and abs(value) >= _LARGEST_INT:

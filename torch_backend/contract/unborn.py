@@ -1,4 +1,4 @@
-"""A shot folder before its first import: where one may be made, and what an import that failed left of it."""
+"""A shot folder before its first import: where it may be made, and how to clean up after a failed import."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _WORK = {SOLVE_FOLDER, RUNS_FOLDER, TAKES_FOLDER}
 
 
 def refuse_foreign(folder: Path) -> None:
-    """JobError if a folder that is to become a shot holds what is no shot's: it is somebody's, not to be filled.
+    """Raises JobError if a folder that is to become a shot contains files that do not belong to a shot.
 
-    Hidden files, which file managers leave anywhere, do not count, nor does what an earlier import left.
+    Hidden files, which file managers leave anywhere, and files of an earlier import are allowed.
     """
     try:
         names = sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
@@ -47,10 +47,10 @@ def refuse_foreign(folder: Path) -> None:
 
 
 def discard_unborn(shot: Path) -> bool:
-    """Takes away what a failed import left of a shot that it was to begin. True if it did; what cannot go stays.
+    """Removes what a failed first import left in a shot folder. True if it did; what cannot be removed stays.
 
-    A shot that has a frame, or anything else that took work, is left alone, and so are files that are not ours. Kept is
-    also the log of a job that ended without a sentence of its own.
+    A shot with a frame or other work is left alone, and so are files of other programs. A shot is also left alone if a
+    job in it failed without a message, because its log is needed.
     """
     shot_folder = ShotFolder(shot)
     try:
@@ -65,10 +65,10 @@ def discard_unborn(shot: Path) -> bool:
         if writer is not None and writer.works():
             return False
         for name in _UNBORN & names - {INFO_FILE}:
-            shutil.rmtree(shot / name, ignore_errors=True)  # a link is left alone
+            shutil.rmtree(shot / name, ignore_errors=True)  # does not remove links
         shot_folder.lock.unlink(missing_ok=True)
         shot_folder.info_path.unlink()
-        with contextlib.suppress(OSError):  # it holds something of the artist's
+        with contextlib.suppress(OSError):  # the folder holds files of the artist
             shot.rmdir()
     except (OSError, ValueError):
         return False
@@ -76,7 +76,7 @@ def discard_unborn(shot: Path) -> bool:
 
 
 def _is_explained(job: Path) -> bool:
-    """True if a job ended in a sentence, or was cancelled, or never wrote a word: nobody needs its log."""
+    """True if a job ended with a message, was cancelled, or logged nothing, so that its log is not needed."""
     status = from_dict(Status, read_json(job / STATUS_FILE)) if (job / STATUS_FILE).is_file() else None
     log = job / LOG_FILE
     if status is not None and not status.ended:

@@ -1,4 +1,4 @@
-"""How files of a shot are written: beside their place, fsynced, and renamed over it, so no reader sees half a file."""
+"""Writes files of a shot: under a temporary name, fsynced, then renamed, so that no reader sees half a file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _worked_on: list[Path] = []
 
 @contextlib.contextmanager
 def working_on(*roots: Path) -> Generator[None]:
-    """While it lasts, `make_folder` makes nothing of a shot whose own folder was moved or deleted."""
+    """During the block, `make_folder` makes no folder in a shot of `roots` that was moved or deleted."""
     _worked_on.extend(roots)
     try:
         yield
@@ -37,10 +37,10 @@ def working_on(*roots: Path) -> Generator[None]:
 
 
 def make_folder(path: Path) -> None:
-    """Makes a folder and those above it, if they are not there.
+    """Makes a folder and its missing parents.
 
-    FileNotFoundError if it belongs to a shot that a job works on and whose own folder is gone: what is written under
-    its old name would look like a shot, and hold next to nothing of it.
+    FileNotFoundError if the folder belongs to a shot that a job works on, and the shot was moved or deleted. Otherwise
+    a nearly empty folder under the shot's old name would look like a shot.
     """
     root = next((root for root in _worked_on if root == path or root in path.parents), None)
     if root is None:
@@ -49,22 +49,23 @@ def make_folder(path: Path) -> None:
     if root == path:
         root.stat()
     for part in reversed([path, *path.parents][: len(path.relative_to(root).parts)]):
-        part.mkdir(exist_ok=True)  # one by one: the system refuses the first without the shot's folder
+        part.mkdir(exist_ok=True)  # one by one: the first one fails if the shot's folder is gone
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
-    """A path beside `path`, with the same suffix, to write to; fsynced and renamed over `path` if all went well.
+    """Yields a temporary path next to `path`, with its suffix, which is fsynced and renamed to `path` after the block.
 
-    Its folder is made, and with `parents` what that is in; FileNotFoundError without, in a shot that was moved.
+    Makes the folder of `path`, and with `parents` also the parents of this folder. Without `parents`, FileNotFoundError
+    if they are missing, as in a shot that was moved. If the block fails, `path` stays unchanged.
     """
     path = Path(path)
     if parents:
         make_folder(path.parent)
     else:
         path.parent.mkdir(exist_ok=True)
-    # Not the process's number: two hosts of a farm have the same ones. Nobody can have put a link there, either. Short:
-    # Windows counts 260 letters of a whole path.
+    # A random name: two hosts of a farm may have the same process id, and nobody can place a link at an unknown name.
+    # A short name: Windows limits a whole path to 260 characters.
     partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.tmp{path.suffix}")
     try:
         yield partial
@@ -72,7 +73,7 @@ def atomic_path(path: str | Path, parents: bool = True) -> Generator[Path]:
             os.fsync(handle.fileno())
         replace_file(partial, path)
     except BaseException:
-        with contextlib.suppress(OSError):  # what went wrong is to be told, not that Windows has it open still
+        with contextlib.suppress(OSError):  # raise the first error, even if Windows still holds the file open
             partial.unlink(missing_ok=True)
         raise
 
@@ -87,22 +88,22 @@ def is_half_written(name: str) -> bool:
 
 
 def sweep_half_written(folder: Path) -> None:
-    """Removes what killed processes left half written in a folder: nobody has touched it for an hour, by the clock of
-    the disk, which dates the files of all computers that write there."""
+    """Removes half-written files of killed processes from a folder: those unchanged for an hour. Their age is measured
+    with the clock of the disk, which dates the files of all computers that write there."""
     left = [file for file in folder.glob(".*.tmp*") if is_half_written(file.name)]
     if not left:
         return
-    with contextlib.suppress(OSError):  # nothing can be written there, nor removed
+    with contextlib.suppress(OSError):  # the folder is read-only
         now = disk_time(folder)
         for file in left:
-            with contextlib.suppress(OSError):  # another sweeper was first, or it is another's: it does no harm
+            with contextlib.suppress(OSError):  # another process removed it, or it belongs to another user
                 if now - file.lstat().st_mtime > _ABANDONED:
                     file.unlink()
 
 
 def disk_time(folder: Path) -> float:
-    """The time by which files in a folder are dated now, seconds since the epoch: a network disk has its server's
-    clock. OSError if nothing can be written there."""
+    """Time of the clock that dates files in a folder, seconds since the epoch: for a network disk, its server's clock.
+    OSError if the folder cannot be written."""
     probe = folder / f".clock.{uuid.uuid4().hex[:12]}.tmp"
     try:
         probe.write_bytes(b"1")
@@ -114,12 +115,12 @@ def disk_time(folder: Path) -> float:
 
 @contextlib.contextmanager
 def replacing_folder(path: str | Path, keep: bool = False) -> Generator[Path]:
-    """Yields an empty folder beside `path`, which takes its place if the block ends well, whole or not at all.
+    """Yields an empty folder next to `path`, which replaces `path` as a whole if the block succeeds.
 
     `keep`: the old folder is left as `replaced_folder(path)`, for the caller to move.
 
-    Until then, and if the block fails, `path` stays as it was. What a killed process left is swept by the next one:
-    a folder that had been moved aside is put back if nothing took its place.
+    Until the block succeeds, `path` stays unchanged. The next call cleans up after a killed process: a folder that was
+    moved aside is put back if nothing replaced it.
     """
     path = Path(path)
     fresh, aside = path.with_name(f".{path.name}.new"), replaced_folder(path)
@@ -141,12 +142,12 @@ def replacing_folder(path: str | Path, keep: bool = False) -> Generator[Path]:
 
 
 def replaced_folder(path: Path) -> Path:
-    """Where `replacing_folder` puts the folder that it replaces."""
+    """Path to which `replacing_folder` moves the old folder."""
     return path.with_name(f".{path.name}.old")
 
 
 def restore_folder(path: Path) -> None:
-    """Puts back the folder that `replacing_folder` moved aside and was killed; if it was replaced, removes it."""
+    """Puts back the folder that a killed `replacing_folder` moved aside, or removes it if it was replaced."""
     aside = replaced_folder(path)
     if aside.is_dir() and not os.path.lexists(path):
         replace_file(aside, path)
@@ -162,20 +163,20 @@ def _discard(folder: Path) -> None:
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Renames over `target`, a file, or a folder to where none is. Waits on Windows, see `files.patiently`."""
+    """Renames a file over `target`, or a folder to an unused path. Waits on Windows, see `files.patiently`."""
     patiently(functools.partial(os.replace, source, target))
 
 
 def remove_file(path: Path) -> None:
-    """Removes a file, if it is there. Waits on Windows, see `files.patiently`."""
+    """Removes a file, if it exists. Waits on Windows, see `files.patiently`."""
     patiently(functools.partial(path.unlink, missing_ok=True))
 
 
 @contextlib.contextmanager
 def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Generator[None]:
-    """Holds a lock file, after waiting for whoever has it; `waiting` is called once if it has to.
+    """Holds a lock file, after waiting until it is free. Calls `waiting` once if the lock is not free at first.
 
-    The system frees it when this process ends, however that comes about.
+    The system releases the lock when this process ends for any reason.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+b") as lock:
@@ -189,7 +190,7 @@ def locked(path: str | Path, waiting: Callable[[], None] | None = None) -> Gener
 
 
 def try_lock(handle: int) -> bool:
-    """Locks an open file for this process, without waiting; False if another one has it. Closing it gives it back."""
+    """Locks an open file without waiting; False if another process holds the lock. Closing the file releases it."""
     try:
         if sys.platform == "win32":
             import msvcrt
@@ -206,19 +207,19 @@ def try_lock(handle: int) -> bool:
 
 
 def write_atomic(path: str | Path, data: bytes, parents: bool = True) -> None:
-    """Writes a whole file, or leaves what was there. `parents`: see `atomic_path`."""
+    """Writes a whole file, or leaves the old one unchanged. `parents`: see `atomic_path`."""
     with atomic_path(path, parents) as partial:
         partial.write_bytes(data)
 
 
 def write_json(path: str | Path, data: Mapping[str, Any], parents: bool = True) -> None:
-    """Writes a JSON object. ValueError on NaN or infinity: other programs read these files. `parents`: see
+    """Writes a JSON object. ValueError on NaN or infinity, because other programs read these files. `parents`: see
     `atomic_path`."""
     write_atomic(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode("utf-8"), parents)
 
 
 def content_key(*parts: Any) -> str:
-    """Short hash of JSON-able values and of files (given as Path: their content), for "already done?"."""
+    """Short hash of JSON-able values and of the content of files (passed as Path), to recognise finished work."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, Path):
@@ -230,7 +231,7 @@ def content_key(*parts: Any) -> str:
 
 
 def need_disk(folder: str | Path, byte_count: float, what: str) -> None:
-    """JobError if the disk of `folder` has no room for `byte_count` bytes more."""
+    """Raises JobError if the disk of `folder` has no room for another `byte_count` bytes."""
     existing = Path(folder).absolute()
     while not existing.exists():
         existing = existing.parent
