@@ -67,7 +67,7 @@ def open_regular(path: str | Path, longest: int | None = None) -> BinaryIO:
         return open(path, "rb", opener=lambda name, _: os.open(name, flags))
 
     try:
-        source = patiently(opened, 4, 0.01)  # 0.04 s, as long as Blender may wait
+        source = patiently(opened, 4, 0.01)  # as long as Blender may wait
     except (IsADirectoryError, PermissionError) as error:
         if isinstance(error, PermissionError) and not os.path.isdir(path):  # Windows raises it for a folder
             raise

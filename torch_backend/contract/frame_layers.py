@@ -27,7 +27,7 @@ class FrameLayer:
     """Group of layers. Empty: in every frame; grain, detail: in frames with grain or detail. Other groups are only in
     frames whose writer gets them as `more`; this table alone defines how they are stored."""
     output: str = ""
-    """Output of the compositor group with this layer; empty: none. Outputs of passes exist only if a take has passes."""
+    """Output of the compositor group for this layer; empty: none. Outputs of passes only exist in takes with passes."""
     tip: str = ""
     """Tooltip of that output."""
     socket: str = "NodeSocketFloat"

@@ -1,4 +1,4 @@
-"""What Blender and a live session say to each other: a request per view, and messages over a pipe."""
+"""Messages between Blender and a live session over a pipe, and the request for a view."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from .files import is_json_object
 
 @dataclass
 class LiveView:
-    """What a live session is asked to draw: one view of the frozen scene."""
+    """Request to a live session to draw one view of the frozen scene."""
 
     view: int
-    """Which of the asker's views it is for; a newer request for the same view takes an older one's place."""
+    """Number of a view in Blender. A newer request for the same view replaces an older one."""
     seq: int
-    """Given back with the frame."""
+    """Sequence number, which the answer repeats."""
     viewmat: list[float]
     """16 floats, world-to-camera, row-major, OpenCV axes, solve units."""
     K: list[float]
     """fx, fy, cx, cy in pixels of `width` x `height`."""
     width: int
-    """Pixels."""
+    """Width in pixels."""
     height: int
-    """Pixels."""
+    """Height in pixels."""
     t_star: float
     """Frame number of the clip at which time stands still."""
     exposed_like: float | None = None
-    """Frame number whose exposure the camera has; None: t*'s."""
+    """Frame number whose exposure the view gets; None: that of t*."""
     show: str = "color"
-    """color; guesses: colour, tinted where nobody saw it near t*; support or motion: that matte as a grey picture."""
+    """color; guesses: colour, tinted where no frame near t* saw the surface; support or motion: this matte in grey."""
     detail: bool = False
-    """Make it of the plates, as a take is: it takes longer, and waits for all views that are not. Of `color` alone."""
+    """Make the view of plates, as in a take. This takes longer, and other views go first. Only for `color`."""
     develop: bool = True
-    """Show the instant developed, if it has been: see `FreezeParams.develop`."""
+    """Show the developed instant, if there is one: see `FreezeParams.develop`."""
 
     def __post_init__(self) -> None:
         if len(self.viewmat) != 16 or len(self.K) != 4:
@@ -51,22 +51,22 @@ class LiveView:
 
 
 LIVE_LIMIT = 8192
-"""Most pixels of a live view along a side."""
+"""Largest width and height of a live view in pixels."""
 LIVE_SHOWS = {
     "color": ("Picture", "The frozen people and place"),
     "guesses": ("Guesses", "The picture, tinted where no frame near t* saw what is shown"),
     "support": ("Support", "White where frames near t* saw what is shown, black where it is a guess"),
     "motion": ("Motion", "White where something moves in the clip"),
 }
-"""What a live view can show: as messages and files name it -> its name and tooltip on the panel."""
+"""Value of `LiveView.show` -> its name and tooltip on the panel."""
 _MESSAGE = struct.Struct("<4sIQ")
-"""Before every message: a mark, bytes of the header, bytes of the body."""
+"""Start of every message: a magic number, size of the header, size of the body, in bytes."""
 _MARK = b"SPL1"
 _LONGEST = (1 << 20, 1 << 31)
 
 
 def write_message(stream: BinaryIO, header: Mapping[str, Any], body: bytes | memoryview = b"") -> None:
-    """Writes one message of a live session: a JSON object, then raw bytes. The stream's own errors pass through."""
+    """Writes one message of a live session: a JSON object, then raw bytes. Errors of the stream pass through."""
     text = json.dumps(header, allow_nan=False).encode()
     stream.write(_MESSAGE.pack(_MARK, len(text), len(body)) + text)
     stream.write(body)
@@ -76,7 +76,7 @@ def write_message(stream: BinaryIO, header: Mapping[str, Any], body: bytes | mem
 def read_message(stream: BinaryIO) -> tuple[dict[str, Any], bytes] | None:
     """The next message of a live session, as (header, body); None at the end of the stream.
 
-    ValueError on anything else than a message: what follows it cannot be understood either.
+    ValueError on anything else than a message. The rest of the stream cannot be read then.
     """
     start = _read_exactly(stream, _MESSAGE.size)
     if start is None:

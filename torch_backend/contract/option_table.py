@@ -120,7 +120,7 @@ def panel(cls: type, name: str, default: Any = None) -> dict[str, Any]:
 
 
 def overscan(text: str) -> float:
-    """`FreezeParams.overscan` from the text of an option: 0 to 100 percent, or "lens" (-1). ValueError on other text."""
+    """`FreezeParams.overscan` from an option's text: 0 to 100 percent, or "lens" (-1). ValueError on other text."""
     try:
         value = -1.0 if text == "lens" else float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""What each step may be asked for: parameters, and their options in the one table (`option_table`)."""
+"""Parameters of each step, with their options for the table of options (`option_table`)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .train_options import TrainParams
 
 @dataclass
 class ImportParams:
-    """Footage into a shot folder."""
+    """Parameters of importing footage into a shot folder."""
 
     source: str = option(
         "",
@@ -38,7 +38,7 @@ class ImportParams:
         label="First",
         tip="First frame number of the clip to import",
     )
-    """First frame number of the clip to take; None: the first there is."""
+    """First frame number of the clip to import; None: the clip's first."""
     last: int | None = option(
         None,
         flag="--last",
@@ -49,7 +49,7 @@ class ImportParams:
         label="Last",
         tip="Last frame number to import, inclusive",
     )
-    """Last frame number to take, inclusive; None: the last there is."""
+    """Last frame number to import, inclusive; None: the clip's last."""
     start: int | None = option(
         None,
         flag="--start",
@@ -61,8 +61,8 @@ class ImportParams:
         label="Start",
         tip="Number of the first frame in the shot, such as 1001. The range above is in the footage's own numbers",
     )
-    """Number that the first frame of the range has in the shot; None: the footage's own. All numbers after the import
-    are the shot's."""
+    """Number that the first frame of the range has in the shot; None: its number in the footage. After the import, all
+    frame numbers are those of the shot."""
     step: int = option(
         0,
         flag="--step",
@@ -84,7 +84,7 @@ class ImportParams:
         words="the source's, at most 720 lines, of portrait footage at most 1280 x 720 pixels",
         limit=Limit("height of the working frames", 16, 16_384, {0: "the source's"}),
     )
-    """Height in pixels of the working frames; 0: the source's, at most 720 lines, or as many pixels in portrait."""
+    """Height in pixels of the working frames; 0: the source's, at most 720 lines, or 1280 x 720 pixels in portrait."""
     fps: float = option(
         0.0,
         flag="--fps",
@@ -94,7 +94,7 @@ class ImportParams:
         label="Frame Rate",
         tip="Frames per second of an image sequence; 0: what its files say, else 24. A video has its own",
     )
-    """Frames per second of a sequence; 0: the footage's own, 24 for a sequence that says none."""
+    """Frames per second of a sequence; 0: as its files state, else 24."""
     layer: str = option(
         "",
         flag="--layer",
@@ -104,8 +104,8 @@ class ImportParams:
         label="Layer",
         tip="Layer or part of an EXR sequence to freeze, by its name or the end of it; empty: the picture itself",
     )
-    """Layer or part of a sequence's pictures to take, by its name or the end of it, or a video's stream by its number;
-    empty: the picture itself, the largest stream."""
+    """Layer or part of an image sequence, by its name or the end of its name; or stream of a video, by its number.
+    Empty: the picture itself, the largest stream."""
     colour_space: str = option(
         "",
         flag="--colour-space",
@@ -117,7 +117,7 @@ class ImportParams:
         tip="Colour space of the footage, by its name in the OCIO configuration ($OCIO, else the built-in ACES studio "
         "configuration: ACEScg, ARRI LogC3 (EI800), ADX10, ...); empty: what the files say",
     )
-    """Colour space of the footage as the OCIO configuration names it; empty: what the files say."""
+    """Name of the footage's colour space in the OCIO configuration; empty: as the files state."""
     lut: str = option(
         "",
         flag="--lut",
@@ -141,7 +141,7 @@ class ImportParams:
         tip="Width of the footage's pixels divided by their height, 2 for most anamorphic lenses; "
         "0: what the files say",
     )
-    """Width of the footage's pixels over their height; 0: what the files say, else 1."""
+    """Width of the footage's pixels over their height; 0: as the files state, else 1."""
     matrix: str = option(
         "auto",
         flag="--matrix",
@@ -183,12 +183,12 @@ class ImportParams:
         "`replaced/` in the shot folder",
         words="refused",
     )
-    """Consent to other frames in a shot on which work was done; that work is kept in SHOT/replaced/."""
+    """Allow other frames in a shot on which work was done. The work is moved to SHOT/replaced/."""
 
 
 @dataclass
 class SolveParams:
-    """Cameras from the working frames."""
+    """Parameters of solving cameras from the working frames."""
 
     camera_model: str = option(
         "SIMPLE_RADIAL",
@@ -214,7 +214,7 @@ class SolveParams:
         label="Focal Length",
         tip="Focal length of the lens in millimetres, for the sensor below; 0: the solve finds it",
     )
-    """Focal length in mm with which the solve begins; 0: it finds it."""
+    """Initial focal length of the solve in mm; 0: the solve estimates it."""
     sensor_mm: float = option(
         36.0,
         flag="--sensor-mm",
@@ -224,7 +224,7 @@ class SolveParams:
         label="Sensor Width",
         tip="Width in millimetres of the part of the sensor that the picture shows; 36 is full frame",
     )
-    """Width in mm of what the picture shows of the sensor, along its width; for `focal_mm`."""
+    """Width in mm of the part of the sensor that the picture shows, for `focal_mm`."""
     refine_focal: bool = option(
         True,
         flag="--hold-focal",
@@ -233,7 +233,7 @@ class SolveParams:
         label="Refine",
         tip="Let the solve correct the focal length. Off: it stays as set",
     )
-    """Refine `focal_mm`; else it is held."""
+    """Let the solve refine `focal_mm`; False: it stays fixed."""
     st_map: str = option(
         "",
         flag="--st-map",
@@ -245,7 +245,7 @@ class SolveParams:
         tip="ST map of the lens, as a lens department hands it over: the footage is undistorted through it before the "
         "solve, and put back through it at the end. EXR of 32 bits, red s, green t; empty: the solve finds the lens",
     )
-    """ST map that holds the lens; empty: the solve finds it."""
+    """File of an ST map of the lens; empty: the solve estimates the lens."""
     st_map_way: str = option(
         "undistort",
         flag="--st-map-way",
@@ -259,7 +259,7 @@ class SolveParams:
             "redistort": ("Redistorts", "It puts the lens back into a render: its pixels look into undistorted ones"),
         },
     )
-    """One of `ST_MAP_WAYS`."""
+    """Direction of the ST map, one of `ST_MAP_WAYS`."""
     st_map_layer: str = option(
         "",
         flag="--st-map-layer",
@@ -269,7 +269,7 @@ class SolveParams:
         label="Map Layer",
         tip="Layer of the ST map's file that holds it, by its name or the end of it; empty: its red and green",
     )
-    """Layer of the map's file; empty: red and green."""
+    """Layer of the map's file; empty: its red and green."""
     retry: bool = option(
         True,
         flag="--no-retry",
@@ -280,7 +280,7 @@ class SolveParams:
         tip="Where a solve fails or is poor, try again: with more features, more pairs of frames, another lens model, "
         "a global mapper. Each retry is reported, and what cannot help is skipped",
     )
-    """Try again in other ways where the solve fails or is poor."""
+    """Try other strategies if the solve fails or is poor."""
     ignore_mask: str = option(
         MASK_FOUND,
         flag="--ignore-mask",
@@ -292,7 +292,7 @@ class SolveParams:
         tip="Mask of what is not part of the scene, white: a logo, dirt, the hands of the crew. It is not matched, not "
         "learnt and not used to fill. One picture for all frames, a picture of a sequence, or a video",
     )
-    """Mask of what is ignored, in white: a picture, a sequence, a video, `MASK_ALPHA` or `MASK_FOUND`. Empty: none."""
+    """Mask (white) of regions to ignore: a picture, a sequence, a video, `MASK_ALPHA` or `MASK_FOUND`. Empty: none."""
     people_mask: str = option(
         "",
         flag="--people-mask",
@@ -321,7 +321,7 @@ class SolveParams:
         tip="Folder of a COLMAP model or one of its files, a transforms.json, or a camera path. "
         "Pictures are matched to the clip's frames by the number in their names",
     )
-    """Cameras to take instead of solving: a COLMAP model's folder, a nerfstudio transforms.json, or a CameraPath.
+    """Cameras to use instead of solving: a COLMAP model's folder, a nerfstudio transforms.json, or a CameraPath.
     Pictures are matched to frames by number. Empty: solve."""
 
 
@@ -331,7 +331,7 @@ STEP_PARAMS: dict[str, type] = {
     "train": TrainParams,
     "freeze": FreezeParams,
 }
-"""Kind of job on the way from a clip to frozen frames -> the dataclass of its parameters."""
+"""Kind of job, in order from a clip to frozen frames -> the dataclass of its parameters."""
 PARAMS: dict[str, type] = {
     **STEP_PARAMS,
     "mattes": MatteParams,
@@ -341,16 +341,16 @@ PARAMS: dict[str, type] = {
 }
 """Kind of job -> the dataclass of its parameters."""
 LIMITS: dict[type, dict[str, Limit]] = {cls: limits_of(cls) for cls in PARAMS.values()}
-"""The numbers of each kind of parameters, by field."""
+"""Limits of the numbers in each dataclass of parameters, by field."""
 
 
 def check_params(params: object) -> None:
-    """ValueError, in a sentence, names the first number of a job's parameters that is out of its `LIMITS`."""
+    """Raises ValueError for the first number among a job's parameters that is outside its `LIMITS`."""
     for name, limit in LIMITS.get(type(params), {}).items():
         chosen = getattr(params, name)
         values: Iterable[Any] = chosen.values() if is_json_object(chosen) else (chosen,)
         for value in values:
-            if value is None or value in limit.also or limit.low <= value <= limit.high:  # NaN is none of them
+            if value is None or value in limit.also or limit.low <= value <= limit.high:  # NaN is refused
                 continue
             also = "".join(f", or {value} for {meaning}" for value, meaning in limit.also.items())
             message = f"The {limit.what} is {value}: it should be {_plain(limit.low)} to {_plain(limit.high)}{also}."
@@ -361,5 +361,5 @@ def check_params(params: object) -> None:
 
 
 def _plain(number: float) -> str:
-    """A limit as one says it: 0.25, 4, 1000000."""
+    """Text of a limit: 0.25, 4, 1000000."""
     return f"{number:.0f}" if float(number).is_integer() else f"{number:g}"

@@ -1,7 +1,7 @@
-"""Where files of another computer lie on this one: the path mapping rules of a render farm.
+"""Maps paths of another computer to this one, by the path mapping rules of a render farm.
 
-The engine that runs a farm writes them to a file (Open Job Description, `pathmapping-1.0`). They map paths that a shot
-stores from the computer that made it, such as its footage.
+The engine that runs a farm writes the rules to a file (Open Job Description, `pathmapping-1.0`). They map paths that
+another computer stored in a shot, such as the path of its footage.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ RULES_VARIABLE = "SPLANNEQUIN_PATH_RULES"
 
 
 def mapped(path: str, rules: list[dict[str, Any]] | None = None) -> str:
-    """A path by the first rule that fits, those of longer sources first; as it is where none does.
+    """A path mapped by the matching rule with the longest source; unchanged if no rule matches.
 
     Args:
-        path: absolute, of the computer that wrote it down, whatever its system.
-        rules: each with source_path_format (POSIX or WINDOWS), source_path and destination_path; None: those of the
-            file that `RULES_VARIABLE` names, none without one.
+        path: absolute path on the computer that stored it, of any system.
+        rules: each with source_path_format (POSIX or WINDOWS), source_path and destination_path; None: the rules in
+            the file that `RULES_VARIABLE` names, if there is one.
 
     Raises:
-        ValueError: the file of rules is none, by its name.
+        ValueError: the file of rules is invalid.
     """
     known = rules if rules is not None else _told()
     for rule in sorted(known, key=lambda rule: -len(str(rule["source_path"]))):
@@ -40,7 +40,7 @@ def mapped(path: str, rules: list[dict[str, Any]] | None = None) -> str:
 
 
 def _below(path: str, source: str, windows: bool) -> list[str] | None:
-    """Parts of a path below a folder; None if it does not lie in it."""
+    """Parts of a path below a folder; None if the path is not in the folder."""
     kind = ntpath if windows else posixpath
     if not (kind.isabs(path) or (windows and kind.splitdrive(path)[0])):
         return None

@@ -31,8 +31,8 @@ def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]
 
     Python imports modules from its working directory unless it gets -P, and a shot folder may come from anywhere. The
     loader of libraries also searches the working directory (Windows always, Linux with an empty entry in
-    LD_LIBRARY_PATH), so it is the interpreter's folder, where nobody puts files for the child. It must not be the
-    shot's or the extension's folder, because Windows lets nobody move or remove a process's working directory.
+    LD_LIBRARY_PATH). It is therefore the interpreter's folder, which holds no foreign files. It must not be the folder
+    of the shot or the extension, because Windows does not move or remove the working directory of a process.
     """
     python = os.path.abspath(python)
     return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}
@@ -242,7 +242,7 @@ _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct",
 
 
 def _process_of_windows(pid: int) -> Process | None:
-    """The process from the Windows API, with its start in units of 100 ns since 1601. Command lines need Windows 8.1."""
+    """The process from the Windows API, with its start in 100 ns units since 1601. Command lines need Windows 8.1."""
     if sys.platform != "win32":
         return None
     import ctypes

@@ -79,7 +79,7 @@ class TrainParams:
         "(the published code), `weight`",
         heeded_with=("supervision", ("paper",)),
     )
-    """Detector of ill-supervised Gaussians for `paper`: weight, grad_norm, or grad_signed (as in the published code)."""
+    """Detector of ill-supervised Gaussians for `paper`: weight, grad_norm, or grad_signed (the published code's)."""
     iterations: int = option(
         0,
         flag="--iterations",

@@ -1,6 +1,6 @@
-"""The verbs of the two command lines: the backend's and Blender's have the same words for the same work.
+"""Verbs of both command lines, the backend's and Blender's, which have the same verb for the same work.
 
-import, solve, train and freeze are the steps, bake is Blender's own. `command_line` makes both parsers of this table.
+import, solve, train and freeze are the steps; only Blender has bake. `command_line` makes both parsers from this table.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BACKEND, BLENDER = "backend", "Blender"
 
 @dataclass
 class NoWords:
-    """Asks for nothing of its own."""
+    """No arguments besides those of jobs."""
 
 
 @dataclass
@@ -41,7 +41,7 @@ class ShotWords:
 
 @dataclass
 class NewShotWords:
-    """The shot to begin."""
+    """The shot to create."""
 
     shot: str = option("", flag="shot", help="shot folder, made if it is not there")
     """Shot folder."""
@@ -49,7 +49,7 @@ class NewShotWords:
 
 @dataclass
 class WholeWords:
-    """Where the whole way from a clip leaves what comes out."""
+    """Where to write the results of all steps from a clip."""
 
     output: str = option("output", flag="--output", metavar="DIR", help="folder for everything that comes out")
     """Folder for the shot and summary.json."""
@@ -61,7 +61,7 @@ class WholeWords:
 
 @dataclass
 class BakeWords:
-    """A take through the compositor."""
+    """A take to render through the compositor."""
 
     shot: str = option("", flag="--shot", required=True, help="shot folder")
     """Shot folder."""
@@ -82,9 +82,9 @@ class BakeWords:
     )
     """Last frame to bake, inclusive; None: the scene's."""
     step: int = option(0, flag="--step", metavar="N", help="bake every n-th frame", words="the scene's step")
-    """Every how many frames one is baked; 0: the scene's step."""
+    """Interval of the frames to bake; 0: the scene's step."""
     device: str = option("auto", **{**DEVICE, "help": "where to freeze what is missing: `auto` takes an NVIDIA GPU"})
-    """Where frames of the take that are missing are frozen."""
+    """Device on which missing frames of the take are frozen."""
     blend: str = option("", flag="--blend", help=".blend to insert the freeze into", words="a new scene")
     """.blend to insert the freeze into; empty: a new scene."""
     part: str = option(
@@ -94,14 +94,14 @@ class BakeWords:
         help="`all`; for several computers at once: `frames` (the pictures alone, each renamed into its place whole), "
         "then once `file` (shot.blend and summary.json alone)",
     )
-    """all; frames: the pictures alone; file: shot.blend and summary.json alone."""
+    """all; frames: only the pictures; file: only shot.blend and summary.json."""
     as_warp: bool = option(
         False,
         flag="--as-warp",
         switch=True,
         help="freeze the plate that the .blend shows by the take's warp, instead of showing the take's frames",
     )
-    """Freeze the plate that the .blend shows by the take's warp."""
+    """Freeze the plate that the .blend shows with the take's warp."""
 
 
 @dataclass
@@ -139,8 +139,8 @@ class ExportWords:
     )
     """Name of the take."""
     placement: str = option("", **PLACEMENT)
-    """JSON file of a `Placement`; empty: the shot's own, else upright. colmap and nerfstudio are moved only if it is
-    named."""
+    """JSON file of a `Placement`; empty: the shot's, else upright. colmap and nerfstudio exports are transformed only
+    if a file is named."""
     text: bool = option(
         False,
         flag="--text",
@@ -148,14 +148,14 @@ class ExportWords:
         help="a COLMAP model as .txt instead of .bin",
         heeded_with=("format", ("colmap",)),
     )
-    """A COLMAP model as text."""
+    """Write a COLMAP model as text."""
     output: str = option("", flag="--output", metavar="DIR", required=True, help="folder to write into")
     """Folder to write into."""
 
 
 @dataclass
 class DoctorWords:
-    """How far to look."""
+    """Extent of the check."""
 
     gpu: bool = option(
         False,
@@ -163,7 +163,7 @@ class DoctorWords:
         switch=True,
         help="test the graphics card anew: a small frame and its gradients against the processor's",
     )
-    """Test the graphics card anew."""
+    """Test the graphics card again."""
 
 
 @dataclass
@@ -175,7 +175,7 @@ class LiveWords:
     run: str = option("main", flag="--run", metavar="NAME", help="name of the run")
     """Name of the run."""
     device: str = option("auto", **{**DEVICE, "help": "where to draw: `auto` takes an NVIDIA GPU"})
-    """Where to draw."""
+    """Device to draw on."""
 
 
 @dataclass
@@ -183,7 +183,7 @@ class FarmWords:
     """Shots for a render farm."""
 
     action: str = option("export", flag="action", choices=("export", "measure"), help="`export` or `measure`")
-    """export: a job for a farm. measure: what the tasks of shots that a farm worked on took, as rates."""
+    """export: write a job for a farm. measure: write rates from the records of a farm's tasks in the shots."""
     shots: tuple[str, ...] = option(
         "",
         flag="shots",
@@ -204,7 +204,7 @@ class FarmWords:
         help="frames at which time stands still, each a take of its own",
         words="one, suggested from support and sharpness",
     )
-    """Instants of every shot, with commas; None: one, suggested."""
+    """Instants of every shot, separated by commas; None: one suggested instant."""
     t_star_list: str = option(
         "",
         flag="--t-star-list",
@@ -228,9 +228,9 @@ class FarmWords:
         help="where shots of clips are made",
         words="beside each clip",
     )
-    """Folder for shots of clips; empty: beside each."""
+    """Folder for the shots of clips; empty: next to each clip."""
     shots_per_job: int = option(15, flag="--shots-per-job", metavar="N", help="shots of one template, at most")
-    """Shots of one template: farms limit how long it may be."""
+    """Most shots in one template, because farms limit its length."""
     request: str = option(
         "",
         flag="--request",
@@ -239,7 +239,7 @@ class FarmWords:
         help="parameters of the steps as JSON, {step: {name: value}}, in the place of options",
         words="the options",
     )
-    """JSON file of parameters, over what the options say."""
+    """JSON file of parameters, which override the options."""
     rates: str = option(
         "",
         flag="--rates",
@@ -248,7 +248,7 @@ class FarmWords:
         help="rates.json of `farm measure`, to estimate with",
         words="ours",
     )
-    """Measured rates for the estimate."""
+    """File of measured rates for the estimate."""
     session_tasks: int = option(
         0,
         flag="--session-tasks",
@@ -256,7 +256,7 @@ class FarmWords:
         help="for the estimate: tasks of a step that a host does before it enters the job's environment again",
         words="all that it does of one",
     )
-    """Tasks of a session, as the farm's engine has them; 0: all that a host does of a step."""
+    """Tasks per session of the farm's engine; 0: all tasks of a step that a host does."""
 
 
 @dataclass
@@ -271,48 +271,48 @@ class TaskWords:
     )
     """Step of the template."""
     shot: str = option("", flag="--shot", metavar="SHOT", required=True, help="shot folder")
-    """Shot folder, as this computer has it."""
+    """Shot folder on this computer."""
     request: str = option("", flag="--request", metavar="FILE", required=True, help="what the template asks for")
     """JSON: parameters of the steps, and names of the takes."""
     paths: tuple[str, ...] = option("", flag="--paths", metavar="STEP.NAME=PATH", many=True, help="paths of parameters")
-    """Paths among the parameters, as this computer has them."""
+    """Paths among the parameters, on this computer."""
     t_star: str = option("", flag="--t-star", metavar="N", help="instant of the take", words="suggested")
     """Instant of the take."""
     first: int = option(0, flag="--first", metavar="N", help="first frame of the part")
     """First frame of the part."""
     frames: int = option(0, flag="--frames", metavar="N", help="frames of the part", words="the whole take")
-    """How many frames the part has; 0: the whole take."""
+    """Number of frames in the part; 0: the whole take."""
     output: str = option("", flag="--output", metavar="DIR", help="folder for what is baked")
-    """Folder for what is baked."""
+    """Folder for baked files."""
     path_rules: str = option("", flag="--path-rules", metavar="FILE", help="the engine's path mapping rules")
     """File of the engine's path mapping rules."""
 
 
 @dataclass(frozen=True)
 class Verb:
-    """A word of the command lines, and what it asks for."""
+    """A verb of the command lines, and its arguments."""
 
     help: str
-    """What it does."""
+    """Description for --help."""
     words: type = NoWords
-    """Dataclass of what it asks for besides the parameters of jobs."""
+    """Dataclass of its arguments besides the parameters of jobs."""
     jobs: Mapping[str, type] = field(default_factory=dict[str, type])
-    """Kind of job that it starts -> dataclass of its parameters, in their order."""
+    """Kind of job that it starts -> dataclass of its parameters, in order."""
     sides: tuple[str, ...] = (BACKEND, BLENDER)
-    """Which command lines have it."""
+    """Sides whose command lines have the verb."""
     json: bool = True
-    """--json changes what it prints."""
+    """True if --json changes what the verb prints."""
     shown: Mapping[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
-    """Field -> (what --help calls it, what it says of it), where this verb means more by it than others."""
+    """Field -> (metavar, help), if the field means more for this verb than for others."""
     now: str = ""
-    """What it is called now: the word itself goes with the next version."""
+    """New name of a deprecated verb, which the next version removes; empty: not deprecated."""
 
 
 INPUT = (
     "INPUT",
     "video file, image sequence or pattern (shot.####.exr); or a shot folder, which is frozen alone",
 )
-"""What `freeze` is given."""
+"""Metavar and help of the input of `freeze`."""
 VERBS: dict[str, Verb] = {
     "import": Verb("footage into a shot folder", NewShotWords, {"import": ImportParams}),
     "solve": Verb("cameras of a shot", ShotWords, {"solve": SolveParams}),

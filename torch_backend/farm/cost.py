@@ -1,4 +1,4 @@
-"""What a job will cost, by measured rates: core-hours, card-hours, disk, and the critical path."""
+"""Cost of a job, by measured rates: core-hours, card-hours, disk, and the critical path."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from .template import Needs
 from .work import Step, disk_bytes
 
 ON_A_CARD = ("train", "open", "freeze")
-"""Steps that a graphics card does, where one is requested."""
+"""Steps that run on a graphics card, if one is requested."""
 SPARE = 1.5
-"""Memory that is requested, over what was seen."""
+"""Ratio of the requested memory to the measured memory."""
 MIB_PER_MEGAPIXEL = 160
-"""Memory that a take's frames want by their size: docs/benchmarks.md, "What a frame costs", 640 x 360 against 4K."""
+"""Memory per megapixel of a take's frames: docs/benchmarks.md, "What a frame costs", 640 x 360 against 4K."""
 _OF_FRAMES = ("open", "freeze", "finish", "bake")
 ENGINE = "engine"
-"""Row of what the farm's engine itself takes; its tasks are sessions."""
+"""Row for the time of the farm's engine itself; its tasks are sessions."""
 HOSTS = (1, 2, 10, 100)
-"""Numbers of hosts that an estimate tells of."""
+"""Numbers of hosts for which an estimate has the total time."""
 
 
 @dataclass(frozen=True)
@@ -31,37 +31,37 @@ class Row:
     kind: str
     tasks: int
     seconds: float
-    """Wall seconds of all its tasks, one after the other."""
+    """Sum of the wall seconds of all its tasks."""
     core_seconds: float
     """Processor seconds."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A whole job."""
+    """Estimated cost of a whole job."""
 
     rows: list[Row]
     shots: int
     tasks: int
     core_hours: float
     card_hours: float
-    """0 where no card is requested."""
+    """0 if no card is requested."""
     disk_gb: float
-    """What the takes, and what is made on the way, will occupy."""
+    """Disk space of takes and intermediate files."""
     critical_seconds: float
-    """How long the job takes at least, however many hosts there are: the longest chain of tasks."""
+    """Shortest time of the job with any number of hosts: the longest chain of tasks."""
     on_hosts: dict[int, float]
-    """Hosts -> seconds until the last task has ended, each with one task at a time."""
+    """Number of hosts, with one task at a time each -> seconds until the last task has ended."""
 
 
 def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bool, session_tasks: int = 0) -> Estimate:
     """The cost of a job.
 
     Args:
-        steps: of all shots, a shot's in their order.
-        rates: step's kind -> rate.
-        card: a graphics card is requested.
-        bake: takes are baked.
+        steps: steps of all shots; those of one shot in order.
+        rates: kind of step -> rate.
+        card: True if a graphics card is requested.
+        bake: True if takes are baked.
         session_tasks: tasks of a step that a host runs in one session of the engine; 0: all of the host's tasks.
     """
     shots: dict[str, FarmShot] = {step.shot.name: step.shot for step in steps}
@@ -88,7 +88,7 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
 
 
 def needs(rates: dict[str, Rate], card: bool, megapixels: float) -> dict[str, Needs]:
-    """What hosts are asked for, by what was measured; `megapixels` of the largest take's frames."""
+    """Requirements of each step on hosts, by measured rates; `megapixels`: size of the largest take's frames."""
     found: dict[str, Needs] = {}
     for kind, rate in rates.items():
         memory = SPARE * rate.memory_mib + (MIB_PER_MEGAPIXEL * megapixels if kind in _OF_FRAMES else 0.0)
@@ -97,7 +97,7 @@ def needs(rates: dict[str, Rate], card: bool, megapixels: float) -> dict[str, Ne
 
 
 def sentences(told: Estimate, rates_from: str) -> list[str]:
-    """An estimate for people, line by line."""
+    """Text of an estimate, line by line."""
     lines = [f"{told.shots} shots, {told.tasks} tasks. By rates {rates_from}, on hosts that do one task at a time:"]
     for row in told.rows:
         of = "sessions" if row.kind == ENGINE else "tasks"
@@ -118,18 +118,18 @@ def _times(step: Step, rates: dict[str, Rate]) -> list[float]:
 
 @dataclass(order=True)
 class _Host:
-    """One that does a task at a time."""
+    """A host that does one task at a time."""
 
     free: float
-    """Second from which on it does nothing."""
+    """Time in seconds at which the host becomes free."""
     number: int
     session: tuple[int, int] = (-1, -1)
-    """Shot and step whose tasks its session is for."""
+    """Shot and step of its current session."""
     tasks: int = 0
-    """Of that session, done."""
+    """Number of tasks done in that session."""
 
     def does(self, step: tuple[int, int], since: float, seconds: float, session_tasks: int) -> float:
-        """Takes a task of a step that is ready since then; returns when it has ended."""
+        """Does a task of a step that is ready at the time `since`; returns the time at which the task ends."""
         if step != self.session or self.tasks == session_tasks > 0:
             self.session, self.tasks = step, 0
             seconds += SESSION_SECONDS
@@ -139,7 +139,7 @@ class _Host:
 
 
 def _makespan(chains: list[list[list[float]]], hosts: int, session_tasks: int) -> float:
-    """When the last task ends, if a free host takes the next one of the earliest shot that has one ready.
+    """Time at which the last task ends, if a free host takes a task of the step that was ready first.
 
     `chains`: shot -> step -> seconds of each task.
     """

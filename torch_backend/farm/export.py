@@ -1,4 +1,4 @@
-"""`farm export`: looks at the shots, estimates, writes the job."""
+"""`farm export`: collects the shots, estimates the cost, and writes the job."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ SOFTWARE = Path(__file__).resolve().parent.parent.parent
 
 
 def export(words: FarmWords, requests: dict[str, Any], trains: bool = False) -> tuple[cost.Estimate, list[Path]]:
-    """Writes the job, or several where there are more shots than one may have. Returns its cost, and the files.
+    """Writes the job, or several jobs if there are too many shots for one. Returns the cost and the files.
 
     Args:
-        words: what was asked for.
+        words: arguments of the verb.
         requests: kind of job -> its dataclass of parameters.
-        trains: an option of the training was given: finished runs are trained again, if it changes them.
+        trains: True if an option of the training was passed, so that finished runs may have to be trained again.
 
     Raises:
-        JobError: what cannot be; OSError: the folder cannot be written.
+        JobError: an argument, a shot or a clip is invalid; OSError: the folder cannot be written.
     """
     for name, value in (("--frames", words.frames), ("--shots-per-job", words.shots_per_job)):
         if value < 1:

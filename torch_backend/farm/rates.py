@@ -1,4 +1,4 @@
-"""Seconds per unit of work: measured here, or on the farm for which the cost is estimated."""
+"""Seconds per unit of work, measured for docs/farm.md or on the farm whose cost is estimated."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class Rate:
-    """Of one kind of step, on one host."""
+    """Rate of one kind of step on one host."""
 
     fixed: float
-    """Seconds that a task takes whatever it has to do: starting, loading."""
+    """Seconds of a task that do not depend on its amount of work: starting, loading."""
     per_unit: float
     """Seconds per unit of `work.Step.amounts`."""
     cores: float
-    """Processor cores that it keeps busy, in the mean."""
+    """Mean number of processor cores that the step keeps busy."""
     memory_mib: int
-    """Most memory in MiB that was seen."""
+    """Largest memory use that was measured, in MiB."""
 
     def seconds(self, amount: float) -> float:
-        """How long a task takes."""
+        """Seconds that a task with this amount of work takes."""
         return self.fixed + self.per_unit * amount
 
 
@@ -45,20 +45,20 @@ MEASURED: dict[str, Rate] = {
 }
 """Step -> rate on one core of the processor of docs/farm.md, which says how they were measured."""
 SESSION_SECONDS = 0.6
-"""Seconds of one core that a session of a host takes besides its tasks: the engine begins it, and enters the job's
-environment, which is set up. Seen with openjd-cli 0.8.0, see docs/farm.md."""
+"""Core seconds that a session of a host takes besides its tasks: the engine starts it and enters the job's environment,
+which is already set up. Measured with openjd-cli 0.8.0, see docs/farm.md."""
 TASK_SECONDS = 0.11
-"""Of each task in it: what `records` cannot see, for the engine starts the task before, and the system clears up its
+"""Seconds of each task that `records` cannot measure: the engine starts the task before, and the system frees its
 memory after."""
 WATCH_CORES = 0.015
 """Cores that the engine keeps busy while it waits for a task."""
 
 
 def measure(records: Iterable[dict[str, Any]]) -> dict[str, Rate]:
-    """Rates by what tasks took (`records.read`), for those steps that there are records of.
+    """Rates measured from the records of tasks (`records.read`), for steps that have records.
 
-    Where tasks had different amounts of work, a fixed cost and a cost per unit are fitted by non-negative least
-    squares. Otherwise both are those of `MEASURED`, scaled by how much slower or faster the tasks were.
+    If the amounts of work differ between tasks, a fixed cost and a cost per unit are fitted by non-negative least
+    squares. Otherwise both are those of `MEASURED`, scaled by the ratio of actual to expected seconds.
     """
     by_step: dict[str, list[tuple[float, float, float, float]]] = {}
     for record in records:
@@ -91,7 +91,7 @@ def to_json(rates: dict[str, Rate]) -> dict[str, Any]:
 
 
 def read_rates(path: str | Path) -> dict[str, Rate]:
-    """`MEASURED` with those of a file in their place. JobError if it is no such file."""
+    """`MEASURED`, overridden by the rates in a file. JobError if the file is invalid."""
     try:
         record = read_json(path)
         if record.get("version") != VERSION:

@@ -1,4 +1,4 @@
-"""What tasks took: one small file each in the shot, to measure by (`farm measure`)."""
+"""Records of the time and memory that tasks took, for `farm measure`: one small file per task in the shot."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from ..contract import JobError, ShotFolder, computer_name, read_json, write_jso
 
 
 def write(shot: Path, step: str, t_star: str, first: int, frames: int, amount: float, began: float) -> None:
-    """Writes what the task that ends now took, over what the same task took before. What cannot be written is not.
+    """Writes the record of the task that ends now, over an earlier one of the same task. Ignores failed writes.
 
     Args:
         shot: the shot folder.
-        step: of the template.
-        t_star: of its take, as the template has it; empty: none.
-        first: first frame of its part; with `frames` 0 of no meaning.
-        frames: of its part; 0: it is made as one.
-        amount: how much it had to do, as `work.Step.amounts` counts.
-        began: when this process began, seconds since the epoch.
+        step: step of the template.
+        t_star: instant of its take, as in the template; empty: none.
+        first: first frame of its part; ignored if `frames` is 0.
+        frames: number of frames in its part; 0: the step has no parts.
+        amount: amount of work, in the units of `work.Step.amounts`.
+        began: time at which this process began, seconds since the epoch.
     """
     times = os.times()
     data: dict[str, Any] = {
@@ -47,14 +47,14 @@ def write(shot: Path, step: str, t_star: str, first: int, frames: int, amount: f
 
 
 def read(shot: Path) -> Iterator[dict[str, Any]]:
-    """What the tasks of a shot took, as `write` wrote it; damaged files are passed over."""
+    """Records of a shot's tasks, as `write` wrote them; damaged files are skipped."""
     for path in sorted(ShotFolder(shot).farm.glob("*.json")):
         with contextlib.suppress(OSError, ValueError):
             yield read_json(path)
 
 
 def _peak_mib() -> int:
-    """Most memory that this process, or one that it started, has held, in MiB; 0 where the system does not tell."""
+    """Peak memory of this process or of one of its children, in MiB; 0 if the system does not report it."""
     if sys.platform == "win32":
         return 0
     import resource

@@ -1,4 +1,4 @@
-"""What a task is asked for, as it comes out of its template: read without what makes templates, which loads torch."""
+"""Reads the request that a task gets from its template. This module is separate from `template`, which loads torch."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 from ..contract import SHORT_JSON, SHOT_SUFFIX, ExitCode, JobError, read_json
 
 VERSION = 1
-"""Of the file that `template` writes a task's request into."""
+"""Version of the file into which `template` writes a task's request."""
 
 
 def read_request(path: str | Path) -> dict[str, Any]:
-    """What `template` wrote. JobError if it is invalid, or from a newer version."""
+    """The request that `template` wrote. JobError if it is invalid, or of another version."""
     try:
         data = read_json(path, SHORT_JSON)
         if data.get("version") != VERSION:
@@ -23,5 +23,5 @@ def read_request(path: str | Path) -> dict[str, Any]:
 
 
 def shot_name(root: Path) -> str:
-    """Folder of a shot below the output folder."""
+    """Name of a shot's folder in the output folder."""
     return root.name.removesuffix(SHOT_SUFFIX)

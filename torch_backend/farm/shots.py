@@ -1,4 +1,4 @@
-"""Shots and clips for a farm: what is known of each, and the takes that are wanted of it."""
+"""Shots and clips for a farm: facts of each, and the takes to make of it."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from ..footage.sequence_files import PICTURES
 from .request import shot_name
 
 _LONGEST = 40
-"""Letters of a shot's name in a job: a step's name may have 64."""
+"""Most characters of a shot's name in a job, because the name of a step may have 64."""
 TAKE_DIGITS = 4
-"""Of the instant in the name of a take that is one of several."""
+"""Digits of the instant in the name of a take, if a shot has several takes."""
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ class FarmShot:
     """One shot of a job."""
 
     name: str
-    """What the steps of the job are called by; no two of a job have the same."""
+    """Name of the shot in the steps of the job; unique within the job."""
     called: str
-    """What the shot is called, or its clip."""
+    """Name of the shot, or of its clip."""
     identity: str
-    """Absolute path of the shot folder; of the clip, or its first picture, if a shot is to be made of it."""
+    """Absolute path of the shot folder; if the shot is to be imported, of the clip or its first picture."""
     output: str
-    """Folder of its baked frames, in that of all shots; no two have the same."""
+    """Name of the folder of its baked frames; unique within the job."""
     root: Path
     """Shot folder, on the computer that submits."""
     clip: str
-    """Footage that it is to be imported from; empty: it is imported."""
+    """Footage from which the shot is to be imported; empty: already imported."""
     first: int
     """First frame of its takes."""
     last: int
@@ -73,13 +73,13 @@ class FarmShot:
     source: tuple[int, int]
     """Width and height in pixels of the footage."""
     takes: dict[str, str]
-    """Instant as a number, or empty where it is suggested -> name of the take."""
+    """Frame number of the instant as text, empty for a suggested one -> name of the take."""
     requests: dict[str, dict[str, Any]]
-    """Step -> its parameters; paths among them are those of the computer that submits."""
+    """Step -> its parameters, with paths of the submitting computer."""
     solved: bool
-    """It has cameras: there is nothing to solve."""
+    """True if the shot has cameras and need not be solved."""
     trained: bool
-    """The run that is to be frozen is finished, and is not to be another: there is nothing to train."""
+    """True if the run to freeze is finished and need not be trained again."""
 
     @property
     def frames(self) -> int:
@@ -91,18 +91,18 @@ def gather(
     given: Sequence[str], requests: dict[str, Any], instants: Sequence[int], table: dict[str, list[int]],
     shots_folder: str, trained_counts: bool = True,
 ) -> list[FarmShot]:  # fmt: skip
-    """Looks at shots and clips.
+    """The shots of a job, from shot folders and clips.
 
     Args:
         given: shot folders, and clips.
         requests: kind of job -> its dataclass of parameters.
-        instants: of shots that the table does not name; none: suggested.
+        instants: instants of shots that are not in the table; empty: suggested ones.
         table: shot's name -> instants.
-        shots_folder: where shots of clips are made; empty: beside each.
-        trained_counts: a finished run is not trained again, even where `requests` ask for another.
+        shots_folder: folder for the shots of clips; empty: next to each clip.
+        trained_counts: True: a finished run is not trained again, even if `requests` differ from it.
 
     Raises:
-        JobError: a shot or clip that cannot be used, or a name in the table that none has; ValueError: parameters.
+        JobError: a shot or clip cannot be used, or no shot has a name in the table; ValueError: invalid parameters.
     """
     found = [_of_shot(path, requests) if is_shot(path) else _of_clip(path, requests, shots_folder) for path in given]
     shots: list[FarmShot] = []
@@ -119,7 +119,7 @@ def gather(
         takes = {"": base} if not own else {str(own[0]): base}
         if len(own) > 1:
             takes = {str(t): f"{base}_{t:0{TAKE_DIGITS}d}" for t in dict.fromkeys(own)}
-        for take in takes.values():  # said now, not by every task
+        for take in takes.values():  # reported now, not by every task
             checked_name(take, "take")
         checked_name(requests["freeze"].run, "run")
         shots.append(dataclasses.replace(shot, takes=takes, trained=shot.trained and trained_counts))
@@ -134,8 +134,8 @@ class _Names:
         self._table, self._found = table, set[str]()
 
     def instants_of(self, shot: FarmShot, otherwise: list[int]) -> list[int]:
-        """Those of a shot: by its name in the job, that of its folder, or what it was called before names were told
-        apart."""
+        """Instants of a shot. The table may have its name in the job, its folder's name, or its name before names were
+        made unique."""
         for name in (shot.name, shot.output, shot.called, _plain(shot.called)):
             if name in self._table:
                 self._found.add(name)
@@ -143,7 +143,7 @@ class _Names:
         return otherwise
 
     def refuse_unknown(self, shots: Sequence[FarmShot]) -> None:
-        """JobError if the table names what no shot is called."""
+        """Raises JobError if no shot has a name in the table."""
         lost = sorted(set(self._table) - self._found)
         if lost:
             raise JobError(
@@ -154,13 +154,13 @@ class _Names:
 
 
 def _distinct(found: Sequence[FarmShot]) -> list[FarmShot]:
-    """The shots, each once, with folders, names and output folders that no two of them share.
+    """The shots, each once, with unique folders, names and output folders.
 
-    What is shared gets a digest of the shot's path, or its clip's, at all who share it: what a shot is called does not
-    depend on the order in which they are given.
+    All shots that would share a name get a digest of their path, or of their clip's, added. The names therefore do not
+    depend on the order of the shots.
     """
     shot_roots = {str(shot.root) for shot in found if not shot.clip}
-    # A clip whose own shot is given, too, is that shot.
+    # Drop a clip if its shot is in the list, too.
     found = [s for s in found if not (s.clip and str(s.root) in shot_roots and is_imported_from(s.root, s.clip))]
     shots = list({shot.identity: shot for shot in found}.values())
     seen = Counter(same_name(str(shot.root)) for shot in shots)
@@ -177,8 +177,8 @@ def _distinct(found: Sequence[FarmShot]) -> list[FarmShot]:
 
 
 def _told_apart(plain: Sequence[str], longer: Sequence[str]) -> list[str]:
-    """Of each two names the plain one, where no other reads like it on some disk, else the longer. JobError if those
-    are alike, too."""
+    """The plain name of each shot, or the longer one if a disk could confuse the plain name with another. JobError if
+    the names are still not unique."""
     seen = Counter(map(same_name, plain))
     names = [p if seen[same_name(p)] == 1 else q for p, q in zip(plain, longer, strict=True)]
     twice = next((name for name, count in Counter(map(same_name, names)).items() if count > 1), None)
@@ -192,7 +192,7 @@ def _cut(name: str, digest: str) -> str:
 
 
 def _of_shot(path: str, requests: dict[str, Any]) -> FarmShot:
-    folder = ShotFolder(os.path.abspath(path))  # without `..`, which would have no name
+    folder = ShotFolder(os.path.abspath(path))  # abspath resolves `..`, which has no name
     try:
         info, record = read_json(folder.info_path), read_json(folder.listing)
         numbers = [int(row["frame"]) for row in record["frames"]]
@@ -220,7 +220,7 @@ def _of_shot(path: str, requests: dict[str, Any]) -> FarmShot:
 
 
 def _of_clip(path: str, requests: dict[str, Any], shots_folder: str) -> FarmShot:
-    """A clip's shot. JobError if it is no footage, or does not say how long it is."""
+    """The shot of a clip. JobError if the clip is not footage, or does not state its length."""
     clip = path if "://" in path else str(Path(path).absolute())
     import_params: ImportParams = dataclasses.replace(requests["import"], source=clip)
     opened = open_source(clip, import_params.fps, import_params.layer)
@@ -244,10 +244,10 @@ def _of_clip(path: str, requests: dict[str, Any], shots_folder: str) -> FarmShot
 
 
 def _root_of(clip: str, called: str, identity: str, shots_folder: str) -> Path:
-    """The shot folder of a clip: beside it, called as it is where no other footage there is called so; in a folder for
-    the shots of clips from anywhere, with a digest of its path. It depends on the clip alone.
+    """The shot folder of a clip: next to the clip and with its name, if no other footage there has that name.
 
-    A shot that was made of the clip before, under its plain name, is that shot.
+    Otherwise, and in `shots_folder`, the name gets a digest of the clip's path, so it depends on the clip alone. A shot
+    that was already made from the clip under its plain name is used again.
     """
     folder = Path(shots_folder).absolute() if shots_folder else Path(clip).parent
     hashed = folder / _hashed_name(called, identity)
@@ -261,7 +261,7 @@ def _root_of(clip: str, called: str, identity: str, shots_folder: str) -> Path:
 
 
 def _is_shared(folder: Path, called: str, identity: str) -> bool:
-    """True if a folder has other footage that is called as a clip is."""
+    """True if a folder has other footage with the name of a clip."""
     wanted, number = same_name(called), re.compile(r"[0-9]+(?=\.[^.]*$)")
     own = number.sub("#", os.path.basename(identity)) if Path(identity).suffix.lower() in PICTURES else ""
     with contextlib.suppress(OSError):
@@ -275,7 +275,7 @@ def _is_shared(folder: Path, called: str, identity: str) -> bool:
 
 
 def _hashed(shot: FarmShot) -> Path:
-    """The folder of a clip's shot where its plain name is another's, too."""
+    """Folder of a clip's shot with a digest in its name; the folder of an imported shot unchanged."""
     return shot.root.with_name(_hashed_name(shot.called, shot.identity)) if shot.clip else shot.root
 
 
@@ -285,7 +285,7 @@ def _hashed_name(called: str, identity: str) -> str:
 
 
 def _keep_camera_path(folder: ShotFolder, freeze: dict[str, Any]) -> None:
-    """A camera's path goes into the shot, where every computer finds it; the request names it from there."""
+    """Copies the camera path into the shot, where every computer finds it, and stores its relative path in `freeze`."""
     if freeze["camera_path"]:
         data = read_json(freeze["camera_path"])
         kept = folder.camera_path(checked_name(freeze["take"], "take"))
@@ -296,14 +296,14 @@ def _keep_camera_path(folder: ShotFolder, freeze: dict[str, Any]) -> None:
 
 
 def _plain(name: str) -> str:
-    """A name that a step of a template may have: short, without control characters, braces and what is no UTF-8."""
+    """`name` made valid for a step of a template: short, without control characters, braces and invalid UTF-8."""
     return re.sub(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff{}]", "_", name)[:_LONGEST].strip() or "shot"
 
 
 def read_requests(path: str, requests: dict[str, Any]) -> dict[str, Any]:
-    """Parameters of the steps with those of a file over them: {kind: {name: value}}.
+    """Parameters of the steps, overridden by those in a file: {kind: {name: value}}.
 
-    JobError names what is no parameter, or cannot be read.
+    JobError names an invalid parameter, or a file that cannot be read.
     """
     if path:
         try:
@@ -324,7 +324,7 @@ def read_requests(path: str, requests: dict[str, Any]) -> dict[str, Any]:
 
 
 def parse_instants(text: str) -> list[int]:
-    """ "34,60" as [34, 60]; empty: none. JobError on what is no number."""
+    """ "34,60" as [34, 60]; [] for an empty text. JobError if a word is not a number."""
     try:
         return [int(word) for word in re.split(r"[\s,]+", text.strip()) if word]
     except ValueError:
@@ -333,11 +333,12 @@ def parse_instants(text: str) -> list[int]:
 
 
 def read_instants(path: str) -> dict[str, list[int]]:
-    """A file with a line per shot, its name and then its instants; # begins a comment. JobError names a wrong line."""
+    """Instants by the name of a shot, from a file with a line per shot: its name, then its instants. # begins a
+    comment. JobError names an invalid line."""
     found: dict[str, list[int]] = {}
     try:
         with open_regular(path, SHORT_JSON) as source:
-            lines = source.read().decode("utf-8-sig").splitlines()  # editors on Windows begin with a mark
+            lines = source.read().decode("utf-8-sig").splitlines()  # Windows editors write a BOM
     except (OSError, ValueError) as error:
         raise JobError(f"{path} cannot be read: {error}.", "", ExitCode.USAGE) from error
     for number, line in enumerate(lines, 1):

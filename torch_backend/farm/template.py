@@ -1,9 +1,9 @@
 """The job template of Open Job Description (2023-09), as JSON, and its parameters.
 
-Each shot has a chain of steps of its own, so that one that fails holds up no other; a step has a task for each instant
-and each part of its frames. No path of the computer that submits stands in a command: shots and clips are task
-parameters of type PATH, the program's folder and what else options name are job parameters of type PATH, so that the
-engine's path mapping reaches all of them.
+Each shot has a separate chain of steps, so that a failure does not stop other shots. A step has a task for each instant
+and each part of its frames. Commands contain no paths of the submitting computer, so that the engine's path mapping
+applies to all paths. Shots and clips are task parameters of type PATH. The program's folder and paths in options are
+job parameters of type PATH.
 
 Source: https://github.com/OpenJobDescription/openjd-specifications/wiki/2023-09-Template-Schemas
 """
@@ -25,11 +25,11 @@ from .work import STEPS, Step
 
 VERSION = "jobtemplate-2023-09"
 TEMPLATE_FILE, PARAMETERS_FILE, VALUES_FILE = "template.json", "parameters.json", "parameter_values.json"
-"""The template; its parameters as `openjd run --job-param file://...` takes them, and as a bundle of Deadline Cloud."""
+"""The template; its parameters for `openjd run --job-param file://...`; its parameters for a Deadline Cloud bundle."""
 MOST_LETTERS = 1024
-"""Of a path, as Open Job Description has it."""
+"""Most characters of a path in Open Job Description."""
 NOTIFY_SECONDS = 60
-"""A training that is cancelled has so long for its checkpoint."""
+"""Seconds that a cancelled training has for its checkpoint."""
 _SAYS = {
     "import": "Footage into the shot folder",
     "solve": "Cameras, and what moves",
@@ -44,12 +44,12 @@ _SAYS = {
 
 @dataclass(frozen=True)
 class Needs:
-    """What a computer must have for the tasks of a step."""
+    """Requirements of a step's tasks on a host."""
 
     memory_mib: int
     """Memory in MiB."""
     gpu: bool
-    """A graphics card that the backend can use."""
+    """True if the host needs a graphics card that the backend can use."""
     cores: int = 1
     """Processor cores."""
 
@@ -58,13 +58,13 @@ def job_template(name: str, steps: Sequence[Step], needs: dict[str, Needs], bake
     """The template of a job.
 
     Args:
-        name: of the job.
-        steps: of all shots, a shot's one after the other.
-        needs: step's kind -> what it needs.
-        bake: takes go through Blender, too: hosts are given one.
+        name: name of the job.
+        steps: steps of all shots; those of one shot in order.
+        needs: kind of step -> its requirements.
+        bake: True if takes are baked, for which hosts get a Blender.
 
     Raises:
-        JobError: a path cannot stand in a template.
+        JobError: a path is not valid in a template.
     """
     paths = paths_of([step.shot for step in steps])
     parameters: list[dict[str, Any]] = [
@@ -90,8 +90,8 @@ def job_template(name: str, steps: Sequence[Step], needs: dict[str, Needs], bake
 
 
 def job_values(software: Path, shots: Sequence[FarmShot], output: Path, bake: bool) -> dict[str, str]:
-    """Values of a template's job parameters, as they are on the computer that submits. JobError names a path that the
-    engine would refuse."""
+    """Values of a template's job parameters on the submitting computer. JobError names a path that the engine would
+    refuse."""
     values = {"Splannequin": str(software), "HostPython": "python3", "BackendPython": "", "Home": ""}
     if bake:
         values |= {"Blender": "", "OutputFolder": str(output)}
@@ -122,9 +122,9 @@ def paths_of(shots: Sequence[FarmShot]) -> dict[str, str]:
 
 _MASKS = mask_path, ignored_path
 _NO_FILES = "", MASK_ALPHA, MASK_FOUND
-"""What options that name files may say instead."""
+"""Values of such options that are not files."""
 _ITS_OWN = {("import", "source"), ("freeze", "camera_path")}
-"""Paths that each shot has its own of: a task parameter, and a file in the shot."""
+"""Options whose path differs between shots: a task parameter, and a file in the shot."""
 
 
 def _path_fields(kind: str) -> list[str]:
@@ -143,7 +143,7 @@ def _parameter(name: str, text: str, flow: str = "", of: str = "DIRECTORY") -> d
 
 
 def _environment(bake: bool) -> dict[str, Any]:
-    """Entered once per session of a host: everything that is installed is pinned, and there already the second time."""
+    """Environment that a host enters once per session. Its packages are pinned, and stay installed between sessions."""
     words = ["--python", "{{Param.BackendPython}}", "--home", "{{Param.Home}}"]
     words += ["--blender", "{{Param.Blender}}", "--bake"] if bake else []
     enter = {"command": "{{Param.HostPython}}", "args": [_LAUNCHER, "farm-host", *words]}
@@ -154,7 +154,7 @@ _LAUNCHER = "{{Param.Splannequin}}/splannequin.py"
 
 
 def _chained(steps: Sequence[Step]) -> list[tuple[Step, str]]:
-    """Each step with the name of the one of its shot that it waits for; empty for a shot's first."""
+    """Each step with the name of the previous step of its shot, for which it waits; empty for a shot's first step."""
     last: dict[str, str] = {}
     found: list[tuple[Step, str]] = []
     for step in sorted(steps, key=lambda step: STEPS.index(step.kind)):
@@ -180,7 +180,7 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
         words += ["--paths", *path_words]
     if any(step.t_stars):
         space.append({"name": "TStar", "type": "INT", "range": [int(t) for t in step.t_stars]})
-        words.append("--t-star={{Task.Param.TStar}}")  # a negative one is no option
+        words.append("--t-star={{Task.Param.TStar}}")  # with =, a negative number is not read as an option
     if step.starts:
         space.append({"name": "First", "type": "INT", "range": step.starts})
         words += ["--first={{Task.Param.First}}", "--frames", str(step.part)]
@@ -207,7 +207,7 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
 
 
 def _request(step: Step) -> str:
-    """What a task is asked for, as the text of a file: parameters without paths, and the takes' names."""
+    """Text of the file with a task's request: parameters without paths, and the takes' names."""
     shot, kind = step.shot, step.kind
     params_kind = kind if kind in STEP_PARAMS else "freeze"
     values = dict(shot.requests[params_kind])
@@ -224,8 +224,8 @@ def _request(step: Step) -> str:
     }
     if params_kind == "freeze":
         request |= {"takes": shot.takes, "first": shot.first, "last": shot.last}
-    # Two braces begin or end a reference. JSON itself never has two: with an indent each stands on a line of its own.
-    # DEL is the one control character that JSON leaves as it is.
+    # Two braces begin or end a reference, so they are escaped in text. JSON with an indent has no two braces in a row
+    # outside text. DEL is the only control character that JSON does not escape.
     text = json.dumps(request, indent=1, sort_keys=True)
     for mark, escaped in (("{{", "{\\u007b"), ("}}", "}\\u007d"), ("\x7f", "\\u007f")):
         text = text.replace(mark, escaped)
@@ -233,8 +233,7 @@ def _request(step: Step) -> str:
 
 
 def _refused(text: str) -> str:
-    """`text`, a path or name that stands in the template as it is. JobError if the engine would refuse it, or read a
-    reference in it."""
+    """`text`, a path or name for the template. JobError if the engine would refuse it, or find a reference in it."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     if "{{" in text or "}}" in text:
         raise JobError(
@@ -246,7 +245,7 @@ def _refused(text: str) -> str:
 
 
 def _refused_value(text: str) -> str:
-    """`text`, a path as it stands in a value beside the template. JobError if the engine would refuse it."""
+    """`text`, a path for a value in the files of parameters. JobError if the engine would refuse it."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     if len(text) > MOST_LETTERS:
         raise JobError(

@@ -1,4 +1,4 @@
-"""Tasks of a job, and how much each has to do."""
+"""Tasks of a job, and the amount of work of each."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from ..freeze.instant.develop import DevelopConfig
 from .shots import FarmShot
 
 STEPS = ("import", "solve", "train", "open", "freeze", "finish", "bake", "deliver")
-"""Of a shot, in their order: each begins when all of the one before has succeeded."""
+"""Steps of a shot, in order. Each begins when all tasks of the previous one have succeeded."""
 MOST_VALUES = 1024
-"""Values of a task parameter, at most, as Open Job Description has it."""
+"""Most values of a task parameter in Open Job Description."""
 
 
 @dataclass(frozen=True)
@@ -24,22 +24,22 @@ class Step:
     kind: str
     """One of `STEPS`."""
     t_stars: list[str]
-    """Instants that it has a task for each; empty: it knows no takes."""
+    """Instants, each with tasks in this step; empty: the step does not depend on takes."""
     starts: list[int]
-    """First frames of the parts that each of them is made in; empty: it is made as one."""
+    """First frames of the parts into which each take is split; empty: one task per take."""
     part: int
     """Frames of a part."""
     amounts: dict[int, float]
-    """First frame of a part, 0 where there are none -> how much a task has to do: megapixels of pictures, of solved
-    frames and training steps with what each costs whatever its size."""
+    """First frame of a part, 0 without parts -> amount of work of a task: megapixels of pictures, plus the fixed cost
+    of each solved frame and training step."""
 
     @property
     def name(self) -> str:
-        """Of the template's step."""
+        """Name of the step in the template."""
         return f"{self.shot.name}: {self.kind}"
 
     def sessions(self, session_tasks: int) -> int:
-        """Number of tasks after which a host enters the job's environment again; 0: once for all."""
+        """Number of sessions for all tasks, if one session has `session_tasks` tasks; 0: one session for all."""
         tasks = max(1, len(self.t_stars)) * max(1, len(self.starts))
         return -(-tasks // session_tasks) if session_tasks else 1
 
@@ -50,9 +50,9 @@ class Step:
 
 
 def steps_of(shot: FarmShot, part: int, bake: bool) -> list[Step]:
-    """What is to be done for a shot, in order; what is done already has no step.
+    """Steps that a shot still needs, in order.
 
-    `part`: frames of a task of freeze and bake; more where a take would have over 1024 of them.
+    `part`: frames per task of freeze and bake. It is raised if a take would have more than 1024 tasks.
     """
     part = max(1, part, -(-shot.frames // MOST_VALUES))
     starts = list(range(shot.first, shot.last + 1, part))
@@ -96,13 +96,13 @@ def _training(shot: FarmShot) -> float:
 
 
 def _trained_width(shot: FarmShot) -> int:
-    """Pixels of the training's pictures."""
+    """Width in pixels of the training images."""
     params: dict[str, Any] = shot.requests["train"]
     return _size(shot).trained_width(params["width"], params["preset"])
 
 
 def _developing(shot: FarmShot) -> float:
-    """Of an instant; 0 where it is not developed."""
+    """Work of developing an instant; 0 if it is not developed."""
     if shot.requests["freeze"]["develop"] != "on":
         return 0.0
     usual, trained = DevelopConfig(), _trained_width(shot)
@@ -112,7 +112,7 @@ def _developing(shot: FarmShot) -> float:
 
 
 def disk_bytes(shot: FarmShot, bake: bool) -> float:
-    """What a shot's takes will occupy, and what is made on the way, in bytes."""
+    """Disk space of a shot's takes and of intermediate files, in bytes."""
     wide, high = take_size(shot)
     freeze = shot.requests["freeze"]
     each = wide * high * (20.0 + (6.0 if freeze["grain"] else 0.0) + (24.0 if freeze["detail"] == "on" else 0.0))
