@@ -1,6 +1,6 @@
-"""The backend of Splannequin: footage, cameras, Gaussians, freeze. Its own process, its own Python; never imports bpy.
+"""The backend of Splannequin: footage, cameras, Gaussians, freeze. It runs in a separate process, without bpy.
 
-This file stays light: Blender reads `torch_backend.contract` through it.
+This file stays light, because Blender imports `torch_backend.contract` through it.
 """
 
 __version__ = "0.3.0"

@@ -13,15 +13,15 @@ class SparseMatrix(Protocol):
     """A matrix [R, C] of float32 of which most entries are zero."""
 
     def __matmul__(self, dense: NDArray[np.float32], /) -> NDArray[np.float32]:
-        """The product with [C, N], dense: [R, N]."""
+        """Product [R, N] with a dense matrix [C, N]."""
         ...
 
 
 def sparse_rows(
     weights: NDArray[np.float32], columns: NDArray[np.integer[Any]], starts: NDArray[np.integer[Any]], width: int
 ) -> SparseMatrix:
-    """Sparse matrix from its rows: row r has `weights[starts[r]:starts[r + 1]]` in the columns that the same slice of
-    `columns` names. Each row is `width` wide."""
+    """Sparse matrix [R, width] from its rows. Row r has the values `weights[starts[r]:starts[r + 1]]` in the columns
+    `columns[starts[r]:starts[r + 1]]`."""
     return cast(Any, sparse).csr_array((weights, columns, starts), shape=(len(starts) - 1, width))
 
 

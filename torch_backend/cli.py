@@ -161,7 +161,7 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
             print_reading(results[kind], console)
             way = _rest_of_the_way(shot, requests, stages[kind])
         info = shot.info()
-        if args.t_star is not None and not info.first <= args.t_star <= info.last:  # reported before hours of training
+        if args.t_star is not None and not info.first <= args.t_star <= info.last:  # report it before hours of training
             raise contract.UserError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
     summary = contract.summarise(str(shot.root), shot.info().source, results, stages, time.perf_counter() - started)
     write_json(output / contract.SUMMARY_FILE, summary)

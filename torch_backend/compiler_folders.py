@@ -76,7 +76,7 @@ def compiler_folders(
 
 
 def need_room(kernels: Path) -> None:
-    """JobError if there is no room for another compiled kernel; OSError if the folder cannot be written."""
+    """Raises JobError if there is no room for another compiled kernel; OSError if the folder cannot be written."""
     kernels.mkdir(parents=True, exist_ok=True)
     if _room(kernels) < _KERNEL_BYTES:
         raise _no_room(kernels)

@@ -192,7 +192,7 @@ class LiveSession:
         return header, body
 
     def _output(self, view: LiveView, at: int) -> OutputFrame:
-        """Output frame of a view. A view from a clip frame's camera gets that frame's exact camera matrix."""
+        """Output frame of a view. If the view has the camera of a clip frame, that frame's exact matrix is used."""
         like = at if view.exposed_like is None else view.exposed_like
         fx, fy, cx, cy = view.K
         viewmat = self.scene.from_solve(np.reshape(view.viewmat, (4, 4)))

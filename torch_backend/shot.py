@@ -73,7 +73,7 @@ class ShotInfo:
     height: int = 0
     """Height in pixels of the working frames."""
     colour: str = "srgb"
-    """Encoding of the working frames: always display-referred sRGB; `linear` if the source was scene-linear."""
+    """`linear` if the source is scene-linear, else `srgb`. Working frames are always display-referred sRGB."""
     t_star: int | None = None
     """Frame number at which time stands still; None until chosen."""
     created: float = field(default_factory=time.time)

@@ -47,7 +47,7 @@ def applied(autograd_function: type[torch.autograd.Function], *inputs: Any) -> A
 
 
 def once_differentiable(backward: _Backward) -> _Backward:
-    """`torch.autograd.function.once_differentiable` that keeps the names of the arguments."""
+    """`torch.autograd.function.once_differentiable` that keeps the argument names of `backward` for type checkers."""
     return cast(_Backward, function.once_differentiable(backward))
 
 
@@ -98,12 +98,12 @@ def determinant(matrices: Tensor) -> Tensor:
 
 
 def singular_values(matrices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(U, S, Vh) of [..., K, K]."""
+    """Singular value decomposition (U, S, Vh) of [..., K, K]."""
     return cast(Any, torch.linalg).svd(matrices)
 
 
 def split(values: Tensor, sizes: int | Sequence[int], dim: int = 0) -> tuple[Tensor, ...]:
-    """Views of `sizes` rows each along `dim` (the last may have fewer), or of the sizes in a sequence."""
+    """Views along `dim` of `sizes` rows each (the last may have fewer), or of several sizes."""
     return cast(Any, values).split(sizes, dim)
 
 

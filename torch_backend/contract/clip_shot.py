@@ -22,8 +22,8 @@ def is_imported_from(
 ) -> bool | None:
     """True if the shot in a folder was imported from a clip, False if from another one; None if unknown.
 
-    A clip at the path of the shot's footage relative to the shot counts as that footage, because both were moved or
-    copied together.
+    If the clip lies where the footage lay relative to the shot, it counts as that footage: both were moved or copied
+    together.
 
     Args:
         folder: shot folder.

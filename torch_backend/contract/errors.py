@@ -87,7 +87,7 @@ def disk_error(folder: str | Path, detail: str = "the disk is full, or limits th
 
 def incomplete(lacks: str) -> JobError:
     """JobError for an environment with a missing or broken package. `lacks`: Python's message."""
-    what = (lacks.strip().splitlines() or ["a package cannot be loaded"])[-1]  # numpy prints a page of advice before it
+    what = (lacks.strip().splitlines() or ["a package cannot be loaded"])[-1]  # numpy's advice fills a page before it
     return JobError(
         f"The backend's environment is incomplete: {what.rstrip('.')}.",
         "Press Repair in the add-on's preferences, or run `python3 splannequin.py setup` again.",

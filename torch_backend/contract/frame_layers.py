@@ -15,7 +15,7 @@ class FrameLayer:
     name: str
     """Name of the layer's socket on Blender's Image node, 4.2 to 5.2."""
     channels: tuple[str, ...]
-    """Channels of the file, in order. Blender reads a single one such as Support.V as a value, R G B A as a colour
+    """Channels of the file, in order. Blender reads a single channel such as Support.V as a value, R G B A as a colour
     (freeze/exr.py)."""
     stored: str
     """Number format in the file: half or float."""

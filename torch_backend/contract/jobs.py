@@ -47,7 +47,7 @@ HEARTBEAT_SECONDS = 2.0
 
 
 class Reporter(Protocol):
-    """Interface through which a station reports, implemented by `job.JobReporter`. By default, nothing is reported."""
+    """Interface through which a station reports, implemented by `job.JobReporter`. The methods below do nothing."""
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
         """`done` of `total` units of `stage` are finished."""

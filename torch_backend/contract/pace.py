@@ -35,7 +35,7 @@ docs/benchmarks.md."""
 _SECONDS = {"import": (1.0, 0.18), "solve": (3.0, 1.7), "train": (3.0, 0.116), "freeze": (15.0, 0.28)}
 """Kind of job -> (fixed seconds, seconds per unit of work), for `sitting.mp4` on two cores of an EPYC."""
 BEGINS_WITH = {"import": "import", "solve": "solve", "train": "training", "freeze": "developing"}
-"""Kind of job -> the stage of which only a job that starts from nothing reports the first percents."""
+"""Kind of job -> its first stage. A job that reports the first percents of this stage started from nothing."""
 LASTING_STAGES = ("solve", "training", "freezing")
 """Stages that last until the end of a job, so that their estimate is also the job's."""
 _OVERDUE = 0.1

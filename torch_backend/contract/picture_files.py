@@ -43,7 +43,7 @@ def is_whole_picture(path: Path) -> bool:
 
 
 def _check_of(head: bytes, suffix: str) -> Callable[[BinaryIO, int], bool] | None:
-    """Check for a file's format, which the first bytes identify, or the suffix if the format has no magic number."""
+    """Check for a format, found by its first bytes, or by its suffix if it has no magic number; None if unknown."""
     for mark, check in _MARKS:
         if head.startswith(mark):
             return check

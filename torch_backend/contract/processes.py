@@ -31,8 +31,8 @@ def python_child(python: str | Path, module: str, *words: str) -> dict[str, Any]
 
     Python imports modules from its working directory unless it gets -P, and a shot folder may come from anywhere. The
     loader of libraries also searches the working directory (Windows always, Linux with an empty entry in
-    LD_LIBRARY_PATH). It is therefore the interpreter's folder, which holds no foreign files. It must not be the folder
-    of the shot or the extension, because Windows does not move or remove the working directory of a process.
+    LD_LIBRARY_PATH). The working directory is therefore the interpreter's folder, which holds no foreign files. The
+    folder of the shot or the extension will not do, because Windows does not move or remove a working directory.
     """
     python = os.path.abspath(python)
     return {"args": [python, "-P", "-m", module, *words], "cwd": os.path.dirname(python)}

@@ -25,7 +25,7 @@ def _plain_number(value: object) -> float | None:
 
 
 VERDICT_WORDS = {"good": "Good.", "fair": "Fair.", "poor": "Poor."}
-"""Word of a verdict -> text shown. Good: usable. Fair: usable except for the named problems. Poor: not usable."""
+"""Word of a verdict -> its text. Good: usable. Fair: usable but for the named problems. Poor: not worth continuing."""
 _MOST_LINES = 12
 DEPTH_KINDS = ("depth", "inverse depth")
 """Quantities in which the maps of a depth sequence may be linear."""

@@ -1,4 +1,4 @@
-"""The shot folder: paths of all files of a shot. No other file of the project contains these names.
+"""The shot folder: paths of all files of a shot. The rest of the project uses this module, not the file names.
 
 shot.json                        facts of the shot
 lock.json                        the process that writes into the shot

@@ -21,7 +21,7 @@ _OF_FRAMES = ("open", "freeze", "finish", "bake")
 ENGINE = "engine"
 """Row for the time of the farm's engine itself; its tasks are sessions."""
 HOSTS = (1, 2, 10, 100)
-"""Numbers of hosts for which an estimate has the total time."""
+"""Numbers of hosts for which the total time is estimated."""
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,7 @@ def gather(
         trained_counts: True: a finished run is not trained again, even if `requests` differ from it.
 
     Raises:
-        JobError: a shot or clip cannot be used, or no shot has a name in the table; ValueError: invalid parameters.
+        JobError: a shot or clip cannot be used, or the table has a name that no shot has; ValueError: parameters.
     """
     found = [_of_shot(path, requests) if is_shot(path) else _of_clip(path, requests, shots_folder) for path in given]
     shots: list[FarmShot] = []
@@ -134,8 +134,8 @@ class _Names:
         self._table, self._found = table, set[str]()
 
     def instants_of(self, shot: FarmShot, otherwise: list[int]) -> list[int]:
-        """Instants of a shot. The table may have its name in the job, its folder's name, or its name before names were
-        made unique."""
+        """Instants of a shot, found by its name in the job, its folder's name, or its name before names were made
+        unique."""
         for name in (shot.name, shot.output, shot.called, _plain(shot.called)):
             if name in self._table:
                 self._found.add(name)
@@ -143,7 +143,7 @@ class _Names:
         return otherwise
 
     def refuse_unknown(self, shots: Sequence[FarmShot]) -> None:
-        """Raises JobError if no shot has a name in the table."""
+        """Raises JobError if the table has a name that no shot has."""
         lost = sorted(set(self._table) - self._found)
         if lost:
             raise JobError(

@@ -61,7 +61,7 @@ def job_template(name: str, steps: Sequence[Step], needs: dict[str, Needs], bake
         name: name of the job.
         steps: steps of all shots; those of one shot in order.
         needs: kind of step -> its requirements.
-        bake: True if takes are baked, for which hosts get a Blender.
+        bake: True if takes are baked, for which hosts need Blender.
 
     Raises:
         JobError: a path is not valid in a template.
