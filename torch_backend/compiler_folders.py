@@ -1,10 +1,10 @@
 """Folders that Warp's compilers can open. On Windows, the paths of these folders must be ASCII.
 
 Warp passes paths as UTF-8, but Clang and NVRTC read them in the Windows code page. With a profile such as
-`C:\\Users\\Jörg` they cannot read the headers in `warp/native` or the folder of compiled kernels, and no kernel
-compiles, for the processor or for a card. Short (8.3) names do not help, because Warp expands them. Both folders
+`C:\\Users\\Jörg` they can read neither the headers in `warp/native` nor the folder of compiled kernels. No kernel
+compiles then, for the processor or for a card. Short (8.3) names do not help, because Warp expands them. Both folders
 therefore move to a folder with an ASCII path, in a place where every user may create folders. Files in this folder are
-loaded as libraries, so this user must own it and no other user may write to it. Standard library only.
+loaded as libraries. This user must therefore own it, and no other user may write to it. Standard library only.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Runs one station as a job, with typed events, cancellation, and a status that stays correct after a crash.
 
-The same code runs a job for Blender (a child process, `python -m torch_backend run-job DIR`), for the command line
-(in this process, with the console as the listener) and for tests.
+The same code serves Blender, the command line and tests. Blender starts a child process, `python -m torch_backend
+run-job DIR`. The command line runs a job in its own process, with the console as the listener.
 """
 
 from __future__ import annotations

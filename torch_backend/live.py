@@ -59,7 +59,7 @@ _TINT, _TINTED = (1.0, 0.15, 0.55), 0.75
 
 
 class Superseded(Exception):
-    """Raised to abandon a view that is being made of plates, which is slow, when a newer request arrives."""
+    """Raised if a newer request arrives while a view is being made of plates, which is slow."""
 
 
 class _LivePlates:

@@ -214,7 +214,7 @@ class _Ask:
         while True:
             while self._take(self._pending.popleft):
                 pass
-            left = len(self._left)  # read before `_entered`, so that a helper that enters in between counts
+            left = len(self._left)  # read before `_entered`: the loop then waits for a helper that enters in between
             if left == len(self._entered):
                 return
             with contextlib.suppress(Empty):
@@ -270,8 +270,8 @@ if hasattr(os, "register_at_fork"):
 
 
 def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
-    """Runs one stage of a block (a ctypes structure with a field `counter`), split among `workers` workers. They run on
-    the calling thread and on the helper threads that start in time, so no worker may wait for another."""
+    """Runs one stage of a block (a ctypes structure with a field `counter`), split among `workers` workers. They run
+    on the calling thread and on the helper threads that start in time. No worker may wait for another."""
     block.counter = 0
     address = ctypes.addressof(block)
     if workers == 1:

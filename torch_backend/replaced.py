@@ -37,9 +37,10 @@ def next_name(shot: ShotFolder) -> str:
 
 
 def keep_replaced(shot: ShotFolder, name: str, same: Sequence[int]) -> None:
-    """Moves everything that belongs to the previous frames to SHOT/replaced/NAME. A second call completes a killed one.
+    """Moves everything that belongs to the previous frames to SHOT/replaced/NAME.
 
-    For `Shot.publish_frames`, while shot.json still describes those frames.
+    `Shot.publish_frames` calls this while shot.json still describes those frames. If the process is killed in between,
+    another call completes the moves.
 
     Args:
         shot: a shot with its new frames in place, and the previous ones where `replacing_folder` left them.

@@ -184,9 +184,9 @@ def split_frames(solved: list[int], holdout: int, phase: int = 0) -> tuple[list[
 
 
 _DECODERS = 8
-"""Most frames that are decoded at the same time. Each one needs some tens of megabytes."""
+"""Largest number of frames decoded at the same time. Each one needs some tens of megabytes."""
 HELD_BYTES = 1 << 30
-"""Most bytes of training images to hold in memory. Larger sets are mapped from a file."""
+"""Largest size of the training images held in memory, in bytes. Larger sets are mapped from a file."""
 
 
 def load_images(
@@ -204,8 +204,8 @@ def load_images(
     are mapped from an unnamed file in the folder `beside`, unless that is None. The file vanishes with the process.
     JobError if the disk has no room for it.
 
-    Several frames are decoded at a time. A function `read` (index into `Scene.frames` -> [height, width, 3] in [0, 1])
-    replaces the decoder, and is called for one frame after the other in the clip's order.
+    Several frames are decoded at a time. `read` replaces the decoder: index into `Scene.frames` -> [height, width, 3]
+    in [0, 1]. It is called for one frame after the other, in the clip's order.
     """
     shape = len(indices), height, width, 3
     if beside is None or 2 * math.prod(shape) <= HELD_BYTES:

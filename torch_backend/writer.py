@@ -61,9 +61,8 @@ def patient_writer(
     For render farms, which restart killed tasks on other computers, without a user who could delete the lock.
 
     Args:
-        waiting: called regularly with a sentence that names the process waited for; an exception from it ends the
-            waiting.
-        silence: seconds, by this computer's clock alone, without a sign of life after which a writer counts as dead.
+        waiting: called regularly with a message that names the other process. If it raises, the wait ends.
+        silence: seconds without a heartbeat after which a writer counts as dead, by this computer's clock alone.
 
     Raises:
         JobError: the shot cannot be written.

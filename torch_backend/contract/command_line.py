@@ -188,7 +188,7 @@ def _dests_of(name: str) -> set[str]:
 
 
 def trains_anew(args: argparse.Namespace) -> bool:
-    """True if an option was passed that only applies to training, so that a finished run may not do."""
+    """True if an option was passed that only applies to training, so that a finished run is not enough."""
     dests = {spec.dest for _, spec in options_for(args.command, TrainParams)} - {"run", "device"}
     return bool(dests & set(getattr(args, "said", {})))
 

@@ -33,7 +33,7 @@ LONGEST_LINE = 1 << 20
 
 
 MOST_PIXELS = 1 << 27
-"""Most pixels of a user's picture: 16384 x 8192. A PNG of a few kilobytes may announce a hundred times as many."""
+"""Largest number of pixels in a user's picture: 16384 x 8192. A PNG of a few kilobytes may announce 100 times more."""
 
 
 def patiently(act: Callable[[], T], tries: int = 40, pause: float = 0.05, windows: bool = os.name == "nt") -> T:
@@ -57,7 +57,7 @@ def open_regular(path: str | Path, longest: int | None = None) -> BinaryIO:
 
     A shot folder may come from anywhere: a pipe would block Blender's main thread, a device would fill its memory.
     FileNotFoundError or another OSError from the system. UnreadableFile, a ValueError, if the path is not a regular
-    file, or if the file has more than `longest` bytes, which a sparse file may have without using disk space.
+    file, or if it has more than `longest` bytes. A sparse file may be that long without using disk space.
     """
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 

@@ -38,8 +38,8 @@ class NumberedFiles:
 def numbered_files(names: Iterable[str]) -> list[NumberedFiles]:
     """The sequences among names, sorted by pattern. A single name can be a sequence.
 
-    Names without digits are left out. If two numbers could be the frame number, and they order the names differently,
-    the names are returned once for each of them.
+    Names without digits are left out. If two numbers could be the frame number and order the names differently, the
+    names are returned for both.
     """
     shapes = _grouped(names, lambda name: (ending(name), *_RUN.split(_stem(name))))
     found = [s for members in shapes for part in _without_twins(members) for s in _sequences(part)]

@@ -13,7 +13,7 @@ PRESET_STEPS = {"preview": 2000, "standard": 9000, "final": 30_000}
 PRESET_WIDTHS = {"preview": 320, "standard": 960, "final": 0}
 """Width in pixels of each preset's training images, at most the working frames' width; 0: the working frames' width."""
 CARD_WIDTH, CARD_GAUSSIANS = 1920, 1_000_000
-"""`final` on a graphics card: width in pixels of its images, at most the source's, and most Gaussians."""
+"""`final` on a graphics card: width in pixels of its images, at most the source's; largest number of Gaussians."""
 CAMERA_MODELS = ("SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
 """Values of `SolveParams.camera_model`."""
 ST_MAP_WAYS = ("undistort", "redistort")

@@ -123,8 +123,8 @@ def expected_seconds(kind: str, params: Any, size: ShotSize) -> float | None:
 
 
 def learn_pace(environment: Path, kind: str, seconds: float, expected: float) -> None:
-    """Stores the pace of a job in the backend's environment. Does nothing after a short job, or in an environment
-    without a `SETUP_NOTES` folder, which Splannequin did not set up."""
+    """Stores the pace of a job in the backend's environment. Ignores short jobs. An environment without a `SETUP_NOTES`
+    folder was not set up by Splannequin and is left unchanged."""
     if expected < _LEAST_SECONDS or not (environment / SETUP_NOTES).is_dir():
         return
     known = _read(environment)

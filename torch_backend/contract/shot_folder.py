@@ -233,7 +233,7 @@ class ShotFolder:
     def own(self, folder: Path) -> Path:
         """`folder` of this shot, checked before files in it are written or removed: a shot may come from anywhere.
 
-        JobError if `folder` is not a folder, or if it or one of its parents in the shot is a link to elsewhere.
+        JobError if `folder` is not a folder. JobError if it, or one of its parents in the shot, is a link.
         """
         path = self.root
         for part in folder.relative_to(self.root).parts:

@@ -47,7 +47,7 @@ def refuse_foreign(folder: Path) -> None:
 
 
 def discard_unborn(shot: Path) -> bool:
-    """Removes what a failed first import left in a shot folder. True if it did; what cannot be removed stays.
+    """Removes what a failed first import left in a shot folder. True if it did; files that cannot be removed stay.
 
     A shot with a frame or other work is left alone, and so are files of other programs. A shot is also left alone if a
     job in it failed without a message, because its log is needed.

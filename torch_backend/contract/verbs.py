@@ -196,7 +196,7 @@ class FarmWords:
     output: str = option(
         "", flag="--output", is_path=True, metavar="DIR", required=True, help="folder for the job's files"
     )
-    """Folder for template.json and parameters.json; of `measure` for rates.json."""
+    """Folder for template.json and parameters.json, or for the rates.json of `measure`."""
     t_star: str | None = option(
         None,
         flag="--t-star",
@@ -230,7 +230,7 @@ class FarmWords:
     )
     """Folder for the shots of clips; empty: next to each clip."""
     shots_per_job: int = option(15, flag="--shots-per-job", metavar="N", help="shots of one template, at most")
-    """Most shots in one template, because farms limit its length."""
+    """Largest number of shots in one template. Farms limit the length of a template."""
     request: str = option(
         "",
         flag="--request",
@@ -275,7 +275,7 @@ class TaskWords:
     request: str = option("", flag="--request", metavar="FILE", required=True, help="what the template asks for")
     """JSON: parameters of the steps, and names of the takes."""
     paths: tuple[str, ...] = option("", flag="--paths", metavar="STEP.NAME=PATH", many=True, help="paths of parameters")
-    """Paths among the parameters, on this computer."""
+    """Paths of parameters on this computer, each as STEP.NAME=PATH."""
     t_star: str = option("", flag="--t-star", metavar="N", help="instant of the take", words="suggested")
     """Instant of the take."""
     first: int = option(0, flag="--first", metavar="N", help="first frame of the part")

@@ -45,8 +45,8 @@ MEASURED: dict[str, Rate] = {
 }
 """Step -> rate on one core of the processor of docs/farm.md, which says how they were measured."""
 SESSION_SECONDS = 0.6
-"""Core seconds that a session of a host takes besides its tasks: the engine starts it and enters the job's environment,
-which is already set up. Measured with openjd-cli 0.8.0, see docs/farm.md."""
+"""Core seconds that a host's session takes besides its tasks. The engine starts the session and enters the job's
+environment, which is already set up. Measured with openjd-cli 0.8.0, see docs/farm.md."""
 TASK_SECONDS = 0.11
 """Seconds of each task that `records` cannot measure: the engine starts the task before, and the system frees its
 memory after."""
@@ -57,8 +57,8 @@ WATCH_CORES = 0.015
 def measure(records: Iterable[dict[str, Any]]) -> dict[str, Rate]:
     """Rates measured from the records of tasks (`records.read`), for steps that have records.
 
-    If the amounts of work differ between tasks, a fixed cost and a cost per unit are fitted by non-negative least
-    squares. Otherwise both are those of `MEASURED`, scaled by the ratio of actual to expected seconds.
+    If the amounts of work differ, non-negative least squares fit a fixed cost and a cost per unit. Otherwise both costs
+    are those of `MEASURED`, scaled by the ratio of actual to expected seconds.
     """
     by_step: dict[str, list[tuple[float, float, float, float]]] = {}
     for record in records:

@@ -43,7 +43,7 @@ from ..footage.sequence_files import PICTURES
 from .request import shot_name
 
 _LONGEST = 40
-"""Most characters of a shot's name in a job, because the name of a step may have 64."""
+"""Largest length of a shot's name in a job. The name of a step, which contains it, may have 64 characters."""
 TAKE_DIGITS = 4
 """Digits of the instant in the name of a take, if a shot has several takes."""
 
@@ -61,7 +61,7 @@ class FarmShot:
     output: str
     """Name of the folder of its baked frames; unique within the job."""
     root: Path
-    """Shot folder, on the computer that submits."""
+    """Shot folder on the submitting computer."""
     clip: str
     """Footage from which the shot is to be imported; empty: already imported."""
     first: int
@@ -134,8 +134,7 @@ class _Names:
         self._table, self._found = table, set[str]()
 
     def instants_of(self, shot: FarmShot, otherwise: list[int]) -> list[int]:
-        """Instants of a shot, found by its name in the job, its folder's name, or its name before names were made
-        unique."""
+        """Instants of a shot in the table, found by its unique name, its folder's name, or its original name."""
         for name in (shot.name, shot.output, shot.called, _plain(shot.called)):
             if name in self._table:
                 self._found.add(name)

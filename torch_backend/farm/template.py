@@ -27,7 +27,7 @@ VERSION = "jobtemplate-2023-09"
 TEMPLATE_FILE, PARAMETERS_FILE, VALUES_FILE = "template.json", "parameters.json", "parameter_values.json"
 """The template; its parameters for `openjd run --job-param file://...`; its parameters for a Deadline Cloud bundle."""
 MOST_LETTERS = 1024
-"""Most characters of a path in Open Job Description."""
+"""Largest length of a path in Open Job Description, in characters."""
 NOTIFY_SECONDS = 60
 """Seconds that a cancelled training has for its checkpoint."""
 _SAYS = {
@@ -110,7 +110,7 @@ def write_job(folder: Path, template: dict[str, Any], values: dict[str, str]) ->
 
 
 def paths_of(shots: Sequence[FarmShot]) -> dict[str, str]:
-    """Job parameter -> path, of all options of the shots' steps that name files."""
+    """Job parameter -> path, for each option of the shots' steps that names files."""
     found: dict[str, str] = {}
     for shot in shots:
         for kind, values in shot.requests.items():

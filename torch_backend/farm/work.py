@@ -13,7 +13,7 @@ from .shots import FarmShot
 STEPS = ("import", "solve", "train", "open", "freeze", "finish", "bake", "deliver")
 """Steps of a shot, in order. Each begins when all tasks of the previous one have succeeded."""
 MOST_VALUES = 1024
-"""Most values of a task parameter in Open Job Description."""
+"""Largest number of values of a task parameter in Open Job Description."""
 
 
 @dataclass(frozen=True)
