@@ -102,8 +102,8 @@ def _static_views(shot: Shot, static_model: StaticModel | None, report: Reporter
 def _keep_surface(
     shot: Shot, clip: Clip, n: int, found: KeyEvidence, labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None
 ) -> None:
-    """Writes the points of still surfaces in key frame `n`: pixels that the matte `labels` [H, W] calls still, at some
-    distance from all others. Some matches of a mover fit a still point by chance, at a depth without a surface."""
+    """Writes the points of still surfaces in key frame `n`. They lie where the matte `labels` [H, W] is still, away from
+    all other labels. Some matches of a mover fit a still point by chance, at a depth without a surface."""
     apart = (labels != STILL).astype(np.uint8)
     reach = 2 * round(AWAY * clip.width / 640) + 1
     apart = cv2.dilate(apart, np.ones((reach, reach), np.uint8)) > 0

@@ -115,7 +115,7 @@ class Shot(ShotFolder):
         news = self.frames / UNPUBLISHED_FILE
         if not news.is_file():
             return
-        with contextlib.suppress(ValueError, KeyError, TypeError):  # damaged by another program: frames.json holds
+        with contextlib.suppress(ValueError, KeyError, TypeError):  # damaged by another program: frames.json is valid
             record = read_json(news)
             info = from_dict(ShotInfo, {**dataclasses.asdict(self.info()), **{name: record[name] for name in IMPORTED}})
             if record.get("replaced"):

@@ -25,8 +25,8 @@ _SECONDS = 5.0
 _LENGTH = 1024
 """Size of every lock file in bytes. A lock is taken over in place, by one write of this size."""
 SILENCE_SECONDS = 180.0
-"""A writer on another computer counts as dead after this time without a new heartbeat: three times as long as network
-disks cache files."""
+"""A writer on another computer counts as dead after this time without a new heartbeat. Network disks cache files for a
+third of this time."""
 _BARE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 

@@ -61,7 +61,7 @@ def own_input() -> int:
 
 
 def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
-    """Stops this process, as Ctrl-C does, once its standard input closes, which happens when its starter ends.
+    """Stops this process, as Ctrl-C does, once its standard input closes. The input closes when the starter ends.
 
     The process has `grace_seconds` for a checkpoint. Then it is killed, with the process group that it leads (POSIX).
     """

@@ -57,8 +57,8 @@ WATCH_CORES = 0.015
 def measure(records: Iterable[dict[str, Any]]) -> dict[str, Rate]:
     """Rates measured from the records of tasks (`records.read`), for steps that have records.
 
-    If the amounts of work differ, non-negative least squares fit a fixed cost and a cost per unit. Otherwise both costs
-    are those of `MEASURED`, scaled by the ratio of actual to expected seconds.
+    If the amounts of work differ, a line fitted to the records gives a fixed cost and a cost per unit; neither is below
+    0. Otherwise both costs are those of `MEASURED`, scaled by the ratio of actual to expected seconds.
     """
     by_step: dict[str, list[tuple[float, float, float, float]]] = {}
     for record in records:
