@@ -102,7 +102,7 @@ def _static_views(shot: Shot, static_model: StaticModel | None, report: Reporter
 def _keep_surface(
     shot: Shot, clip: Clip, n: int, found: KeyEvidence, labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None
 ) -> None:
-    """Writes the points of still surfaces in key frame `n`. They lie where the matte `labels` [H, W] is still, away from
+    """Writes the points of still surfaces in key frame `n`. They lie where the matte `labels` [H, W] is still, far from
     all other labels. Some matches of a mover fit a still point by chance, at a depth without a surface."""
     apart = (labels != STILL).astype(np.uint8)
     reach = 2 * round(AWAY * clip.width / 640) + 1

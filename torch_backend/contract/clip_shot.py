@@ -92,7 +92,7 @@ def readable_stem(name: str, is_numbered: bool) -> str:
 
 
 def same_name(name: str) -> str:
-    """Key that is the same for names that some disk takes for one file: without case, and with normalised accents."""
+    """`name` without case and with normalised accents: the same for names that some disks take for one file."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 

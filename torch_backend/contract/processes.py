@@ -98,7 +98,7 @@ def computer_name() -> str:
 
     On Linux the hash covers the machine id and the namespace of process ids, which differs between containers. On
     Windows it covers the machine's GUID. Other systems have no hash. A Mac has its local host name, because the result
-    of `gethostname` depends on the network, such as home or studio.
+    of `gethostname` depends on the network and differs between home and studio.
     """
     marks: list[str] = []
     if sys.platform == "win32":
