@@ -34,10 +34,10 @@ from ...scene import Scene, evenly_spaced, read_image, resize_intrinsics
 from ...shot import Shot
 from ...torch_types import from_numpy
 from ...train import LoadedRun
-from ..bands import bands
 from ..frozen import FrozenGaussians, fade, freeze_at, render_frozen, span_of
 from ..views.source_views import MARGIN
 from ..views.working_plates import MEASURED_WIDTH, VIEWS
+from .plane_filter import filtered
 from .planes import Array, Planes, fit_planes, grid_of, smoothed, window_means
 
 LEAST_INVERSE = 1e-4
@@ -366,64 +366,15 @@ def selected(
     """
     import cv2
 
-    height, width = splats.shape
     rows, columns = (axis.astype(np.float32) for axis in grid_of(planes.value.shape))
     level = planes.value - planes.along * columns - planes.down * rows
-    fit = planes.fits(config.uneven)
-    maps = [level, planes.along, planes.down, fit, np.square(sigma), *np.moveaxis(small, -1, 0)]
-    windows = [np.pad(m.astype(np.float32), config.radii[0], mode="edge") for m in maps]
+    maps = [level, planes.along, planes.down, planes.fits(config.uneven), np.square(sigma)]
     rough = np.asarray(cv2.medianBlur(splats, 3), np.float32)
-    out, deviation = np.zeros_like(splats), np.zeros_like(splats)
-    for part in bands(height, width):
-        colors = [np.ascontiguousarray(picture[part, :, i]) for i in range(picture.shape[2])]
-        size = *planes.value.shape, height
-        out[part], deviation[part] = _from_windows(windows, rough[part], colors, part.start, size, config)
+    out, deviation = filtered(
+        np.concatenate([np.stack(maps, axis=-1), small], axis=2), rough, picture, config.radii[0], config.noise,
+        config.outlier, config.color, LEAST_INVERSE,
+    )  # fmt: skip
     return np.where(splats > 0, out, 0.0), np.where(splats > 0, deviation, 0.0)
-
-
-def _from_windows(
-    windows: list[Array], rough: Array, colors: list[Array], top: int, size: tuple[int, int, int],
-    config: SurfaceDepthConfig,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Some rows of `selected`, starting at row `top`.
-
-    Args:
-        windows: level, slopes, fit, variance and channels of the smaller picture, [h, w] plus a border of `radii[0]`.
-        rough: [b, W] the splats' inverse depth of these rows, median-filtered.
-        colors: [b, W] per channel of the picture.
-        size: (h, w) without the border, and the picture's height.
-    """
-    import cv2
-
-    (h, w, height), (rows, width), border = size, rough.shape, config.radii[0]
-    down = (np.arange(top, top + rows, dtype=np.float32) + 0.5) * (h / height)
-    at = border + down.astype(np.int64)
-    y = (down - 0.5 - 0.5 * h)[:, None]
-    x = ((np.arange(width, dtype=np.float32) + 0.5) * (w / width) - 0.5 - 0.5 * w)[None]
-    near = 1.0 / (config.noise * np.maximum(rough, LEAST_INVERSE))
-    total = np.full_like(rough, 1e-20)
-    mean, square, spread = np.zeros_like(rough), np.zeros_like(rough), np.zeros_like(rough)
-    for dy in (-config.radii[0], 0, config.radii[0]):
-        lines = [m[at + dy] for m in windows]
-        for dx in (-config.radii[0], 0, config.radii[0]):
-            columns = slice(border + dx, border + dx + w)
-            level, along, below, fit, variance, *window_colors = (
-                cv2.resize(m[:, columns], (width, rows), interpolation=cv2.INTER_NEAREST) for m in lines
-            )
-            guess = level + along * x + below * y - rough
-            off = np.zeros_like(rough)
-            for one, other in zip(window_colors, colors, strict=True):
-                off += np.square((one - other) * np.float32(1.0 / config.color))
-            # Splats choose among windows of one colour; windows of another colour are rejected, whatever their depth.
-            weight = fit * np.exp(-0.5 * off) * (np.exp(-0.5 * np.square(guess * near)) + config.outlier)
-            total += weight
-            mean += weight * guess
-            square += weight * np.square(guess)
-            spread += weight * variance
-    known = total > 1e-12
-    variance = np.maximum(square / total - np.square(mean / total), 0.0) + spread / total
-    deviation = np.where(known, np.sqrt(variance), config.noise * rough)
-    return np.where(known, rough + mean / total, rough), deviation
 
 
 class FrameDepths:
