@@ -31,21 +31,21 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 BARS = {"W0": (0.0, 1e-4), "W1": (100.0, 4e-4)}
 """Workload -> (least PSNR in dB over all pixels, largest relative L2 gradient error of any input)."""
 _NOTES = """\
-- **Flips.** Alpha below 1/255 is dropped, so a pixel within rounding of the cut moves by up to 4e-3 with the last bit
-  of an input. No body is wrong there: such pixels are left out of errors and gradients, and their share is bounded.
-  Pixels count as the same side when their alphas differ by less than 3e-4. A pixel that is opaque in the end hides a
-  flip from its alpha, and that flip stays in the errors.
-- **Background.** Float32 keeps 1 - alpha to 6e-8 at best. Where everything is opaque the background's gradient is of
-  that size, so its error is relative to 1 % at least of the gradient in an empty scene.
-- **Saturated opacity.** torch's float32 sigmoid of 17 is 1, its gradient 0; the other bodies form exp(-|x|) and keep
-  it.
-- **Far from the origin.** World to camera is done in float32: at 1400 units from the origin it cancels to 1e-4 of a
-  unit.
-- **Enormous Gaussians.** Beyond 1e12 px^2 of projected variance a Gaussian is culled, since float32 could not invert
-  its covariance. On that cut bodies may round to different sides.
-- **Enormous colours.** Gradients of positions are proportional to colours, and overflow when those pass 1e30 or so.
-- **Beyond the frustum.** The Jacobian's clamp bounds how large a splat may get off screen, and leaves it turned
-  there, in every body alike.
+- **Flips.** Alpha below 1/255 is dropped, so a pixel within rounding of the cut changes by up to 4e-3 with the last bit
+  of an input. No implementation is wrong there. Such pixels are excluded from errors and gradients, and their share is
+  bounded. Pixels are on the same side if their alphas differ by less than 3e-4. A pixel that ends opaque hides a flip
+  from its alpha, and that flip stays in the errors.
+- **Background.** Float32 keeps 1 - alpha to 6e-8 at best. Behind opaque splats the background's gradient is of that
+  size. Its error is therefore relative to at least 1 % of the gradient in an empty scene.
+- **Saturated opacity.** torch's float32 sigmoid of 17 is 1, with gradient 0; the other implementations use exp(-|x|),
+  which keeps the gradient.
+- **Far from the origin.** World to camera is computed in float32: 1400 units from the origin, cancellation leaves an
+  error of 1e-4 units.
+- **Enormous Gaussians.** A Gaussian above 1e12 px^2 of projected variance is culled, since float32 could not invert its
+  covariance. Near that limit, implementations may round to different sides.
+- **Enormous colours.** Gradients of positions are proportional to colours, and overflow when colours exceed about 1e30.
+- **Outside the frustum.** In every implementation, the Jacobian's clamp bounds the size of a splat off screen, but
+  distorts its orientation.
 """
 
 
@@ -78,9 +78,7 @@ def _cases(bodies: list[str], names: list[str]) -> list[str]:
         title = f"{name}: {case.note}" if case.note else name
         lines.append(f"| {title} | {' | '.join(map(_errors, errors))} | {bounds} |")
     close = len(names) - len(lines) + 2
-    others = (
-        f"In the other {close} cases every body reaches {_CLOSE[0]:.0f} dB, with gradients within {_cell(_CLOSE[1])}."
-    )
+    others = f"In the other {close} cases every implementation reaches {_CLOSE[0]:.0f} dB, with gradients within {_cell(_CLOSE[1])}."
     return [*lines, "", others]
 
 
@@ -94,7 +92,7 @@ def _generated(cases: int) -> str:
         raise SystemExit(f"the property tests did not run:\n{run.stdout[-2000:]}{run.stderr[-1000:]}")
     total, _, parts = counts[0].removeprefix("rasteriser: ").partition(" generated cases ")
     verdict = run.stdout.splitlines()[-1].strip("= ").partition(" in ")[0]
-    return f"{int(total):,} cases of {parts.count(',') + 1} properties, one test per property and body: {verdict}."
+    return f"{int(total):,} cases of {parts.count(',') + 1} properties, one test per property and implementation: {verdict}."
 
 
 def _machine() -> str:
@@ -111,7 +109,9 @@ def _machine() -> str:
 def _workloads(bodies: list[str]) -> list[str]:
     """Table of the rooms of benchmarks/workload.py: errors over all pixels and per input, with `BARS`."""
     lines = [
-        "| workload, body | flips | dB, all pixels | dB | " + " | ".join(i for i in INPUTS if i != "sh") + " | bars |",
+        "| workload, implementation | flips | dB, all pixels | dB | "
+        + " | ".join(i for i in INPUTS if i != "sh")
+        + " | bars |",
         "|---" * (len(INPUTS) + 4) + "|",
     ]
     for name, (least, most) in BARS.items():
@@ -135,21 +135,21 @@ def report(bodies: list[str], names: list[str], cases: int) -> str:
     text = [
         "# Numerics of the rasteriser",
         "",
-        "Written by `python -m benchmarks.numerics`; do not edit. Errors of each body against the float64 oracle "
-        "(torch, autograd) on inputs rounded to float32.",
+        "Generated by `python -m benchmarks.numerics`; do not edit. Errors of each implementation against the float64 "
+        "oracle (torch, autograd) on inputs rounded to float32.",
         "",
         f"{datetime.date.today().isoformat()}; {_machine()}.",
         "",
         "`dB` is the PSNR at pixels without flips, for a peak of 1 (or the brightest channel); `flips` is the share of "
         "the other pixels. Errors of gradients are relative L2.",
         "",
-        "Bodies: `cpu` is compiled float32, `reference32` the torch reference in float32, `cuda` the CUDA kernels on "
+        "Implementations: `cpu` is compiled float32, `reference32` the torch reference in float32, `cuda` the CUDA kernels on "
         "CPU fibers (smaller scenes).",
         "",
         "## Two rooms",
         "",
-        "W0: 400 Gaussians, 64 x 48. W1: 20,000 Gaussians, 320 x 180. Gradients are of a random weighting of colours "
-        "and alphas, at pixels without flips.",
+        "W0: 400 Gaussians, 64 x 48. W1: 20,000 Gaussians, 320 x 180. Gradients are taken of a random weighting of "
+        "colours and alphas, at pixels without flips.",
         "",
         *_workloads(bodies),
         "",
@@ -160,7 +160,7 @@ def report(bodies: list[str], names: list[str], cases: int) -> str:
         "## Generated cases",
         "",
         "`tests/backend/raster/test_properties.py`: " + _generated(cases) + " `SPLANNEQUIN_CASES=20000` in the "
-        "environment tries that many of each property.",
+        "environment runs that many cases of each property.",
         "",
         "## Hard cases",
         "",

@@ -242,7 +242,7 @@ CASES: dict[str, Case] = {
     "scales up to e^6 units": Case(
         _scales(1.0, 3.0, 6.0),
         gradient=5e-3,
-        note="gradients of sheets that look flat from edge to edge are small differences of large numbers",
+        note="gradients of sheets nearly uniform across the picture are small differences of large numbers",
     ),
     "scales of e^-20, e^-50, 0": Case(_scales(-20.0, -50.0, -math.inf)),
     "the same, antialiased": Case(_scales(-20.0, -50.0, -math.inf, antialiased=True)),
@@ -256,7 +256,7 @@ CASES: dict[str, Case] = {
     "opacity 1 (logits 15, 100, inf)": Case(
         _opacities(15.0, 100.0, math.inf),
         plain=0.5,
-        note="torch's float32 sigmoid is 1 beyond 17: its gradients, of 3e-7, are gone",
+        note="torch's float32 sigmoid is 1 beyond 17, so its gradients of 3e-7 vanish",
     ),
     "opacity 0 (logits -100, -inf), some not": Case(_opacities(-100.0, -math.inf, 0.0)),
     "opacity 0.01 everywhere": Case(_opacities(-4.6), flips=0.05),
@@ -284,7 +284,7 @@ CASES: dict[str, Case] = {
         psnr=55,
         gradient=5e-2,
         flips=0.1,
-        note="positions themselves are exact float32 numbers; their transform to the camera cancels 1400 against 1400",
+        note="positions are exact float32 numbers; their transform to the camera subtracts 1400 from 1400",
     ),
     "equal depths": Case(_equal_depths),
 }
