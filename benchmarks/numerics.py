@@ -78,7 +78,8 @@ def _cases(bodies: list[str], names: list[str]) -> list[str]:
         title = f"{name}: {case.note}" if case.note else name
         lines.append(f"| {title} | {' | '.join(map(_errors, errors))} | {bounds} |")
     close = len(names) - len(lines) + 2
-    others = f"In the other {close} cases every implementation reaches {_CLOSE[0]:.0f} dB, with gradients within {_cell(_CLOSE[1])}."
+    bounds = f"{_CLOSE[0]:.0f} dB, with gradients within {_cell(_CLOSE[1])}"
+    others = f"In the other {close} cases every implementation reaches {bounds}."
     return [*lines, "", others]
 
 
@@ -92,7 +93,8 @@ def _generated(cases: int) -> str:
         raise SystemExit(f"the property tests did not run:\n{run.stdout[-2000:]}{run.stderr[-1000:]}")
     total, _, parts = counts[0].removeprefix("rasteriser: ").partition(" generated cases ")
     verdict = run.stdout.splitlines()[-1].strip("= ").partition(" in ")[0]
-    return f"{int(total):,} cases of {parts.count(',') + 1} properties, one test per property and implementation: {verdict}."
+    properties = parts.count(",") + 1
+    return f"{int(total):,} cases of {properties} properties, one test per property and implementation: {verdict}."
 
 
 def _machine() -> str:
@@ -143,8 +145,8 @@ def report(bodies: list[str], names: list[str], cases: int) -> str:
         "`dB` is the PSNR at pixels without flips, for a peak of 1 (or the brightest channel); `flips` is the share of "
         "the other pixels. Errors of gradients are relative L2.",
         "",
-        "Implementations: `cpu` is compiled float32, `reference32` the torch reference in float32, `cuda` the CUDA kernels on "
-        "CPU fibers (smaller scenes).",
+        "Implementations: `cpu` is compiled float32, `reference32` the torch reference in float32, `cuda` the CUDA "
+        "kernels on CPU fibers (smaller scenes).",
         "",
         "## Two rooms",
         "",
