@@ -78,8 +78,8 @@ def _cases(bodies: list[str], names: list[str]) -> list[str]:
         title = f"{name}: {case.note}" if case.note else name
         lines.append(f"| {title} | {' | '.join(map(_errors, errors))} | {bounds} |")
     close = len(names) - len(lines) + 2
-    bounds = f"{_CLOSE[0]:.0f} dB, with gradients within {_cell(_CLOSE[1])}"
-    others = f"In the other {close} cases every implementation reaches {bounds}."
+    reached = f"{_CLOSE[0]:.0f} dB, with gradients within {_cell(_CLOSE[1])}"
+    others = f"In the other {close} cases every implementation reaches {reached}."
     return [*lines, "", others]
 
 
