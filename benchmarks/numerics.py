@@ -37,15 +37,15 @@ _NOTES = """\
   from its alpha, and that flip stays in the errors.
 - **Background.** Float32 keeps 1 - alpha to 6e-8 at best. Behind opaque splats the background's gradient is of that
   size. Its error is therefore relative to at least 1 % of the gradient in an empty scene.
-- **Saturated opacity.** torch's float32 sigmoid of 17 is 1, with gradient 0; the other implementations use exp(-|x|),
-  which keeps the gradient.
+- **Saturated opacity.** torch's float32 sigmoid of 17 is 1, with gradient 0; the others use exp(-|x|), which keeps
+  the gradient.
 - **Far from the origin.** World to camera is computed in float32: 1400 units from the origin, cancellation leaves an
   error of 1e-4 units.
 - **Enormous Gaussians.** A Gaussian above 1e12 px^2 of projected variance is culled, since float32 could not invert its
   covariance. Near that limit, implementations may round to different sides.
 - **Enormous colours.** Gradients of positions are proportional to colours, and overflow when colours exceed about 1e30.
-- **Outside the frustum.** In every implementation, the Jacobian's clamp bounds the size of a splat off screen, but
-  distorts its orientation.
+- **Outside the frustum.** In every implementation, the Jacobian's clamp bounds the size of splats off screen, but
+  rotates them.
 """
 
 
