@@ -381,7 +381,7 @@ def _train(spec: RunSpec, truth: TruthScene, run_name: str, jobs: int) -> tuple[
         write_json(path, facts)
     since = time.process_time()
     # Several children train runs of one shot at once, each under a lock named after its run.
-    code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print, alone=False)
+    code, summary = run_job(new_job(truth.shot, "train", spec.params(run_name)), print, exclusive=False)
     if code != ExitCode.OK:
         return int(code), "", facts
     if whole:

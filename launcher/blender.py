@@ -39,8 +39,8 @@ class Blender:
 
     def running(self, script: Path, *arguments: str) -> list[str]:
         """The command line that runs `script` with `arguments`."""
-        safe, apart = (("-P",), ()) if self.is_wheel else ((), ("--",))
-        return [*self.command, *safe, str(script), *apart, *arguments]
+        safe, separator = (("-P",), ()) if self.is_wheel else ((), ("--",))
+        return [*self.command, *safe, str(script), *separator, *arguments]
 
     def extension_tool(self, *arguments: str) -> list[str]:
         """The command line that runs Blender's tool for extensions (`build`, `validate`, `server-generate`).
@@ -107,14 +107,14 @@ def choose_wheels() -> list[tuple[str, str]]:
     at_hand = [(s, sys.executable) for s in DEMO_WHEELS if BPY_WHEELS[s] == sys.version_info[:2]]
     if at_hand:
         return sorted(at_hand, key=lambda wheel: not bpy_environment(wheel[0]).ready())
-    other: list[tuple[str, str]] = []
+    fitting: list[tuple[str, str]] = []
     for series in DEMO_WHEELS:
         if bpy_environment(series).ready():
             return [(series, "")]
         python = python_for(series)
         if python:
-            other.append((series, python))
-    return other
+            fitting.append((series, python))
+    return fitting
 
 
 def python_for(series: str) -> str | None:

@@ -63,12 +63,12 @@ def stop_children(children: Sequence[subprocess.Popen[Any]]) -> None:
     All children are interrupted before the wait begins, so that they stop in parallel.
     """
     living = [child for child in children if child.poll() is None]
-    until = time.monotonic() + GRACE_SECONDS
+    deadline = time.monotonic() + GRACE_SECONDS
     try:
         for child in living:
             child.send_signal(getattr(signal, "CTRL_BREAK_EVENT", signal.SIGTERM) if WINDOWS else signal.SIGINT)
         for child in living:
-            child.wait(max(0.0, until - time.monotonic()))
+            child.wait(max(0.0, deadline - time.monotonic()))
     except (KeyboardInterrupt, subprocess.TimeoutExpired):
         for child in living:
             if child.poll() is None:
@@ -87,12 +87,12 @@ def _kill(child: subprocess.Popen[Any]) -> None:
 
 def wait_for_any(children: Sequence[subprocess.Popen[Any]], seconds: float) -> subprocess.Popen[Any] | None:
     """The first child that has ended; None if none ends within `seconds`. Ctrl-C interrupts it on every system."""
-    until = time.monotonic() + seconds
+    deadline = time.monotonic() + seconds
     while True:
         for child in children:
             if child.poll() is not None:
                 return child
-        if time.monotonic() >= until:
+        if time.monotonic() >= deadline:
             return None
         time.sleep(0.1)
 
@@ -174,7 +174,7 @@ def exit_code_of(code: int) -> int:
     return ExitCode.INTERNAL
 
 
-BLENDERS_OWN = re.compile(
+BLENDER_LOG_LINE = re.compile(
     r"\d\d:\d\d\.\d+ |Info: |Fra:|Saved: |Blender \d|Read blend: | ?Time: |\s*$|.*RuntimeWarning: |    "
 )
 """Lines of Blender's output that do not concern an artist; they only go to the log."""
@@ -191,7 +191,7 @@ def run_blender(command: Sequence[str], log: Path, **environ: str) -> int:
                 stream.write(line + "\n")
                 if line.startswith("Error: "):
                     print(line, file=sys.stderr, flush=True)
-                elif not BLENDERS_OWN.match(line):
+                elif not BLENDER_LOG_LINE.match(line):
                     say(line)
         return exit_code_of(child.wait())
     except KeyboardInterrupt:

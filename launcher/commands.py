@@ -26,19 +26,19 @@ from .blender import get_blender, set_up_wheel
 from .children import run_blender, run_child, say, tied_command
 from .environments import backend_environment, bench_environment, set_up
 from .errors import LauncherError
-from .places import HERE, ROOT
+from .places import ROOT, WORKING_FOLDER
 from .summary import read_summary
 
 
-def freeze(given: str, output: Path, options: Sequence[str]) -> int:
+def freeze(clip: str, output: Path, options: Sequence[str]) -> int:
     """Freezes a clip or a shot folder: runs the backend's steps, then the bake in Blender; returns an exit code.
 
     For a shot folder only the frames are frozen again; see `contract.freezes_a_shot`.
     """
     started = time.monotonic()
-    if "://" not in given and not any(mark in given for mark in "#%*@") and not os.path.exists(given):
+    if "://" not in clip and not any(mark in clip for mark in "#%*@") and not os.path.exists(clip):
         raise LauncherError(
-            f"There is no clip at {given}: give the path of a video file, an image sequence or a shot folder.",
+            f"There is no clip at {clip}: give the path of a video file, an image sequence or a shot folder.",
             ExitCode.USAGE,
         )
     backend = backend_environment()
@@ -46,14 +46,15 @@ def freeze(given: str, output: Path, options: Sequence[str]) -> int:
     blender, took = get_blender()
     setting_up += took
 
-    say(f"Freezing {given} into {output}")
-    again = "://" not in given and is_shot(given)
-    command = tied_command(backend.python, "torch_backend", "freeze", given, *options)
+    say(f"Freezing {clip} into {output}")
+    is_existing_shot = "://" not in clip and is_shot(clip)
+    command = tied_command(backend.python, "torch_backend", "freeze", clip, *options)
     freezing = time.monotonic()
-    code = run_child([*command, *([] if again else ["--output", str(output)])], cwd=HERE, tied=True)
+    place = [] if is_existing_shot else ["--output", str(output)]
+    code = run_child([*command, *place], cwd=WORKING_FOLDER, tied=True)
     if code:
         return code
-    summary = _of_a_shot(given, options, time.monotonic() - freezing) if again else read_summary(output)
+    summary = _of_a_shot(clip, options, time.monotonic() - freezing) if is_existing_shot else read_summary(output)
     if "shot" not in summary or "take" not in summary:
         raise LauncherError(f"The backend left no figures in {output / 'summary.json'}: see the messages above.", 1)
     write_json(output / "summary.json", summary)
@@ -148,7 +149,7 @@ def bench(arguments: Sequence[str], output: Path) -> int:
     setting_up = set_up(backend, sys.executable)
     setting_up += set_up(bench_environment(), backend.python)
     renderer: list[str] = []
-    if not _own_scenes(arguments):
+    if not _brings_scenes(arguments):
         blender, took = get_blender()
         if not blender.is_wheel:
             raise LauncherError(
@@ -157,7 +158,7 @@ def bench(arguments: Sequence[str], output: Path) -> int:
             )
         renderer, setting_up = ["--bpy", blender.command[0]], setting_up + took
     command = [backend.python, "-P", "-m", "benchmarks.bench", "--results", str(output), "--tied", *renderer]
-    code = run_child([*command, *arguments], cwd=HERE, tied=True)
+    code = run_child([*command, *arguments], cwd=WORKING_FOLDER, tied=True)
     summary: dict[str, Any] = {"command": "bench", "exit_code": code}
     summary.update(wall_seconds=round(time.monotonic() - started, 2), setup_seconds=round(setting_up, 2))
     if code == 0:
@@ -166,7 +167,7 @@ def bench(arguments: Sequence[str], output: Path) -> int:
     return code
 
 
-def _own_scenes(arguments: Sequence[str]) -> bool:
+def _brings_scenes(arguments: Sequence[str]) -> bool:
     """True if a benchmark's arguments need no synthetic scene."""
     named = {word.partition("=")[0] for word in arguments}
     return bool(named & {"--truth", "--shot"}) and not named & {"--size", "--quick", "--limits", "--hard"}

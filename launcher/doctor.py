@@ -89,9 +89,9 @@ def machine_findings() -> Iterator[Finding]:
     yield Finding("cores", "ok" if cores > 1 else "note", f"{cores} on {platform.platform(terse=True)}")
     if (known := memory()) is not None:
         total = known[0] / 1e9
-        enough = total >= 6
+        is_enough = total >= 6
         yield Finding(
-            "memory", "ok" if enough else "note", f"{total:.1f} GB{'' if enough else ': close other programs'}"
+            "memory", "ok" if is_enough else "note", f"{total:.1f} GB{'' if is_enough else ': close other programs'}"
         )
     folder = next(p for p in (home(), *home().parents) if os.path.exists(p))
     if not backend_environment().ready() and not (folder.is_dir() and os.access(folder, os.W_OK)):

@@ -114,8 +114,8 @@ class Environment:
         try:
             stamp = read_json(self.stamp)
             same = stamp["venv"] == (self.folder / "pyvenv.cfg").read_text(encoding="utf-8")
-            whole = isinstance(stamp["files"], dict) and isinstance(stamp["packages"], dict)
-            return stamp if same and whole and not self.begun.exists() else {}
+            is_complete = isinstance(stamp["files"], dict) and isinstance(stamp["packages"], dict)
+            return stamp if same and is_complete and not self.begun.exists() else {}
         except (OSError, ValueError, KeyError, TypeError):
             return {}
 
@@ -212,15 +212,15 @@ def _make(environment: Environment, python: str, wheels: Path | None) -> None:
     lists = [word for name in environment.requirements for word in ("-r", str(REQUIREMENTS / f"{name}.lock"))]
     install("installing packages", *exactly, *lists)
     if environment.torch:
-        lock, own = _torch(environment, options, index)
+        lock, index_options = _torch(environment, options, index)
         if lock:
-            install("installing PyTorch", *exactly, "-r", str(REQUIREMENTS / lock), *own)
+            install("installing PyTorch", *exactly, "-r", str(REQUIREMENTS / lock), *index_options)
             if needs_cuda(environment.folder):
                 install("installing PyTorch's CUDA libraries", *exactly, "-r", str(REQUIREMENTS / "cuda.lock"))
         else:
             # Its dependencies are already installed, except libraries of another CUDA, which that index has.
             say(f"  the PyTorch of {index} is not in this version's list of hashes: pip checks what that index states")
-            install("installing PyTorch", _torch_pin(), *own)
+            install("installing PyTorch", _torch_pin(), *index_options)
     _step(environment, "importing what was installed", [environment.python, "-P", "-c", environment.probe])
     venv = (environment.folder / "pyvenv.cfg").read_text(encoding="utf-8")
     files = {**before.get("files", {}), **environment.hashes()}

@@ -45,13 +45,13 @@ def find_python(accept: Callable[[tuple[int, int]], bool], names: Sequence[str])
             found = shutil.which(name, path=folder)
             if found and os.path.isabs(found):  # skips the working folder, which Windows searches first
                 candidates.append(found)
-        wanted = name.replace("python", "")
-        if wanted:
+        number = name.replace("python", "")
+        if number:
             pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-            candidates += [str(p) for p in sorted(pyenv.glob(f"{wanted}.*/bin/{name}"), reverse=True)]
+            candidates += [str(p) for p in sorted(pyenv.glob(f"{number}.*/bin/{name}"), reverse=True)]
             launcher = shutil.which("py") if WINDOWS else None
             if launcher and os.path.isabs(launcher):
-                command = [launcher, f"-{wanted}", "-I", "-c", "import sys; print(sys.executable)"]
+                command = [launcher, f"-{number}", "-I", "-c", "import sys; print(sys.executable)"]
                 located = subprocess.run(command, capture_output=True, text=True)
                 if located.returncode == 0:
                     candidates.append(located.stdout.strip())

@@ -23,7 +23,7 @@ from .commands import bench, freeze, setup, take_of
 from .doctor import doctor
 from .environments import backend_environment
 from .errors import LauncherError
-from .places import DEMO_CLIP, HERE
+from .places import DEMO_CLIP, WORKING_FOLDER
 from .release import package
 from .summary import failed_job, read_summary
 from .testing import run_sensitive_tests, run_tests
@@ -96,14 +96,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return farm.task(words[0], words[1:])
     module = {"freeze": ["torch_backend", "freeze"], "bench": ["benchmarks.bench"]}.get(words[0] if words else "")
     if module and {"-h", "--help"} & set(words) and backend_environment().ready():
-        return run_child([backend_environment().python, "-P", "-m", *module, "--help"], cwd=HERE)
-    args, rest = parser().parse_known_args(words)
-    if rest and args.command in ("doctor", "setup", "package"):
-        parser().error(f"unrecognized arguments: {' '.join(rest)}")
+        return run_child([backend_environment().python, "-P", "-m", *module, "--help"], cwd=WORKING_FOLDER)
+    args, extra = parser().parse_known_args(words)
+    if extra and args.command in ("doctor", "setup", "package"):
+        parser().error(f"unrecognized arguments: {' '.join(extra)}")
     for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
             signal.signal(getattr(signal, name), _interrupt)
-    default = _place_of(args.clip, rest) if args.command == "freeze" else args.command
+    default = _place_of(args.clip, extra) if args.command == "freeze" else args.command
     try:
         output = Path(os.path.abspath(args.output or Path("output") / default))
     except OSError:
@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The summary of an earlier run must not be mistaken for this run's.
         (output / "summary.json").unlink(missing_ok=True)
         tempfile.TemporaryFile(dir=output).close()  # fails now if the folder is not writable, not after minutes of work
-        code = dispatch(args, rest, output)
+        code = dispatch(args, extra, output)
     except LauncherError as refused:
         error, code = str(refused), refused.exit_code
     except KeyboardInterrupt as interrupt:
@@ -135,33 +135,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _place_of(given: str, options: Sequence[str], folder: Path = Path("output")) -> str:
+def _place_of(clip: str, options: Sequence[str], folder: Path = Path("output")) -> str:
     """Name of the folder in output/ for a freeze of a clip or shot; different inputs get different folders.
 
     It is the name of the clip, or of shot and take. If another input already uses it, a digest of the path is appended.
     """
-    place = Path(given)
+    place = Path(clip)
     name = place.stem
-    if "://" not in given and is_shot(given):
+    if "://" not in clip and is_shot(clip):
         if name == "shot":  # the default of `--shot-name`; the parent folder has the telling name
             name = place.absolute().parent.name
-        name = f"{name}_{take_of(given, options)}"
+        name = f"{name}_{take_of(clip, options)}"
     name = re.sub(r"[^\w.-]+", "_", name)
-    return f"{name}-{path_digest(_absolute(given))}" if _is_anothers(folder / name, given) else name
+    return f"{name}-{path_digest(_absolute(clip))}" if _has_different_source(folder / name, clip) else name
 
 
-def _is_anothers(folder: Path, given: str) -> bool:
-    """True if a folder is known to hold results of another clip or shot than `given`."""
-    wanted, shots = _absolute(given), list(folder.glob("*" + SHOT_SUFFIX))
-    if "://" not in given and is_shot(given):
+def _has_different_source(folder: Path, clip: str) -> bool:
+    """True if a folder is known to hold results of another clip or shot than `clip`."""
+    target, shots = _absolute(clip), list(folder.glob("*" + SHOT_SUFFIX))
+    if "://" not in clip and is_shot(clip):
         shot_path = str(read_summary(folder).get("shot") or "")
-        return bool(shots) or (bool(shot_path) and os.path.normcase(shot_path) != os.path.normcase(wanted))
-    made_of_a_shot = not shots and bool(read_summary(folder).get("shot"))
-    return made_of_a_shot or any(is_imported_from(shot, wanted) is False for shot in shots)
+        return bool(shots) or (bool(shot_path) and os.path.normcase(shot_path) != os.path.normcase(target))
+    is_from_shot = not shots and bool(read_summary(folder).get("shot"))
+    return is_from_shot or any(is_imported_from(shot, target) is False for shot in shots)
 
 
-def _absolute(given: str) -> str:
-    return given if "://" in given else os.path.abspath(given)
+def _absolute(clip: str) -> str:
+    return clip if "://" in clip else os.path.abspath(clip)
 
 
 def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:
@@ -174,18 +174,18 @@ def _unwritable(failed: OSError, output: Path) -> tuple[str, int]:
     return f"Cannot write to {output}: {failed.strerror or failed}. Choose another --output folder.", code
 
 
-def dispatch(args: argparse.Namespace, rest: list[str], output: Path) -> int:
+def dispatch(args: argparse.Namespace, extra: list[str], output: Path) -> int:
     """Runs the chosen command; returns its exit code."""
     if args.command == "demo":
-        return freeze(str(DEMO_CLIP), output, ["--preset", "preview", *rest])
+        return freeze(str(DEMO_CLIP), output, ["--preset", "preview", *extra])
     if args.command == "freeze":
-        return freeze(args.clip, output, rest)
+        return freeze(args.clip, output, extra)
     if args.command == "setup":
         return setup(args.bpy, args.tests, args.backend, output, args.wheels)
     if args.command == "package":
         return package(args.blender, output)
     if args.command == "bench":
-        return bench(rest, output)
+        return bench(extra, output)
     if args.command == "test":
-        return run_sensitive_tests(rest, output) if args.instructions else run_tests(rest, args.bpy, output)
+        return run_sensitive_tests(extra, output) if args.instructions else run_tests(extra, args.bpy, output)
     return doctor(output, args.gpu)

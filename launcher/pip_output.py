@@ -39,7 +39,7 @@ SYSTEMS = (
     "Apple silicon"
 )
 """Systems for which all packages have wheels."""
-_OTHERS = (
+_UNSUPPORTED = (
     (r"win32", "a 32-bit Python on Windows"),
     (r"win-arm", "Windows on ARM"),
     (r"macosx-.*-x86_64", "a Mac with an Intel processor"),
@@ -57,7 +57,7 @@ def lacking_system(system: str | None = None) -> str:
     system = (system or sysconfig.get_platform()).replace("universal2", platform.machine())
     if re.fullmatch(r"win-amd64|linux-x86_64|macosx-.*-arm64", system):
         return ""
-    return next((words for pattern, words in _OTHERS if re.match(pattern, system)), system)
+    return next((words for pattern, words in _UNSUPPORTED if re.match(pattern, system)), system)
 
 
 def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = None, system: str | None = None) -> None:
@@ -79,7 +79,7 @@ def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = N
     if re.search(r"No space left|Errno 28|not enough space", output, re.I):
         code, advice = ExitCode.DISK, "free some disk, or name a folder on another disk in SPLANNEQUIN_HOME"
     elif "DO NOT MATCH THE HASHES" in output:
-        last, advice = _other_hash(output, wheels)
+        last, advice = _hash_mismatch(output, wheels)
     elif wheels is not None and re.search(r"No matching distribution|from versions:", output):
         lacking = re.search(r"No matching distribution found for ([\w.=+-]+)", output)
         last = f"{wheels} has no wheel of {lacking.group(1) if lacking else 'a package'} for this Python and system"
@@ -101,7 +101,7 @@ def refuse(name: str, log: Path, step: str, output: str, wheels: Path | None = N
     raise LauncherError(f"Setting up {name} failed at {step} ({last[:200]}): {advice}. Log: {log}", code)
 
 
-def _other_hash(output: str, wheels: Path | None) -> tuple[str, str]:
+def _hash_mismatch(output: str, wheels: Path | None) -> tuple[str, str]:
     """(problem, advice) for a file whose SHA-256 is not in the lock, from pip's output."""
     named = re.search(r"^([\w.-]+)\S* from (\S+)", output.partition("DO NOT MATCH THE HASHES")[2], re.M)
     package = named.group(1) if named else "a package"
@@ -118,11 +118,11 @@ def _unreachable(output: str) -> tuple[str, str]:
     urls = [url.strip() for url in listed.group(1).split(",")] if listed else ["https://pypi.org/simple"]
     hosts = [part.hostname for part in map(urllib.parse.urlsplit, urls) if part.scheme != "file" and part.hostname]
     what = named.group(1) if named else " or ".join(dict.fromkeys(hosts)) or "the package index"
-    again = "then start the same command again: it goes on where it stopped"
+    retry = "then start the same command again: it goes on where it stopped"
     if re.search(r"ProxyError|Cannot connect to proxy", output):
-        return f"the proxy on the way to {what} cannot be used", f"check HTTPS_PROXY and pip.conf, {again}"
+        return f"the proxy on the way to {what} cannot be used", f"check HTTPS_PROXY and pip.conf, {retry}"
     if "SSLError" in output or "certificate" in output:
         advice = "if a proxy signs for it, name its certificate in PIP_CERT"
-        return f"the certificate of {what} is not accepted", f"{advice}, {again}"
+        return f"the certificate of {what} is not accepted", f"{advice}, {retry}"
     advice = "check the network; behind a firewall name a proxy (HTTPS_PROXY) or an index of your own (PIP_INDEX_URL)"
-    return f"{what} cannot be reached", f"{advice}, {again}"
+    return f"{what} cannot be reached", f"{advice}, {retry}"

@@ -12,5 +12,5 @@ REQUIREMENTS = ROOT / "requirements"
 DEMO_CLIP = ROOT / "examples" / "sitting.mp4"
 WINDOWS = os.name == "nt"
 LINUX = sys.platform.startswith("linux")
-HERE = Path()
+WORKING_FOLDER = Path()
 """The user's working folder, for children that receive paths as the user typed them."""

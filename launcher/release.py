@@ -224,8 +224,8 @@ def check_listing(folder: Path, archive: str, digest: str) -> None:
         facts = [(one["archive_url"], one["archive_size"], one["archive_hash"]) for one in listed]
     except (ValueError, KeyError, TypeError) as error:
         raise LauncherError(f"Blender's listing {folder / 'index.json'} cannot be read: {error!r}.") from error
-    wanted = (f"./{archive}", (folder / archive).stat().st_size, f"sha256:{digest}")
-    if facts != [wanted]:
+    expected = (f"./{archive}", (folder / archive).stat().st_size, f"sha256:{digest}")
+    if facts != [expected]:
         raise LauncherError(f"Blender's listing {folder / 'index.json'} does not describe {archive}: {facts}.")
 
 

@@ -20,19 +20,19 @@ from .environments import backend_environment, set_up
 from .errors import LauncherError
 from .places import ROOT
 
-AT_ONCE = 2
+PARALLEL_LEGS = 2
 """Largest number of legs that run in parallel, if there are as many cores. More legs would slow each other down: a test
 uses little more than one core."""
 NEWS_SECONDS = 60.0
 """Interval in seconds of progress lines while legs run in parallel, whose output is shown when they end."""
 
 
-BACKEND_APART = tuple(
+SECOND_HALF = tuple(
     f"tests/backend/{name}" for name in ("cameras", "lens", "sfm", "motion", "raster", "footage", "card")
 )
 """Folders with half of the backend's tests by duration: a separate leg in parallel to the other half. None of them
 needs the run that the other half trains once."""
-OTHER_INSTRUCTIONS = {
+OLDER_INSTRUCTIONS = {
     "ATEN_CPU_CAPABILITY": "default",
     "SPLANNEQUIN_MARCH": "x86-64-v3",
     "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
@@ -98,15 +98,15 @@ class Leg:
             self.failed = 1
             return
         for suite in suites:
-            bad = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
+            failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
             skipped = int(suite.get("skipped", 0))
-            self.passed += int(suite.get("tests", 0)) - bad - skipped
-            self.failed += bad
+            self.passed += int(suite.get("tests", 0)) - failed - skipped
+            self.failed += failed
             self.skipped += skipped
 
 
-def run_legs(legs: Sequence[Leg], backend_python: str, logs: Path | None, at_once: int = 1) -> None:
-    """Runs legs in order, up to `at_once` in parallel. On Ctrl-C all are stopped, and KeyboardInterrupt is raised.
+def run_legs(legs: Sequence[Leg], backend_python: str, logs: Path | None, parallel: int = 1) -> None:
+    """Runs legs in order, up to `parallel` in parallel. On Ctrl-C all are stopped, and KeyboardInterrupt is raised.
 
     Args:
         legs: each receives its result.
@@ -116,12 +116,12 @@ def run_legs(legs: Sequence[Leg], backend_python: str, logs: Path | None, at_onc
         at_once: largest number of parallel legs, each of which uses its share of the cores.
     """
     waiting = list(legs)
-    together = logs is not None and at_once > 1 and len(legs) > 1
-    share = {"OMP_NUM_THREADS": str(max(1, cores() // at_once))} if together else {}
+    together = logs is not None and parallel > 1 and len(legs) > 1
+    share = {"OMP_NUM_THREADS": str(max(1, cores() // parallel))} if together else {}
     running: dict[subprocess.Popen[bytes], tuple[Leg, Path | None, float]] = {}
     try:
         while waiting or running:
-            while waiting and len(running) < (at_once if together else 1):
+            while waiting and len(running) < (parallel if together else 1):
                 leg = waiting.pop(0)
                 log = logs / f"{re.sub(r'[^a-z0-9.]+', '-', leg.name.lower())}.log" if together and logs else None
                 say(f"\n=== {leg.name}" + (f" (beside others; its output comes when it ends: {log})" if log else ""))
@@ -164,7 +164,7 @@ def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -
         output: folder for summary, reports and logs.
     """
     paths = [a for a in pytest_args if not a.startswith("-") and (ROOT / a.split("::")[0]).exists()]
-    rest = [a for a in pytest_args if a not in paths]
+    extra = [a for a in pytest_args if a not in paths]
     if not paths:
         paths = [*ADDON_TESTS] if series else ["tests", *ADDON_TESTS]
     addon_paths = [p for p in paths if Path(p).as_posix().startswith("tests/addon")]
@@ -173,24 +173,24 @@ def run_tests(pytest_args: Sequence[str], series: Sequence[str], output: Path) -
     set_up(backend, sys.executable)
     legs: list[Leg] = []
     pytest = [backend.python, "-P", "-m", "pytest"]
-    apart = BACKEND_APART if not pytest_args and not series else ()
-    if apart:  # the longest leg first, so that no core is idle at the end
-        legs.append(Leg("backend, one half", [*pytest, *apart], output / "junit-backend-half.xml"))
+    half = SECOND_HALF if not pytest_args and not series else ()
+    if half:  # the longest leg first, so that no core is idle at the end
+        legs.append(Leg("backend, one half", [*pytest, *half], output / "junit-backend-half.xml"))
     if backend_paths:
-        ignored = [f"--ignore={path}" for path in ("tests/addon", *apart)]
-        legs.append(Leg("backend", [*pytest, *ignored, *backend_paths, *rest], output / "junit-backend.xml"))
+        ignored = [f"--ignore={path}" for path in ("tests/addon", *half)]
+        legs.append(Leg("backend", [*pytest, *ignored, *backend_paths, *extra], output / "junit-backend.xml"))
     if addon_paths:
         blenders = [set_up_wheel(one, True)[0] for one in series] or [get_blender(testing=True)[0]]
         for blender in blenders:
             if not blender.is_wheel:
                 raise LauncherError("The add-on's tests need a bpy wheel: start again with Python 3.11 or 3.13.")
-            command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *rest]
+            command = [*blender.command, "-P", "-m", "pytest", *addon_paths, *extra]
             report = output / f"junit-{blender.label.replace(' ', '-')}.xml"
             legs.append(Leg(f"add-on in {blender.label}", command, report))
     if not pytest_args and not series:
         legs += checkers(backend.python)
     output.mkdir(parents=True, exist_ok=True)
-    run_legs(legs, backend.python, output, min(AT_ONCE, cores()))
+    run_legs(legs, backend.python, output, min(PARALLEL_LEGS, cores()))
     return _close_tests(legs, output)
 
 
@@ -199,14 +199,14 @@ def run_sensitive_tests(pytest_args: Sequence[str], output: Path) -> int:
     backend = backend_environment(testing=True)
     set_up(backend, sys.executable)
     x86 = platform.machine().lower() in ("x86_64", "amd64")
-    environ = {name: value for name, value in OTHER_INSTRUCTIONS.items() if x86 or name == "ATEN_CPU_CAPABILITY"}
+    environ = {name: value for name, value in OLDER_INSTRUCTIONS.items() if x86 or name == "ATEN_CPU_CAPABILITY"}
     legs: list[Leg] = []
     for name in ("raster", "freeze"):
         paths = [path for path in SENSITIVE if path.startswith(f"tests/backend/{name}")]
         command = [backend.python, "-P", "-m", "pytest", *paths, *pytest_args]
         legs.append(Leg(f"{name}, other instructions", command, output / f"junit-{name}.xml", environ))
     output.mkdir(parents=True, exist_ok=True)
-    run_legs(legs, backend.python, output, min(AT_ONCE, cores()))
+    run_legs(legs, backend.python, output, min(PARALLEL_LEGS, cores()))
     return _close_tests(legs, output)
 
 

@@ -34,7 +34,7 @@ SIDES = {BACKEND: "backend", BLENDER: "Blender"}
 
 def text() -> str:
     """The whole page."""
-    return "\n".join([*_INTRODUCTION, *_commands(), *_step_options(), *_other_options(), *_layers()]).rstrip() + "\n"
+    return "\n".join([*_INTRODUCTION, *_commands(), *_step_options(), *_command_options(), *_layers()]).rstrip() + "\n"
 
 
 _INTRODUCTION = [
@@ -107,7 +107,7 @@ def _step_options() -> list[str]:
     ]
 
 
-def _other_options() -> list[str]:
+def _command_options() -> list[str]:
     """Table of the options of all other commands, and of `freeze` and `farm` without the steps' options."""
     rows: list[list[str]] = []
     for name, verb in VERBS.items():

@@ -6,8 +6,8 @@ import sys
 from .cli import main
 
 if sys.argv[1:2] == ["farm-task"]:
-    told = main()
+    exit_code = main()
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(told)  # unloading torch takes longer than a frame, and every farm task would pay for it
+    os._exit(exit_code)  # unloading torch takes longer than a frame, and every farm task would pay for it
 sys.exit(main())

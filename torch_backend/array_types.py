@@ -36,11 +36,11 @@ def sparse_entries(
     return library.csr_array(library.coo_array((weights, (rows, columns)), shape=shape))
 
 
-def pieces(ends: NDArray[np.integer[Any]], others: NDArray[np.integer[Any]], count: int) -> NDArray[np.int32]:
-    """Connected component of each node of a graph, [count] labels from 0. Edges join `ends` [E] with `others` [E]."""
+def pieces(first: NDArray[np.integer[Any]], second: NDArray[np.integer[Any]], count: int) -> NDArray[np.int32]:
+    """Connected component of each node of a graph, [count] labels from 0. Edges join `first` [E] with `second` [E]."""
     from scipy.sparse import csgraph
 
-    graph = sparse_entries(np.ones(len(ends), np.float32), ends, others, (count, count))
+    graph = sparse_entries(np.ones(len(first), np.float32), first, second, (count, count))
     return np.asarray(cast(Any, csgraph).connected_components(graph, directed=False)[1], np.int32)
 
 

@@ -31,7 +31,7 @@ class Console:
         self._last = ("", 0.0)
         self._open_line = False
         self.error: dict[str, Any] | None = None
-        self._way: contract.WholeWay | None = None
+        self._total: contract.TotalProgress | None = None
         self._job = ("", 0.0)
         """Kind of the running job, and its start in seconds since the epoch."""
 
@@ -51,17 +51,17 @@ class Console:
         elif event.type == "done" and event.data["state"] == "cancelled":
             self._line("Cancelled. Start the same command again to go on: finished work is kept.")
 
-    def begins(self, kind: str, way: contract.WholeWay | None) -> None:
-        """Notes that a job of `kind` begins. `way`: progress of the sequence of jobs to which the job belongs."""
-        self._job, self._way = (kind, time.time()), way
+    def begins(self, kind: str, total: contract.TotalProgress | None) -> None:
+        """Notes that a job of `kind` begins. `total`: progress of the sequence of jobs to which the job belongs."""
+        self._job, self._total = (kind, time.time()), total
 
     def _of_all(self, event: Event) -> str:
         """Progress of all jobs together, in words; empty if there is no estimate."""
-        if self._way is None:
+        if self._total is None:
             return ""
         kind, since = self._job
         lasts = event.data["stage"] in contract.LASTING_STAGES
-        share, left = self._way.at(kind, event.time - since, event.data.get("eta_seconds") if lasts else None)
+        share, left = self._total.at(kind, event.time - since, event.data.get("eta_seconds") if lasts else None)
         return f"; in all {share:.0%}, {contract.duration(left)} left"
 
     def _progress(self, event: Event) -> None:
@@ -145,21 +145,21 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     requests = _requests(args)
     try:
         root = output / (args.shot_name + SHOT_SUFFIX)
-        _refuse_anothers(root, requests["import"])
+        _check_same_clip(root, requests["import"])
         shot = Shot.create(root, args.shot_name)
     except OSError as error:
         _give_up(error, output)
     stages: dict[str, float] = {}
     results: dict[str, Any] = {}
-    way: contract.WholeWay | None = None
+    total: contract.TotalProgress | None = None
     for kind, params in requests.items():
         since = time.perf_counter()
-        console.begins(kind, way)
+        console.begins(kind, total)
         results[kind] = run_station(shot, kind, params, console)
         stages[kind] = round(time.perf_counter() - since, 2)
         if kind == "import":
             print_reading(results[kind], console)
-            way = _rest_of_the_way(shot, requests, stages[kind])
+            total = _total_progress(shot, requests, stages[kind])
         info = shot.info()
         if args.t_star is not None and not info.first <= args.t_star <= info.last:  # report it before hours of training
             raise contract.UserError(f"t* is frame {args.t_star}: the shot has frames {info.first} to {info.last}.")
@@ -169,23 +169,23 @@ def freeze_clip(args: argparse.Namespace, console: Console) -> int:
     return ExitCode.OK
 
 
-def _rest_of_the_way(shot: Shot, requests: dict[str, Any], spent: float) -> contract.WholeWay | None:
+def _total_progress(shot: Shot, requests: dict[str, Any], spent: float) -> contract.TotalProgress | None:
     """Time estimate of the jobs after the import, which took `spent` seconds; None if there is none."""
     try:
         size, pace = contract.ShotSize.of(shot), contract.paces(Path(sys.prefix))
     except (OSError, ValueError):
         return None
     seconds = {kind: contract.expected_seconds(kind, requests[kind], size) for kind in requests if kind != "import"}
-    return contract.WholeWay({kind: (s or 0.0) * pace.get(kind, 1.0) for kind, s in seconds.items()}, spent)
+    return contract.TotalProgress({kind: (s or 0.0) * pace.get(kind, 1.0) for kind, s in seconds.items()}, spent)
 
 
-def _refuse_anothers(root: Path, asked: contract.ImportParams) -> None:
+def _check_same_clip(root: Path, params: contract.ImportParams) -> None:
     """Raises JobError if the shot in a folder comes from another clip than the requested one or a copy of it."""
-    if contract.is_imported_from(root, asked.source) is False:
+    if contract.is_imported_from(root, params.source) is False:
         from .footage.importing import holds_footage
 
-        if not holds_footage(root, asked):
-            contract.refuse_anothers(root, asked.source)
+        if not holds_footage(root, params):
+            contract.check_same_clip(root, params.source)
 
 
 def _requests(args: argparse.Namespace) -> dict[str, Any]:
@@ -224,12 +224,12 @@ def print_places(take: dict[str, Any], console: Console) -> None:
             print(f"{name:<14} {take[key]}", file=console.stream, flush=True)
 
 
-def print_mattes(made: dict[str, Any], console: Console) -> None:
+def print_mattes(result: dict[str, Any], console: Console) -> None:
     """Prints the paths of a take's mattes."""
     if not console.as_json:
-        for name, folder in made["mattes"].items():
+        for name, folder in result["mattes"].items():
             print(f"Matte {name}: {folder}", file=console.stream, flush=True)
-        print(f"Cryptomatte: {made['cryptomatte'] or 'none'}", file=console.stream, flush=True)
+        print(f"Cryptomatte: {result['cryptomatte'] or 'none'}", file=console.stream, flush=True)
 
 
 def print_verdict(facts: dict[str, Any], console: Console) -> None:
@@ -456,17 +456,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(args: argparse.Namespace, console: Console) -> int:
-    if args.command in contract.COMMANDS and args.command not in _OTHERS:
-        return freeze_clip(args, console) if _is_whole(args) else one_step(args, console)
-    return _OTHERS[args.command](args, console)
+    if args.command in contract.COMMANDS and args.command not in _UTILITIES:
+        return freeze_clip(args, console) if _is_full_run(args) else one_step(args, console)
+    return _UTILITIES[args.command](args, console)
 
 
-def _is_whole(args: argparse.Namespace) -> bool:
+def _is_full_run(args: argparse.Namespace) -> bool:
     """True if the command runs all steps from a clip; False if it runs one step on a shot."""
     return args.command == "freeze" and not contract.freezes_a_shot(args)
 
 
-_OTHERS = {
+_UTILITIES = {
     "status": status, "doctor": doctor, "export": export, "stmaps": stmaps, "run-job": run_job, "live": live,
     "farm": farm, "farm-task": farm_task,
 }  # fmt: skip

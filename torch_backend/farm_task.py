@@ -56,8 +56,8 @@ class EngineReporter(Reporter):
         if stage == before and ((now - since < _STATUS_SECONDS and share < 1.0) or share == last_share):
             return
         self._last = (stage, now, share)
-        self._say("openjd_progress", f"{100 * share:.1f}")
-        self._say("openjd_status", f"{self.what}: {stage} {100 * share:.0f}% {message}")
+        self._emit("openjd_progress", f"{100 * share:.1f}")
+        self._emit("openjd_status", f"{self.what}: {stage} {100 * share:.0f}% {message}")
 
     def image(self, label: str, path: str | Path) -> None:
         """Prints a line to the log."""
@@ -90,9 +90,9 @@ class EngineReporter(Reporter):
 
     def fail(self, sentence: str) -> None:
         """Tells the engine why the task failed."""
-        self._say("openjd_fail", f"{self.what}: {sentence}")
+        self._emit("openjd_fail", f"{self.what}: {sentence}")
 
-    def _say(self, word: str, text: str) -> None:
+    def _emit(self, word: str, text: str) -> None:
         print(f"{word}: {contract.printable(text, 400)}", flush=True)
 
 
@@ -149,7 +149,7 @@ def _cancelling(reporter: EngineReporter) -> Generator[None]:
             signal.signal(number, handler)
 
 
-def asked_of(args: argparse.Namespace, request: dict[str, Any], kind: str) -> Any:
+def params_of(args: argparse.Namespace, request: dict[str, Any], kind: str) -> Any:
     """Parameters of one kind of job for a task: those of the request, with the paths of this computer.
 
     ValueError names the invalid parameter.
@@ -167,7 +167,7 @@ def asked_of(args: argparse.Namespace, request: dict[str, Any], kind: str) -> An
 
 def _station(args: argparse.Namespace, request: dict[str, Any], reporter: EngineReporter) -> int:
     """Runs import, solve or train as a job of the shot. The job waits while another one writes to the shot."""
-    params = asked_of(args, request, args.step)
+    params = params_of(args, request, args.step)
     shot = Shot.create(args.shot, request["name"]) if args.step == "import" else Shot.open(args.shot)
     code, _ = run_job(new_job(shot, args.step, params), reporter, patient=True)
     if code != ExitCode.OK:
@@ -192,7 +192,7 @@ def _take(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
 
 
 def _freezing(args: argparse.Namespace, request: dict[str, Any]) -> FreezeParams:
-    params: FreezeParams = asked_of(args, request, "freeze")
+    params: FreezeParams = params_of(args, request, "freeze")
     params.take, params.only_missing = request["takes"][args.t_star], True
     params.t_star = int(args.t_star) if args.t_star else params.t_star
     params.first, params.last = int(request["first"]), int(request["last"])
@@ -219,10 +219,10 @@ def _bake(args: argparse.Namespace, request: dict[str, Any], reporter: EngineRep
     command: list[str] = json.loads(blender)
     words = ["bake", "--json", "--tied", "--shot", args.shot, "--take", params.take, "--output", str(output)]
     words += [f"--first={first}", f"--last={last}", "--step", "1", "--part", part]
-    apart = ["--"] if len(command) > 2 else []  # Blender reads arguments before `--` as its own options
+    separator = ["--"] if len(command) > 2 else []  # Blender reads arguments before `--` as its own options
     environ = {**os.environ, "SPLANNEQUIN_BACKEND_PYTHON": sys.executable}
     child = subprocess.Popen(
-        [*command, str(script), *apart, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        [*command, str(script), *separator, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace", env=environ,
         cwd=os.path.dirname(os.path.abspath(command[0])),
     )  # fmt: skip

@@ -45,11 +45,11 @@ class JobReporter:
         self._cancelled = False
         self._last_poll = 0.0
         self._missed = 0
-        self._mine: Writer | None = None
-        self._taken_by: Writer | None = None
+        self._writer: Writer | None = None
+        self._new_writer: Writer | None = None
         self._last_progress = ("", 0.0)
         self._stage_started = ("", 0.0, 0.0)
-        self.from_nothing = False
+        self.is_fresh_start = False
         """True if the job's first stage began at its start, so the job reused no earlier work."""
         self._foretold = ("", 0.0)
         now = time.time()
@@ -69,7 +69,7 @@ class JobReporter:
         with self._lock:
             if stage != self._stage_started[0]:
                 self._stage_started = (stage, now, fraction)
-                self.from_nothing |= stage == contract.BEGINS_WITH.get(self.status.kind) and fraction < 0.05
+                self.is_fresh_start |= stage == contract.BEGINS_WITH.get(self.status.kind) and fraction < 0.05
             eta = self._eta(now, fraction)
             self.status.stage, self.status.fraction = stage, fraction
             self.status.message, self.status.eta_seconds = message, eta
@@ -94,8 +94,8 @@ class JobReporter:
     def check_cancelled(self) -> None:
         if self._missed >= _MISSED_BEATS:
             raise contract.MissingError(f"{self.folder} is gone")
-        if self._taken_by is not None:  # another job owns the shot now, so this one writes no more
-            message = f"The shot was taken over by {self._taken_by.host}: this computer had fallen silent."
+        if self._new_writer is not None:  # another job owns the shot now, so this one writes no more
+            message = f"The shot was taken over by {self._new_writer.host}: this computer had fallen silent."
             raise JobError(message, "It goes on there.", ExitCode.USAGE)
         now = time.monotonic()
         if not self._cancelled and now - self._last_poll >= _CANCEL_POLL_SECONDS:
@@ -109,12 +109,12 @@ class JobReporter:
         self.progress("waiting", 0, 1, why)
         self.check_cancelled()
 
-    def holds(self, mine: Writer) -> None:
-        """Notes that the shot's lock contains `mine`. The job ends if the lock later names another writer."""
-        self._mine = mine
+    def holds(self, writer: Writer) -> None:
+        """Notes that the shot's lock contains `writer`. The job ends if the lock later names another writer."""
+        self._writer = writer
 
     @property
-    def heard(self) -> bool:
+    def has_listener(self) -> bool:
         """True if a listener receives the events."""
         return self._listener is not None
 
@@ -146,9 +146,9 @@ class JobReporter:
 
     def _eta(self, now: float, fraction: float) -> float | None:
         stage, since, at_fraction = self._stage_started
-        of, until = self._foretold
-        if of == stage and now < until and fraction < 1.0:  # the station's forecast, while it lasts
-            return round(until - now, 1)
+        of, end = self._foretold
+        if of == stage and now < end and fraction < 1.0:  # the station's forecast, while it lasts
+            return round(end - now, 1)
         gained = fraction - at_fraction
         if gained <= 0.02 or now - since < 1.0:
             return None
@@ -174,10 +174,10 @@ class JobReporter:
     def _heartbeat(self) -> None:
         while not self._stop.wait(contract.HEARTBEAT_SECONDS / 2):
             self._write_status()
-            if self._mine is not None:
+            if self._writer is not None:
                 with contextlib.suppress(OSError, ValueError):
                     holder = contract.read_writer(self.folder.parent.parent)
-                    self._taken_by = holder if holder not in (None, self._mine) else None
+                    self._new_writer = holder if holder not in (None, self._writer) else None
 
     def _write_status(self) -> None:
         with self._lock:
@@ -193,7 +193,7 @@ class JobReporter:
 
 
 def run_job(
-    folder: str | Path, listener: Listener | None = None, alone: bool = True, patient: bool = False
+    folder: str | Path, listener: Listener | None = None, exclusive: bool = True, patient: bool = False
 ) -> tuple[int, Any]:
     """Runs the request in `folder` to its end. Returns (exit code, result or None); never raises for a failed job.
 
@@ -214,12 +214,12 @@ def run_job(
         return ExitCode.USAGE, None
     with working_on(Path(request.shot).absolute(), folder.parent.parent):
         reporter = JobReporter(folder, request.kind, listener)
-        with contextlib.ExitStack() as held, _signals_cancel(reporter):  # keeps the lock until the last status
-            return _run(request, reporter, held if alone else None, patient)
+        with contextlib.ExitStack() as locks, _signals_cancel(reporter):  # keeps the lock until the last status
+            return _run(request, reporter, locks if exclusive else None, patient)
 
 
 def _run(
-    request: JobRequest, reporter: JobReporter, held: contextlib.ExitStack | None, patient: bool
+    request: JobRequest, reporter: JobReporter, locks: contextlib.ExitStack | None, patient: bool
 ) -> tuple[int, Any]:
     result: Any = None
     state, code, message, hint = "done", int(ExitCode.OK), "", ""
@@ -227,15 +227,15 @@ def _run(
         params = request.typed_params()
         shot = Shot.open(request.shot)
         words = shot.root, request.kind, reporter.folder.name
-        if held is not None:
-            mine = patient_writer(*words, reporter.waiting) if patient else only_writer(*words)
-            reporter.holds(held.enter_context(mine))
+        if locks is not None:
+            lock = patient_writer(*words, reporter.waiting) if patient else only_writer(*words)
+            reporter.holds(locks.enter_context(lock))
             shot.publish_frames()
         reporter.check_cancelled()
         since = time.monotonic()
         with _kept_in_place(shot, request.kind):
             result = RUNNERS[request.kind](shot, params, reporter)
-        if reporter.from_nothing:
+        if reporter.is_fresh_start:
             _learn_pace(shot, request.kind, params, time.monotonic() - since)
     except Cancelled:
         state, code = "cancelled", int(ExitCode.CANCELLED)
@@ -261,7 +261,7 @@ def _run(
         else:
             message, hint = known.message, known.hint
     reporter.finish(state, code, message, hint, result)
-    if state == "failed" and not reporter.heard and not reporter.folder.is_dir():
+    if state == "failed" and not reporter.has_listener and not reporter.folder.is_dir():
         # In Blender, the standard error is the open log file, which moves with the shot's folder.
         print(f"{message} {hint}".rstrip(), file=sys.stderr)
     return code, result
@@ -284,10 +284,10 @@ def _kept_in_place(shot: Shot, kind: str) -> Generator[None]:
         raise
     except Exception as error:
         if not _exists(shot):
-            raise contract.gone(shot.root, kind) from error
+            raise contract.missing_shot_error(shot.root, kind) from error
         raise
     if not _exists(shot):
-        raise contract.gone(shot.root, kind)
+        raise contract.missing_shot_error(shot.root, kind)
 
 
 def _exists(shot: Shot) -> bool:

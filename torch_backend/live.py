@@ -29,7 +29,16 @@ import torch
 from torch import Tensor
 
 from . import contract
-from .contract import NO_DEPTH, JobError, LiveView, from_dict, own_input, path_error, read_message, write_message
+from .contract import (
+    NO_DEPTH,
+    JobError,
+    LiveView,
+    detach_standard_input,
+    from_dict,
+    path_error,
+    read_message,
+    write_message,
+)
 from .footage.plates import Plates
 from .freeze.composite.compositor import CompositeConfig, CompositeFrame, Compositor
 from .freeze.frozen import (
@@ -94,8 +103,8 @@ class _Details:
 
     def __init__(self, shot: Shot, run: LoadedRun, scene: Scene) -> None:
         self._shot, self._run, self._scene = shot, run, scene
-        self._made: tuple[tuple[int, int], _LivePlates, Compositor] | None = None
-        self._whole: tuple[int, int] | None = None
+        self._cached: tuple[tuple[int, int], _LivePlates, Compositor] | None = None
+        self._full_size: tuple[int, int] | None = None
 
     def frame(
         self, output: OutputFrame, frozen: FrozenGaussians, image: FrozenImage, stop: Callable[[], bool]
@@ -103,23 +112,23 @@ class _Details:
         """A view of plates, at its own scale. JobError if a plate cannot be read; Superseded once `stop` is true."""
         height, width = image.alpha.shape
         size = self._size(output)
-        if self._made is None or self._made[0] != size:
-            self._made = None  # frees memory before the next one is made
+        if self._cached is None or self._cached[0] != size:
+            self._cached = None  # frees memory before the next one is made
             plates = _LivePlates(self._shot, size)
-            self._made = size, plates, Compositor(self._run, self._scene, plates, _DETAIL, plates.moving)
-        _, plates, compositor = self._made
+            self._cached = size, plates, Compositor(self._run, self._scene, plates, _DETAIL, plates.moving)
+        _, plates, compositor = self._cached
         plates.stop = stop
         return compositor.frame(output, frozen, image, width, height)
 
     def _size(self, output: OutputFrame) -> tuple[int, int]:
         """Width and height of plates about as fine as a view: the source's size, halved as often as possible."""
-        if self._whole is None:
-            whole = Plates(self._shot)
-            self._whole = whole.width, whole.height
-        focal = float(self._scene.Ks[0, 0, 0]) * self._whole[0] / self._scene.width
+        if self._full_size is None:
+            full = Plates(self._shot)
+            self._full_size = full.width, full.height
+        focal = float(self._scene.Ks[0, 0, 0]) * self._full_size[0] / self._scene.width
         finer = focal / max(float(output.K[0, 0]), 1e-6)
         halved = 2 ** max(0, math.floor(math.log2(finer * _COARSER)))
-        return max(16, round(self._whole[0] / halved)), max(16, round(self._whole[1] / halved))
+        return max(16, round(self._full_size[0] / halved)), max(16, round(self._full_size[1] / halved))
 
 
 class LiveSession:
@@ -211,8 +220,8 @@ class LiveSession:
         key = frame, file
         if key not in self._frozen:
             field = self._field(frame)
-            made = None if file is None else load_developed(self._shot, self.run, frame, field)
-            self._frozen[key] = field if made is None else made
+            developed = None if file is None else load_developed(self._shot, self.run, frame, field)
+            self._frozen[key] = field if developed is None else developed
             while len(self._frozen) > _INSTANTS_KEPT:
                 self._frozen.popitem(last=False)
         self._frozen.move_to_end(key)
@@ -281,10 +290,10 @@ class _Waiting:
     def better_than(self, view: LiveView) -> bool:
         """True if a view made of plates should be abandoned: a faster or newer request waits, or the session ended."""
         with self._change:
-            waits = any(not other.detail or other.view == view.view for other in self._views.values())
+            waits = any(not queued.detail or queued.view == view.view for queued in self._views.values())
             return self._ended or bool(self._refused) or waits
 
-    def put_back(self, view: LiveView) -> None:
+    def requeue(self, view: LiveView) -> None:
         """Queues a request again, unless a newer one for the same view waits."""
         with self._change:
             self._views.setdefault(view.view, view)
@@ -304,7 +313,7 @@ def serve(session: LiveSession, requests: BinaryIO, answers: BinaryIO) -> None:
             try:
                 header, body = session.draw(request, functools.partial(waiting.better_than, request))
             except Superseded:
-                waiting.put_back(request)
+                waiting.requeue(request)
                 continue
             except Exception as error:
                 known = error if isinstance(error, JobError) else contract.broke("The live view", error)
@@ -320,7 +329,7 @@ def run_live(shot: str | Path, run: str, device: str = "auto") -> int:
     # Text that a library prints would corrupt the messages, so it goes to the standard error from now on.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    requests = os.fdopen(own_input(), "rb")
+    requests = os.fdopen(detach_standard_input(), "rb")
     try:
         session = LiveSession(Shot.open(shot), run, device)
     except Exception as error:

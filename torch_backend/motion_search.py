@@ -15,8 +15,8 @@ from .contract import MOTION_FILE, MOTION_UNFINISHED_FILE, PICTURE, SURFACE, Can
 from .footage.images import is_whole_png
 from .motion.flow import FlowConfig
 from .motion.mattes import MOTION_VERSION, MOVING, STILL, UNKNOWN, read_found, record_of, solve_key, write_matte
-from .motion.moving import Clip, Labels, StaticViews, scored_ahead
-from .motion.surface import AWAY, KeyEvidence, is_damaged, surface_points, write_surface
+from .motion.moving import Clip, Labels, StaticViews, prefetched_scores
+from .motion.surface import BORDER_DISTANCE, KeyEvidence, is_damaged, surface_points, write_surface
 from .sfm.masks import IGNORE, PEOPLE, limited, load_mask
 from .sfm.verdict import doubt_of
 from .shot import Shot, make_folder, need_disk, write_json
@@ -64,7 +64,7 @@ def find_motion(
     shares = np.zeros((len(files), 3))
     for n in written:
         shares[n] = _shares(read_found(files[clip.frames[n]]))
-    with scored_ahead(clip, config, written, report) as scored:
+    with prefetched_scores(clip, config, written, report) as scored:
         labels_of = Labels(clip, _static_views(shot, static_model, report), config)
         for count, frame in enumerate(scored, start=len(written) + 1):
             report.check_cancelled()
@@ -104,10 +104,10 @@ def _keep_surface(
 ) -> None:
     """Writes the points of still surfaces in key frame `n`. They lie where the matte `labels` [H, W] is still, far from
     all other labels. Some matches of a mover fit a still point by chance, at a depth without a surface."""
-    apart = (labels != STILL).astype(np.uint8)
-    reach = 2 * round(AWAY * clip.width / 640) + 1
-    apart = cv2.dilate(apart, np.ones((reach, reach), np.uint8)) > 0
-    excluded = apart if ignored is None else apart | ignored
+    not_still = (labels != STILL).astype(np.uint8)
+    reach = 2 * round(BORDER_DISTANCE * clip.width / 640) + 1
+    not_still = cv2.dilate(not_still, np.ones((reach, reach), np.uint8)) > 0
+    excluded = not_still if ignored is None else not_still | ignored
     points = surface_points(found, clip.unit, np.asarray(excluded, np.bool_), clip.frames[n])
     write_surface(shot.surface(clip.frames[n]), *points)
 

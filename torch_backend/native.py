@@ -171,7 +171,7 @@ def build(name: str, text: str) -> Launch:
     return launch
 
 
-class _Ask:
+class _Task:
     """One launch of a kernel. Lists record which workers began and ended, because an interrupt cannot leave an append
     half done."""
 
@@ -179,8 +179,8 @@ class _Ask:
         self._run, self._address, self._stage = run, address, stage
         self._pending = deque(range(workers))
         self._entered: list[None] = []
-        self._left: list[None] = []
-        self._told: SimpleQueue[None] = SimpleQueue()
+        self._exited: list[None] = []
+        self._finished: SimpleQueue[None] = SimpleQueue()
         self.errors: list[BaseException] = []
         """Exceptions of workers that failed."""
 
@@ -190,8 +190,8 @@ class _Ask:
         try:
             self._take(self._pending.pop)
         finally:
-            self._left.append(None)
-            self._told.put(None)
+            self._exited.append(None)
+            self._finished.put(None)
 
     def carry_out(self, crew: "_Crew", helpers: int) -> None:
         """Carries out the launch on the calling thread: requests helpers, runs pending workers, then waits for the
@@ -203,8 +203,8 @@ class _Ask:
         while True:
             try:
                 if helpers:
-                    wanted, helpers = helpers, 0
-                    crew.ask(self, wanted)
+                    count, helpers = helpers, 0
+                    crew.submit(self, count)
                 self._finish()
                 return
             except BaseException as raised:  # Ctrl-C: raised again once no thread uses the block
@@ -214,11 +214,13 @@ class _Ask:
         while True:
             while self._take(self._pending.popleft):
                 pass
-            left = len(self._left)  # read before `_entered`: the loop then waits for a helper that enters in between
-            if left == len(self._entered):
+            exited = len(
+                self._exited
+            )  # read before `_entered`: the loop then waits for a helper that enters in between
+            if exited == len(self._entered):
                 return
             with contextlib.suppress(Empty):
-                self._told.get(timeout=_LOOK_SECONDS)
+                self._finished.get(timeout=_LOOK_SECONDS)
 
     def _take(self, pop: Callable[[], int]) -> bool:
         try:
@@ -237,9 +239,9 @@ class _Crew:
 
     def __init__(self) -> None:
         self._lock, self._threads = threading.Lock(), 0
-        self._asked: SimpleQueue[_Ask] = SimpleQueue()
+        self._queue: SimpleQueue[_Task] = SimpleQueue()
 
-    def ask(self, ask: _Ask, helpers: int) -> None:
+    def submit(self, task: _Task, helpers: int) -> None:
         """Requests `helpers` threads for a launch, or as many as the system allows."""
         if self._threads < helpers:
             with self._lock:
@@ -250,11 +252,11 @@ class _Crew:
                         break
                     self._threads += 1
         for _ in range(min(helpers, self._threads)):  # without a thread to take it, a request would stay in the queue
-            self._asked.put(ask)
+            self._queue.put(task)
 
     def _work(self) -> None:
         while True:
-            self._asked.get().help()
+            self._queue.get().help()
 
 
 _crew = _Crew()
@@ -277,10 +279,10 @@ def run_workers(run: Launch, block: Any, stage: int, workers: int) -> None:
     if workers == 1:
         run(address, stage, 0)
         return
-    ask = _Ask(run, address, stage, workers)
-    ask.carry_out(_crew, workers - 1)
-    if ask.errors:
-        raise ask.errors[0]
+    task = _Task(run, address, stage, workers)
+    task.carry_out(_crew, workers - 1)
+    if task.errors:
+        raise task.errors[0]
 
 
 class Snippet:

@@ -179,13 +179,13 @@ def split_frames(solved: list[int], holdout: int, phase: int = 0) -> tuple[list[
     if holdout < 2:
         raise UserError(f"holdout is {holdout}: it should be 0 or at least 2")
     test = [i for n, i in enumerate(solved) if n % holdout == phase % holdout and 0 < n < len(solved) - 1]
-    held = set(test)
-    return [i for i in solved if i not in held], test
+    held_out = set(test)
+    return [i for i in solved if i not in held_out], test
 
 
 _DECODERS = 8
 """Largest number of frames decoded at the same time. Each one needs some tens of megabytes."""
-HELD_BYTES = 1 << 30
+IMAGE_MEMORY_BYTES = 1 << 30
 """Largest size of the training images held in memory, in bytes. Larger sets are mapped from a file."""
 
 
@@ -195,23 +195,23 @@ def load_images(
     width: int,
     height: int,
     report: Reporter | None = None,
-    beside: Path | None = None,
+    folder: Path | None = None,
     read: Callable[[int], Tensor] | None = None,
 ) -> Tensor:
     """Working frames `indices` at a training size, [I, height, width, 3] float16 in [0, 1] of the scene's display.
 
-    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `HELD_BYTES` of images
-    are mapped from an unnamed file in the folder `beside`, unless that is None. The file vanishes with the process.
+    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `IMAGE_MEMORY_BYTES` of images
+    are mapped from an unnamed file in `folder`, unless that is None. The file vanishes with the process.
     JobError if the disk has no room for it.
 
     Several frames are decoded at a time. `read` replaces the decoder: index into `Scene.frames` -> [height, width, 3]
     in [0, 1]. It is called for one frame after the other, in the clip's order.
     """
     shape = len(indices), height, width, 3
-    if beside is None or 2 * math.prod(shape) <= HELD_BYTES:
+    if folder is None or 2 * math.prod(shape) <= IMAGE_MEMORY_BYTES:
         images = torch.empty(*shape, dtype=torch.float16)
     else:
-        images = _mapped(beside, shape)
+        images = _mapped(folder, shape)
 
     def load(n: int) -> None:
         index = indices[n]

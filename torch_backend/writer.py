@@ -34,9 +34,9 @@ _BARE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os
 def only_writer(root: Path, kind: str, job: str) -> Generator[Writer]:
     """Holds the lock of the shot in `root`. JobError if another job holds it, or if the shot cannot be written."""
     pid = os.getpid()
-    mine = Writer(contract.computer_name(), pid, contract.process_start(pid), kind, job, time.time())
+    writer = Writer(contract.computer_name(), pid, contract.process_start(pid), kind, job, time.time())
     try:
-        _take(root, mine)
+        _take(root, writer)
     except OSError as error:
         if is_disk_full(error) or isinstance(error, FileNotFoundError):
             raise
@@ -44,9 +44,9 @@ def only_writer(root: Path, kind: str, job: str) -> Generator[Writer]:
         raise JobError(f"Cannot write to {root}: {reason}.", "Choose another shot folder.", ExitCode.DISK) from error
     folder = os.open(root, os.O_RDONLY) if os.unlink in os.supports_dir_fd else None
     try:
-        yield mine
+        yield writer
     finally:
-        _release(root, mine, folder)
+        _release(root, writer, folder)
         if folder is not None:
             os.close(folder)
 
@@ -67,11 +67,11 @@ def patient_writer(
     Raises:
         JobError: the shot cannot be written.
     """
-    heard, since = None, time.monotonic()
-    with contextlib.ExitStack() as held:
+    last_sign, since = None, time.monotonic()
+    with contextlib.ExitStack() as stack:
         while True:
             try:
-                mine = held.enter_context(only_writer(root, kind, job))
+                writer = stack.enter_context(only_writer(root, kind, job))
                 break
             except JobError as error:
                 holder = _read_writer(root)
@@ -81,12 +81,12 @@ def patient_writer(
                     holder = None
                 waiting(error.message)
             sign = None if holder is None else (holder, _heartbeat(root, holder))
-            if sign != heard:
-                heard, since = sign, time.monotonic()
+            if sign != last_sign:
+                last_sign, since = sign, time.monotonic()
             elif holder is not None and holder.host != contract.computer_name() and time.monotonic() - since > silence:
-                _bury(root, holder)
+                _remove_lock(root, holder)
             time.sleep(min(1.0, silence / 4))
-        yield mine
+        yield writer
 
 
 def _read_writer(root: Path) -> Writer | None:
@@ -105,7 +105,7 @@ def _heartbeat(root: Path, holder: Writer) -> object:
         return None
 
 
-def _bury(root: Path, dead: Writer) -> None:
+def _remove_lock(root: Path, dead: Writer) -> None:
     """Removes the lock of a dead writer. Puts the lock back if a new writer took it in between."""
     path = contract.ShotFolder(root).lock
     partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
@@ -121,32 +121,32 @@ def _bury(root: Path, dead: Writer) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _take(root: Path, mine: Writer) -> None:
-    path, until = contract.ShotFolder(root).lock, time.monotonic() + _SECONDS
-    while not _make(path, mine):
+def _take(root: Path, writer: Writer) -> None:
+    path, deadline = contract.ShotFolder(root).lock, time.monotonic() + _SECONDS
+    while not _make(path, writer):
         try:
             holder = contract.read_writer(root)
         except (OSError, ValueError) as error:  # being written just now, or by another program
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 hint = f"If nothing works on this shot, delete {path}."
                 raise JobError(f"Whether a step works on {root.name} cannot be told: {error}.", hint, ExitCode.USAGE) \
                     from error  # fmt: skip
             time.sleep(0.05)
             continue
         if holder is None:  # released in between, or a dangling link
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 what = f"{path} cannot be made, and names nobody who works on {root.name}."
                 raise JobError(what, "Delete it, then start again.", ExitCode.USAGE)
             time.sleep(0.01)
             continue
         if holder.works():
-            if not contract.gives_back(root, holder) or time.monotonic() > until:
+            if not contract.is_ending(root, holder) or time.monotonic() > deadline:
                 raise contract.busy(root, holder)
             time.sleep(0.01)
             continue
-        if _take_over(path, holder, mine):
+        if _take_over(path, holder, writer):
             return
-        if time.monotonic() > until:
+        if time.monotonic() > deadline:
             what = f"{path} was left by a step that was ended, and cannot be replaced."
             raise JobError(what, "Delete it, then start again.", ExitCode.USAGE)
         time.sleep(0.01)
@@ -156,7 +156,7 @@ def _text(writer: Writer) -> bytes:
     return json.dumps(dataclasses.asdict(writer)).encode().ljust(_LENGTH)
 
 
-def _make(path: Path, mine: Writer) -> bool:
+def _make(path: Path, writer: Writer) -> bool:
     """Creates a complete lock file in one step; False if there is one already.
 
     The server of a network disk creates hard links atomically. On a disk without hard links, the lock is opened
@@ -164,7 +164,7 @@ def _make(path: Path, mine: Writer) -> bool:
     """
     partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
     try:
-        _write(partial, mine)
+        _write(partial, writer)
         if sys.platform == "win32":
             try:
                 os.rename(partial, path)  # does not replace a file on Windows
@@ -176,7 +176,7 @@ def _make(path: Path, mine: Writer) -> bool:
             except FileExistsError:
                 return os.stat(partial).st_nlink == 2  # NFS sent the request twice, and the first one succeeded
             except OSError:  # no links on this disk
-                _write(path, mine)
+                _write(path, writer)
     except FileExistsError:
         return False
     finally:
@@ -184,11 +184,11 @@ def _make(path: Path, mine: Writer) -> bool:
     return True
 
 
-def _write(path: Path, mine: Writer) -> None:
+def _write(path: Path, writer: Writer) -> None:
     """Creates a new lock file. FileExistsError if there is one."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BARE)
     try:
-        os.write(handle, _text(mine))
+        os.write(handle, _text(writer))
         os.fsync(handle)
     except OSError:
         path.unlink(missing_ok=True)
@@ -197,8 +197,8 @@ def _write(path: Path, mine: Writer) -> None:
         os.close(handle)
 
 
-def _take_over(path: Path, dead: Writer, mine: Writer) -> bool:
-    """Replaces the entry of a dead process of this computer with `mine`; False if another process was faster.
+def _take_over(path: Path, dead: Writer, writer: Writer) -> bool:
+    """Replaces the entry of a dead process of this computer with `writer`; False if another process was faster.
 
     Only processes of this computer try this, and the system lets one of them at a time lock the file.
     """
@@ -210,26 +210,26 @@ def _take_over(path: Path, dead: Writer, mine: Writer) -> bool:
         if not try_lock(handle):
             return False
         try:
-            same = contract.from_dict(Writer, json.loads(lock.read(_LENGTH))) == dead
-            if not same or not os.path.samestat(os.stat(path), os.fstat(handle)):
+            is_same = contract.from_dict(Writer, json.loads(lock.read(_LENGTH))) == dead
+            if not is_same or not os.path.samestat(os.stat(path), os.fstat(handle)):
                 return False
         except (FileNotFoundError, ValueError):
             return False
         lock.seek(0)
-        lock.write(_text(mine))
+        lock.write(_text(writer))
         lock.truncate(_LENGTH)
         lock.flush()
         os.fsync(handle)
     return True
 
 
-def _release(root: Path, mine: Writer, folder: int | None) -> None:
-    """Removes the lock if it is `mine`. `folder`, a handle of the shot folder, finds a lock even in a renamed shot."""
+def _release(root: Path, writer: Writer, folder: int | None) -> None:
+    """Removes the lock if it is `writer`. `folder`, a handle of the shot folder, finds a lock even in a renamed shot."""
     path = Path(contract.WRITER_FILE) if folder is not None else root / contract.WRITER_FILE
     for _ in range(40):
         try:
             with os.fdopen(os.open(path, os.O_RDONLY | _BARE, dir_fd=folder), "rb") as lock:
-                if lock.read(_LENGTH) != _text(mine):
+                if lock.read(_LENGTH) != _text(writer):
                     return
             os.unlink(path, dir_fd=folder)
             return

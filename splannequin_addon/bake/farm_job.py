@@ -37,7 +37,7 @@ def begin(words: contract.FarmWords, requests: dict[str, Any]) -> children.Quest
         words = dataclasses.replace(words, request=str(request))
         if values.get("freeze", {}).get("device"):
             device = ["--device", values["freeze"]["device"]]
-    return backend.ask("farm", *contract.said_of(words), *device)
+    return backend.ask("farm", *contract.arguments_of(words), *device)
 
 
 def written(asked: children.Question) -> list[str]:

@@ -153,7 +153,7 @@ def _freeze_clip(args: argparse.Namespace, console: Console) -> int:
     began = time.perf_counter()
     output = _output(args)
     shot = output / (args.shot_name + contract.SHOT_SUFFIX)
-    contract.refuse_anothers(shot, args.clip)
+    contract.check_same_clip(shot, args.clip)
     scene, fresh = _scene(args.blend)
     settings_of(scene).shot_path = str(shot)
     requests = asked(args)

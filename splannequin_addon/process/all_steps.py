@@ -28,7 +28,7 @@ class Chain:
 
     ahead: list[str]
     """Names of the steps still to be started, in order."""
-    way: contract.WholeWay
+    way: contract.TotalProgress
     """Estimated durations of the steps."""
     step: str = ""
     """Name of the running step."""
@@ -64,7 +64,7 @@ def missing(scene: bpy.types.Scene) -> list[str]:
 def begin(scene: bpy.types.Scene, shot: Path) -> None:
     """Starts the first missing step; the timer starts the others. Without a window, all steps have ended on return."""
     ahead = missing(scene)
-    chain = _chains[shot] = Chain(ahead, contract.WholeWay(_expected(scene, shot, ahead)))
+    chain = _chains[shot] = Chain(ahead, contract.TotalProgress(_expected(scene, shot, ahead)))
     if not bpy.app.background:
         _begin_next(chain, scene)
         job_timer.meanwhile(lambda: _turn(shot, chain))

@@ -199,7 +199,7 @@ def refuse_second_writer(shot: Path) -> None:
         writer = contract.read_writer(shot)
     except (OSError, ValueError):
         writer = None  # the backend reports a damaged lock
-    if writer is not None and writer.works() and not contract.gives_back(shot, writer):
+    if writer is not None and writer.works() and not contract.is_ending(shot, writer):
         raise contract.busy(shot, writer)
     for job in latest(shot).values():
         is_local = job.status is None or job.status.host in ("", contract.computer_name())  # others hold the lock
@@ -430,7 +430,7 @@ def _declare_dead(job: Job, status: contract.Status | None) -> contract.Status:
     now = time.time()
     status = status or contract.Status(job.kind, "failed", 0, now, 0.0, now)
     if not job.folder.is_dir():
-        lost = contract.gone(job.shot, job.kind)
+        lost = contract.missing_shot_error(job.shot, job.kind)
         status.state, status.message, status.hint, status.exit_code = "failed", lost.message, lost.hint, lost.exit_code
         return status
     code = job.process.returncode if job.process else None

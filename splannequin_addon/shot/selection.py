@@ -49,10 +49,10 @@ def folder_of(one: OneShot) -> Path | None:
 
 
 def beside(clip: Path) -> Path:
-    """Cached `contract.shot_beside`, looked up once a second, because it is called at every redraw."""
+    """Cached `contract.default_shot_folder`, looked up once a second, because it is called at every redraw."""
     found = _beside.get(clip)
     if found is None or time.monotonic() - found[0] > _LOOK_SECONDS:
-        found = _beside[clip] = (time.monotonic(), contract.shot_beside(clip, source.is_of))
+        found = _beside[clip] = (time.monotonic(), contract.default_shot_folder(clip, source.is_of))
     return found[1]
 
 

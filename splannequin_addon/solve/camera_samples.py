@@ -134,7 +134,7 @@ def transforms(
         "h": size[1],
         **shared,
         "camera_model": "PINHOLE",
-        contract.OWN_FACTS: {
+        contract.CAMERA_FACTS_KEY: {
             "world": contract.SCENE_WORLD,
             "is_numbered_as_shot": is_numbered_as_shot,
             "notes": [list(note) for note in notes],

@@ -225,7 +225,7 @@ def begin_export(words: contract.ExportWords) -> children.Question:
     Raises:
         contract.JobError: there is no backend, or it cannot be started.
     """
-    return backend.ask("export", *contract.said_of(words))
+    return backend.ask("export", *contract.arguments_of(words))
 
 
 def exported(asked: children.Question, folder: Path) -> str:

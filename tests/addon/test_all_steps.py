@@ -36,7 +36,7 @@ def ended_job(addon, contract, watch, step, state="done"):
 
 def begun(chain, watch, ahead, step="solve"):
     """Register a chain of steps with `step` running and `ahead` still to run."""
-    found = chain.Chain(list(ahead), chain.contract.WholeWay({}), step)
+    found = chain.Chain(list(ahead), chain.contract.TotalProgress({}), step)
     chain._chains[watch.shot] = found
     return found
 
@@ -106,7 +106,7 @@ def test_cancel_between_two_steps_ends_it(addon, contract, chain, watch):
 
 def test_the_bar_goes_by_what_the_running_job_says_of_itself(addon, contract, chain, watch):
     found = begun(chain, watch, ["train"])
-    found.way = contract.WholeWay({"solve": 50.0, "train": 100.0})
+    found.way = contract.TotalProgress({"solve": 50.0, "train": 100.0})
     ended_job(addon, contract, watch, "solve", "running")
     job = watch.jobs["solve"]
     job.status.stage, job.status.eta_seconds = "solve", 50.0

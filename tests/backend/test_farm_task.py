@@ -177,12 +177,12 @@ def test_two_shots_of_one_name_are_baked_into_two_folders(imported_shots, tmp_pa
 
 
 def test_paths_among_the_parameters_are_those_of_this_computer():
-    from torch_backend.farm_task import asked_of
+    from torch_backend.farm_task import params_of
 
     args = cli.parser().parse_args(
         ["farm-task", "solve", "--shot", "s", "--request", "r", "--paths", "solve.people_mask=/mnt/a.png", "train.x=1"]
     )
-    params = asked_of(args, {"solve": {"focal_mm": 35.0}}, "solve")
+    params = params_of(args, {"solve": {"focal_mm": 35.0}}, "solve")
     assert (params.focal_mm, params.people_mask) == (35.0, "/mnt/a.png")
     with pytest.raises((ValueError, JobError), match="focal length"):
-        asked_of(args, {"solve": {"focal_mm": 1e9}}, "solve")
+        params_of(args, {"solve": {"focal_mm": 1e9}}, "solve")

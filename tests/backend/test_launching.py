@@ -185,8 +185,8 @@ def test_a_caller_does_itself_what_no_worker_has_begun():
     def busy(_address, _stage, _worker):
         hold.wait()
 
-    crew.ask(native._Ask(busy, 0, 0, 1), 1)  # its only thread is busy with another request
-    ask = native._Ask(lambda _address, _stage, worker: done.append(worker), 0, 0, 5)
+    crew.submit(native._Task(busy, 0, 0, 1), 1)  # its only thread is busy with another request
+    ask = native._Task(lambda _address, _stage, worker: done.append(worker), 0, 0, 5)
     ask.carry_out(crew, 1)
     assert sorted(done) == [0, 1, 2, 3, 4] and not ask.errors
     hold.set()
@@ -246,7 +246,7 @@ def test_a_caller_that_gets_no_threads_does_it_all_itself(monkeypatch):
         raise RuntimeError("can't start new thread")
 
     crew, done = native._Crew(), []
-    ask = native._Ask(lambda _address, _stage, worker: done.append(worker), 0, 0, 4)
+    ask = native._Task(lambda _address, _stage, worker: done.append(worker), 0, 0, 4)
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", start)
         ask.carry_out(crew, 3)

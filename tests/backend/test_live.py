@@ -212,7 +212,7 @@ def test_what_is_being_made_of_plates_stops_between_two_plates(trained):
         waiting._views = OrderedDict({waits.view: waits})
         assert waiting.better_than(view) == better
     waiting._views = OrderedDict({1: newer, 2: dataclasses.replace(view, view=2, detail=False)})
-    waiting.put_back(view)
+    waiting.requeue(view)
     assert waiting.next().view == 2
     assert waiting.next() is newer
 

@@ -16,7 +16,7 @@ import pytest
 from torch_backend import contract, job
 from torch_backend.contract import ExitCode, JobError, Writer
 from torch_backend.shot import Shot, atomic_path, make_folder, working_on, write_json
-from torch_backend.writer import _bury, only_writer, patient_writer
+from torch_backend.writer import _remove_lock, only_writer, patient_writer
 
 CLIP = Path(__file__).parents[2] / "examples" / "sitting.mp4"
 ELSEWHERE = "elsewhere (0a1b2c3d)"
@@ -136,7 +136,7 @@ def test_runs_of_one_benchmark_may_be_trained_at_once(shot, monkeypatch):
     with only_writer(shot.root, "train", "another"):
         folder = job.new_job(shot, "train", contract.TrainParams(run="mine"))
         assert job.run_job(folder)[0] == ExitCode.USAGE
-        assert job.run_job(folder, alone=False) == (ExitCode.OK, "trained")
+        assert job.run_job(folder, exclusive=False) == (ExitCode.OK, "trained")
 
 
 def test_another_computers_lock_is_never_taken_over(shot):
@@ -335,7 +335,7 @@ def test_a_patient_writer_waits_for_one_of_its_own_computer_however_silent(shot)
 def test_a_lock_that_changed_hands_is_not_taken_for_the_dead_ones(shot):
     dead, _ = foreign_job(shot)
     put_lock(shot, dataclasses.replace(dead, job="another"))
-    _bury(shot.root, dead)
+    _remove_lock(shot.root, dead)
     assert contract.read_writer(shot.root).job == "another"
     assert [p.name for p in shot.root.glob(".lock*")] == []
 

@@ -62,9 +62,9 @@ def test_figures_of_an_earlier_run_do_not_pass_for_this_one(tmp_path: Path):
 
 
 def test_a_benchmark_of_ones_own_scenes_needs_no_blender():
-    assert commands._own_scenes(["--truth", "folder"]) and commands._own_scenes(["--shot=x", "--seeds", "2"])
-    assert not commands._own_scenes(["--shot", "x", "--hard"])
-    assert not commands._own_scenes(["--quick"]) and not commands._own_scenes(["--shot", "x", "--size=tiny"])
+    assert commands._brings_scenes(["--truth", "folder"]) and commands._brings_scenes(["--shot=x", "--seeds", "2"])
+    assert not commands._brings_scenes(["--shot", "x", "--hard"])
+    assert not commands._brings_scenes(["--quick"]) and not commands._brings_scenes(["--shot", "x", "--size=tiny"])
 
 
 def test_benchs_help_is_the_benchmarks_own():

@@ -17,14 +17,14 @@ def trap(hostile, tmp_path: Path) -> Path:
 def test_the_backend_runs_without_it(trap: Path, tmp_path: Path, capfd):
     """It runs in the user's current folder, which relative paths refer to."""
     command = [sys.executable, "-P", "-m", "torch_backend", "freeze", "absent.mp4", "--output", "out"]
-    assert children.run_child(command, cwd=places.HERE) == 3
+    assert children.run_child(command, cwd=places.WORKING_FOLDER) == 3
     assert f"{tmp_path / 'clips' / 'absent.mp4'} does not exist" in "".join(capfd.readouterr())
     assert not trap.exists(), trap.read_text()
 
 
 def test_what_a_child_starts_in_turn_is_safe_too(trap: Path):
     grandchild = f"import subprocess; raise SystemExit(subprocess.call([{sys.executable!r}, '-m', 'json.tool', '-h']))"
-    assert children.run_child([sys.executable, "-P", "-c", grandchild], cwd=places.HERE) == 0
+    assert children.run_child([sys.executable, "-P", "-c", grandchild], cwd=places.WORKING_FOLDER) == 0
     assert not trap.exists(), trap.read_text()
 
 

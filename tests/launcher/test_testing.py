@@ -54,7 +54,7 @@ def test_two_legs_run_beside_each_other_and_each_ones_output_stays_whole(tmp_pat
     pair = [tmp_path / "one", tmp_path / "two"]
     legs = [Leg(a.name, [sys.executable, "-c", MEETING, str(a), str(b)]) for a, b in (pair, pair[::-1])]
     alone = Leg("Three", [sys.executable, "-c", "import os; raise SystemExit(os.environ['OMP_NUM_THREADS'] == '')"])
-    run_legs([*legs, alone], sys.executable, tmp_path, at_once=2)
+    run_legs([*legs, alone], sys.executable, tmp_path, parallel=2)
     out = capfd.readouterr().out
     for name in ("one", "two"):
         assert f"begins {name}\nends {name} True\n\n=== {name}: 1 passed, 0 failed" in out
@@ -64,7 +64,7 @@ def test_two_legs_run_beside_each_other_and_each_ones_output_stays_whole(tmp_pat
 
 def test_one_leg_at_a_time_prints_as_it_goes(tmp_path: Path, capfd):
     legs = [Leg(name, [sys.executable, "-c", f"print({name!r})"]) for name in ("first", "second")]
-    run_legs(legs, sys.executable, tmp_path, at_once=1)
+    run_legs(legs, sys.executable, tmp_path, parallel=1)
     out = capfd.readouterr().out
     assert out.index("\nfirst\n") < out.index("=== first: 1 passed") < out.index("=== second\n")
     assert not list(tmp_path.glob("*.log"))

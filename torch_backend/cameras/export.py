@@ -57,8 +57,8 @@ def export_cameras(shot: Shot, kind: str, folder: Path, text: bool = False, plac
         path, points = moved(path, where), {**points, "xyz": where.points(points["xyz"])}
     if kind == "nerfstudio":
         return _write_transforms(shot, path, points, folder)
-    other = [folder / (part + (".bin" if text else ".txt")) for part in PARTS]
-    existing = next((file for file in other if file.is_file()), None)
+    conflicting = [folder / (part + (".bin" if text else ".txt")) for part in PARTS]
+    existing = next((file for file in conflicting if file.is_file()), None)
     if existing is not None:
         raise JobError(
             f"{folder} holds another COLMAP model already ({existing.name}).", "Choose another folder.", ExitCode.USAGE

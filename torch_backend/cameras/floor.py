@@ -54,8 +54,8 @@ def find_floor(
     chance = np.random.default_rng(0)
     points = chance.permutation(points)[:_ALL]
     centres, up = np.asarray(centres, dtype=np.float64), _unit(np.asarray(ups, dtype=np.float64).mean(axis=0))
-    away = points - np.median(centres, axis=0)
-    near = NEAR * float(np.median(np.linalg.norm(away, axis=1)))
+    offsets = points - np.median(centres, axis=0)
+    near = NEAR * float(np.median(np.linalg.norm(offsets, axis=1)))
     corners = points[chance.integers(len(points), size=(_TRIES, 3))]
     normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     facing = normals @ up

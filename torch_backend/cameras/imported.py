@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contract import (
+    CAMERA_FACTS_KEY,
     LONGEST_ARRAYS,
-    OWN_FACTS,
     SCENE_WORLD,
     CameraPath,
     ExitCode,
@@ -112,7 +112,7 @@ class Matched:
     """By frame number."""
     missing: list[int]
     """Frame numbers without a camera."""
-    said: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    notes: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
     """(sentence, hint) about the matching, if the pictures are numbered differently or the match is ambiguous."""
 
 
@@ -239,17 +239,17 @@ def _from_transforms(file: Path, data: dict[str, Any]) -> ImportedSolve:
     """
     lenses: dict[Lens, int] = {}
     cameras: list[ImportedCamera] = []
-    own_facts: Any = data.get(OWN_FACTS)
-    facts = cast("dict[str, Any]", own_facts) if isinstance(own_facts, dict) else {}
+    extra: Any = data.get(CAMERA_FACTS_KEY)
+    facts = cast("dict[str, Any]", extra) if isinstance(extra, dict) else {}
     for n, frame in enumerate(data["frames"]):
         name = frame.get("file_path")
         matrix = np.array(frame.get("transform_matrix", []), np.float64)
         if not isinstance(name, str) or matrix.shape not in ((4, 4), (3, 4)):
             raise ValueError(f"frame {n} of {file} has no file_path or no transform_matrix of 4 x 4 numbers")
-        whole = np.eye(4)
-        whole[: len(matrix)] = matrix
-        turned = _rigid(whole, name) * [1.0, -1.0, -1.0, 1.0]  # OpenGL camera axes to OpenCV's
-        pose = np.concatenate([turned[:, :3].T, -(turned[:, :3].T @ turned[:, 3:])], axis=1)
+        full = np.eye(4)
+        full[: len(matrix)] = matrix
+        rotated = _rigid(full, name) * [1.0, -1.0, -1.0, 1.0]  # OpenGL camera axes to OpenCV's
+        pose = np.concatenate([rotated[:, :3].T, -(rotated[:, :3].T @ rotated[:, 3:])], axis=1)
         lens = lenses.setdefault(_transforms_lens(file, {**data, **frame}), len(lenses))
         number = int(Path(name).stem) if facts.get("is_numbered_as_shot") is True else None
         cameras.append(ImportedCamera(name, pose, lens, number))
@@ -330,7 +330,7 @@ def match(
     shifts = any(c.number is None for c in solve.cameras)  # frame numbers of the shot need no shift
     paired = [(name, table, pair(sorted(table), counted, may_shift=shifts)) for name, table in tables.items()]
     fitting = [one for one in paired if sum(n in one[2].numbers for n in needed) >= least]
-    fitting = [one for one in fitting if one[2].by_own_number] or fitting
+    fitting = [one for one in fitting if one[2].by_frame_number] or fitting
     if len(fitting) > 1:
         names = ", ".join(name for name, _, _ in fitting[:4])
         raise _refusal(
@@ -343,10 +343,12 @@ def match(
     missing = [n for n in frames if n not in cameras]
     found = sum(n in cameras for n in needed)
     if not fitting:
-        held = f"its pictures are numbered {min(table)} to {max(table)}" if table else "its pictures have no numbers"
+        numbering = (
+            f"its pictures are numbered {min(table)} to {max(table)}" if table else "its pictures have no numbers"
+        )
         raise _refusal(
             f"Only {found} of the {len(needed)} frames needed, from {frames[0]} to {frames[-1]}, have a camera in "
-            f"{solve.path.name or solve.path}: {held}.",
+            f"{solve.path.name or solve.path}: {numbering}.",
             "Pictures are matched by the frame number in their names: name them as the clip counts.",
         )
     for lens in (solve.lenses[n] for n in sorted({c.lens for c in cameras.values()})):
@@ -384,7 +386,7 @@ def _tables(solve: ImportedSolve) -> dict[str, dict[int, ImportedCamera]]:
 
 def remarks(solve: ImportedSolve, matched: Matched) -> list[tuple[str, str]]:
     """Messages for the artist about the import and the matching, as (sentence, hint)."""
-    remarks = [*solve.notes, *matched.said]
+    remarks = [*solve.notes, *matched.notes]
     if matched.missing:
         remarks.append(
             (
@@ -395,7 +397,7 @@ def remarks(solve: ImportedSolve, matched: Matched) -> list[tuple[str, str]]:
     return remarks
 
 
-def own_points(solve: ImportedSolve, matched: Matched, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
+def stored_points(solve: ImportedSolve, matched: Matched, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
     """The imported points in the layout of points.npz, before filtering. None if the file holds no points.
 
     Returns:

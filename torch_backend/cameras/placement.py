@@ -100,9 +100,9 @@ def camera_to_world(viewmats: NDArray[Any]) -> NDArray[np.float64]:
     """
     viewmats = np.asarray(viewmats, np.float64)
     result = np.zeros_like(viewmats)
-    turned = np.swapaxes(viewmats[:, :3, :3], 1, 2)
-    result[:, :3, :3] = turned * [1.0, -1.0, -1.0]
-    result[:, :3, 3] = -(turned @ viewmats[:, :3, 3:])[..., 0]
+    rotation = np.swapaxes(viewmats[:, :3, :3], 1, 2)
+    result[:, :3, :3] = rotation * [1.0, -1.0, -1.0]
+    result[:, :3, 3] = -(rotation @ viewmats[:, :3, 3:])[..., 0]
     result[:, 3, 3] = 1.0
     return result
 

@@ -30,7 +30,7 @@ def load_cameras(shot: Shot) -> CameraPath:
 
     Raises JobError (SOLVE) if the shot is not solved or the file is damaged, ValueError if the file is too new.
     """
-    path = _there(shot, CAMERAS_FILE)
+    path = _existing(shot, CAMERAS_FILE)
     data = _object(path)
     check_version(data, path.name)
     try:
@@ -45,7 +45,7 @@ def load_cameras(shot: Shot) -> CameraPath:
 
 def load_record(shot: Shot) -> dict[str, Any]:
     """The contents of solve.json. Raises JobError (SOLVE) if the shot is not solved or the file is damaged."""
-    return _object(_there(shot, SOLVE_FILE))
+    return _object(_existing(shot, SOLVE_FILE))
 
 
 def load_points(shot: Shot) -> dict[str, NDArray[Any]]:
@@ -53,7 +53,7 @@ def load_points(shot: Shot) -> dict[str, NDArray[Any]]:
 
     Raises JobError (SOLVE) if the shot is not solved or the file is damaged.
     """
-    path = _there(shot, POINTS_FILE)
+    path = _existing(shot, POINTS_FILE)
     try:
         with open_arrays(path) as handle, np.load(handle, allow_pickle=False) as data:
             points = {name: data[name] for name in _POINTS}
@@ -74,7 +74,7 @@ def damaged(path: Path, why: Exception | str) -> JobError:
     return JobError(f"{path} is damaged ({reason[:200]}).", "Solve the camera again.", ExitCode.SOLVE)
 
 
-def _there(shot: Shot, name: str) -> Path:
+def _existing(shot: Shot, name: str) -> Path:
     path = shot.solve / name
     if not path.is_file():
         raise JobError(f"{shot.root.name} has no cameras yet.", "Run the camera step first.", ExitCode.SOLVE)

@@ -42,11 +42,12 @@ row-major; `K` = (fx, fy, cx, cy) in pixels, pixel centres at +0.5; frame number
 # pyright: reportUnusedImport=false
 # Other modules import every name below from this package.
 
-from .camera_path import OWN_FACTS, SCENE_WORLD, CameraFrame, CameraPath
+from .camera_path import CAMERA_FACTS_KEY, SCENE_WORLD, CameraFrame, CameraPath
 from .checkpoint_header import checkpoint_facts
-from .clip_shot import is_imported_from, path_digest, readable_stem, refuse_anothers, same_name, shot_beside
+from .clip_shot import check_same_clip, collision_key, default_shot_folder, is_imported_from, path_digest, readable_stem
 from .colour import PROBE, SHOULDER, SHOULDER_FROM, SHOULDER_ROLL
 from .command_line import (
+    arguments_of,
     as_json,
     command_line,
     freezes_a_shot,
@@ -54,7 +55,6 @@ from .command_line import (
     notes,
     options_for,
     requested_params,
-    said_of,
     trains_anew,
     words_of,
 )
@@ -126,13 +126,13 @@ from .jobs import (
     JobRequest,
     Reporter,
     Status,
-    gone,
+    missing_shot_error,
     new_job,
     runs_job,
 )
 from .light_facts import LightFacts, light_of_take, point_of
 from .live_messages import LIVE_LIMIT, LIVE_SHOWS, LiveView, read_message, write_message
-from .lock import Writer, busy, gives_back, read_writer
+from .lock import Writer, busy, is_ending, read_writer
 from .option_choices import (
     CAMERA_MODELS,
     CARD_GAUSSIANS,
@@ -175,7 +175,7 @@ from .pace import (
     BEGINS_WITH,
     LASTING_STAGES,
     ShotSize,
-    WholeWay,
+    TotalProgress,
     duration,
     expected_seconds,
     learn_pace,
@@ -191,9 +191,9 @@ from .processes import (
     child_environment,
     commands_of_ps,
     computer_name,
+    detach_standard_input,
     end_with_starter,
     memory,
-    own_input,
     process,
     process_of_ps,
     process_start,

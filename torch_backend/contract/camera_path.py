@@ -13,7 +13,7 @@ from .errors import UserError
 from .files import read_json
 from .typed import CONTRACT_VERSION, check_version, from_dict
 
-OWN_FACTS = "splannequin"
+CAMERA_FACTS_KEY = "splannequin"
 """Key of a transforms.json for facts from Blender that nerfstudio's format does not have: `world`;
 `is_numbered_as_shot`, true if the numbers of pictures are certainly frame numbers of the shot; `notes`, a list of
 [sentence, hint] for the artist."""

@@ -18,7 +18,7 @@ _NUMBER = re.compile(r"[._-]?(?<![0-9A-Za-z])(?:#+|@+|%0?[0-9]*d|[0-9]+)$")
 
 
 def is_imported_from(
-    folder: Path, clip: str | Path, told: Callable[[Path, str, int], str] | None = None
+    folder: Path, clip: str | Path, read_field: Callable[[Path, str, int], str] | None = None
 ) -> bool | None:
     """True if the shot in a folder was imported from a clip, False if from another one; None if unknown.
 
@@ -30,27 +30,27 @@ def is_imported_from(
         clip: absolute path.
         told: (file, name, most bytes) -> value under a name in a JSON file; empty if the file cannot be read.
     """
-    told = told or told_by
-    source = told(ShotFolder(folder).info_path, "source", SHORT_JSON)
+    read_field = read_field or json_field
+    source = read_field(ShotFolder(folder).info_path, "source", SHORT_JSON)
     if not source:
         return None
     if _place(source) == _place(clip):
         return True
-    beside = told(ShotFolder(folder).listing, "beside", LONGEST_JSON)
-    if beside and not os.path.isabs(beside):
-        if _place(folder / beside) == _place(clip):
+    relative = read_field(ShotFolder(folder).listing, "beside", LONGEST_JSON)
+    if relative and not os.path.isabs(relative):
+        if _place(folder / relative) == _place(clip):
             return True
-        if os.path.exists(folder / beside):
+        if os.path.exists(folder / relative):
             return False
     if os.path.exists(source):
         return False
     return _place(folder.parent / re.split(r"[\\/]", source)[-1]) == _place(clip)
 
 
-def refuse_anothers(folder: Path, clip: str | Path) -> None:
+def check_same_clip(folder: Path, clip: str | Path) -> None:
     """Raises JobError if the shot in a folder was imported from another clip than this one."""
     if is_imported_from(folder, clip) is False:
-        source = told_by(ShotFolder(folder).info_path, "source", SHORT_JSON)
+        source = json_field(ShotFolder(folder).info_path, "source", SHORT_JSON)
         raise JobError(
             f"{folder} is the shot of another clip: {source}.",
             "Name another folder with --output, or another shot with --shot-name.",
@@ -58,7 +58,7 @@ def refuse_anothers(folder: Path, clip: str | Path) -> None:
         )
 
 
-def told_by(file: Path, name: str, longest: int) -> str:
+def json_field(file: Path, name: str, longest: int) -> str:
     """Value under a name in a JSON file of at most `longest` bytes; empty if the file cannot be read."""
     try:
         return str(read_json(file, longest).get(name, ""))
@@ -66,15 +66,15 @@ def told_by(file: Path, name: str, longest: int) -> str:
         return ""
 
 
-def shot_beside(clip: Path, is_of: Callable[[Path, Path], bool | None] = is_imported_from) -> Path:
+def default_shot_folder(clip: Path, is_of: Callable[[Path, Path], bool | None] = is_imported_from) -> Path:
     """Default shot folder of a clip, next to the clip and with its name. If another clip's shot has that name, the
     clip's ending or a digest of its path is added."""
     names = clip.stem, clip.name if clip.suffix else f"{clip.name} 2", f"{clip.stem}-{path_digest(clip)}"
     places = [clip.with_name(name + SHOT_SUFFIX) for name in names]
-    owned = [is_of(place, clip) for place in places]
-    for wanted in (True, None):
-        if wanted in owned:
-            return places[owned.index(wanted)]
+    answers = [is_of(place, clip) for place in places]
+    for answer in (True, None):
+        if answer in answers:
+            return places[answers.index(answer)]
     return places[-1]
 
 
@@ -91,7 +91,7 @@ def readable_stem(name: str, is_numbered: bool) -> str:
     return (_NUMBER.sub("", stem) if is_numbered else stem) or stem
 
 
-def same_name(name: str) -> str:
+def collision_key(name: str) -> str:
     """`name` without case and with normalised accents: the same for names that some disks take for one file."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 

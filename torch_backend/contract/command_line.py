@@ -59,7 +59,7 @@ class _Noted(argparse.Action):
     ) -> None:
         setattr(namespace, self.dest, True if self.nargs == 0 else values)
         if option_string is not None:
-            namespace.said = {**getattr(namespace, "said", {}), self.dest: self.option_strings[0]}
+            namespace.explicit = {**getattr(namespace, "explicit", {}), self.dest: self.option_strings[0]}
 
 
 def options_for(name: str, cls: type, side: str = "") -> list[tuple[Any, Option]]:
@@ -90,10 +90,10 @@ def _add_options(parser: argparse.ArgumentParser, name: str, verb: Verb, side: s
             if spec.many:
                 words["nargs"] = "+"
             if spec.flag.startswith("--"):
-                own = unset.get(one.name)
+                fallback = unset.get(one.name)
                 words["required"] = spec.required
-                words["default"] = (None if spec.required else one.default) if own is None else ""
-                default = own or default_of(one, spec)
+                words["default"] = (None if spec.required else one.default) if fallback is None else ""
+                default = fallback or default_of(one, spec)
                 words["help"] += f" (default: {default})" if default else ""
             parser.add_argument(spec.flag, type=_parser_of(spec, hints[one.name]), **words)
 
@@ -111,8 +111,8 @@ def requested_params(args: argparse.Namespace, unset: Mapping[str, Any] | None =
     name = args.command
     kinds = VERBS[name].jobs
     if freezes_a_shot(args):
-        _refuse_what_a_clip_wants(args)
-        ranges = {name: getattr(args, name) for name in _RANGE if name in getattr(args, "said", {})}
+        _refuse_clip_options(args)
+        ranges = {name: getattr(args, name) for name in _RANGE if name in getattr(args, "explicit", {})}
         return {"freeze": FreezeParams(**{**_values(args, name, FreezeParams, unset or {}), **ranges})}
     return {kind: cls(**_values(args, name, cls, unset or {})) for kind, cls in kinds.items()}
 
@@ -125,7 +125,7 @@ def _values(args: argparse.Namespace, name: str, cls: type, unset: Mapping[str, 
         if spec.switch:
             value = one.default != value
         elif spec.is_path:
-            value = [_absolute(each) for each in value] if spec.many else _absolute(value)
+            value = [_absolute(item) for item in value] if spec.many else _absolute(value)
         values[one.name] = unset.get(one.name, value) if value == "" else value
     return values
 
@@ -141,13 +141,13 @@ def words_of(args: argparse.Namespace) -> Any:
     return verb.words(**_values(args, args.command, verb.words, {}))
 
 
-def said_of(words: Any) -> list[str]:
+def arguments_of(words: Any) -> list[str]:
     """Inverse of `words_of`: command-line arguments for an object of a verb's `words`, without the verb's name."""
     found: list[str] = []
     for one, spec in options_of(words.__class__):
         value: Any = getattr(words, one.name)
         if not spec.flag.startswith("--"):
-            found += [str(each) for each in (value if spec.many else (value,))]
+            found += [str(item) for item in (value if spec.many else (value,))]
         elif value != one.default and value is not None:
             found.append(spec.flag if spec.switch else f"{spec.flag}={value}")
     return found
@@ -168,10 +168,10 @@ _RANGE = ("first", "last", "step")
 """Options of the frame range: frames to read of a clip, or frames to freeze of a shot."""
 
 
-def _refuse_what_a_clip_wants(args: argparse.Namespace) -> None:
+def _refuse_clip_options(args: argparse.Namespace) -> None:
     """Raises JobError if `freeze SHOT` has options that only apply to earlier steps."""
     known = {*_RANGE, *(spec.dest for _, spec in options_for("freeze", FreezeParams))}
-    lost = {dest: flag for dest, flag in getattr(args, "said", {}).items() if dest not in known}
+    lost = {dest: flag for dest, flag in getattr(args, "explicit", {}).items() if dest not in known}
     if lost:
         verb, it = ("is", "it") if len(lost) == 1 else ("are", "them")
         steps = [name for name in ("import", "solve", "train") if lost.keys() & _dests_of(name)]
@@ -190,24 +190,24 @@ def _dests_of(name: str) -> set[str]:
 def trains_anew(args: argparse.Namespace) -> bool:
     """True if an option was passed that only applies to training, so that a finished run is not enough."""
     dests = {spec.dest for _, spec in options_for(args.command, TrainParams)} - {"run", "device"}
-    return bool(dests & set(getattr(args, "said", {})))
+    return bool(dests & set(getattr(args, "explicit", {})))
 
 
 def notes(args: argparse.Namespace) -> list[str]:
     """Notes on options without effect, and on a deprecated verb."""
-    verb, explicit = VERBS[args.command], getattr(args, "said", {})
+    verb, explicit = VERBS[args.command], getattr(args, "explicit", {})
     found: list[str] = []
     if verb.now:
         found.append(f"`{args.command} SHOT` is called `{verb.now} SHOT` now: the old word goes with the next version.")
     for cls in (verb.words, *verb.jobs.values()):
         dests = {one.name: spec.dest for one, spec in options_for(args.command, cls)}
         for one, spec in options_for(args.command, cls):
-            if spec.heeded_with is None or dests[one.name] not in explicit:
+            if spec.effective_with is None or dests[one.name] not in explicit:
                 continue
-            field, values = spec.heeded_with
+            field, values = spec.effective_with
             if getattr(args, dests[field]) not in values:
-                other = _listed([f"--{field.replace('_', '-')} {value}" for value in values])
-                found.append(f"{spec.flag} is passed over: it is heeded only with {other}.")
+                required = _listed([f"--{field.replace('_', '-')} {value}" for value in values])
+                found.append(f"{spec.flag} is passed over: it is heeded only with {required}.")
     if "extend" in explicit:
         lost = [flag for dest, flag in explicit.items() if dest not in ("extend", "run", "device")]
         if lost:

@@ -163,11 +163,11 @@ def read_lines(
         inside = False  # True within a line that is too long
         while line := source.readline(longest):
             start += len(line)
-            whole = line.endswith(b"\n")
-            if not whole and len(line) < longest:
+            is_complete = line.endswith(b"\n")
+            if not is_complete and len(line) < longest:
                 return  # half written: the next call reads it
-            yield (line if whole and not inside else b""), start
-            inside = not whole
+            yield (line if is_complete and not inside else b""), start
+            inside = not is_complete
 
 
 def printable(text: str, longest: int = 2000) -> str:

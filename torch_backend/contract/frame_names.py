@@ -16,7 +16,7 @@ _ENDING = re.compile(r"\.[A-Za-z][A-Za-z0-9]*$")
 _MARK = re.compile(r"#+|@+|%0?[0-9]*d(?![A-Za-z])")
 """Placeholder of the number in a pattern: `####`, `@@@@`, `%04d`, `%d`."""
 _WILDCARD = {"*": ".*", "?": "."}
-_ALIKE = {".jpeg": ".jpg", ".tiff": ".tif"}
+_SAME_FORMAT = {".jpeg": ".jpg", ".tiff": ".tif"}
 """Alternative ending of a format -> its usual ending."""
 Item = TypeVar("Item")
 
@@ -31,7 +31,7 @@ class NumberedFiles:
     """Frame number -> name, ascending."""
     twice: tuple[str, str] | None = None
     """Two names with the same number (`f_1.png`, `f_01.png`), if there are any."""
-    others_vary: bool = False
+    has_second_number: bool = False
     """True if another number in the names varies too, such as a time."""
 
 
@@ -42,7 +42,7 @@ def numbered_files(names: Iterable[str]) -> list[NumberedFiles]:
     names are returned for both.
     """
     shapes = _grouped(names, lambda name: (ending(name), *_RUN.split(_stem(name))))
-    found = [s for members in shapes for part in _without_twins(members) for s in _sequences(part)]
+    found = [s for members in shapes for part in _by_exact_ending(members) for s in _sequences(part)]
     return sorted(found, key=lambda s: s.pattern)
 
 
@@ -52,17 +52,17 @@ def matching_files(names: Iterable[str], pattern: str) -> list[NumberedFiles]:
     A placeholder matches a number of any width. `*` and `?` are wildcards. A pattern without a placeholder only filters
     names.
     """
-    names, wanted = list(names), ending(pattern)
+    names, suffix = list(names), ending(pattern)
     stem = _stem(pattern)
-    if wanted:
-        names = [name for name in names if ending(name) == wanted]
+    if suffix:
+        names = [name for name in names if ending(name) == suffix]
     marks = list(_MARK.finditer(stem))
     if not marks:
         rule = re.compile(_rule(stem))
         return numbered_files(name for name in names if rule.fullmatch(_stem(name)))
-    for other in (None, "[0-9]+"):  # a second placeholder is literal (`take#2.####`), else a number
+    for wildcard in (None, "[0-9]+"):  # a second placeholder is literal (`take#2.####`), else a number
         for mark in reversed(marks):
-            rule = _marked_rule(stem, marks, mark, other)
+            rule = _marked_rule(stem, marks, mark, wildcard)
             found = [(match, name) for name in names if (match := rule.fullmatch(_stem(name)))]
             if found:
                 return _by_mark(found, pattern)
@@ -78,7 +78,7 @@ def ending(name: str) -> str:
     """Lower-case ending of a name, with `.jpeg` as `.jpg` and `.tiff` as `.tif`; empty if it has none."""
     found = _ENDING.search(name)
     text = found[0].lower() if found else ""
-    return _ALIKE.get(text, text)
+    return _SAME_FORMAT.get(text, text)
 
 
 def file_as_blender_counts(name: str, number: int) -> str:
@@ -104,7 +104,7 @@ def _grouped(items: Iterable[Item], key: Callable[[Item], object]) -> list[list[
     return list(groups.values())
 
 
-def _without_twins(names: list[str]) -> list[list[str]]:
+def _by_exact_ending(names: list[str]) -> list[list[str]]:
     """`names` as one group; grouped by exact ending if some names differ only in that (`f_1.jpg`, `f_1.JPG`)."""
     if len({_stem(name) for name in names}) == len(names):
         return [names]
@@ -155,8 +155,8 @@ def _numbered(names: list[str], numbers: list[int], place: int) -> NumberedFiles
         hashes = "#" * (min(widths) if len(widths) == 1 else 1)
         words += [texts[n], hashes if n == place else column[0] if len(set(column)) == 1 else "*"]
     pattern = "".join([*words, texts[-1]]) + names[0][len(_stem(names[0])) :]
-    others = any(len(set(column)) > 1 for n, column in enumerate(zip(*runs, strict=True)) if n != place)
-    return NumberedFiles(pattern, *_table(names, numbers), others_vary=others)
+    varies = any(len(set(column)) > 1 for n, column in enumerate(zip(*runs, strict=True)) if n != place)
+    return NumberedFiles(pattern, *_table(names, numbers), has_second_number=varies)
 
 
 def _table(names: list[str], numbers: list[int]) -> tuple[dict[int, str], tuple[str, str] | None]:
@@ -175,14 +175,14 @@ def _rule(text: str) -> str:
     return "".join(_WILDCARD.get(letter) or re.escape(letter) for letter in text)
 
 
-def _marked_rule(stem: str, marks: list[re.Match[str]], number: re.Match[str], other: str | None) -> re.Pattern[str]:
-    """Regular expression for stems of names, with `number` as a group. `other`: expression for the other placeholders,
+def _marked_rule(stem: str, marks: list[re.Match[str]], number: re.Match[str], wildcard: str | None) -> re.Pattern[str]:
+    """Regular expression for stems of names, with `number` as a group. `wildcard`: expression for the other placeholders,
     None: literal."""
     parts: list[str] = []
     at = 0
     for mark in marks:
         parts.append(_rule(stem[at : mark.start()]))
-        parts.append("([0-9]+)" if mark is number else other or re.escape(mark[0]))
+        parts.append("([0-9]+)" if mark is number else wildcard or re.escape(mark[0]))
         at = mark.end()
     return re.compile("".join([*parts, _rule(stem[at:])]))
 
@@ -192,7 +192,7 @@ def _by_mark(found: list[tuple[re.Match[str], str]], pattern: str) -> list[Numbe
     groups = _grouped(found, lambda one: (one[0].string[: one[0].start(1)], one[0].string[one[0].end(1) :]))
     numbers = [int(match[1]) for match, _ in found]
     if len(groups) > 1 and len(set(numbers)) == len(numbers):
-        return [NumberedFiles(pattern, *_table([name for _, name in found], numbers), others_vary=True)]
+        return [NumberedFiles(pattern, *_table([name for _, name in found], numbers), has_second_number=True)]
     return [s for members in groups for s in _of_mark(members)]
 
 
@@ -200,7 +200,7 @@ def _of_mark(members: list[tuple[re.Match[str], str]]) -> list[NumberedFiles]:
     """The sequences among names that differ only in the number of the placeholder."""
     found: list[NumberedFiles] = []
     of_name = {name: match for match, name in members}
-    for names in _without_twins(list(of_name)):
+    for names in _by_exact_ending(list(of_name)):
         match = of_name[names[0]]
         widths = {len(of_name[name][1]) for name in names}
         hashes = "#" * (min(widths) if len(widths) == 1 else 1)

@@ -33,15 +33,15 @@ def files_digest(files: Mapping[int, Path]) -> str:
     """Hash of numbered files: their numbers, sizes and contents. A file that cannot be read counts as empty."""
     numbers = sorted(files)
     if len(numbers) == 1:
-        digests = [_or_nothing(files[numbers[0]])]
+        digests = [_digest_or_empty(files[numbers[0]])]
     else:
         with ThreadPoolExecutor(_READERS) as readers:
-            digests = list(readers.map(_or_nothing, (files[n] for n in numbers)))
+            digests = list(readers.map(_digest_or_empty, (files[n] for n in numbers)))
     digest_lines = "".join(f"{number} {digest}\n" for number, digest in zip(numbers, digests, strict=True))
     return hashlib.sha256(digest_lines.encode()).hexdigest()[:32]
 
 
-def _or_nothing(path: Path) -> str:
+def _digest_or_empty(path: Path) -> str:
     try:
         return file_digest(path)
     except (OSError, ValueError):

@@ -41,10 +41,10 @@ def package_name(name: str) -> str:
 def record_packages(environment: Path, names: Iterable[str]) -> dict[str, Any]:
     """Record of the installed packages among `names`: name of the dist-info -> SHA-256 of its RECORD, and sizes of
     files by their path in site-packages. OSError or ValueError if a RECORD cannot be read."""
-    site, wanted = site_packages(environment), {package_name(n) for n in names}
+    site, packages = site_packages(environment), {package_name(n) for n in names}
     facts: dict[str, Any] = {}
     for folder in sorted(site.glob("*.dist-info")) if site else ():
-        if package_name(folder.name.partition("-")[0]) in wanted:
+        if package_name(folder.name.partition("-")[0]) in packages:
             text = _record(folder)
             facts[folder.name] = {"record": hashlib.sha256(text).hexdigest(), "files": _sizes(text)}
     return facts

@@ -156,7 +156,7 @@ WORK = {
 """Kind of job -> its name in messages."""
 
 
-def gone(shot: Path, kind: str) -> JobError:
+def missing_shot_error(shot: Path, kind: str) -> JobError:
     """The error of a job whose shot was moved or deleted while it ran."""
     return JobError(
         f"{WORK.get(kind, 'A step')} ended: the shot folder {shot} was moved or deleted meanwhile.",
@@ -173,9 +173,9 @@ def runs_job(pid: int, started: float, folder: Path) -> bool:
     found = process(pid) if pid > 1 else None
     if found is None or not started or found.started != started:
         return False
-    _, ours, named_folder = found.command.rpartition(f" {JOB_COMMAND} ")
+    _, separator, named_folder = found.command.rpartition(f" {JOB_COMMAND} ")
     try:
-        return bool(ours) and os.path.isabs(named_folder) and os.path.samefile(named_folder, folder)
+        return bool(separator) and os.path.isabs(named_folder) and os.path.samefile(named_folder, folder)
     except (OSError, ValueError):
         return False
 

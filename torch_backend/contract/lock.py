@@ -49,7 +49,7 @@ def read_writer(shot: Path) -> Writer | None:
     return from_dict(Writer, data)
 
 
-def gives_back(shot: Path, writer: Writer) -> bool:
+def is_ending(shot: Path, writer: Writer) -> bool:
     """True if the job that holds the lock has reported its end, so that it is about to release the lock."""
     try:
         status = read_json(ShotFolder(shot).jobs / checked_name(writer.job, "job") / STATUS_FILE, SHORT_JSON)

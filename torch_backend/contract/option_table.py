@@ -58,7 +58,7 @@ class Option:
     """Side whose command line has the option (`verbs.BACKEND`, `verbs.BLENDER`); empty: both."""
     required: bool = False
     """True if the option must be passed."""
-    heeded_with: tuple[str, tuple[Any, ...]] | None = None
+    effective_with: tuple[str, tuple[Any, ...]] | None = None
     """(field, values): the option has an effect only if that other field has one of these values."""
     always: Any = None
     """Value that the command lines always set, without an option."""

@@ -87,8 +87,8 @@ class ShotSize:
 
     def freeze_work(self, frames: int, width: int) -> float:
         """Work of one part of a take: `frames` frozen frames, `width` pixels wide."""
-        each = width * self.take_height(width) / 1e6
-        return frames * each + (frames + FIRST_FRAMES) * PER_WORKING * self.megapixels
+        megapixels = width * self.take_height(width) / 1e6
+        return frames * megapixels + (frames + FIRST_FRAMES) * PER_WORKING * self.megapixels
 
     def take_height(self, width: int) -> int:
         """Height in pixels of a frozen frame `width` pixels wide, without overscan."""
@@ -140,11 +140,11 @@ def paces(environment: Path) -> dict[str, float]:
 
 def _read(environment: Path) -> dict[str, list[float]]:
     try:
-        told = read_json(environment / SETUP_NOTES / PACES_FILE, SHORT_JSON)
+        record = read_json(environment / SETUP_NOTES / PACES_FILE, SHORT_JSON)
     except (OSError, ValueError):
         return {}
     found: dict[str, list[float]] = {}
-    rows = told.get("paces") if told.get("version") == VERSION else None
+    rows = record.get("paces") if record.get("version") == VERSION else None
     for kind, values in rows.items() if is_json_object(rows) else ():
         listed = cast(list[Any], values) if isinstance(values, list) else []
         numbers = [float(v) for v in listed if isinstance(v, int | float) and _FACTORS[0] <= v <= _FACTORS[1]]
@@ -153,7 +153,7 @@ def _read(environment: Path) -> dict[str, list[float]]:
     return found
 
 
-class WholeWay:
+class TotalProgress:
     """Progress and estimate of several jobs that run one after the other."""
 
     def __init__(self, expected: Mapping[str, float], spent: float = 0.0) -> None:
@@ -178,27 +178,27 @@ class WholeWay:
             self._end_job()
             self._kind = kind
         self._spent = spent
-        mine = self._expected.get(kind, 0.0)
+        expected_of_job = self._expected.get(kind, 0.0)
         expected, actual = self._measured
-        rest = left
-        if rest is None:
-            mean = mine * (actual / expected if expected > 0.0 else 1.0)
-            rest = max(mean - spent, _OVERDUE * max(mean, spent))
-        if spent + rest >= _BEGUN_BEFORE * mine:
-            expected, actual = expected + mine, actual + spent + rest
+        remaining = left
+        if remaining is None:
+            mean = expected_of_job * (actual / expected if expected > 0.0 else 1.0)
+            remaining = max(mean - spent, _OVERDUE * max(mean, spent))
+        if spent + remaining >= _BEGUN_BEFORE * expected_of_job:
+            expected, actual = expected + expected_of_job, actual + spent + remaining
         pace = actual / expected if expected > 0.0 else 1.0
         order = list(self._expected)
         follows = order[order.index(kind) + 1 :] if kind in self._expected else []
-        left_of_all = rest + pace * sum(self._expected[each] for each in follows)
+        total_left = remaining + pace * sum(self._expected[name] for name in follows)
         done = self._earlier + spent
-        self._share = max(self._share, done / max(done + left_of_all, 1e-9))
-        return self._share, left_of_all
+        self._share = max(self._share, done / max(done + total_left, 1e-9))
+        return self._share, total_left
 
     def _end_job(self) -> None:
-        mine = self._expected.get(self._kind, 0.0)
-        if mine > 0.0 and self._spent >= _BEGUN_BEFORE * mine:
+        expected_of_job = self._expected.get(self._kind, 0.0)
+        if expected_of_job > 0.0 and self._spent >= _BEGUN_BEFORE * expected_of_job:
             expected, actual = self._measured
-            self._measured = expected + mine, actual + self._spent
+            self._measured = expected + expected_of_job, actual + self._spent
         self._earlier += self._spent
 
 

@@ -30,12 +30,12 @@ def mapped(path: str, rules: list[dict[str, Any]] | None = None) -> str:
     Raises:
         ValueError: the file of rules is invalid.
     """
-    known = rules if rules is not None else _told()
+    known = rules if rules is not None else _rules()
     for rule in sorted(known, key=lambda rule: -len(str(rule["source_path"]))):
         windows = str(rule["source_path_format"]).upper() == "WINDOWS"
-        rest = _below(path, str(rule["source_path"]), windows)
-        if rest is not None:
-            return os.path.join(str(rule["destination_path"]), *rest)
+        tail = _below(path, str(rule["source_path"]), windows)
+        if tail is not None:
+            return os.path.join(str(rule["destination_path"]), *tail)
     return path
 
 
@@ -44,9 +44,9 @@ def _below(path: str, source: str, windows: bool) -> list[str] | None:
     kind = ntpath if windows else posixpath
     if not (kind.isabs(path) or (windows and kind.splitdrive(path)[0])):
         return None
-    whole, folder = _parts(path, windows), _parts(source, windows)
-    same = [p.lower() for p in whole] if windows else whole, [p.lower() for p in folder] if windows else folder
-    return whole[len(folder) :] if same[0][: len(folder)] == same[1] else None
+    parts, folder = _parts(path, windows), _parts(source, windows)
+    same = [p.lower() for p in parts] if windows else parts, [p.lower() for p in folder] if windows else folder
+    return parts[len(folder) :] if same[0][: len(folder)] == same[1] else None
 
 
 def _parts(path: str, windows: bool) -> list[str]:
@@ -54,15 +54,15 @@ def _parts(path: str, windows: bool) -> list[str]:
     return [part for part in text.split("/") if part not in ("", ".")]
 
 
-def _told() -> list[dict[str, Any]]:
+def _rules() -> list[dict[str, Any]]:
     file = os.environ.get(RULES_VARIABLE, "")
     if not file or not Path(file).is_file():
         return []
     data = read_json(Path(file), LONGEST_JSON)
     rules: Any = data.get("path_mapping_rules") or []
-    wanted = {"source_path_format", "source_path", "destination_path"}
+    required = {"source_path_format", "source_path", "destination_path"}
     rows = cast("list[Any]", rules) if isinstance(rules, list) else [None]
-    found = [rule for rule in rows if is_json_object(rule) and wanted <= set(rule)]
+    found = [rule for rule in rows if is_json_object(rule) and required <= set(rule)]
     if len(found) != len(rows):
         raise UserError(f"{file} holds no path mapping rules as Open Job Description writes them")
     return found

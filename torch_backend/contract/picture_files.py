@@ -202,17 +202,17 @@ def _targa(file: BinaryIO, size: int) -> bool:
     head = file.read(18)
     comment, mapped, kind = head[0], head[1], head[2]
     width, height, bits = struct.unpack("<HHB", head[12:17])
-    each, left = (bits + 7) // 8, width * height
-    if mapped or not each or not left:
+    pixel_bytes, pixels_left = (bits + 7) // 8, width * height
+    if mapped or not pixel_bytes or not pixels_left:
         return False
     if not kind & 8:
-        return size >= 18 + comment + left * each
+        return size >= 18 + comment + pixels_left * pixel_bytes
     data, at = file.read(), comment
-    while left > 0 and at < len(data):
+    while pixels_left > 0 and at < len(data):
         run = (data[at] & 0x7F) + 1
-        at += 1 + each * (1 if data[at] & 0x80 else run)
-        left -= run
-    return left <= 0 and at <= len(data)
+        at += 1 + pixel_bytes * (1 if data[at] & 0x80 else run)
+        pixels_left -= run
+    return pixels_left <= 0 and at <= len(data)
 
 
 def _radiance(file: BinaryIO, size: int) -> bool:

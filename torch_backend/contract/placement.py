@@ -49,8 +49,8 @@ class Placement:
         rows = [matrix[0:3], matrix[4:7], matrix[8:11]]
         square = self.scale**2
         products = [sum(a * b for a, b in zip(rows[i], rows[j])) for i in range(3) for j in range(3)]
-        wanted = [square if i == j else 0.0 for i in range(3) for j in range(3)]
-        is_similar = all(abs(p - w) <= TOLERANCE * square for p, w in zip(products, wanted))
+        ideal = [square if i == j else 0.0 for i in range(3) for j in range(3)]
+        is_similar = all(abs(p - w) <= TOLERANCE * square for p, w in zip(products, ideal))
         if not (self.scale > 0.0 and is_similar and list(matrix[12:]) == [0.0, 0.0, 0.0, 1.0]):
             raise UserError(
                 "The placement's scene_from_solve should turn, scale evenly and move: it mirrors, shears or flattens."

@@ -47,16 +47,16 @@ def child_environment(root: Path) -> dict[str, str]:
     return environment | {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join([str(root), *inherited])}
 
 
-def own_input() -> int:
+def detach_standard_input() -> int:
     """A private handle of the standard input, for a thread that reads it. The null device replaces handle 0.
 
     On Windows, any access to a pipe blocks while a thread waits to read from it. Otherwise, a child that inherits the
     pipe would block at its start, and a library while it is loaded.
     """
     standard_input = os.dup(0)
-    nothing = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nothing, 0)
-    os.close(nothing)
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, 0)
+    os.close(null)
     return standard_input
 
 
@@ -65,11 +65,11 @@ def end_with_starter(grace_seconds: float = GRACE_SECONDS) -> None:
 
     The process has `grace_seconds` for a checkpoint. Then it is killed, with the process group that it leads (POSIX).
     """
-    watch = functools.partial(_stop_when_alone, own_input(), grace_seconds)
+    watch = functools.partial(_stop_with_starter, detach_standard_input(), grace_seconds)
     threading.Thread(target=watch, name="end with starter", daemon=True).start()
 
 
-def _stop_when_alone(starter: int, grace_seconds: float) -> None:
+def _stop_with_starter(starter: int, grace_seconds: float) -> None:
     with contextlib.suppress(OSError):
         while os.read(starter, 1):
             pass

@@ -53,7 +53,7 @@ class TrainParams:
         flag="--host",
         choices=HOSTS,
         help="motion model that `--method auto` uses",
-        heeded_with=("method", ("auto",)),
+        effective_with=("method", ("auto",)),
     )
     """Host that the method `auto` uses."""
     host_config: str = option(
@@ -77,7 +77,7 @@ class TrainParams:
         choices=DETECTORS,
         help="with `--supervision paper`, how defective Gaussians are detected: `grad_norm` (the paper), `grad_signed` "
         "(the published code), `weight`",
-        heeded_with=("supervision", ("paper",)),
+        effective_with=("supervision", ("paper",)),
     )
     """Detector of ill-supervised Gaussians for `paper`: weight, grad_norm, or grad_signed (the published code's)."""
     iterations: int = option(

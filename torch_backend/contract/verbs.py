@@ -135,7 +135,7 @@ class ExportWords:
         flag="--take",
         metavar="NAME",
         help="take whose splats are written",
-        heeded_with=("format", ("ply", "usd")),
+        effective_with=("format", ("ply", "usd")),
     )
     """Name of the take."""
     placement: str = option("", **PLACEMENT)
@@ -146,7 +146,7 @@ class ExportWords:
         flag="--text",
         switch=True,
         help="a COLMAP model as .txt instead of .bin",
-        heeded_with=("format", ("colmap",)),
+        effective_with=("format", ("colmap",)),
     )
     """Write a COLMAP model as text."""
     output: str = option("", flag="--output", metavar="DIR", required=True, help="folder to write into")

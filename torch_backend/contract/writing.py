@@ -123,14 +123,14 @@ def replacing_folder(path: str | Path, keep: bool = False) -> Generator[Path]:
     moved aside is put back if nothing replaced it.
     """
     path = Path(path)
-    fresh, aside = path.with_name(f".{path.name}.new"), replaced_folder(path)
+    fresh, replaced = path.with_name(f".{path.name}.new"), replaced_folder(path)
     restore_folder(path)
     _discard(fresh)
     make_folder(fresh)
     try:
         yield fresh
         if os.path.lexists(path):
-            replace_file(path, aside)
+            replace_file(path, replaced)
         replace_file(fresh, path)
     except BaseException:
         restore_folder(path)
@@ -138,7 +138,7 @@ def replacing_folder(path: str | Path, keep: bool = False) -> Generator[Path]:
     finally:
         _discard(fresh)
     if not keep:
-        _discard(aside)
+        _discard(replaced)
 
 
 def replaced_folder(path: Path) -> Path:
@@ -148,10 +148,10 @@ def replaced_folder(path: Path) -> Path:
 
 def restore_folder(path: Path) -> None:
     """Puts back the folder that a killed `replacing_folder` moved aside, or removes it if it was replaced."""
-    aside = replaced_folder(path)
-    if aside.is_dir() and not os.path.lexists(path):
-        replace_file(aside, path)
-    _discard(aside)
+    replaced = replaced_folder(path)
+    if replaced.is_dir() and not os.path.lexists(path):
+        replace_file(replaced, path)
+    _discard(replaced)
 
 
 def _discard(folder: Path) -> None:

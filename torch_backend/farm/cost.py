@@ -68,13 +68,13 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
     chains = [[_times(step, rates) for step in steps if step.shot.name == name] for name in shots]
     rows: list[Row] = []
     for kind in dict.fromkeys(step.kind for step in steps):
-        every = [seconds for step in steps if step.kind == kind for seconds in _times(step, rates)]
-        rows.append(Row(kind, len(every), sum(every), sum(every) * rates[kind].cores))
+        durations = [seconds for step in steps if step.kind == kind for seconds in _times(step, rates)]
+        rows.append(Row(kind, len(durations), sum(durations), sum(durations) * rates[kind].cores))
     tasks = sum(row.tasks for row in rows)
     sessions = sum(step.sessions(session_tasks) for step in steps)
     engine = SESSION_SECONDS * sessions + TASK_SECONDS * tasks
     rows.append(Row(ENGINE, sessions, engine, engine + WATCH_CORES * sum(row.seconds for row in rows)))
-    every_host = {hosts: _makespan(chains, hosts, session_tasks) for hosts in HOSTS}
+    makespans = {hosts: _makespan(chains, hosts, session_tasks) for hosts in HOSTS}
     return Estimate(
         rows,
         len(shots),
@@ -83,7 +83,7 @@ def estimate(steps: Sequence[Step], rates: dict[str, Rate], card: bool, bake: bo
         sum(row.seconds for row in rows if row.kind in ON_A_CARD) / 3600.0 if card else 0.0,
         sum(disk_bytes(shot, bake) for shot in shots.values()) / 1e9,
         max((sum(max(times) + SESSION_SECONDS + TASK_SECONDS for times in chain) for chain in chains), default=0.0),
-        every_host,
+        makespans,
     )
 
 
@@ -96,18 +96,18 @@ def needs(rates: dict[str, Rate], card: bool, megapixels: float) -> dict[str, Ne
     return found
 
 
-def sentences(told: Estimate, rates_from: str) -> list[str]:
+def sentences(costs: Estimate, rates_from: str) -> list[str]:
     """Text of an estimate, line by line."""
-    lines = [f"{told.shots} shots, {told.tasks} tasks. By rates {rates_from}, on hosts that do one task at a time:"]
-    for row in told.rows:
+    lines = [f"{costs.shots} shots, {costs.tasks} tasks. By rates {rates_from}, on hosts that do one task at a time:"]
+    for row in costs.rows:
         of = "sessions" if row.kind == ENGINE else "tasks"
         lines.append(f"  {row.kind:<8} {row.tasks:>6} {of:<8} {_hours(row.seconds):>10}")
-    lines.append(f"Processor: {told.core_hours:.2f} core-hours.")
-    if told.card_hours:
-        lines.append(f"Card: {told.card_hours:.2f} card-hours, if a card is no faster than the rates say.")
-    lines.append(f"Disk: up to {told.disk_gb:.1f} GB.")
-    ends = ", ".join(f"{hosts} {_hours(seconds)}" for hosts, seconds in told.on_hosts.items())
-    lines.append(f"Until the last task ends, by hosts: {ends}; never under {_hours(told.critical_seconds)}.")
+    lines.append(f"Processor: {costs.core_hours:.2f} core-hours.")
+    if costs.card_hours:
+        lines.append(f"Card: {costs.card_hours:.2f} card-hours, if a card is no faster than the rates say.")
+    lines.append(f"Disk: up to {costs.disk_gb:.1f} GB.")
+    ends = ", ".join(f"{hosts} {_hours(seconds)}" for hosts, seconds in costs.on_hosts.items())
+    lines.append(f"Until the last task ends, by hosts: {ends}; never under {_hours(costs.critical_seconds)}.")
     return lines
 
 

@@ -38,13 +38,13 @@ def export(words: FarmWords, requests: dict[str, Any], trains: bool = False) -> 
     found = shots.gather(words.shots, requests, instants, table, words.shots_folder, not trains)
     output = Path(words.output)
     known = rates.read_rates(words.rates) if words.rates else rates.MEASURED
-    every = [step for shot in found for step in work.steps_of(shot, words.frames, words.bake)]
-    costs = cost.estimate(every, known, card, words.bake, words.session_tasks)
+    all_steps = [step for shot in found for step in work.steps_of(shot, words.frames, words.bake)]
+    costs = cost.estimate(all_steps, known, card, words.bake, words.session_tasks)
     groups = [found[n : n + words.shots_per_job] for n in range(0, len(found), words.shots_per_job)]
     files: list[Path] = []
     for number, group in enumerate(groups, 1):
         names = {shot.name for shot in group}
-        steps = [step for step in every if step.shot.name in names]
+        steps = [step for step in all_steps if step.shot.name in names]
         largest = max(wide * high / 1e6 for wide, high in map(work.take_size, group))
         job = template.job_template(_name(group), steps, cost.needs(known, card, largest), words.bake)
         values = template.job_values(SOFTWARE, group, output / "baked", words.bake)
@@ -54,5 +54,5 @@ def export(words: FarmWords, requests: dict[str, Any], trains: bool = False) -> 
 
 
 def _name(group: list[shots.FarmShot]) -> str:
-    rest = f" and {len(group) - 1} more" if len(group) > 1 else ""
-    return f"Splannequin: {group[0].name}{rest}"
+    suffix = f" and {len(group) - 1} more" if len(group) > 1 else ""
+    return f"Splannequin: {group[0].name}{suffix}"

@@ -24,6 +24,7 @@ from ..contract import (
     ShotFolder,
     check_params,
     checked_name,
+    collision_key,
     from_dict,
     is_imported_from,
     is_shot,
@@ -31,7 +32,6 @@ from ..contract import (
     path_digest,
     read_json,
     readable_stem,
-    same_name,
     write_json,
 )
 from ..contract.files import is_json_object
@@ -88,7 +88,7 @@ class FarmShot:
 
 
 def gather(
-    given: Sequence[str], requests: dict[str, Any], instants: Sequence[int], table: dict[str, list[int]],
+    paths: Sequence[str], requests: dict[str, Any], instants: Sequence[int], table: dict[str, list[int]],
     shots_folder: str, trained_counts: bool = True,
 ) -> list[FarmShot]:  # fmt: skip
     """The shots of a job, from shot folders and clips.
@@ -104,21 +104,21 @@ def gather(
     Raises:
         JobError: a shot or clip cannot be used, or the table has a name that no shot has; ValueError: parameters.
     """
-    found = [_of_shot(path, requests) if is_shot(path) else _of_clip(path, requests, shots_folder) for path in given]
+    found = [_of_shot(path, requests) if is_shot(path) else _of_clip(path, requests, shots_folder) for path in paths]
     shots: list[FarmShot] = []
     base, names = requests["freeze"].take, _Names(table)
     for shot in _distinct(found):
-        own = names.instants_of(shot, list(instants))
-        for t_star in own:
+        chosen = names.instants_of(shot, list(instants))
+        for t_star in chosen:
             if not shot.first <= t_star <= shot.last:
                 raise JobError(
                     f"t* is frame {t_star}: {shot.name} has frames {shot.first} to {shot.last}.",
                     "Choose a frame of the shot.",
                     ExitCode.USAGE,
                 )
-        takes = {"": base} if not own else {str(own[0]): base}
-        if len(own) > 1:
-            takes = {str(t): f"{base}_{t:0{TAKE_DIGITS}d}" for t in dict.fromkeys(own)}
+        takes = {"": base} if not chosen else {str(chosen[0]): base}
+        if len(chosen) > 1:
+            takes = {str(t): f"{base}_{t:0{TAKE_DIGITS}d}" for t in dict.fromkeys(chosen)}
         for take in takes.values():  # reported now, not by every task
             checked_name(take, "take")
         checked_name(requests["freeze"].run, "run")
@@ -162,25 +162,25 @@ def _distinct(found: Sequence[FarmShot]) -> list[FarmShot]:
     # Drop a clip if its shot is in the list, too.
     found = [s for s in found if not (s.clip and str(s.root) in shot_roots and is_imported_from(s.root, s.clip))]
     shots = list({shot.identity: shot for shot in found}.values())
-    seen = Counter(same_name(str(shot.root)) for shot in shots)
-    shots = [dataclasses.replace(s, root=_hashed(s)) if seen[same_name(str(s.root))] > 1 else s for s in shots]
+    seen = Counter(collision_key(str(shot.root)) for shot in shots)
+    shots = [dataclasses.replace(s, root=_hashed(s)) if seen[collision_key(str(s.root))] > 1 else s for s in shots]
     digests = [path_digest(shot.identity) for shot in shots]
     plain = [_plain(shot.called) for shot in shots]
-    names = _told_apart(plain, [f"{_cut(n, d)}-{d}" for n, d in zip(plain, digests, strict=True)])
+    names = _distinct_names(plain, [f"{_cut(n, d)}-{d}" for n, d in zip(plain, digests, strict=True)])
     folders = [shot_name(shot.root) for shot in shots]
-    outputs = _told_apart(folders, [f"{n}-{d}" for n, d in zip(folders, digests, strict=True)])
+    outputs = _distinct_names(folders, [f"{n}-{d}" for n, d in zip(folders, digests, strict=True)])
     return [
         dataclasses.replace(shot, name=name, output=output)
         for shot, name, output in zip(shots, names, outputs, strict=True)
     ]
 
 
-def _told_apart(plain: Sequence[str], longer: Sequence[str]) -> list[str]:
+def _distinct_names(plain: Sequence[str], longer: Sequence[str]) -> list[str]:
     """The plain name of each shot, or the longer one if a disk could confuse the plain name with another. JobError if
     the names are still not unique."""
-    seen = Counter(map(same_name, plain))
-    names = [p if seen[same_name(p)] == 1 else q for p, q in zip(plain, longer, strict=True)]
-    twice = next((name for name, count in Counter(map(same_name, names)).items() if count > 1), None)
+    seen = Counter(map(collision_key, plain))
+    names = [p if seen[collision_key(p)] == 1 else q for p, q in zip(plain, longer, strict=True)]
+    twice = next((name for name, count in Counter(map(collision_key, names)).items() if count > 1), None)
     if twice is not None:
         raise JobError(f"Two shots would be called {twice}.", "Rename one of them.", ExitCode.USAGE)
     return names
@@ -261,14 +261,14 @@ def _root_of(clip: str, called: str, identity: str, shots_folder: str) -> Path:
 
 def _is_shared(folder: Path, called: str, identity: str) -> bool:
     """True if a folder has other footage with the name of a clip."""
-    wanted, number = same_name(called), re.compile(r"[0-9]+(?=\.[^.]*$)")
-    own = number.sub("#", os.path.basename(identity)) if Path(identity).suffix.lower() in PICTURES else ""
+    key, number = collision_key(called), re.compile(r"[0-9]+(?=\.[^.]*$)")
+    pattern = number.sub("#", os.path.basename(identity)) if Path(identity).suffix.lower() in PICTURES else ""
     with contextlib.suppress(OSError):
         for name in os.listdir(folder):
             is_picture = Path(name).suffix.lower() in PICTURES
             is_video = (mimetypes.guess_type(name)[0] or "").startswith("video/") or name.lower().endswith(".mxf")
-            is_own = name == os.path.basename(identity) or (is_picture and number.sub("#", name) == own)
-            if (is_picture or is_video) and not is_own and same_name(readable_stem(name, is_picture)) == wanted:
+            is_same_clip = name == os.path.basename(identity) or (is_picture and number.sub("#", name) == pattern)
+            if (is_picture or is_video) and not is_same_clip and collision_key(readable_stem(name, is_picture)) == key:
                 return True
     return False
 

@@ -30,7 +30,7 @@ MOST_LETTERS = 1024
 """Largest length of a path in Open Job Description, in characters."""
 NOTIFY_SECONDS = 60
 """Seconds that a cancelled training has for its checkpoint."""
-_SAYS = {
+_DESCRIPTIONS = {
     "import": "Footage into the shot folder",
     "solve": "Cameras, and what moves",
     "train": "Gaussians, and what of them moves",
@@ -78,7 +78,7 @@ def job_template(name: str, steps: Sequence[Step], needs: dict[str, Needs], bake
             _parameter("Blender", "Blender's program on the hosts; empty: a bpy wheel is set up, or it is on the PATH"),
             _parameter("OutputFolder", "Folder for what is baked: SHOT/TAKE/composited", "OUT"),
         ]
-    parameters += [_parameter(each, f"Path of the option {each}", "IN", "FILE") for each in sorted(paths)]
+    parameters += [_parameter(option, f"Path of the option {option}", "IN", "FILE") for option in sorted(paths)]
     return {
         "specificationVersion": VERSION,
         "name": _refused(name),
@@ -115,7 +115,7 @@ def paths_of(shots: Sequence[FarmShot]) -> dict[str, str]:
     for shot in shots:
         for kind, values in shot.requests.items():
             for field in _path_fields(kind):
-                if values[field] not in _NO_FILES and (kind, field) not in _ITS_OWN:
+                if values[field] not in _NO_FILES and (kind, field) not in _PER_SHOT_PATHS:
                     found[_parameter_name(kind, field)] = values[field]
     return found
 
@@ -123,7 +123,7 @@ def paths_of(shots: Sequence[FarmShot]) -> dict[str, str]:
 _MASKS = mask_path, ignored_path
 _NO_FILES = "", MASK_ALPHA, MASK_FOUND
 """Values of such options that are not files."""
-_ITS_OWN = {("import", "source"), ("freeze", "camera_path")}
+_PER_SHOT_PATHS = {("import", "source"), ("freeze", "camera_path")}
 """Options whose path differs between shots: a task parameter, and a file in the shot."""
 
 
@@ -192,7 +192,7 @@ def _step(step: Step, before: str, needs: Needs, paths: dict[str, str], bake: bo
         "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": NOTIFY_SECONDS},
     }
     request = _request(step)
-    template: dict[str, Any] = {"name": step.name, "description": f"{_SAYS[kind]}."}
+    template: dict[str, Any] = {"name": step.name, "description": f"{_DESCRIPTIONS[kind]}."}
     if before:
         template["dependencies"] = [{"dependsOn": before}]
     amounts: list[dict[str, Any]] = [{"name": "amount.worker.vcpu", "min": needs.cores}]

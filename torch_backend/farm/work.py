@@ -57,12 +57,12 @@ def steps_of(shot: FarmShot, part: int, bake: bool) -> list[Step]:
     part = max(1, part, -(-shot.frames // MOST_VALUES))
     starts = list(range(shot.first, shot.last + 1, part))
     size, (wide, high) = _size(shot), take_size(shot)
-    each = wide * high / 1e6
+    megapixels = wide * high / 1e6
     lengths = {start: min(part, shot.last + 1 - start) for start in starts}
     frozen = {start: size.freeze_work(n, wide) for start, n in lengths.items()}
-    baked = {start: n * each for start, n in lengths.items()}
-    whole = {0: shot.frames * each}
-    every = list(shot.takes)
+    baked = {start: n * megapixels for start, n in lengths.items()}
+    full = {0: shot.frames * megapixels}
+    takes = list(shot.takes)
     plain: list[tuple[str, float]] = []
     if shot.clip:
         plain.append(("import", size.import_work()))
@@ -71,12 +71,12 @@ def steps_of(shot: FarmShot, part: int, bake: bool) -> list[Step]:
     if not shot.trained:
         plain.append(("train", _training(shot)))
     steps = [Step(shot, kind, [], [], part, {0: amount}) for kind, amount in plain]
-    steps.append(Step(shot, "open", every, [], part, {0: _developing(shot)}))
-    steps.append(Step(shot, "freeze", every, starts, part, frozen))
-    steps.append(Step(shot, "finish", every, [], part, whole))
+    steps.append(Step(shot, "open", takes, [], part, {0: _developing(shot)}))
+    steps.append(Step(shot, "freeze", takes, starts, part, frozen))
+    steps.append(Step(shot, "finish", takes, [], part, full))
     if bake:
-        steps.append(Step(shot, "bake", every, starts, part, baked))
-        steps.append(Step(shot, "deliver", every, [], part, whole))
+        steps.append(Step(shot, "bake", takes, starts, part, baked))
+        steps.append(Step(shot, "deliver", takes, [], part, full))
     return steps
 
 
@@ -115,7 +115,7 @@ def disk_bytes(shot: FarmShot, bake: bool) -> float:
     """Disk space of a shot's takes and of intermediate files, in bytes."""
     wide, high = take_size(shot)
     freeze = shot.requests["freeze"]
-    each = wide * high * (20.0 + (6.0 if freeze["grain"] else 0.0) + (24.0 if freeze["detail"] == "on" else 0.0))
-    taken = shot.frames * (each + (3.0 * wide * high if bake else 0.0)) * len(shot.takes)
+    frame_bytes = wide * high * (20.0 + (6.0 if freeze["grain"] else 0.0) + (24.0 if freeze["detail"] == "on" else 0.0))
+    take_bytes = shot.frames * (frame_bytes + (3.0 * wide * high if bake else 0.0)) * len(shot.takes)
     working = shot.working[0] * shot.working[1] * 4.0 * shot.frames
-    return taken + (working if shot.clip else 0.0) + (0.0 if shot.trained else 100e6)
+    return take_bytes + (working if shot.clip else 0.0) + (0.0 if shot.trained else 100e6)

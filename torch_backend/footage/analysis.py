@@ -151,6 +151,8 @@ def choose_solved(measures: Sequence[FrameMeasures], step: int) -> set[int]:
         window = [m for m in measures[max(0, anchor - reach) : anchor + reach + 1] if not m.flags]
         if window:
             best = max(window, key=lambda m: m.sharpness)
-            own = measures[anchor]
-            chosen.add(own.frame if own in window and own.sharpness >= BLUR_RATIO * best.sharpness else best.frame)
+            measure = measures[anchor]
+            chosen.add(
+                measure.frame if measure in window and measure.sharpness >= BLUR_RATIO * best.sharpness else best.frame
+            )
     return chosen

@@ -12,5 +12,5 @@ def seconds_of(frame: av.VideoFrame) -> float | None:
 
 def side_data(frame: av.VideoFrame, kind: object) -> bytes:
     """Side data of one kind attached to a frame; empty if there is none."""
-    every: Any = frame.side_data
-    return next((bytes(one) for one in every if one.type == kind), b"")
+    entries: Any = frame.side_data
+    return next((bytes(one) for one in entries if one.type == kind), b"")

@@ -87,11 +87,11 @@ def find_bars(pictures: Sequence[NDArray[np.uint8]]) -> Bars:
     if float(np.abs(stack - stack.mean(axis=0)).mean()) < 1.0:  # in a static clip every edge stays in place
         return Bars()
     top, bottom, left, right = _flat(stack)
-    rest = stack[:, top : stack.shape[1] - bottom, left : stack.shape[2] - right]
+    picture = stack[:, top : stack.shape[1] - bottom, left : stack.shape[2] - right]
     if not (left or right):
-        left = right = _blurred(rest)
+        left = right = _blurred(picture)
     if not (top or bottom):
-        top = bottom = _blurred(rest.swapaxes(1, 2))
+        top = bottom = _blurred(picture.swapaxes(1, 2))
     return Bars(top, bottom, left, right)
 
 
@@ -112,10 +112,10 @@ def _flat_sides(stack: NDArray[np.float32]) -> tuple[int, int]:
     return first, last
 
 
-def _has_colour_of(found: NDArray[np.float32], other: NDArray[np.float32], lines: int) -> bool:
-    """True if the first rows of `other` [F, H, W], up to near the border, have the colour of the bar in `found`."""
-    off = np.abs(other[:, : max(1, lines - _NEAR)] - np.median(found[:, :lines]))
-    return bool((np.quantile((off <= _FLAT).mean(axis=2), 1.0 - _OFTEN, axis=0) >= _FLAT_SHARE).all())
+def _has_colour_of(found: NDArray[np.float32], region: NDArray[np.float32], lines: int) -> bool:
+    """True if the first rows of `region` [F, H, W], up to near the border, have the colour of the bar in `found`."""
+    difference = np.abs(region[:, : max(1, lines - _NEAR)] - np.median(found[:, :lines]))
+    return bool((np.quantile((difference <= _FLAT).mean(axis=2), 1.0 - _OFTEN, axis=0) >= _FLAT_SHARE).all())
 
 
 def _flat_side(stack: NDArray[np.float32]) -> int:
@@ -123,13 +123,13 @@ def _flat_side(stack: NDArray[np.float32]) -> int:
     height = stack.shape[1]
     most = int(_MOST * height)
     head = stack[:, : most + 2 * _NEAR]
-    off = np.abs(head - np.median(head[:, : max(1, int(_LEAST * height))]))
-    flat = np.quantile((off <= _FLAT).mean(axis=2), 1.0 - _OFTEN, axis=0) >= _FLAT_SHARE
+    difference = np.abs(head - np.median(head[:, : max(1, int(_LEAST * height))]))
+    flat = np.quantile((difference <= _FLAT).mean(axis=2), 1.0 - _OFTEN, axis=0) >= _FLAT_SHARE
     lines = int(np.argmin(flat)) if not flat.all() else len(flat)
     if not _LEAST * height <= lines <= most:
         return 0
-    inside = (off[:, lines : lines + _NEAR].max(axis=1) > _STEP).mean(axis=1)
-    outside = (off[:, max(0, lines - 2 * _NEAR) : lines - _NEAR + 1].max(axis=1) > _STEP).mean(axis=1)
+    inside = (difference[:, lines : lines + _NEAR].max(axis=1) > _STEP).mean(axis=1)
+    outside = (difference[:, max(0, lines - 2 * _NEAR) : lines - _NEAR + 1].max(axis=1) > _STEP).mean(axis=1)
     return lines if np.quantile(inside - outside, 1.0 - _OFTEN) >= _STEP_SHARE else 0
 
 

@@ -21,7 +21,7 @@ _LEAST_FRAMES, _LEAST_WIDTH = 12, 160
 """Minimum number and width of the pictures for a decision."""
 _EDGE = 2.0
 """Minimum median gradient of an edge, in steps of 255 per pixel."""
-_ALIKE, _OFTEN = 0.5, 0.75
+_MAX_DEVIATION, _OFTEN = 0.5, 0.75
 """Largest relative difference of a frame's gradient from the median; minimum share of frames within it. Measured in
 three real and five synthetic clips: at most half of the frames agree on a scene edge, all on the edge of a logo."""
 _SCENE_OFTEN = 0.35
@@ -55,19 +55,19 @@ def find_mark(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.bool_] | None
     gradients = np.stack([_gradient(picture, size) for picture in pictures])
     middle = np.median(gradients, axis=0).astype(np.float32)
     length = np.hypot(*middle)
-    alike = np.zeros_like(length)
+    agreement = np.zeros_like(length)
     usual = np.zeros_like(length)
     for gradient in gradients:  # one at a time: all of them in float32 would be a hundred megabytes
         x, y = gradient.astype(np.float32)
-        alike += np.hypot(x - middle[0], y - middle[1]) < _ALIKE * length
+        agreement += np.hypot(x - middle[0], y - middle[1]) < _MAX_DEVIATION * length
         usual += np.hypot(x, y)
-    alike, usual = alike / len(gradients), usual / len(gradients)
-    edges = (length > _EDGE) & (alike > _OFTEN)
+    agreement, usual = agreement / len(gradients), usual / len(gradients)
+    edges = (length > _EDGE) & (agreement > _OFTEN)
     if not edges.any():
         return None
-    mark = _whole(edges, unit)
+    mark = _filled(edges, unit)
     world = (usual > _EDGE) & ~mark
-    moves = world.sum() > 2 * edges.sum() and np.median(alike[world]) < _SCENE_OFTEN
+    moves = world.sum() > 2 * edges.sum() and np.median(agreement[world]) < _SCENE_OFTEN
     if not moves or not mark.any() or mark.mean() > _MOST:
         return None
     large = cv2.resize(mark.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
@@ -82,7 +82,7 @@ def _gradient(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.f
     return np.stack(parts).astype(np.float16)
 
 
-def _whole(edges: NDArray[np.bool_], unit: float) -> NDArray[np.bool_]:
+def _filled(edges: NDArray[np.bool_], unit: float) -> NDArray[np.bool_]:
     """Mask [h, w] of the regions outlined by edges: gaps closed, holes filled, small parts removed."""
     closed = np.asarray(cv2.morphologyEx(edges.astype(np.uint8), cv2.MORPH_CLOSE, _disc(_CLOSE * unit)), np.uint8)
     numbers, areas = _parts(closed)

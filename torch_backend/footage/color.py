@@ -118,10 +118,10 @@ def rgb_to_xyz(chromaticities: Chromaticities) -> NDArray[np.float64]:
 def to_rec709(chromaticities: Chromaticities) -> NDArray[np.float64]:
     """Matrix [3, 3] from linear RGB of these primaries to linear Rec.709, adapting their white to D65 (Bradford)."""
     bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-    ours, theirs = rgb_to_xyz(REC709), rgb_to_xyz(chromaticities)
-    cones = (bradford @ ours.sum(axis=1)) / (bradford @ theirs.sum(axis=1))
-    adapted = linear_solution(bradford, cones[:, None] * (bradford @ theirs))
-    return linear_solution(ours, adapted)
+    target, source = rgb_to_xyz(REC709), rgb_to_xyz(chromaticities)
+    cones = (bradford @ target.sum(axis=1)) / (bradford @ source.sum(axis=1))
+    adapted = linear_solution(bradford, cones[:, None] * (bradford @ source))
+    return linear_solution(target, adapted)
 
 
 LIGHTS = ("rec709", "rec2020", "p3d65", "ap1", "ap0")
@@ -237,7 +237,7 @@ class InputSpace:
         return self.transfer in _SCENE
 
     @property
-    def as_it_stands(self) -> bool:
+    def is_passthrough(self) -> bool:
         """True if the values are used as sRGB without conversion."""
         return self.transfer in _DISPLAY and self.transfer != "g18" and self._wide is None
 
@@ -274,7 +274,7 @@ class InputSpace:
         if self.is_light:
             raise ValueError(f"{self.name} holds light: sRGB would cut it")
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=65504.0, neginf=0.0)
-        if self.as_it_stands:
+        if self.is_passthrough:
             return np.clip(pixels, 0.0, 1.0)
         light, encode = self._light(pixels)
         return encode(np.clip(light, 0.0, 1.0))
@@ -285,7 +285,7 @@ class InputSpace:
         NaN becomes 0. Values are clipped to the range of a half float.
         """
         pixels = np.nan_to_num(pixels, nan=0.0, posinf=_HALF_MAX, neginf=-_HALF_MAX)
-        if self.as_it_stands:
+        if self.is_passthrough:
             light = srgb_to_linear(pixels)
         else:
             light, encode = self._light(pixels)

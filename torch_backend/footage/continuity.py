@@ -54,7 +54,7 @@ class Features:
     """Mean square of the Laplacian of the picture with normalised contrast: sharpness independent of brightness."""
 
     @property
-    def enough(self) -> bool:
+    def is_sufficient(self) -> bool:
         """True if the picture has enough features for a comparison."""
         return len(self.points) >= _LEAST_FEATURES
 
@@ -80,18 +80,18 @@ def link(a: Features, b: Features) -> Link:
         matches = [best for best, second in pairs if best.distance < _DISTINCT * second.distance]
     if len(matches) < 8:
         return Link()
-    here, there = a.points[[m.queryIdx for m in matches]], b.points[[m.trainIdx for m in matches]]
+    at_a, at_b = a.points[[m.queryIdx for m in matches]], b.points[[m.trainIdx for m in matches]]
     cv2.setRNGSeed(0)  # makes RANSAC deterministic
     # Both are None without a homography, which OpenCV's type stubs omit.
-    answer: tuple[Any, Any] = cv2.findHomography(here, there, cv2.RANSAC, _TOLERANCE, maxIters=500)
+    answer: tuple[Any, Any] = cv2.findHomography(at_a, at_b, cv2.RANSAC, _TOLERANCE, maxIters=500)
     homography, found = answer
     inside = np.zeros(len(matches), bool) if found is None else np.asarray(found).ravel() > 0
     if not inside.any():
         return Link()
-    way = float(np.median(np.linalg.norm(there[inside] - here[inside], axis=1)))
+    way = float(np.median(np.linalg.norm(at_b[inside] - at_a[inside], axis=1)))
     count = int(inside.sum())
     return Link(
-        count, count / min(len(a.points), len(b.points)), way / WIDTH, there[inside], np.asarray(homography, np.float64)
+        count, count / min(len(a.points), len(b.points)), way / WIDTH, at_b[inside], np.asarray(homography, np.float64)
     )
 
 

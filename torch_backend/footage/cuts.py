@@ -21,7 +21,7 @@ from .continuity import Features, Link, link, sure_features
 
 SUSPICIOUS = 0.35
 """SIFT features decide if the overlap of two frames by quick features, relative to their neighbours, is below this."""
-APART = 0.13
+DIFFERENT_SCENES = 0.13
 """Largest overlap of different scenes by SIFT features, relative to the overlap of neighbouring frames.
 Measured: 0.20 to 1.5 in the fastest parts of three handheld clips, darkened, noisy, flickering and blurred. 0.01 to
 0.083 at cuts, including cuts to mirrored pictures and to other views of one room."""
@@ -31,11 +31,11 @@ _LINKED = 0.15
 """Minimum share of quick features in common with a neighbour. Noise, flashes and smeared frames have fewer."""
 _SHARP = 0.4
 """Ratio of a frame's sharpness to the median of its take, below which the frame is smeared."""
-_AROUND = 8
+_WINDOW = 8
 """Number of frames for the median sharpness of a take."""
 _LEAST_TAKE = 3
 """Minimum number of frames for the median sharpness of a take."""
-_ALIKE = 0.06
+_UNRELATED = 0.06
 """Share of quick features that unrelated pictures may have in common, with a margin: measured up to 0.04."""
 _NEAR = 0.2
 """Largest shift of the picture, as a share of its width, at which two frames around a third one must overlap."""
@@ -50,8 +50,8 @@ _EXPLAINED = 0.85
 """Minimum share of a dissolved frame's variance that the sum of the two pictures explains."""
 _GAINED = 2.2
 """Minimum factor by which the sum reduces the residual of either picture alone. Measured: 2.2 to 8 in dissolves over 4
-to 30 frames; often more within one take, see `_UNLIKE`."""
-_UNLIKE = 0.65
+to 30 frames; often more within one take, see `_SAME_SCENE`."""
+_SAME_SCENE = 0.65
 """Correlation of the two aligned pictures above which they show the same scene. Measured: 0.41 to 0.55 in dissolves,
 0.74 and more within one take, where the mean of two neighbours also explains the frame between."""
 _LEAST_PART = 0.25
@@ -116,16 +116,16 @@ class Frames:
 
 def find_transitions(frames: Frames, usable: Sequence[int]) -> list[Transition]:
     """All transitions, in order. `usable` are the indices of frames without flags (blank, duplicate, corrupt)."""
-    shown = [i for i in usable if frames.quick[i].enough]
+    shown = [i for i in usable if frames.quick[i].is_sufficient]
     ends = (shown[:1], shown[-1:])
 
-    def held(n: int) -> bool:
+    def is_linked(n: int) -> bool:
         # Noise in black, flashes and smeared frames match no neighbour.
         near = [pair for pair in (shown[max(0, n - 1) : n + 1], shown[n : n + 2]) if len(pair) == 2]
         return max((frames.share(*pair) for pair in near), default=0.0) >= _LINKED
 
     # The first and the last frame may be the rest of another take, so they always stay.
-    shown = [i for n, i in enumerate(shown) if [i] in ends or held(n)]
+    shown = [i for n, i in enumerate(shown) if [i] in ends or is_linked(n)]
     found = _breaks(frames, shown)
     return sorted([*found, *_mixtures(frames, shown, found)], key=lambda one: one.before)
 
@@ -141,7 +141,7 @@ def _breaks(frames: Frames, shown: list[int]) -> list[Transition]:
             continue
         sure_level = min(frames.sure(*pair).count for pair in inner)
         if sure_level < _LEAST_LEVEL or any(
-            frames.sure(a, b).count > APART * sure_level for a in before for b in after
+            frames.sure(a, b).count > DIFFERENT_SCENES * sure_level for a in before for b in after
         ):
             continue
         if any(frames.sure(*pair).shift > _NEAR for pair in inner):
@@ -159,16 +159,16 @@ def _breaks(frames: Frames, shown: list[int]) -> list[Transition]:
 
 def _is_sharp(frames: Frames, shown: list[int], n: int, way: int) -> bool:
     """True if a frame is as sharp as its take, which lies before it (`way` -1) or after it (1)."""
-    take = shown[max(0, n - _AROUND) : n + 1] if way < 0 else shown[n : n + _AROUND + 1]
+    take = shown[max(0, n - _WINDOW) : n + 1] if way < 0 else shown[n : n + _WINDOW + 1]
     if len(take) < _LEAST_TAKE:  # a few frames at the clip's end may all be smeared: use both sides
-        take = shown[max(0, n - _AROUND) : n + _AROUND + 1]
+        take = shown[max(0, n - _WINDOW) : n + _WINDOW + 1]
     usual = float(np.median([frames.quick[i].sharpness for i in take]))
     return frames.quick[shown[n]].sharpness >= _SHARP * usual
 
 
 def _is_plain_gap(frames: Frames, before: int, after: int) -> bool:
     """True if all frames between two takes are blank. The smeared frames of a whip pan are not."""
-    return not any(frames.quick[i].enough for i in range(before + 1, after))
+    return not any(frames.quick[i].is_sufficient for i in range(before + 1, after))
 
 
 def _faded(frames: Frames, before: int, after: int) -> Transition | None:
@@ -206,7 +206,7 @@ def _mixtures(frames: Frames, shown: list[int], known: list[Transition]) -> list
 def _mixed(frames: Frames, a: int, m: int, b: int) -> str:
     """Kind of transition ("dissolve", "wipe or dissolve") if frame `m` mixes the takes of `a` and `b`; else empty."""
     quick = frames.share(a, m), frames.share(m, b)
-    if frames.share(a, b) > _ALIKE or max(quick) < _ALIKE:
+    if frames.share(a, b) > _UNRELATED or max(quick) < _UNRELATED:
         return ""
     left, right = frames.sure(a, m), frames.sure(b, m)
     level, across = min(left.count, right.count), frames.sure(a, b).count
@@ -229,7 +229,7 @@ def _is_sum(frames: Frames, left: Link, m: int, right: Link, a: int, b: int) -> 
     if covered.mean() < 0.5 or target[covered].var() == 0.0:
         return False
     first, second, values = laid[0][covered], laid[1][covered], target[covered]
-    if not np.corrcoef(first, second)[0, 1] <= _UNLIKE:
+    if not np.corrcoef(first, second)[0, 1] <= _SAME_SCENE:
         return False
 
     def fitted(*columns: NDArray[np.float32]) -> tuple[float, NDArray[np.float64]]:
@@ -238,11 +238,11 @@ def _is_sum(frames: Frames, left: Link, m: int, right: Link, a: int, b: int) -> 
         return float(np.square(values - basis @ weights).mean() / values.var()), weights
 
     unexplained, weights = fitted(first, second)
-    alone = min(fitted(first)[0], fitted(second)[0])
+    single = min(fitted(first)[0], fitted(second)[0])
     parts = float(weights[0]), float(weights[1])
     return (
         unexplained <= 1.0 - _EXPLAINED
-        and alone >= _GAINED * unexplained
+        and single >= _GAINED * unexplained
         and min(parts) >= _LEAST_PART
         and 0.75 <= sum(parts) <= 1.25
     )

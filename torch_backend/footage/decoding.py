@@ -35,7 +35,7 @@ def decoded(container: Any, stream: Any, noticed: Noticed | None = None, fields:
     `fields`: result of `unmarked_fields` for an interlaced clip that is not marked as such.
     """
     noticed = noticed or Noticed()
-    return _whole_pictures(stored_frames(container, stream, noticed), noticed, fields)
+    return _deinterlaced(stored_frames(container, stream, noticed), noticed, fields)
 
 
 def unmarked_fields(container: Any, stream: Any) -> str:
@@ -101,7 +101,7 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
     still in the decoder.
     """
     packets: Iterator[Any] = container.demux(stream)
-    held: Any = None
+    pending: Any = None
     while True:
         error = None
         try:
@@ -111,18 +111,18 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
         if packet is not None and not packet.size and packet.dts is not None:
             continue  # in an AVI, a repeat of the previous frame; a decoder would read it as the end
         at_end = packet is None or not packet.size
-        if held is not None and not (at_end and held.is_corrupt):
-            yield held
+        if pending is not None and not (at_end and pending.is_corrupt):
+            yield pending
         if at_end:
             if error is not None:
                 yield error
             elif packet is not None:
                 yield packet
             return
-        held = packet
+        pending = packet
 
 
-def _whole_pictures(frames: Iterator[Any], noticed: Noticed, fields: str) -> Iterator[Any]:
+def _deinterlaced(frames: Iterator[Any], noticed: Noticed, fields: str) -> Iterator[Any]:
     """Deinterlaces frames by FFmpeg's bwdif, from the first interlaced frame on. Keeps the number of frames.
 
     The filter does not change progressive frames. With `fields` ("tff" or "bff"), all frames count as interlaced. The
@@ -133,7 +133,7 @@ def _whole_pictures(frames: Iterator[Any], noticed: Noticed, fields: str) -> Ite
     for frame in frames:
         failed = isinstance(frame, FFmpegError)
         if graph is not None and (failed or _size(frame) != size):
-            yield from _rest(graph)
+            yield from _flushed(graph)
             graph = None
         if failed:
             yield frame
@@ -147,7 +147,7 @@ def _whole_pictures(frames: Iterator[Any], noticed: Noticed, fields: str) -> Ite
         graph.vpush(frame)
         yield from _pulled(graph)
     if graph is not None:
-        yield from _rest(graph)
+        yield from _flushed(graph)
 
 
 def _size(frame: av.VideoFrame) -> tuple[int, int, str]:
@@ -156,8 +156,8 @@ def _size(frame: av.VideoFrame) -> tuple[int, int, str]:
 
 def _deinterlacer(frame: av.VideoFrame, fields: str) -> av.filter.Graph:
     """A graph that makes one picture of each frame: keeps the first field and interpolates the other lines."""
-    wanted = f"parity={fields}:deint=all" if fields else "parity=auto:deint=interlaced"
-    return _graph(frame, ("bwdif", f"mode=send_frame:{wanted}"))
+    options = f"parity={fields}:deint=all" if fields else "parity=auto:deint=interlaced"
+    return _graph(frame, ("bwdif", f"mode=send_frame:{options}"))
 
 
 def _graph(frame: av.VideoFrame, *filters: tuple[str, str]) -> av.filter.Graph:
@@ -179,6 +179,6 @@ def _pulled(graph: av.filter.Graph) -> Iterator[Any]:
             return
 
 
-def _rest(graph: av.filter.Graph) -> Iterator[Any]:
+def _flushed(graph: av.filter.Graph) -> Iterator[Any]:
     graph.vpush(None)
     yield from _pulled(graph)

@@ -88,15 +88,15 @@ def find_depth(shot: Shot, source: str, report: Reporter) -> DepthSequence:
         raise footage_error(f"The depth sequence {path} does not exist.", "Check the path.")
     sequence = find_sequence(path)
     counted = counted_of(record)
-    theirs = sorted(sequence.files)
-    paired = pair(theirs, counted)
+    numbers = sorted(sequence.files)
+    paired = pair(numbers, counted)
     if not paired.numbers:
         raise footage_error(
-            f"None of the depth maps {sequence.pattern} ({theirs[0]} to {theirs[-1]}) belongs to a frame "
+            f"None of the depth maps {sequence.pattern} ({numbers[0]} to {numbers[-1]}) belongs to a frame "
             f"({counted.frames[0]} to {counted.frames[-1]}).",
             "Number them as the clip's frames.",
         )
-    words = pairing_words(f"The depth sequence {sequence.pattern}", theirs, paired)
+    words = pairing_words(f"The depth sequence {sequence.pattern}", numbers, paired)
     if words is not None:
         report.warning(*words)
     width, height = record.get("source_size") or (record["width"], record["height"])

@@ -60,8 +60,8 @@ class EarlierWork:
 
         Before that, restores lost or damaged files of the shot from the new frames in `fresh`.
         """
-        whole = ("width", "height", "fps", "colour", "bits", "step")
-        if any(record[name] != self.record.get(name) for name in whole) or not self._agree(record):
+        fields = ("width", "height", "fps", "colour", "bits", "step")
+        if any(record[name] != self.record.get(name) for name in fields) or not self._agree(record):
             return
         for row in self.record["frames"]:
             if not is_whole_png(self.shot.frames / row["file"]):

@@ -40,9 +40,9 @@ class Coding:
     """YCbCr matrix, a key of `LUMA`; `RGB` if the planes are red, green and blue."""
     is_full: bool
     """True if codes go from 0 to the largest, False if black is 16 and white 235 of 255."""
-    matrix_told: bool
+    is_matrix_declared: bool
     """True if the file or the artist declares the matrix, False if it was assumed."""
-    range_told: bool
+    is_range_declared: bool
     """True if the file or the artist declares the range, False if it was assumed."""
 
     @property
@@ -62,7 +62,7 @@ def coding_of(frame: av.VideoFrame, matrix: str = "", code_range: str = "") -> C
     Players assume BT.709 for 1280 columns or more, BT.601 for fewer, and video range for YCbCr.
     """
     if frame.format.is_rgb or frame.format.name == "pal8":
-        return Coding(RGB, is_full=True, matrix_told=True, range_told=True)
+        return Coding(RGB, is_full=True, is_matrix_declared=True, is_range_declared=True)
     tagged = MATRICES.get(int(frame.colorspace))
     assumed = BT709 if max(frame.width, frame.height) >= 1280 else BT601
     # Formats named yuvj are full range. FFmpeg also assumes full range for grey without a tag.
@@ -74,8 +74,8 @@ def coding_of(frame: av.VideoFrame, matrix: str = "", code_range: str = "") -> C
     return Coding(
         MATRIX_OVERRIDES.get(matrix) or tagged or assumed,
         is_full=codes == FULL_RANGE,
-        matrix_told=bool(matrix) or tagged is not None or _is_grey(frame),
-        range_told=bool(code_range) or known,
+        is_matrix_declared=bool(matrix) or tagged is not None or _is_grey(frame),
+        is_range_declared=bool(code_range) or known,
     )
 
 

@@ -44,7 +44,7 @@ CAREFUL = Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolat
 """Accurate flags of FFmpeg's scaler. Without them, it reads chroma only at every other column, and rounds down."""
 
 _FULL_BYTES = 4 << 20
-_MADE_BY = {
+_REMEDIES = {
     RAW_FOLDER: ("Import the clip again.", ExitCode.FOOTAGE),
     FRAMES_FOLDER: ("Solve the camera again.", ExitCode.SOLVE),
 }
@@ -125,10 +125,10 @@ def read_frame(path: Path) -> NDArray[Any]:
     try:
         return read_png(path)
     except (ValueError, FileNotFoundError) as error:
-        again = _MADE_BY.get(path.parent.name)
-        if again is None:
+        remedy = _REMEDIES.get(path.parent.name)
+        if remedy is None:
             raise
-        raise JobError(f"Frame {int(path.stem)} is damaged or missing: {path}.", *again) from error
+        raise JobError(f"Frame {int(path.stem)} is damaged or missing: {path}.", *remedy) from error
 
 
 def is_whole_png(path: Path) -> bool:

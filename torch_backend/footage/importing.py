@@ -52,9 +52,9 @@ from .sources import (
     SourceFrame,
     SourceInfo,
     footage_error,
-    told_in,
+    overrides_of,
 )
-from .strangers import keep_strangers
+from .strangers import keep_foreign_files
 
 FRAMES_VERSION = 1
 _WRITERS = 2
@@ -79,7 +79,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
     Raises JobError (FOOTAGE, DISK) or Cancelled; neither leaves a partial import.
     """
     _check(config)
-    opened = open_source(source, config.fps, config.layer, Colours(config.colour_space), told_in(config))
+    opened = open_source(source, config.fps, config.layer, Colours(config.colour_space), overrides_of(config))
     shift = shift_of(opened.info, config)
     _check_range(opened, config, shift)
     key = import_key(opened.info, config, shift=shift)
@@ -105,7 +105,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
             refuse_unusable(extracted.measures)
             refuse_cuts(extracted.measures, fresh / RAW_FOLDER, shift)
             record = _record(opened, config, extracted, key, shift)
-            record["beside"] = _beside(shot, source)
+            record["beside"] = _relative_source(shot, source)
             if earlier is not None:
                 earlier.stop_if_same(record, fresh)
                 if not config.replace:
@@ -116,7 +116,7 @@ def import_footage(shot: Shot, source: str, config: FootageConfig, report: Repor
             record |= _marked(shot, record, fresh, report)
             write_json(fresh / FRAMES_FILE, record)
             write_json(fresh / UNPUBLISHED_FILE, _news(record, source) | order)
-            keep_strangers(shot.frames, fresh, record)
+            keep_foreign_files(shot.frames, fresh, record)
     except SamePictures:
         report.progress("import", 1, 1, "already imported")
         shot.update(source=str(source))
@@ -189,10 +189,10 @@ def load_frames(shot: Shot) -> dict[str, Any]:
         for row in record["frames"]:
             row["sharpness"] = float(row.get("sharpness", 0.0))
         numbers = [number for number, *_ in rows]
-        whole = bool(rows) and numbers == sorted(set(numbers)) and int(record["width"]) * int(record["height"]) > 0
+        is_valid = bool(rows) and numbers == sorted(set(numbers)) and int(record["width"]) * int(record["height"]) > 0
     except (ValueError, TypeError, KeyError, OverflowError):
-        record, numbers, whole = {}, [], False
-    if not whole:
+        record, numbers, is_valid = {}, [], False
+    if not is_valid:
         raise footage_error(f"{path} is damaged.", "Import the clip again.")
     if numbers[0] < 0 or numbers[-1] > LAST_FRAME:  # earlier versions read a dash in a file name as a minus
         raise footage_error(
@@ -211,7 +211,7 @@ def holds_footage(root: Path, config: FootageConfig) -> bool:
         record = read_json(ShotFolder(root).listing)
     except (OSError, ValueError):
         return False
-    opened = open_source(config.source, config.fps, config.layer, Colours(config.colour_space), told_in(config))
+    opened = open_source(config.source, config.fps, config.layer, Colours(config.colour_space), overrides_of(config))
     return record.get("footage") == footage_key(opened.info, recorded_shift(record))
 
 
@@ -221,10 +221,10 @@ def source_places(shot: Shot, record: dict[str, Any]) -> list[str]:
     These are the recorded path mapped for this machine, the recorded path, the recorded path relative to the shot (both
     may have moved together), and the file's name in the shot's parent folder.
     """
-    named, beside = shot.info().source, str(record.get("beside") or "")
+    named, relative = shot.info().source, str(record.get("beside") or "")
     places = [mapped(named), named] if named else []
-    if beside:
-        places.append(str((shot.root / beside).resolve()))
+    if relative:
+        places.append(str((shot.root / relative).resolve()))
     if named:
         places.append(str(shot.root.parent / re.split(r"[\\/]", named)[-1]))
     return list(dict.fromkeys(places))
@@ -264,8 +264,8 @@ def _finished(shot: Shot, keys: set[str]) -> dict[str, Any] | None:
         record = load_frames(shot)
     except JobError:  # missing or damaged: import again
         return None
-    whole = record.get("key") in keys and all(is_whole_png(shot.frames / f["file"]) for f in record["frames"])
-    return record if whole else None
+    is_complete = record.get("key") in keys and all(is_whole_png(shot.frames / f["file"]) for f in record["frames"])
+    return record if is_complete else None
 
 
 def _extract(shot: Shot, opened: Source, config: FootageConfig, into: Path, report: Reporter) -> Extracted:
@@ -419,7 +419,7 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
     ignored = bars.widened.mask(*pictures[0].shape)
     found: dict[str, Any] = {}
     if bars.sides:
-        found["bars"] = _tell_bars(bars, pictures[0].shape, record, report)
+        found["bars"] = _report_bars(bars, pictures[0].shape, record, report)
     if mark is not None:
         ignored[inner] |= mark
         report.warning(
@@ -431,7 +431,7 @@ def _marked(shot: Shot, record: dict[str, Any], fresh: Path, report: Reporter) -
     return {"burnt_in": {"file": BURNT_IN_FILE, "share": round(float(ignored.mean()), 5)}, **found}
 
 
-def _tell_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], report: Reporter) -> dict[str, float]:
+def _report_bars(bars: Bars, shape: tuple[int, ...], record: dict[str, Any], report: Reporter) -> dict[str, float]:
     """The entry of frames.json for bars found in pictures [h, w]. Warns the artist.
 
     The value of each side is a share of the frame's height or width, and includes the mixed lines.
@@ -474,7 +474,7 @@ def _news(record: dict[str, Any], source: str) -> dict[str, Any]:
     return {"source": str(source), "first": frames[0]["frame"], "last": frames[-1]["frame"], **imported}
 
 
-def _beside(shot: Shot, source: str) -> str:
+def _relative_source(shot: Shot, source: str) -> str:
     """Path of the footage relative to the shot folder, with slashes, so that both can be moved together."""
     try:
         return Path(os.path.relpath(source, shot.root)).as_posix()

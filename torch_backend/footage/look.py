@@ -41,7 +41,7 @@ class LookSpace(InputSpace):
         return f"by the look {Path(self.file).name}"
 
     @property
-    def as_it_stands(self) -> bool:
+    def is_passthrough(self) -> bool:
         """False: every picture goes through the table."""
         return False
 

@@ -86,11 +86,11 @@ def read_masks(shot: Shot, sources: dict[str, str], report: Reporter) -> dict[st
     Raises JobError (FOOTAGE) for a mask that is unreadable, has another aspect ratio, lacks frames or covers nothing,
     and for masks that together cover nearly everything.
     """
-    wanted = {kind: source for kind, source in sources.items() if source}
-    if not wanted:
+    requested = {kind: source for kind, source in sources.items() if source}
+    if not requested:
         return {}
     frames = load_frames(shot)
-    masks = {kind: _Reading(shot, frames, kind, source, report).mask() for kind, source in wanted.items()}
+    masks = {kind: _Reading(shot, frames, kind, source, report).mask() for kind, source in requested.items()}
     covered = 0.0
     for number in masks[next(iter(masks))].packed:
         covered += float(np.logical_or.reduce([mask.of(number) for mask in masks.values()]).mean())
@@ -116,23 +116,23 @@ class _Reading:
 
     def mask(self) -> Mask:
         """Reads all pictures of the source into one mask."""
-        made = Mask(self.kind, self.size)
+        result = Mask(self.kind, self.size)
         pictures = self._alpha() if self.source == MASK_ALPHA else self._pictures()
         total = 0.0
         for done, (number, grey) in enumerate(pictures, start=1):
             self.report.check_cancelled()
             covered = self._covered(grey)
             for frame in [number] if number is not None else self.numbers:
-                made.add(frame, covered)
+                result.add(frame, covered)
                 total += float(covered.mean())
             self.report.progress("solve: masks", done, len(self.numbers), WORDS[self.kind])
-        made.share = total / max(1, len(self.numbers))
+        result.share = total / max(1, len(self.numbers))
         if total == 0.0:
             hint = "White is what is masked, from half of it on."
             if self.source == MASK_ALPHA:
                 hint = "Ignored is what is transparent; what is opaque may move."
             raise footage_error(f"{self.name} covers nothing in any frame.", hint)
-        return made
+        return result
 
     def _covered(self, grey: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Covered pixels [H, W] bool at the working size of a picture [h, w] in 0..1. Raises as `_check_shape` does."""
@@ -143,18 +143,18 @@ class _Reading:
 
     def _check_shape(self, w: int, h: int) -> None:
         """Raises JobError for a picture with another aspect ratio than the footage, or with far more pixels."""
-        ours = self.frames.get("source_size") or self.size
-        if w * h > max(ours[0] * ours[1], _MOST_PIXELS):
+        full = self.frames.get("source_size") or self.size
+        if w * h > max(full[0] * full[1], _MOST_PIXELS):
             raise footage_error(
-                f"{self.name} is {w}x{h}, the footage {ours[0]}x{ours[1]}: it has far more pixels than are of use.",
+                f"{self.name} is {w}x{h}, the footage {full[0]}x{full[1]}: it has far more pixels than are of use.",
                 "Render the mask at the footage's size, or a fraction of it.",
             )
         aspect = float(self.frames.get("reading", {}).get("pixel_aspect", 1.0))
         shape = w / h
         # A mask of anamorphic footage has square pixels, or the pixels of the footage.
-        if all(abs(shape / (ours[0] / ours[1] / stretch) - 1.0) > _SHAPE for stretch in (1.0, aspect)):
+        if all(abs(shape / (full[0] / full[1] / stretch) - 1.0) > _SHAPE for stretch in (1.0, aspect)):
             raise footage_error(
-                f"{self.name} is {w}x{h}, the footage {ours[0]}x{ours[1]}: they have not the same shape.",
+                f"{self.name} is {w}x{h}, the footage {full[0]}x{full[1]}: they have not the same shape.",
                 "Render the mask at the footage's size, or a fraction of it.",
             )
 
@@ -171,7 +171,7 @@ class _Reading:
             files = self._files(path)
             if None not in files:
                 matched = self._matched(sorted(n for n in files if n is not None))
-                files = dict[int | None, Path]({frame: files[theirs] for frame, theirs in matched.items()})
+                files = dict[int | None, Path]({frame: files[number] for frame, number in matched.items()})
             pictures = functools.partial(self._of_mask_files, files)
         way = self._way(pictures(with_alpha=True))
         for frame, colour, alpha in pictures():
@@ -207,16 +207,16 @@ class _Reading:
             return {None: path} if sequence is None else {**sequence.files}
         return {**find_sequence(path).files}
 
-    def _matched(self, theirs: list[int]) -> dict[int, int]:
+    def _matched(self, pictures: list[int]) -> dict[int, int]:
         """Frame -> number of the mask's picture. Raises JobError, which lists the frames without a picture."""
-        paired = pair(theirs, self.counted, needs_all=True)
+        paired = pair(pictures, self.counted, needs_all=True)
         missing = sorted(set(self.numbers) - set(paired.numbers))
         if missing:
             raise footage_error(
                 f"{self.name} has no picture for {frame_words(missing)}, of {len(self.numbers)} frames.",
                 "Number it as the clip's frames, or give one picture, without a number in its name, for all of them.",
             )
-        words = pairing_words(self.name, theirs, paired)
+        words = pairing_words(self.name, pictures, paired)
         if words is not None:
             self.report.warning(*words)
         return paired.numbers
@@ -238,21 +238,21 @@ class _Reading:
         video = open_video(path)
         self._check_shape(video.info.width, video.info.height)
         count = sum(1 for _ in video.frames(None, None))
-        wanted = {theirs: frame for frame, theirs in self._matched(list(range(1, count + 1))).items()}
+        frame_of = {picture: frame for frame, picture in self._matched(list(range(1, count + 1))).items()}
 
         def pictures(with_alpha: bool = False) -> Iterator[_Picture]:
             if with_alpha and not video.has_alpha:
                 return
-            last = max(wanted)
+            last = max(frame_of)
             alphas = iter(video.alphas(last)) if video.has_alpha else None
             for one in video.frames(None, last):
                 alpha = None if alphas is None else next((found for n, found in alphas if n == one.number), None)
-                if one.number in wanted:
+                if one.number in frame_of:
                     colour = plate_encoding.display(one.pixels)
                     if alpha is not None and alpha.shape != colour.shape[:2]:
                         size = colour.shape[1], colour.shape[0]
                         alpha = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR), np.float32)
-                    yield wanted[one.number], colour, alpha
+                    yield frame_of[one.number], colour, alpha
 
         return pictures
 
@@ -279,8 +279,8 @@ class _Reading:
                 f"{video.path.name} has no alpha to mask by.", "Give the mask as pictures of their own, or a video."
             )
         missing = set(self.numbers)
-        for own_number, alpha in video.alphas(self.numbers[-1] - self.counted.shift):
-            number = own_number + self.counted.shift
+        for footage_number, alpha in video.alphas(self.numbers[-1] - self.counted.shift):
+            number = footage_number + self.counted.shift
             if number in missing:
                 missing.remove(number)
                 yield number, alpha
@@ -303,9 +303,9 @@ class _Reading:
                 SequenceSource(sequence, settings.fps, settings.layer)
             except (JobError, OSError):
                 continue
-            own = sequence.files
-            if own.keys() >= {number - self.counted.shift for number in self.numbers}:
-                files = {number: own[number - self.counted.shift] for number in self.numbers}
+            available = sequence.files
+            if available.keys() >= {number - self.counted.shift for number in self.numbers}:
+                files = {number: available[number - self.counted.shift] for number in self.numbers}
                 return files, settings.layer
         raise footage_error(
             f"The footage {self.shot.info().source} cannot be read any more: its alpha is not known.",

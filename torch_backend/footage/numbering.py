@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..contract import ImportParams
 from .sources import Known, PlateReader, Source, SourceFrame, SourceInfo
 
-OWN_NUMBERS = "Frames are named by the footage's own numbers here."
+FOOTAGE_NUMBERS = "Frames are named by the footage's own numbers here."
 """Sentence added to the hint of a warning about single frames, if shot and footage count differently."""
 
 
@@ -51,11 +51,11 @@ class Renumbered:
     def frames(self, first: int | None, last: int | None) -> Iterator[SourceFrame]:
         """See `Source.frames`."""
         earlier = len(self.warnings)
-        own = (None if number is None else number - self._shift for number in (first, last))
-        for frame in self._source.frames(*own):
+        span = (None if number is None else number - self._shift for number in (first, last))
+        for frame in self._source.frames(*span):
             yield replace(frame, number=frame.number + self._shift)
         self.warnings[earlier:] = [
-            (message, f"{hint} {OWN_NUMBERS}".strip()) for message, hint in self.warnings[earlier:]
+            (message, f"{hint} {FOOTAGE_NUMBERS}".strip()) for message, hint in self.warnings[earlier:]
         ]
 
     def plates(self, known: Known) -> PlateReader:

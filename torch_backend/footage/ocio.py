@@ -51,7 +51,7 @@ class OcioSpace(InputSpace):
         return True
 
     @property
-    def as_it_stands(self) -> bool:
+    def is_passthrough(self) -> bool:
         """False: `known_space` returns a plain `InputSpace` for sRGB."""
         return False
 
@@ -113,7 +113,7 @@ class Colours:
         return known_space(str(rules.getColorSpaceFromFilepath(str(file))), config)
 
     def _used(self) -> str:
-        return self.config if self.config and _is_there(self.config) else active_config()
+        return self.config if self.config and _exists(self.config) else active_config()
 
 
 def active_config() -> str:
@@ -121,7 +121,7 @@ def active_config() -> str:
     return os.environ.get("OCIO") or BUILT_IN
 
 
-def _is_there(config: str) -> bool:
+def _exists(config: str) -> bool:
     return config.startswith("ocio://") or Path(config).is_file()
 
 

@@ -15,17 +15,17 @@ from .images import error_of
 from .ocio import Colours
 from .sequence import SequenceSource
 from .sequence_files import PICTURES, find_sequence, numbered_neighbours, unreadable_pictures
-from .sources import Source, Told, footage_error
+from .sources import Overrides, Source, footage_error
 from .video import VideoSource
 
 
 def open_source(
-    source: str, fps: float = 0.0, layer: str = "", colours: Colours | None = None, told: Told | None = None
+    source: str, fps: float = 0.0, layer: str = "", colours: Colours | None = None, overrides: Overrides | None = None
 ) -> Source:
     """Opens a video file, or a numbered sequence by its folder, one of its files or a pattern.
 
     `fps` overrides the rate of a sequence. `layer` is the layer of a sequence, or the stream number of a video.
-    `colours` and `told` override what the files declare; None: no overrides.
+    `colours` and `overrides` override what the files declare; None: no overrides.
 
     Raises JobError if the footage is missing, empty or of an unknown kind.
     """
@@ -35,25 +35,25 @@ def open_source(
         )
     path, colours = Path(source), colours or Colours()
     try:
-        wanted = not path.exists() and is_pattern(path.name)
+        is_sequence = not path.exists() and is_pattern(path.name)
         if path.is_dir():
             os.listdir(path)
     except (OSError, ValueError) as error:  # no permission, a name that is too long or has a zero byte
         reason = getattr(error, "strerror", None) or error
         raise footage_error(f"The footage {source!r} cannot be opened: {reason}.", "Check the path.") from error
-    if wanted or path.is_dir() or (path.is_file() and not opens_as_video(path)):
-        return _pictures(path, fps, layer, colours, told)
+    if is_sequence or path.is_dir() or (path.is_file() and not opens_as_video(path)):
+        return _pictures(path, fps, layer, colours, overrides)
     if path.exists() and not path.is_file():
         raise footage_error(f"{source} is neither a file nor a folder.", "Choose a video file or an image sequence.")
     if not path.is_file():
         raise footage_error(
             f"The footage {source} does not exist.", "Check the path; a clip on a server must be mounted."
         )
-    video = open_video(path, colours, told, layer)
+    video = open_video(path, colours, overrides, layer)
     layer = "" if video.has_streams else layer
-    for value, what, own in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
+    for value, what, kept in ((fps, "rate", f"{video.info.fps:g} frames per second"), (layer, "layer", "a single one")):
         if value:
-            video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {own}.", ""))
+            video.warnings.append((f"The {what} {value!r} is passed over: a video has its own, {kept}.", ""))
     return video
 
 
@@ -76,10 +76,12 @@ def opens_as_video(path: Path) -> bool:
         picture.close()
 
 
-def open_video(path: Path, colours: Colours | None = None, told: Told | None = None, layer: str = "") -> VideoSource:
+def open_video(
+    path: Path, colours: Colours | None = None, overrides: Overrides | None = None, layer: str = ""
+) -> VideoSource:
     """Opens a video. Raises JobError for a still picture, and for an animated picture that cannot be read."""
     try:
-        video = VideoSource(path, colours, told, layer)
+        video = VideoSource(path, colours, overrides, layer)
     except JobError as error:
         if path.suffix.lower() in PICTURES:
             raise footage_error(
@@ -111,11 +113,11 @@ def _is_clip(path: Path) -> bool:
         return False
 
 
-def _pictures(path: Path, fps: float, layer: str, colours: Colours, told: Told | None) -> SequenceSource:
+def _pictures(path: Path, fps: float, layer: str, colours: Colours, overrides: Overrides | None) -> SequenceSource:
     """Opens a sequence. Warns that options for videos are ignored."""
-    told = told or Told()
-    pictures = SequenceSource(find_sequence(path), fps, layer, colours, told.pixel_aspect, told.look)
-    for value, what in ((told.matrix, "matrix"), (told.levels, "levels")):
+    overrides = overrides or Overrides()
+    pictures = SequenceSource(find_sequence(path), fps, layer, colours, overrides.pixel_aspect, overrides.look)
+    for value, what in ((overrides.matrix, "matrix"), (overrides.levels, "levels")):
         if value:
             pictures.warnings.append((f"The {what} {value!r} is passed over: pictures hold RGB as it is.", ""))
     return pictures

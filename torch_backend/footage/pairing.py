@@ -32,7 +32,7 @@ class Pairing:
 
     numbers: dict[int, int]
     """Frame -> number of its picture, ascending."""
-    by_own_number: bool = True
+    by_frame_number: bool = True
     """True if each picture has the number of its frame."""
     is_certain: bool = True
     """False if another numbering of the pictures fits equally well."""
@@ -65,17 +65,17 @@ def pair(pictures: Sequence[int], counted: Counted, needs_all: bool = False, may
     steps = [0, counted.shift]
     clip = counted.clip or (frames[0], frames[-1])
     # Pictures may count independently if they start at 0 or 1, or if few numbers match a frame but the total matches.
-    strange = 2 * len(set(pictures) & set(frames)) < len(frames)
-    as_many = len(pictures) in (len(frames), clip[1] - clip[0] + 1)
-    may_count_anew = may_shift and (first in (0, 1) or (strange and as_many))
+    few_match = 2 * len(set(pictures) & set(frames)) < len(frames)
+    same_count = len(pictures) in (len(frames), clip[1] - clip[0] + 1)
+    may_count_anew = may_shift and (first in (0, 1) or (few_match and same_count))
     if may_count_anew:
         steps += [clip[0] - first, frames[0] - first]
     if may_shift and first == 0 and clip[0] - counted.shift == 1:  # programs count from 0, people from 1
         steps.insert(0, clip[0])
     ways = [_Way(step, pictures, counted, needs_all) for step in dict.fromkeys(steps)]
     best = max(ways, key=lambda way: way.worth)
-    if may_count_anew and len(pictures) == len(frames) and _is_even(pictures) and not best.worth.enough:
-        return Pairing(dict(zip(frames, pictures, strict=True)), by_own_number=False)
+    if may_count_anew and len(pictures) == len(frames) and _is_even(pictures) and not best.worth.is_sufficient:
+        return Pairing(dict(zip(frames, pictures, strict=True)), by_frame_number=False)
     certain = [way.worth for way in ways].count(best.worth) == 1
     return Pairing(best.numbers, best.step == 0, certain)
 
@@ -89,7 +89,7 @@ class _Worth(NamedTuple):
     """True if pictures and frames match one to one."""
     inside: int
     """Minus the number of pictures outside of the clip."""
-    enough: bool
+    is_sufficient: bool
     """True if enough frames have a picture: all if all need one, otherwise half."""
 
 
@@ -98,13 +98,15 @@ class _Way:
 
     def __init__(self, step: int, pictures: Sequence[int], counted: Counted, needs_all: bool) -> None:
         self.step = step
-        wanted = set(counted.frames)
-        self.numbers = {n + step: n for n in pictures if n + step in wanted}
+        frames = set(counted.frames)
+        self.numbers = {n + step: n for n in pictures if n + step in frames}
         covers = len(self.numbers)
         first, last = counted.clip or (pictures[0] + step, pictures[-1] + step)
         outside = sum(not first <= n + step <= last for n in pictures) if covers else len(pictures)
-        enough = covers == len(wanted) if needs_all else 2 * covers >= len(wanted)
-        self.worth = _Worth(needs_all and enough, covers == len(wanted) == len(pictures), -outside, enough)
+        is_sufficient = covers == len(frames) if needs_all else 2 * covers >= len(frames)
+        self.worth = _Worth(
+            needs_all and is_sufficient, covers == len(frames) == len(pictures), -outside, is_sufficient
+        )
 
 
 def _is_even(numbers: Sequence[int]) -> bool:
@@ -117,11 +119,11 @@ def pairing_words(name: str, pictures: Sequence[int], paired: Pairing) -> tuple[
 
     `name` is the subject, such as "The mask m.####.png".
     """
-    if not paired.numbers or (paired.by_own_number and paired.is_certain):
+    if not paired.numbers or (paired.by_frame_number and paired.is_certain):
         return None
     frame, picture = next(iter(paired.numbers.items()))
     last = list(paired.numbers)[-1]
-    how = "each is taken for the frame of its number" if paired.by_own_number else "they are taken in order"
+    how = "each is taken for the frame of its number" if paired.by_frame_number else "they are taken in order"
     return (
         f"{name} is numbered {pictures[0]} to {pictures[-1]}, the frames {frame} to {last}: picture {picture} is taken "
         f"for frame {frame}, {how}.",

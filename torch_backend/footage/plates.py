@@ -29,7 +29,7 @@ from .importing import FootageConfig, import_keys, load_frames, source_places
 from .numbering import recorded_shift, renumbered
 from .ocio import Colours
 from .opening import open_source
-from .sources import Known, Source, SourceInfo, told_in
+from .sources import Known, Source, SourceInfo, overrides_of
 
 PLATES_VERSION = 1
 STAYS = "Frozen frames stay at the size and depth of the working frames."
@@ -87,7 +87,7 @@ class Plates:
             source = None  # the working frames have the same pixels
         self._reader = source.plates(self._known(record)) if source is not None else None
         self._warp: tuple[PlateLens | MapLens, BandUndistorter] | None = None
-        self._held: OrderedDict[int, NDArray[Any]] = OrderedDict()
+        self._cache: OrderedDict[int, NDArray[Any]] = OrderedDict()
         footage = source.info.key if source is not None else "working frames"
         self.key = content_key(PLATES_VERSION, record.get("key"), solved.get("key"), footage, [self.width, self.height])
 
@@ -105,7 +105,7 @@ class Plates:
     @property
     def kept(self) -> int:
         """Number of cached plates."""
-        return len(self._held)
+        return len(self._cache)
 
     def original(self) -> SourceInfo | None:
         """Facts of the footage, also if working frames replace it; None if it is missing or not the imported one."""
@@ -131,20 +131,20 @@ class Plates:
 
     def close(self) -> None:
         """Frees the cache and closes the footage. Later requests read the plates again."""
-        self._held.clear()
+        self._cache.clear()
         if self._reader is not None:
             self._reader.close()
 
     def _codes(self, frame: int) -> NDArray[Any]:
         if frame not in self._files:
             raise UserError(f"the shot has no frame {frame}: it has {self.frames[0]} to {self.frames[-1]}")
-        if frame in self._held:
-            self._held.move_to_end(frame)
-            return self._held[frame]
-        while len(self._held) >= self._keep:
-            self._held.popitem(last=False)
-        self._held[frame] = self._read(frame)
-        return self._held[frame]
+        if frame in self._cache:
+            self._cache.move_to_end(frame)
+            return self._cache[frame]
+        while len(self._cache) >= self._keep:
+            self._cache.popitem(last=False)
+        self._cache[frame] = self._read(frame)
+        return self._cache[frame]
 
     def _read(self, frame: int) -> NDArray[Any]:
         if self._reader is None:
@@ -199,7 +199,8 @@ class Plates:
         colours = Colours(config.colour_space, str(reading.get("ocio", "")))
         for place in source_places(self._shot, record):
             try:
-                yield place, renumbered(open_source(place, config.fps, config.layer, colours, told_in(config)), shift)
+                source = open_source(place, config.fps, config.layer, colours, overrides_of(config))
+                yield place, renumbered(source, shift)
             except (JobError, OSError):
                 continue
 
@@ -239,10 +240,10 @@ class Plates:
             small = resize_float(np.clip(plate_encoding.display(picture), 0.0, 1.0), width, height)
         else:
             small = plate_encoding.display(plate_encoding.resize_plate(picture, width, height))
-        off = np.clip(small, 0.0, 1.0) - plate_encoding.display(raw)
+        difference = np.clip(small, 0.0, 1.0) - plate_encoding.display(raw)
         # Compare luma: colour at edges depends on chroma upsampling, which differs between versions.
-        alike = (np.abs(off @ _LUMA) > _AGREE).mean() < _DISAGREE_SHARE
-        return bool(alike and np.abs(off.mean(axis=(0, 1))).max() < _AGREE)
+        is_similar = (np.abs(difference @ _LUMA) > _AGREE).mean() < _DISAGREE_SHARE
+        return bool(is_similar and np.abs(difference.mean(axis=(0, 1))).max() < _AGREE)
 
 
 def _config(record: dict[str, Any]) -> FootageConfig:

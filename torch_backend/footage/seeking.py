@@ -25,7 +25,7 @@ _THREADS = 2
 """Number of decoder threads. Each holds its own frames."""
 _KEPT = 4
 """Number of decoded frames kept: the next request is usually for a neighbour, forwards or backwards."""
-_AHEAD = 32
+_MAX_SKIP = 32
 """Distance in frames up to which further decoding is faster than a seek: key frames are usually farther apart."""
 _EARLIER = (0.0, 1.0, 5.0, 20.0)
 """Offsets in seconds before a frame at which to search for a key frame, in this order."""
@@ -82,7 +82,7 @@ class VideoReader:
             return self._source.plate_of(frame)
         if self._container is None:
             self._reopen()
-        far = not self._at < number <= self._at + _AHEAD
+        far = not self._at < number <= self._at + _MAX_SKIP
         if far and self._can_seek and self._start is not None:
             plate = self._sought(number)
             if plate is not None:

@@ -77,19 +77,19 @@ class SequenceSource:
         fps: float = 0.0,
         layer: str = "",
         colours: Colours | None = None,
-        told_aspect: Fraction | None = None,
+        declared_aspect: Fraction | None = None,
         look: str = "",
     ) -> None:
         self.warnings: list[tuple[str, str]] = []
         self._files = sequence.files
         if len(self._files) < FEW:
             raise footage_error(f"{sequence.pattern} is a single picture.", "A freeze needs a clip: choose a sequence.")
-        if sequence.numbered.others_vary:
+        if sequence.numbered.has_second_number:
             self.warnings.append(_several_numbers(sequence.pattern))
         first, spec, self._layer, names = self._first_readable(layer)
         self._channels = channel_names(spec)
         self._space = look_space(look) if look else _input_space(first, spec, colours or Colours(), self.warnings)
-        aspect = told_aspect or _pixel_aspect(spec)
+        aspect = declared_aspect or _pixel_aspect(spec)
         self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
         orientation = orientation_of_picture(spec)
         if orientation is None:
@@ -107,8 +107,8 @@ class SequenceSource:
             fps=float(rate or DEFAULT_FPS),
             first=min(self._files),
             last=max(self._files),
-            deep=light or not space.as_it_stands or str(spec.format) not in ("uint8", "int8"),
-            extended=light or not space.as_it_stands or str(spec.format) in ("half", "float", "double"),
+            deep=light or not space.is_passthrough or str(spec.format) not in ("uint8", "int8"),
+            extended=light or not space.is_passthrough or str(spec.format) in ("half", "float", "double"),
             colour="linear" if light else "srgb",
             # By content: footage may be copied or moved. Footage that this version reads differently gets a new key.
             key=content_key_of(self._files) + reading_key,
@@ -123,17 +123,18 @@ class SequenceSource:
             },
             file=str(first),
             probe=space.probe,
-            unlike=_unlike(spec, len(names), self._aspect, self._orientation) or _named_unlike(first.name, self._files),
+            mismatch=_mismatch(spec, len(names), self._aspect, self._orientation)
+            or _name_mismatch(first.name, self._files),
         )
 
     def _reading_key(self, layers: int) -> list[Any]:
         """Part of the clip's key about the interpretation of the pictures; empty for ordinary ones, as in old keys."""
         space = self._space
-        ordinary = space.as_it_stands or space == InputSpace("lin", declared=space.declared)
+        ordinary = space.is_passthrough or space == InputSpace("lin", declared=space.declared)
         ordinary = ordinary and self._aspect == 1 and self._layer.alpha is None and layers == 1
         key: list[Any] = [space.name, self._layer.name, float(self._aspect), "straight", *space.origin.values()]
-        turned = [] if self._orientation == UPRIGHT else [f"orientation {self._orientation.code}"]
-        return ([] if ordinary else key) + turned
+        rotation = [] if self._orientation == UPRIGHT else [f"orientation {self._orientation.code}"]
+        return ([] if ordinary else key) + rotation
 
     def _former_key(self, sequence: PictureSequence) -> list[Any]:
         """The key of these files in an earlier version: by name, size and modification time."""
@@ -194,9 +195,9 @@ class SequenceSource:
     def _describe(self, names: list[str], requested_layer: str, size: tuple[int, int]) -> None:
         """Warns about a chosen layer, pixels that are not square, and a conversion of primaries."""
         if len(names) > 1 and not requested_layer:
-            others = ", ".join(shown(n) for n in names if n != self._layer.name)
+            unused = ", ".join(shown(n) for n in names if n != self._layer.name)
             message = f"The pictures have {len(names)} layers: {shown(self._layer.name)} is taken."
-            self.warnings.append((message, f"The others: {others}."))
+            self.warnings.append((message, f"The others: {unused}."))
         if self._aspect != 1:
             self.warnings.append(
                 (
@@ -332,8 +333,8 @@ def _open(file: Path, part: int) -> tuple[oiio.ImageSpec, oiio.ImageBuf, str]:
     return spec, buffer, (error_of(buffer) or "it is damaged") if buffer.has_error else ""
 
 
-def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction, orientation: Orientation) -> str:
-    """Why other programs show such pictures differently, see `SourceInfo.unlike`."""
+def _mismatch(spec: oiio.ImageSpec, layers: int, aspect: Fraction, orientation: Orientation) -> str:
+    """Why other programs show such pictures differently, see `SourceInfo.mismatch`."""
     if orientation != UPRIGHT:  # Blender ignores the orientation tag, up to 5.2
         return f"its pictures are {orientation.words} by their header"
     if aspect != 1:
@@ -345,8 +346,8 @@ def _unlike(spec: oiio.ImageSpec, layers: int, aspect: Fraction, orientation: Or
     return "" if (spec.width, spec.height) == (spec.full_width, spec.full_height) else "its pictures exceed their frame"
 
 
-def _named_unlike(name: str, files: dict[int, Path]) -> str:
-    """Result of `_unlike` from the file names: Blender opens one file, and derives the names of the others."""
+def _name_mismatch(name: str, files: dict[int, Path]) -> str:
+    """Result of `_mismatch` from the file names: Blender opens one file, and derives the names of the others."""
     if Path(name).suffix.lower() not in _IN_BLENDER:
         return f"Blender does not show {Path(name).suffix} pictures as they are"
     if all(file.name == file_as_blender_counts(name, number) for number, file in files.items()):
@@ -358,7 +359,7 @@ def _former_name(sequence: PictureSequence) -> str:
     """Name of a sequence without gaps in the keys of earlier versions: `shot.1001-1010#.exr`."""
     numbers = list(sequence.files)
     hashes = re.search(r"#+", sequence.pattern)
-    if hashes is None or sequence.numbered.others_vary:
+    if hashes is None or sequence.numbered.has_second_number:
         return sequence.pattern
     width = len(hashes[0])
     pad = "#" * (width // 4) if width % 4 == 0 else "@" * width

@@ -135,9 +135,9 @@ def _only(folder: Path, found: list[NumberedFiles], who: str, missing: JobError 
 
 
 def _no_sequence_in(folder: Path) -> JobError:
-    others = sorted(numbered_files(_names_in(folder)), key=lambda s: -len(s.files))
-    if others and len(others[0].files) >= LEAST_FRAMES and not _is_readable(others[0]):
-        return unreadable_pictures(others[0].pattern)
+    candidates = sorted(numbered_files(_names_in(folder)), key=lambda s: -len(s.files))
+    if candidates and len(candidates[0].files) >= LEAST_FRAMES and not _is_readable(candidates[0]):
+        return unreadable_pictures(candidates[0].pattern)
     return footage_error(
         f"The folder {folder} holds no numbered image sequence.", "Choose a folder with frames, or a video."
     )

@@ -65,14 +65,14 @@ class SourceInfo:
     """The video, or the first picture of the sequence."""
     probe: tuple[float, ...] = ()
     """Linear Rec.709 light of the value `contract.PROBE` in the footage."""
-    unlike: str = ""
+    mismatch: str = ""
     """Clause why another program would show the files differently; empty if it would not."""
     former_key: list[Any] = field(default_factory=list[Any])
     """`key` in earlier versions, from names and modification times. Imports with this key stay valid."""
 
 
 @dataclass(frozen=True)
-class Told:
+class Overrides:
     """The user's overrides of properties of the footage."""
 
     matrix: str = ""
@@ -85,7 +85,7 @@ class Told:
     """File of a look to apply to the footage, see `look`; empty: none."""
 
 
-def told_in(config: ImportParams) -> Told:
+def overrides_of(config: ImportParams) -> Overrides:
     """The overrides in the parameters of an import. Raises JobError for a colour space together with a look."""
     matrix, levels = ("" if value == "auto" else value for value in (config.matrix, config.levels))
     if config.lut and config.colour_space:
@@ -94,7 +94,7 @@ def told_in(config: ImportParams) -> Told:
             "Give one of them: a look already makes a picture for a display.",
         )
     look = mapped(config.lut) if config.lut else ""
-    return Told(matrix, levels, Fraction(config.pixel_aspect).limit_denominator(10_000) or None, look)
+    return Overrides(matrix, levels, Fraction(config.pixel_aspect).limit_denominator(10_000) or None, look)
 
 
 class Source(Protocol):

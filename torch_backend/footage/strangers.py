@@ -17,15 +17,15 @@ from ..contract import (
 from ..shot import make_folder
 
 
-def keep_strangers(old: Path, fresh: Path, record: dict[str, Any]) -> None:
+def keep_foreign_files(old: Path, fresh: Path, record: dict[str, Any]) -> None:
     """Links or copies foreign files of the frames folder `old` into `fresh`. Renames a file if its name is in use.
 
     All files are foreign except frames.json, the frames listed in it, and their undistorted copies beside raw/.
     """
-    ours, needed = _listed(old / FRAMES_FILE), _names(record)
+    listed, needed = _listed(old / FRAMES_FILE), _names(record)
     for found in sorted(p for p in old.rglob("*") if p.is_symlink() or not p.is_dir()):
         name = found.relative_to(old)
-        if name in ours or is_half_written(name.name):
+        if name in listed or is_half_written(name.name):
             continue
         while name in needed or os.path.lexists(fresh / name):
             name = name.with_name(f"{name.stem}.kept{name.suffix}")

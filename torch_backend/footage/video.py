@@ -28,10 +28,10 @@ from .orientation import UPRIGHT, Orientation, display_matrix, orientation_of_ma
 from .seeking import VideoReader
 from .sources import (
     Known,
+    Overrides,
     PlateReader,
     SourceFrame,
     SourceInfo,
-    Told,
     believable_aspect,
     content_key_of,
     footage_error,
@@ -85,14 +85,16 @@ class VideoSource:
     Warns if the file ends earlier than announced, or if the picture changes its size.
     """
 
-    def __init__(self, path: Path, colours: Colours | None = None, told: Told | None = None, layer: str = "") -> None:
+    def __init__(
+        self, path: Path, colours: Colours | None = None, overrides: Overrides | None = None, layer: str = ""
+    ) -> None:
         """`layer`: number of the video stream to read, from 1; empty: the largest. Ignored for a single stream."""
         self.path, self.layer = path, layer
         self.warnings: list[tuple[str, str]] = []
-        told = told or Told()
+        overrides = overrides or Overrides()
         with self._open() as container:
             stream = stream_of(container, path, layer)
-            self._tell_streams(container, stream)
+            self._report_streams(container, stream)
             if stream.codec_context.width * stream.codec_context.height > MOST_PIXELS:
                 raise too_large(path.name, stream.codec_context.width, stream.codec_context.height)
             frame = first_frame(container, stream, path)
@@ -101,29 +103,29 @@ class VideoSource:
             self._orientation, self._rotation = orientation or UPRIGHT, frame.rotation
             # FFmpeg derives the stream's pixel aspect from the display matrix. If that matrix is not applied, use the
             # codec's pixel aspect.
-            aspect = told.pixel_aspect or pixel_aspect(stream if orientation else stream.codec_context)
+            aspect = overrides.pixel_aspect or pixel_aspect(stream if orientation else stream.codec_context)
             self._aspect = believable_aspect(aspect or Fraction(1), self.warnings)
-            look = look_space(told.look) if told.look else None
+            look = look_space(overrides.look) if overrides.look else None
             self._space = look or _chosen_space(path, colours or Colours()) or _input_space(frame, self.warnings)
-            self._coding = coding_of(frame, told.matrix, told.levels)
+            self._coding = coding_of(frame, overrides.matrix, overrides.levels)
             self._deep = depth_of(frame) > 8 or self._space.is_light
             self._size = width, height = self._shown_size(frame)
             rate = stream.average_rate or stream.guessed_rate
-            rate_told, rate = bool(rate), rate or Fraction(24)
+            is_rate_declared, rate = bool(rate), rate or Fraction(24)
             count = stream.frames or count_from_duration(container, stream, rate)
             self._fields = "" if frame.interlaced_frame else self._unmarked_fields(frame.height)
             self._interlaced = bool(frame.interlaced_frame or self._fields)
             self._promise = promise(container, stream, rate)
             self._alpha_decoder = alpha_decoder_of(stream)
-            held = any(component.is_alpha for component in frame.format.components)
-            self.has_alpha = held or bool(self._alpha_decoder)
+            has_alpha_plane = any(component.is_alpha for component in frame.format.components)
+            self.has_alpha = has_alpha_plane or bool(self._alpha_decoder)
             """True if the clip has an alpha that `alphas` can read."""
             self._warn_about(frame)
             if orientation is None:
                 self.warnings.append(_NO_ORIENTATION)
             reading = {
                 **_reading(frame, self._space, self._coding),
-                "fps_told": rate_told,
+                "fps_told": is_rate_declared,
                 "pixel_aspect_told": aspect is not None,
                 **self._reading_of(container, stream),
             }
@@ -136,7 +138,7 @@ class VideoSource:
             first=1,
             last=count or None,
             deep=self._deep,
-            extended=not self._space.as_it_stands,
+            extended=not self._space.is_passthrough,
             colour="linear" if self._space.is_light else "srgb",
             # Clips that this version reads differently get a new key and are imported again.
             key=content_key_of({1: path}) + reading_key,
@@ -144,7 +146,7 @@ class VideoSource:
             reading=reading,
             file=str(path),
             probe=self._space.probe,
-            unlike=self._unlike(frame, orientation),
+            mismatch=self._mismatch(frame, orientation),
         )
 
     def _reading_key(self) -> list[Any]:
@@ -163,8 +165,8 @@ class VideoSource:
             **({"focal_35mm": lens} if (lens := focal_of_video(container, stream)) else {}),
         }
 
-    def _unlike(self, frame: av.VideoFrame, orientation: Orientation | None) -> str:
-        """Why other programs show the clip differently, see `SourceInfo.unlike`."""
+    def _mismatch(self, frame: av.VideoFrame, orientation: Orientation | None) -> str:
+        """Why other programs show the clip differently, see `SourceInfo.mismatch`."""
         tagged = coding_of(frame)
         if self._is_picture:
             return "Blender shows an animated picture as a still one"
@@ -178,7 +180,7 @@ class VideoSource:
             return "it is interlaced, and frames are made of its fields here"
         if (tagged.matrix, tagged.is_full) != (self._coding.matrix, self._coding.is_full):
             return "its matrix or range was set by hand"
-        if not tagged.matrix_told and tagged.matrix != BT601:  # FFmpeg, and therefore Blender, assume BT.601
+        if not tagged.is_matrix_declared and tagged.matrix != BT601:  # FFmpeg, and therefore Blender, assume BT.601
             return "it does not say by which matrix its colours are stored"
         return ""
 
@@ -257,7 +259,7 @@ class VideoSource:
         """A decoded frame as a plate, see `plate_encoding`. Raises JobError if its size differs from the clip's."""
         if self._shown_size(frame) != self._size:
             raise footage_error(f"{self.path.name} is not the clip that was imported: its size changes.")
-        if self._space.as_it_stands:
+        if self._space.is_passthrough:
             pixels = rgb_codes(frame, self._coding, deep=self._deep)
         else:
             pixels = plate_encoding.half_of(exact_rgb(frame, self._coding), self._space)
@@ -312,7 +314,7 @@ class VideoSource:
             raise footage_error(message, hint + remedy)
         self.warnings.append((message, hint))
 
-    def _tell_streams(self, container: Any, stream: Any) -> None:
+    def _report_streams(self, container: Any, stream: Any) -> None:
         """Warns about the choice if there are several video streams."""
         streams = streams_of(container, self.path)
         self.has_streams = len(streams) > 1
@@ -354,7 +356,7 @@ class VideoSource:
         """A decoded frame, upright, [H, W, 3]: uint8 or uint16 sRGB, or float16 light."""
         if self._space.is_light:
             return self.plate_of(frame)
-        if self._space.as_it_stands:
+        if self._space.is_passthrough:
             pixels = rgb_codes(frame, self._coding, deep=self._deep)
         else:
             values = self._space.to_srgb(exact_rgb(frame, self._coding))
@@ -385,7 +387,7 @@ class VideoSource:
                     "Deliver it graded for SDR, or as scene-linear EXR, if it should look otherwise.",
                 )
             )
-        elif not space.as_it_stands and not isinstance(space, LookSpace):
+        elif not space.is_passthrough and not isinstance(space, LookSpace):
             self.warnings.append((f"The clip is {space.name}: converted to Rec.709.", ""))
         if self._interlaced:
             unsaid = ", though it does not say so" if self._fields else ""
@@ -424,9 +426,9 @@ def _reading(frame: av.VideoFrame, space: InputSpace, coding: Coding) -> dict[st
         **space.origin,
         "primaries": _primaries_read(frame, space),
         "matrix": coding.matrix_name,
-        "matrix_told": coding.matrix_told,
+        "matrix_told": coding.is_matrix_declared,
         "range": coding.range_name,
-        "range_told": coding.range_told,
+        "range_told": coding.is_range_declared,
         "bits": depth_of(frame),
     }
 
@@ -437,7 +439,7 @@ def _chosen_space(path: Path, colours: Colours) -> InputSpace | None:
 
 
 def _reading_key(space: InputSpace) -> list[str]:
-    return [] if space.as_it_stands else [space.name, *space.origin.values()]
+    return [] if space.is_passthrough else [space.name, *space.origin.values()]
 
 
 def _primaries_read(frame: av.VideoFrame, space: InputSpace) -> str:

@@ -124,14 +124,14 @@ class Lens:
         with np.errstate(all="ignore"):
             for _ in range(_MOST_STEPS):
                 at, slope = self._bent(ideal)
-                off = at - target
-                error = float(np.abs(off * self.focal).max(initial=0.0))
+                offset = at - target
+                error = float(np.abs(offset * self.focal).max(initial=0.0))
                 if not error > _DONE_PX:  # converged, or NaN
                     break
                 (a, b), (c, d) = np.moveaxis(slope, 0, -1)
                 det = a * d - b * c
-                ideal[:, 0] -= (d * off[:, 0] - b * off[:, 1]) / det
-                ideal[:, 1] -= (a * off[:, 1] - c * off[:, 0]) / det
+                ideal[:, 0] -= (d * offset[:, 0] - b * offset[:, 1]) / det
+                ideal[:, 1] -= (a * offset[:, 1] - c * offset[:, 0]) / det
         if not error < _WRONG_PX:
             raise self._folded()
         return ideal * self.plate_focal + self.centre

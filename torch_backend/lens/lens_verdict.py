@@ -17,7 +17,7 @@ FISHEYE_START = 0.45
 """Initial focal length of a fisheye, as a share of the picture's width: 127 degrees wide."""
 MOST_BEND = 1.0
 """Largest plausible first radial coefficient."""
-RUN_OFF = 1.3
+MAX_FOCAL_CHANGE = 1.3
 """Largest factor by which a solve may change the artist's focal length. Beyond it, the artist's value is kept."""
 WIDE_DEG = 100.0
 """Angle of view above which a lens solved without a fisheye model may be a fisheye."""
@@ -41,13 +41,13 @@ def angle_deg(model: str, width: int, height: int, params: Sequence[float]) -> f
     return float(np.degrees(2.0 * angle[reached[0]])) if len(reached) else 360.0
 
 
-def doubt_of(model: str, width: int, height: int, params: Sequence[float], given: float = 0.0) -> str:
+def doubt_of(model: str, width: int, height: int, params: Sequence[float], known_focal: float = 0.0) -> str:
     """Why a lens is implausible: a value of `lens.doubtful`, or "off".
 
-    "off" means that its focal length differs from `given` (pixels) by more than the factor `RUN_OFF`.
+    "off" means that its focal length differs from `known_focal` (pixels) by more than the factor `MAX_FOCAL_CHANGE`.
     """
     focal = _focal(model, params)
-    if given and not given / RUN_OFF <= focal <= given * RUN_OFF:
+    if known_focal and not known_focal / MAX_FOCAL_CHANGE <= focal <= known_focal * MAX_FOCAL_CHANGE:
         return "off"
     bends = bends_of(model, params)
     if model == FISHEYE:
@@ -55,7 +55,7 @@ def doubt_of(model: str, width: int, height: int, params: Sequence[float], given
         found = "narrow" if not angle >= NARROWEST_DEG else "wide" if angle > MOST_DEG else ""
     else:
         found = doubtful(width, height, _focals(model, params), *[*bends, 0.0][:2])
-    if found in ("narrow", "wide") and given:  # the artist knows the lens
+    if found in ("narrow", "wide") and known_focal:  # the artist knows the lens
         found = ""
     return found or ("bent" if impossible(model, width, height, params) else "")
 
@@ -137,35 +137,37 @@ def left_px(answer: dict[str, Any]) -> float:
 def _remarks(answer: dict[str, Any]) -> list[tuple[str, str]]:
     lens = answer["lens"]
     found, used = (_shown_deg(lens, *it) for it in (("found_deg", lens["found_px"]), ("view_deg", answer["focal_px"])))
-    given_px = lens.get("given_px")
-    if lens["held"] and given_px:
+    known_px = lens.get("given_px")
+    if lens["held"] and known_px:
         return [
             (
                 f"The solve would have another focal length than was given ({lens['found_px']:.0f} px instead of "
-                f"{given_px:.0f}): it was held as given.",
+                f"{known_px:.0f}): it was held as given.",
                 "Is it for the sensor's width, and was the clip not cropped or stabilised?",
             )
         ]
     if lens["held"]:
-        off = "found one that folds the picture over" if lens["doubt"] == "bent" else f"ran off to {found:.0f} degrees"
+        finding = (
+            "found one that folds the picture over" if lens["doubt"] == "bent" else f"ran off to {found:.0f} degrees"
+        )
         if lens.get("start_px"):
             return [
                 (
-                    f"The clip does not tell its lens (the solve {off}): the one that the file names was taken, "
+                    f"The clip does not tell its lens (the solve {finding}): the one that the file names was taken, "
                     f"{used:.0f} degrees wide.",
                     "Was the clip cropped or stabilised? Then it is narrower.",
                 )
             ]
         return [
             (
-                f"The clip does not tell its lens (the solve {off}): a usual one of {used:.0f} degrees was taken.",
+                f"The clip does not tell its lens (the solve {finding}): a usual one of {used:.0f} degrees was taken.",
                 "Depth may look stretched; a range in which the camera travels more tells the lens.",
             )
         ]
     if lens["doubt"] == "off":
         return [
             (
-                f"The focal length came out as {lens['found_px']:.0f} px, and {given_px:.0f} were given.",
+                f"The focal length came out as {lens['found_px']:.0f} px, and {known_px:.0f} were given.",
                 "Is it for the sensor's width, and was the clip not cropped or stabilised?",
             )
         ]

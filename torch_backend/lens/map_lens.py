@@ -103,11 +103,11 @@ def exponents(degree: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def fitted(points: NDArray[np.float64], values: NDArray[np.float64], degree: int, box: Sequence[float]) -> Polynomial:
     """Least-squares fit of a polynomial of total degree `degree` that maps `points` [N, 2] to `values` [N, 2]."""
-    whole = Polynomial(degree, (box[0], box[1], box[2], box[3]), ())
-    left, above = whole._vanders(points[:, 0], points[:, 1])  # pyright: ignore[reportPrivateUsage]
+    full = Polynomial(degree, (box[0], box[1], box[2], box[3]), ())
+    left, above = full._vanders(points[:, 0], points[:, 1])  # pyright: ignore[reportPrivateUsage]
     x, y = exponents(degree)
     terms = np.linalg.lstsq(left[:, x] * above[:, y], values, rcond=None)[0]
-    return Polynomial(degree, whole.box, tuple(float(term) for term in terms.T.ravel()))
+    return Polynomial(degree, full.box, tuple(float(term) for term in terms.T.ravel()))
 
 
 @dataclass(frozen=True)
@@ -156,8 +156,8 @@ class MapLens:
     @cached_property
     def is_none(self) -> bool:
         """True if original and undistorted frames are the same."""
-        around = _around(self.width, self.height)
-        return bool(np.abs(self.to_original(around) - around).max() < _NONE_PX)
+        border_points = _border_points(self.width, self.height)
+        return bool(np.abs(self.to_original(border_points) - border_points).max() < _NONE_PX)
 
     @property
     def slopes_in_the_middle(self) -> tuple[float, float]:
@@ -172,7 +172,7 @@ class MapLens:
         Raises JobError (SOLVE) if the inversion fails.
         """
         points = self.map_of_plate(pixels)
-        at = self.bend(points) if self.forward else self._back(points)
+        at = self.bend(points) if self.forward else self._inverse(points)
         return at * (self.width, self.height)
 
     def to_plate(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -181,7 +181,7 @@ class MapLens:
         Raises JobError (SOLVE) if the inversion fails.
         """
         points = pixels / (self.width, self.height)
-        at = self._back(points) if self.forward else self.bend(points)
+        at = self._inverse(points) if self.forward else self.bend(points)
         return ((at - 0.5) / self.window + 0.5) * (self.width, self.height)
 
     def where(self, width: int, height: int) -> NDArray[np.float32]:
@@ -233,35 +233,35 @@ class MapLens:
         """Maps pixels [N, 2] of the undistorted frame to the map's undistorted picture, 0 to 1, y down."""
         return (pixels / (self.width, self.height) - 0.5) * self.window + 0.5
 
-    def _back(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The points that `bend` maps to `wanted` [N, 2], by Newton's method, with an error below 1e-6 px.
+    def _inverse(self, target: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The points that `bend` maps to `target` [N, 2], by Newton's method, with an error below 1e-6 px.
 
         Raises JobError if the iteration does not converge.
         """
         size = np.array([self.width, self.height])
         low, high = np.array(self.bend.box[:2]), np.array(self.bend.box[2:])
         reach = _BEYOND * (high - low)
-        at = self._start(wanted)
+        at = self._start(target)
         error = np.inf
         with np.errstate(all="ignore"):
             for _ in range(_MOST_STEPS):
-                off = self.bend(at) - wanted
-                error = float(np.abs(off * size).max(initial=0.0))
+                offset = self.bend(at) - target
+                error = float(np.abs(offset * size).max(initial=0.0))
                 if not error > _DONE_PX:  # converged, or NaN
                     break
                 (a, b), (c, d) = np.moveaxis(self.bend.slopes(at), 0, -1)
                 det = a * d - b * c
-                at[:, 0] -= (d * off[:, 0] - b * off[:, 1]) / det
-                at[:, 1] -= (a * off[:, 1] - c * off[:, 0]) / det
+                at[:, 0] -= (d * offset[:, 0] - b * offset[:, 1]) / det
+                at[:, 1] -= (a * offset[:, 1] - c * offset[:, 0]) / det
                 at = np.clip(at, low - reach, high + reach)
         if not error < _WRONG_PX:
             raise _folded()
         return at
 
-    def _start(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Initial guess for `_back`: inverts the linear approximation at the middle."""
+    def _start(self, target: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Initial guess for `_inverse`: inverts the linear approximation at the middle."""
         middle = np.array([[0.5, 0.5]])
-        return 0.5 + linear_solution(self.bend.slopes(middle)[0], (wanted - self.bend(middle)).T).T
+        return 0.5 + linear_solution(self.bend.slopes(middle)[0], (target - self.bend(middle)).T).T
 
 
 def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) -> MapLens:
@@ -279,7 +279,7 @@ def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) ->
     """
     ratio = lens.width / lens.height / shape
     sides = np.array([min(1.0, ratio), min(1.0, 1.0 / ratio)])
-    border = _around(lens.width, lens.height)
+    border = _border_points(lens.width, lens.height)
     size = np.array([lens.width, lens.height])
 
     def tried(share: float) -> MapLens:
@@ -287,12 +287,12 @@ def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) ->
         return replace(lens, window=(float(x), float(y)))
 
     def inside(share: float) -> bool:
-        made = tried(share)
-        points = made.map_of_plate(border)
+        candidate = tried(share)
+        points = candidate.map_of_plate(border)
         if known is not None and not ((points > known[:2]) & (points < known[2:])).all():
             return False
         try:
-            at = made.to_original(border)
+            at = candidate.to_original(border)
         except JobError:
             return False
         return bool(((at > 0.5 - _SLACK_PX) & (at < size - 0.5 + _SLACK_PX)).all())
@@ -311,7 +311,7 @@ def widest(lens: MapLens, shape: float, known: Sequence[float] | None = None) ->
     return tried(1.0 if 1.0 <= low <= 1.0 + 3.0 / min(lens.width, lens.height) else low)
 
 
-def _around(width: int, height: int) -> NDArray[np.float64]:
+def _border_points(width: int, height: int) -> NDArray[np.float64]:
     """Pixel centres [N, 2] of a picture's border, and of its middle row and column."""
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
     lines = [np.stack([x, np.full_like(x, at)], 1) for at in (y[0], y[len(y) // 2], y[-1])]

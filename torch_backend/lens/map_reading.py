@@ -108,11 +108,11 @@ def read_lens(path: str, way: str, layer: str, frames: dict[str, Any], report: R
             "Ask for 32 bits.",
         )
     found = _fit(undistorted, original, read, scale)
-    if found.off.max() > ROUGH_PX + 2.0 * read.rounding * scale.max():
-        worst = (undistorted if way == UNDISTORT else original)[int(found.off.argmax())] * read.size
+    if found.errors.max() > ROUGH_PX + 2.0 * read.rounding * scale.max():
+        worst = (undistorted if way == UNDISTORT else original)[int(found.errors.argmax())] * read.size
         raise _refused(
             f"{name} is no smooth map of a lens: at column {worst[0]:.0f}, row {worst[1]:.0f} it is "
-            f"{found.off.max():.2f} pixels off from what is around it.",
+            f"{found.errors.max():.2f} pixels off from what is around it.",
             "Write it as an uncompressed or zip-compressed EXR of 32 bits, of the lens alone, without stabilising.",
         )
     _check_bend(found, name, scale, read.rounding, report)
@@ -124,7 +124,7 @@ def read_lens(path: str, way: str, layer: str, frames: dict[str, Any], report: R
     lens = widest(lens, shape, known)
     lens.check()
     if known is not None:
-        _say_what_is_open(lens, known, name, report)
+        _warn_uncovered(lens, known, name, report)
     return lens
 
 
@@ -158,11 +158,12 @@ def _read(path: Path, layer: str, name: str) -> _Map:
         opened.close()
     pixels = np.asarray(pixels, np.float64).reshape(spec.height, spec.width, -1)
     s, t = pixels[..., channels[0]], pixels[..., channels[1]]
-    bad = ~(np.isfinite(s) & np.isfinite(t))
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
+    invalid = ~(np.isfinite(s) & np.isfinite(t))
+    if invalid.any():
+        row, column = np.argwhere(invalid)[0]
         raise _refused(
-            f"{name} holds {int(bad.sum())} pixels that are no numbers (NaN), the first at column {column}, row {row}.",
+            f"{name} holds {int(invalid.sum())} pixels that are no numbers (NaN), the first at column {column}, "
+            f"row {row}.",
             "Write it without holes: 0 in both channels says that there is nothing.",
         )
     known = (s != 0.0) | (t != 0.0)
@@ -193,13 +194,13 @@ def _channels(opened: oiio.ImageInput, layer: str, name: str) -> tuple[int, tupl
                 found.append((prefix or title.lower(), part, places, alpha))
         part += 1
     names = ", ".join(one[0] or "red and green without a name" for one in found)
-    wanted = layer.lower()
-    matching = [x for x in found if not wanted or wanted in (x[0], x[0].rpartition(".")[2])]
+    layer_name = layer.lower()
+    matching = [x for x in found if not layer_name or layer_name in (x[0], x[0].rpartition(".")[2])]
     if not found:
         raise _refused(f"{name} has no red and green channel.", "Write s into red and t into green.")
     if not matching:
         raise _refused(f"{name} has no layer {layer!r} with two channels of coordinates.", f"It has: {names}.")
-    plain = [x for x in matching if not x[0]] if not wanted else [x for x in matching if x[0] == wanted]
+    plain = [x for x in matching if not x[0]] if not layer_name else [x for x in matching if x[0] == layer_name]
     if len(matching) > 1 and len(plain) != 1:
         raise _refused(f"{name} has several layers that may be meant: {names}.", "Choose one: --st-map-layer.")
     chosen = (plain or matching)[0]
@@ -219,13 +220,13 @@ def _samples(read: _Map, way: str, name: str, report: Reporter) -> tuple[NDArray
     known = read.known[at[:, 1], at[:, 0]]
     points = (at + 0.5 + read.at) / read.size
     values = np.stack([read.s[at[:, 1], at[:, 0]], read.t[at[:, 1], at[:, 0]]], -1)
-    own = known & ((points > 0.0) & (points < 1.0)).all(1)
-    if own.sum() < _LEAST_SHARE * ((points > 0.0) & (points < 1.0)).all(1).sum() or own.sum() < 100:
+    valid = known & ((points > 0.0) & (points < 1.0)).all(1)
+    if valid.sum() < _LEAST_SHARE * ((points > 0.0) & (points < 1.0)).all(1).sum() or valid.sum() < 100:
         raise _refused(
-            f"{name} has coordinates in {100 * float(own.mean()):.0f} % of its picture only.",
+            f"{name} has coordinates in {100 * float(valid.mean()):.0f} % of its picture only.",
             "Is it an ST map? Red should grow from left to right, green from the bottom to the top.",
         )
-    slope = fitted(points[own], values[own], 1, (0.0, 0.0, 1.0, 1.0)).slopes(np.array([[0.5, 0.5]]))[0]
+    slope = fitted(points[valid], values[valid], 1, (0.0, 0.0, 1.0, 1.0)).slopes(np.array([[0.5, 0.5]]))[0]
     across, down = float(slope[0, 0]), float(slope[1, 1])
     if max(abs(float(slope[0, 1])), abs(float(slope[1, 0]))) > min(abs(across), abs(down)):
         raise _refused(f"{name} has s and t in each other's place, or is turned.", "Red is s, green is t.")
@@ -238,7 +239,7 @@ def _samples(read: _Map, way: str, name: str, report: Reporter) -> tuple[NDArray
         raise _refused(f"{name} is mirrored: its red falls from left to right.", "Flip it, and the footage alike.")
     if across > 8.0 or abs(down) > 8.0:
         raise _refused(
-            f"{name} holds pixels (up to {float(np.abs(values[own]).max()):.0f}), not shares of the picture.",
+            f"{name} holds pixels (up to {float(np.abs(values[valid]).max()):.0f}), not shares of the picture.",
             "Divide red by the width and green by the height of the picture that is looked into.",
         )
     if down > 0.0:
@@ -247,8 +248,10 @@ def _samples(read: _Map, way: str, name: str, report: Reporter) -> tuple[NDArray
         values[:, 1] = 1.0 - values[:, 1]
     if way == REDISTORT:
         return values[known], points[known]
-    own = known & ((values > -_CUT) & (values < 1.0 + _CUT)).all(1)  # lens models are arbitrary outside of the picture
-    return points[own], values[own]
+    valid = known & ((values > -_CUT) & (values < 1.0 + _CUT)).all(
+        1
+    )  # lens models are arbitrary outside of the picture
+    return points[valid], values[valid]
 
 
 def _spread(length: int) -> NDArray[np.int64]:
@@ -265,40 +268,40 @@ class _Fit:
     """True if `bend` maps the undistorted picture to the original; False for the opposite direction."""
     points: NDArray[np.float64]
     """[N, 2]: input points of the fit."""
-    off: NDArray[np.float64]
+    errors: NDArray[np.float64]
     """[N]: error at each point, in pixels of the footage."""
 
     @property
     def error(self) -> float:
-        """Root mean square of `off`."""
-        return float(np.sqrt((self.off**2).mean()))
+        """Root mean square of `errors`."""
+        return float(np.sqrt((self.errors**2).mean()))
 
 
 def _fit(
     undistorted: NDArray[np.float64], original: NDArray[np.float64], read: _Map, scale: NDArray[np.float64]
 ) -> _Fit:
     """Fits the polynomial of the lowest sufficient degree to corresponding points [N, 2], in the better direction."""
-    few = np.unique(np.linspace(0, len(original) - 1, _SAMPLES).astype(np.int64))
+    sample = np.unique(np.linspace(0, len(original) - 1, _SAMPLES).astype(np.int64))
     # Include the outermost known points, which keep the polynomial stable at the border.
-    few = np.union1d(few, np.flatnonzero((np.abs(undistorted - 0.5) >= np.abs(undistorted - 0.5).max(0)).any(1)))
+    sample = np.union1d(sample, np.flatnonzero((np.abs(undistorted - 0.5) >= np.abs(undistorted - 0.5).max(0)).any(1)))
 
     def tried(degree: int, forward: bool) -> _Fit:
         points, values = (undistorted, original) if forward else (original, undistorted)
         half = 0.5 / np.array(read.size)
         box = (*(points.min(0) - half), *(points.max(0) + half))
-        bend = fitted(points[few], values[few], degree, box)
+        bend = fitted(points[sample], values[sample], degree, box)
         return _Fit(bend, forward, points, np.hypot(*((bend(points) - values) * scale).T))
 
     best: dict[bool, _Fit] = {}
     for degree in DEGREES:
         for forward in (True, False):
-            made, before = tried(degree, forward), best.get(forward)
-            if made.off.max() < CLOSE_PX:
-                return made
-            if before is None or made.error < NO_GAIN * before.error:
-                best[forward] = made
-        both = min(best.values(), key=lambda one: one.error)
-        if both.bend.degree < degree and both.error < read.rounding * scale.max():
+            candidate, before = tried(degree, forward), best.get(forward)
+            if candidate.errors.max() < CLOSE_PX:
+                return candidate
+            if before is None or candidate.error < NO_GAIN * before.error:
+                best[forward] = candidate
+        better = min(best.values(), key=lambda one: one.error)
+        if better.bend.degree < degree and better.error < read.rounding * scale.max():
             break  # the remaining error is the rounding of the file
     return min(best.values(), key=lambda one: one.error)
 
@@ -306,9 +309,9 @@ def _fit(
 def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: float, report: Reporter) -> None:
     """Raises JobError for a map that folds over or only shifts. Warns about a map without distortion."""
     grid = found.points[:: max(1, len(found.points) // 20_000)]
-    turned = np.linalg.det(found.bend.slopes(grid))
-    if not turned.min() > 0.0:
-        worst = 100.0 * grid[int(turned.argmin())]
+    determinants = np.linalg.det(found.bend.slopes(grid))
+    if not determinants.min() > 0.0:
+        worst = 100.0 * grid[int(determinants.argmin())]
         raise _refused(
             f"{name} folds over: at {worst[0]:.0f} % of the width and {worst[1]:.0f} % of the height two of its pixels "
             "look at one place.",
@@ -316,10 +319,10 @@ def _check_bend(found: _Fit, name: str, scale: NDArray[np.float64], rounding: fl
         )
     at, seen = (grid - 0.5) * scale, (found.bend(grid) - 0.5) * scale
     plain = np.concatenate([at, np.ones((len(at), 1))], 1)  # inputs of an affine fit
-    straight = np.linalg.lstsq(plain, seen, rcond=None)[0]
-    if np.abs(plain @ straight - seen).max() > STRAIGHT_PX + rounding * scale.max():
+    affine = np.linalg.lstsq(plain, seen, rcond=None)[0]
+    if np.abs(plain @ affine - seen).max() > STRAIGHT_PX + rounding * scale.max():
         return
-    shift = straight[2] if found.forward else -straight[2]
+    shift = affine[2] if found.forward else -affine[2]
     if np.abs(shift).max() > 2.0 * STRAIGHT_PX + 0.5 * rounding * scale.max():
         raise _refused(
             f"{name} bends nothing, but moves the whole picture by {shift[0]:.2f} and {shift[1]:.2f} pixels.",
@@ -337,15 +340,15 @@ def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect:
     # The window of this lens is the map's whole picture.
     slope = lens.slopes_in_the_middle
     width, height = read.size
-    ours = source[0] / source[1]
+    footage_shape = source[0] / source[1]
     fits: dict[float, float] = {}
     for stretch in {1.0, aspect}:  # a map for anamorphic footage has square pixels, or the pixels of the footage
-        own = stretch * width / height
+        map_shape = stretch * width / height
         if way == UNDISTORT:
-            fits[own] = slope[0] / slope[1] * ours / own
-        elif abs(own / ours - 1.0) < 0.01:
-            fits[ours] = slope[0] / slope[1]
-    best = min(fits, key=lambda own: abs(math.log(fits[own])), default=None)
+            fits[map_shape] = slope[0] / slope[1] * footage_shape / map_shape
+        elif abs(map_shape / footage_shape - 1.0) < 0.01:
+            fits[footage_shape] = slope[0] / slope[1]
+    best = min(fits, key=lambda map_shape: abs(math.log(fits[map_shape])), default=None)
     if best is None or abs(math.log(fits[best])) > SHAPE:
         raise _refused(
             f"{name} is {width} x {height}, the footage {source[0]} x {source[1]}: it is of a picture of another "
@@ -355,7 +358,7 @@ def _shape(read: _Map, lens: MapLens, way: str, source: tuple[int, ...], aspect:
     return best
 
 
-def _say_what_is_open(lens: MapLens, known: tuple[Any, ...], name: str, report: Reporter) -> None:
+def _warn_uncovered(lens: MapLens, known: tuple[Any, ...], name: str, report: Reporter) -> None:
     """Warns if redistortion needs coordinates outside of the map."""
     x, y = np.linspace(0.5, lens.width - 0.5, 41), np.linspace(0.5, lens.height - 0.5, 41)
     at = lens.map_of_plate(lens.to_plate(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)))

@@ -34,8 +34,8 @@ class PlateLens:
     def is_none(self) -> bool:
         """True if original and undistorted frames are the same."""
         fx, fy, cx, cy, *bend = self.lens.params
-        straight = self.lens.model != "OPENCV_FISHEYE" and not any(bend)
-        return straight and bool(np.allclose((fx, fy, cx, cy), self.pinhole, rtol=1e-9, atol=0.0))
+        is_undistorted = self.lens.model != "OPENCV_FISHEYE" and not any(bend)
+        return is_undistorted and bool(np.allclose((fx, fy, cx, cy), self.pinhole, rtol=1e-9, atol=0.0))
 
     def where(self, width: int, height: int) -> NDArray[np.float32]:
         """Position [height, width, 2] in the original picture of each pixel of the undistorted plate of the same size.

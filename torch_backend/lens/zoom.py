@@ -49,8 +49,8 @@ def focal_change(
         normal = _part(weighted.T @ jacobian.reshape(-1, 7))
         try:
             step = _part(-np.linalg.solve(normal, weighted.T @ residual.reshape(-1)))
-            turned = quat_to_rotation(np.array([1.0, *(0.5 * step[:3])]))  # a small turn, to first order
-            rotation, shift = _part(turned @ rotation), _part(turned @ shift + step[3:6])
+            update = quat_to_rotation(np.array([1.0, *(0.5 * step[:3])]))  # a small turn, to first order
+            rotation, shift = _part(update @ rotation), _part(update @ shift + step[3:6])
             change += float(step[6])
             if not abs(change) < _MOST:
                 return float("nan")

@@ -215,26 +215,26 @@ def neighbours(matches: Matches, key: int, count: int, config: FlowConfig) -> li
     for side in (-1, 1):
         last = None
         for baseline in config.baselines:
-            other = key + side * baseline
-            if 0 <= other < count:
-                x, y, found = matches.match(key, other)
-                last = Seen(other, (x, y), found, 1)
+            neighbour = key + side * baseline
+            if 0 <= neighbour < count:
+                x, y, found = matches.match(key, neighbour)
+                last = Seen(neighbour, (x, y), found, 1)
                 result.append(last)
             else:
                 last = None
         while last is not None and last.links < config.links:
-            other = last.key + side * config.baselines[-1]
-            if not 0 <= other < count:
+            neighbour = last.key + side * config.baselines[-1]
+            if not 0 <= neighbour < count:
                 break
-            last = _chained(matches, last, other)
+            last = _chained(matches, last, neighbour)
             result.append(last)
     return result
 
 
-def _chained(matches: Matches, seen: Seen, other: int) -> Seen:
-    """Points of `seen` followed from its key to the key `other`."""
-    *_, found = matches.match(seen.key, other)
-    step = matches.flow(seen.key, other)
+def _chained(matches: Matches, seen: Seen, target: int) -> Seen:
+    """Points of `seen` followed from its key to the key `target`."""
+    *_, found = matches.match(seen.key, target)
+    step = matches.flow(seen.key, target)
     at = seen.at[0] + sample(step[0], seen.at), seen.at[1] + sample(step[1], seen.at)
-    both = seen.found & (sample(found, seen.at) > 0.7) & matches.inside(at)
-    return Seen(other, at, both, seen.links + 1)
+    found_both = seen.found & (sample(found, seen.at) > 0.7) & matches.inside(at)
+    return Seen(target, at, found_both, seen.links + 1)

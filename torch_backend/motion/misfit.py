@@ -73,24 +73,24 @@ def misfit(
     """
     median, number = _median(frame, inverse, references, grid)
     gaps: list[Map] = [np.max(np.abs(frame.colors - np.asarray(each, np.float32)), axis=-1) for each in (shown, median)]
-    from_model, from_others = (cv2.GaussianBlur(gap, (0, 0), config.sigma * unit) for gap in gaps)
-    gap = np.where(number >= config.fewest, np.minimum(from_model, from_others), np.float32(0.0))
+    from_model, from_views = (cv2.GaussianBlur(gap, (0, 0), config.sigma * unit) for gap in gaps)
+    gap = np.where(number >= config.fewest, np.minimum(from_model, from_views), np.float32(0.0))
     return gap / np.float32(max(float(np.quantile(gap, config.usual)), 1.0))
 
 
-def _median(frame: Sight, inverse: Map, others: Sequence[Sight], grid: tuple[Map, Map]) -> tuple[Map, NDArray[Any]]:
+def _median(frame: Sight, inverse: Map, views: Sequence[Sight], grid: tuple[Map, Map]) -> tuple[Map, NDArray[Any]]:
     """([h, w, 3] median of the others along the frame's still surfaces, [h, w] number of others that show the surface).
 
     The others' brightness is fitted to the frame's. Where none shows the surface, the median is the frame itself.
     """
     colors = frame.colors.astype(np.float32)
     brought: list[Map] = []
-    for other in others:
-        picture, visible = _carried(frame, inverse, other, grid)
-        few = np.zeros_like(visible)
-        few[::_SPARSE, ::_SPARSE] = visible[::_SPARSE, ::_SPARSE]
+    for view in views:
+        picture, visible = _carried(frame, inverse, view, grid)
+        sample = np.zeros_like(visible)
+        sample[::_SPARSE, ::_SPARSE] = visible[::_SPARSE, ::_SPARSE]
         for c in range(3):
-            factor, offset = fitted_brightness(colors[..., c][few], picture[..., c][few])
+            factor, offset = fitted_brightness(colors[..., c][sample], picture[..., c][sample])
             picture[..., c] = factor * picture[..., c] + offset
         brought.append(np.where(visible[..., None], picture, np.float32(np.nan)))
     if not brought:
@@ -101,13 +101,13 @@ def _median(frame: Sight, inverse: Map, others: Sequence[Sight], grid: tuple[Map
     return np.where(number[..., None] > 0, middle, colors), number
 
 
-def _carried(frame: Sight, inverse: Map, other: Sight, grid: tuple[Map, Map]) -> tuple[Map, Mask]:
-    """([h, w, 3] float32 colours of `other` at this frame's still points, [h, w] which points `other` shows)."""
-    at, over = Ray(grid, (frame.viewmat, other.viewmat), (frame.K, other.K)).project(inverse)
+def _carried(frame: Sight, inverse: Map, view: Sight, grid: tuple[Map, Map]) -> tuple[Map, Mask]:
+    """([h, w, 3] float32 colours of `view` at this frame's still points, [h, w] which points `view` shows)."""
+    at, over = Ray(grid, (frame.viewmat, view.viewmat), (frame.K, view.K)).project(inverse)
     x, y = (np.clip(0.5 * p - 0.5, -1e4, 1e4).astype(np.float32) for p in at)
     height, width = inverse.shape
     inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1) & (over < _BEHIND)
-    colors = cv2.remap(other.colors.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colors = cv2.remap(view.colors.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return colors, inside
 
 
@@ -117,6 +117,6 @@ def seeded(mask: Mask, seeds: Mask, least: int) -> Mask:
     numbers = np.asarray(numbers, np.int32)
     keep = about[:, cv2.CC_STAT_AREA] >= least
     keep[0] = False
-    held = np.zeros(count, bool)
-    held[np.unique(numbers[seeds & mask])] = True
-    return (keep & held)[numbers]
+    has_seed = np.zeros(count, bool)
+    has_seed[np.unique(numbers[seeds & mask])] = True
+    return (keep & has_seed)[numbers]

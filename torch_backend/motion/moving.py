@@ -37,7 +37,7 @@ _LEFT_EVERY = 2
 """Residual motion is computed in every second key frame, because sways are slow."""
 _ENOUGH, _UNKNOWN = 3.0, 0.1
 """Weight of a score at which it saturates, and weight below which a point is unknown."""
-_AHEAD = 32
+_PREFETCHED = 32
 """Largest number of frames scored ahead of their labelling by the static model. At 640 x 480 they take 100 MB."""
 
 
@@ -169,21 +169,21 @@ class Scored:
 
 
 @contextlib.contextmanager
-def scored_ahead(
+def prefetched_scores(
     clip: Clip, config: FlowConfig, written: Collection[int], report: Reporter
 ) -> Generator[Iterator[Scored]]:
-    """Context of an iterator of `_scores` that a thread computes at most `_AHEAD` frames ahead of the consumer."""
+    """Context of an iterator of `_scores` that a thread computes at most `_PREFETCHED` frames ahead of the consumer."""
     scores = _scores(clip, config, written, report)
     with ThreadPoolExecutor(1, "optical flow") as pool:
-        waiting = deque(pool.submit(next, scores, None) for _ in range(_AHEAD))
+        waiting = deque(pool.submit(next, scores, None) for _ in range(_PREFETCHED))
 
-        def taken() -> Iterator[Scored]:
+        def results() -> Iterator[Scored]:
             while (scored := waiting.popleft().result()) is not None:
                 waiting.append(pool.submit(next, scores, None))
                 yield scored
 
         try:
-            yield taken()
+            yield results()
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -192,12 +192,12 @@ def _scores(clip: Clip, config: FlowConfig, written: Collection[int], report: Re
     """Scores of all frames that are not in `written`, in order."""
     keys, reach = clip.keys, config.reach * config.baselines[-1]
     groups = [range(keys[k - 1] + 1 if k else 0, keys[k] + 1) for k in range(len(keys))]
-    wanted = [any(n not in written for n in group) for group in groups]
-    if not any(wanted):
+    needed = [any(n not in written for n in group) for group in groups]
+    if not any(needed):
         return
-    first, last = wanted.index(True), len(wanted) - 1 - wanted[::-1].index(True)
+    first, last = needed.index(True), len(needed) - 1 - needed[::-1].index(True)
     matches = Matches(clip.picture, config, clip.unit)
-    own: dict[int, tuple[Map, Map, Map]] = {}
+    scored: dict[int, tuple[Map, Map, Map]] = {}
     evidences: dict[int, KeyEvidence] = {}
     final: dict[int, tuple[Map, Map]] = {}
     start = max(0, first - 1 - reach)
@@ -206,31 +206,31 @@ def _scores(clip: Clip, config: FlowConfig, written: Collection[int], report: Re
         report.check_cancelled()
         if turn < len(keys):
             left = None if turn % _LEFT_EVERY == 0 else left
-            own[turn], left, found = _own_score(clip, matches, turn, config, left)
+            scored[turn], left, found = _key_score(clip, matches, turn, config, left)
             if not clip.guessed[turn]:
                 evidences[turn] = KeyEvidence(found, matches.grid, clip.shown(turn)[1])
         key = turn - reach
-        if key < max(0, first - 1) or not (wanted[key] or wanted[min(key + 1, last)]):
+        if key < max(0, first - 1) or not (needed[key] or needed[min(key + 1, last)]):
             continue
-        final[key] = _followed(matches, key, own, len(keys), reach, config)
-        for n in groups[key] if wanted[key] else ():
+        final[key] = _followed(matches, key, scored, len(keys), reach, config)
+        for n in groups[key] if needed[key] else ():
             if n not in written:
                 is_key = n == keys[key]
                 picture, sight = clip.shown(key) if is_key else clip.frame(n)
                 if is_key:
-                    score, inverse = final[key], own[key][2]
+                    score, inverse = final[key], scored[key][2]
                 else:
-                    score, inverse = _between(clip, matches, picture, key, final, own)
+                    score, inverse = _between(clip, matches, picture, key, final, scored)
                 evidence = evidences.get(key) if is_key else None
                 yield Scored(n, picture, sight, *score, inverse, matches.grid, evidence)
-        for store in (own, evidences, final):
+        for store in (scored, evidences, final):
             for old in [k for k in store if k < key - reach + 1]:
                 del store[old]
         matches.forget(key - config.baselines[-1] + 1, key - config.links * config.baselines[-1])
         clip.forget(key - config.baselines[-1])
 
 
-def _own_score(
+def _key_score(
     clip: Clip, matches: Matches, key: int, config: FlowConfig, before: tuple[Map, Map] | None
 ) -> tuple[tuple[Map, Map, Map], tuple[Map, Map], Evidence]:
     """((score, weight, inverse), (score, weight) of residual motion, evidence) of a key frame, as in `Scored`.
@@ -240,27 +240,27 @@ def _own_score(
     seen = neighbours(matches, key, len(clip.keys), config)
     test = StillTest(clip.look, clip.viewmats, clip.Ks, clip.guessed, matches.grid, clip.unit)
     counts = evidence(test, key, seen, clip.depths[key], config)
-    inverse, count = counts.inverse, counts.on + counts.off
-    score = np.clip(counts.off / (count + config.doubt) / config.share, 0.0, 1.0)
+    inverse, count = counts.inverse, counts.still + counts.moving
+    score = np.clip(counts.moving / (count + config.doubt) / config.share, 0.0, 1.0)
     if before is None:
         left, known = ResidualFlow(clip.picture, test, config).score(key, len(clip.keys), inverse, clip.depths[key])
     else:
         last = next(each for each in seen if each.key == key - 1)
         left, known = (sample(values, last.at) * last.found for values in before)
     sure = np.minimum(count / config.sure, 1.0) * (count >= 1.0)
-    own = np.maximum(score, left), np.maximum(sure, known * (left > score)), inverse
-    return own, (left, known), counts
+    scored = np.maximum(score, left), np.maximum(sure, known * (left > score)), inverse
+    return scored, (left, known), counts
 
 
 def _followed(
-    matches: Matches, key: int, own: dict[int, tuple[Map, Map, Map]], count: int, reach: int, config: FlowConfig
+    matches: Matches, key: int, scored: dict[int, tuple[Map, Map, Map]], count: int, reach: int, config: FlowConfig
 ) -> tuple[Map, Map]:
     """Score and weight of a key frame, averaged with those of its neighbours so that a surface has one label."""
-    score, sure, _ = own[key]
+    score, sure, _ = scored[key]
     total, weight = 2.0 * score * sure, 2.0 * sure
     for seen in neighbours(matches, key, count, config):
         if abs(seen.key - key) <= reach:
-            score, sure, _ = own[seen.key]
+            score, sure, _ = scored[seen.key]
             share = sample(sure, seen.at) * seen.found
             total = total + share * sample(score, seen.at)
             weight = weight + share
@@ -269,18 +269,18 @@ def _followed(
 
 def _between(
     clip: Clip, matches: Matches, picture: NDArray[np.uint8], key: int, final: dict[int, tuple[Map, Map]],
-    own: dict[int, tuple[Map, Map, Map]],
+    scored: dict[int, tuple[Map, Map, Map]],
 ) -> tuple[tuple[Map, Map], Map]:  # fmt: skip
     """((score, weight), inverse depths of still points) of a frame between `key` - 1 and `key`, by flow to both."""
     total = np.zeros(picture.shape, np.float32)[::2, ::2]
     weight, inverse, count = (np.zeros_like(total) for _ in range(3))
-    for other in (key - 1, key):
-        at, found = matches.loose(picture, clip.picture(other))
-        score, sure = final[other]
+    for neighbour in (key - 1, key):
+        at, found = matches.loose(picture, clip.picture(neighbour))
+        score, sure = final[neighbour]
         share = sample(sure, at) * found
         total, weight = total + share * sample(score, at), weight + share
         near = found + np.float32(1e-3)
-        inverse, count = inverse + near * sample(own[other][2], at), count + near
+        inverse, count = inverse + near * sample(scored[neighbour][2], at), count + near
     return (total / np.maximum(weight, 1e-6), weight), inverse / count
 
 
@@ -288,12 +288,12 @@ class Labels:
     """Labels frames by their scores and, if available, by renders of a static model of the clip."""
 
     def __init__(self, clip: Clip, static: StaticViews | None, config: FlowConfig) -> None:
-        self._clip, self._static, self._config, self._rest = clip, static, config, MisfitConfig()
-        self._references = {} if static is None else clip.references(self._rest.references)
+        self._clip, self._static, self._config, self._misfit_config = clip, static, config, MisfitConfig()
+        self._references = {} if static is None else clip.references(self._misfit_config.references)
 
     def __call__(self, frame: Scored) -> NDArray[np.uint8]:
         """[H, W] 0 still, 128 unknown, 255 moving."""
-        config, rest, size = self._config, self._rest, (self._clip.width, self._clip.height)
+        config, limits, size = self._config, self._misfit_config, (self._clip.width, self._clip.height)
         grey = cv2.resize(frame.picture, frame.score.shape[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
         spread = _Spread(grey, config.radius, config.edge)
         weight = np.minimum(frame.weight, _ENOUGH)
@@ -303,7 +303,7 @@ class Labels:
         score, known, difference = (cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in maps)
         least = round((config.blob * self._clip.width / 640) ** 2)
         moving = seeded(score > config.grow, score > config.seed, least)
-        moving |= seeded(difference > rest.weak, difference > rest.strong, least)
+        moving |= seeded(difference > limits.weak, difference > limits.strong, least)
         still = seeded(~moving, ~moving, least)  # fills small holes of moving areas
         unknown = known < _UNKNOWN
         unknown = seeded(unknown, unknown, least)
@@ -318,8 +318,8 @@ class Labels:
         if shown is None:
             return np.zeros(frame.inverse.shape, np.float32)
         shown = _sized(shown, (clip.flow_size[0] // 2, clip.flow_size[1] // 2))
-        others = [other for key, other in self._references.items() if clip.keys[key] != frame.index]
-        return misfit(frame.sight, frame.inverse, shown, others, frame.grid, 0.5 * clip.unit, self._rest)
+        views = [view for key, view in self._references.items() if clip.keys[key] != frame.index]
+        return misfit(frame.sight, frame.inverse, shown, views, frame.grid, 0.5 * clip.unit, self._misfit_config)
 
 
 class _Spread:

@@ -63,7 +63,11 @@ class ResidualFlow:
         look = self._test.look(key)
         texture = Texture(look.grid, self._test.unit, config)
         keys = [key + side * step for side in (-1, 1) for step in config.spans if 0 <= key + side * step < count]
-        laid = [self._laid(key, other, inverse, look, texture) for other in keys if not self._guessed(key, other)]
+        laid = [
+            self._laid(key, neighbour, inverse, look, texture)
+            for neighbour in keys
+            if not self._guessed(key, neighbour)
+        ]
         if len(laid) < 2:
             return np.zeros_like(inverse), np.zeros_like(inverse)
         pairs = [each.pair for each in laid]
@@ -81,8 +85,8 @@ class ResidualFlow:
         score = (second / (1.0 + config.rim * outlines(inverse)) - faint) / (config.clear - faint)
         return np.clip(score, 0.0, 1.0), np.minimum(known, 1.0)
 
-    def _guessed(self, key: int, other: int) -> bool:
-        return self._test.guessed[key] or self._test.guessed[other]
+    def _guessed(self, key: int, neighbour: int) -> bool:
+        return self._test.guessed[key] or self._test.guessed[neighbour]
 
     def _limit(self, length: Map, telling: Mask) -> float:
         """Unit of residual flow: the distance that may show motion, from the median of the matches."""
@@ -90,35 +94,35 @@ class ResidualFlow:
         noise = float(np.median(length[telling])) if np.count_nonzero(telling) >= FEW else 0.0
         return float(np.clip(self._config.unusual * noise, least, self._config.most_left * least))
 
-    def _left(self, key: int, other: int, at: tuple[Map, Map], within: Mask) -> Map:
-        """[h, w, 2] flow from a key frame to `other` warped onto it. `at` are the key's still points in `other`."""
+    def _left(self, key: int, neighbour: int, at: tuple[Map, Map], within: Mask) -> Map:
+        """[h, w, 2] flow from a key frame to `neighbour` warped onto it. `at` are the key's still points in `neighbour`."""
         one = self._picture(key)
         x, y = (cv2.resize(p, one.shape[::-1], interpolation=cv2.INTER_LINEAR) - np.float32(0.5) for p in at)
-        brought = cv2.remap(self._picture(other), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        brought = cv2.remap(self._picture(neighbour), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         # Pixels outside the other picture are filled from this picture, so that their flow is zero.
         outside = cv2.resize((~within).astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST)
         cv2.copyTo(one, outside, brought)
         flow = np.nan_to_num(dense_flow(self._dis, one, brought))
         return np.asarray(cv2.resize(flow, within.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
-    def _laid(self, key: int, other: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
-        """Key frame `other` warped onto `key` by inverse depths, with their residual flow."""
+    def _laid(self, key: int, neighbour: int, inverse: Map, look: Look, texture: Texture) -> _Laid:
+        """Key frame `neighbour` warped onto `key` by inverse depths, with their residual flow."""
         test = self._test
-        pair = Pair.between(test, key, Seen(other, test.grid, np.zeros(inverse.shape, bool), 1), self._config)
+        pair = Pair.between(test, key, Seen(neighbour, test.grid, np.zeros(inverse.shape, bool), 1), self._config)
         at, _ = pair.ray.project(inverse)
         within = inside(at, inverse.shape)
-        left = self._left(key, other, at, within)
+        left = self._left(key, neighbour, at, within)
         moved = test.grid[0] + left[..., 0], test.grid[1] + left[..., 1]
         match = sample(at[0], moved), sample(at[1], moved)
-        off = [match[i] - at[i] for i in (0, 1)]
-        drift = _drift(off, within & texture.telling, inverse, self._config.least * test.unit)
-        pair.gain = brightness(look.grid, sample(pair.other.grid, match), within)
-        still, found = (pair.other.unlike(look.grid, place, pair.gain) for place in (at, match))
+        residual = [match[i] - at[i] for i in (0, 1)]
+        drift = _drift(residual, within & texture.telling, inverse, self._config.least * test.unit)
+        pair.gain = brightness(look.grid, sample(pair.neighbour.grid, match), within)
+        still, found = (pair.neighbour.difference(look.grid, place, pair.gain) for place in (at, match))
         sharp = within & texture.telling
         usual = float(np.median(found[sharp])) if np.count_nonzero(sharp) >= FEW else 0.0
         likeness = within / (1.0 + found / (4.0 * usual + 8.0 * _FLOOR))
         gained = (still - found) / (found + usual + _FLOOR) / self._config.bearing
-        pair.seen = Seen(other, (match[0] - drift[0], match[1] - drift[1]), within, 1)
+        pair.seen = Seen(neighbour, (match[0] - drift[0], match[1] - drift[1]), within, 1)
         pair.weight = likeness.astype(np.float32)
         noise = float(np.quantile(found[within], 0.3)) if np.count_nonzero(within) >= FEW else 0.0
         least, most = self._config.visible
@@ -139,13 +143,13 @@ def _drift(left: list[Map], telling: Mask, inverse: Map, unit: float) -> list[Ma
     near = np.minimum(inverse / max(float(np.median(inverse[telling])), 1e-9), _NEAREST).astype(np.float32)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, near], axis=-1)
     design = terms[::_SPARSE, ::_SPARSE][few].astype(np.float64)
-    wanted = np.stack([part[::_SPARSE, ::_SPARSE][few] for part in left], axis=-1).astype(np.float64)
+    target = np.stack([part[::_SPARSE, ::_SPARSE][few] for part in left], axis=-1).astype(np.float64)
     count = design.shape[1]
     found = np.zeros((count, 2))
-    found[0] = np.median(wanted, axis=0)
+    found[0] = np.median(target, axis=0)
     for _ in range(_TURNS):
-        gap = np.sum((wanted - design @ found) ** 2, axis=1)
+        gap = np.sum((target - design @ found) ** 2, axis=1)
         weight = 1.0 / np.square(1.0 + gap / max(unit**2, float(np.median(gap))))
         normal = design.T @ (design * weight[:, None]) + 1e-3 * len(design) * np.eye(count)
-        found = linear_solution(normal, design.T @ (wanted * weight[:, None]))
+        found = linear_solution(normal, design.T @ (target * weight[:, None]))
     return [(terms @ found[:, i].astype(np.float32)) for i in (0, 1)]

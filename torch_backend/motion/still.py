@@ -24,7 +24,7 @@ _NEAR = 2
 """Distance in key frames up to which pictures are comparable even if one is blurred."""
 _AGREES = 1.5
 """Factor on the tolerance up to which a match agrees with a still point."""
-_MOST_UNLIKE, _OTHER_DEPTH = 400.0, 4.0
+_MAX_DIFFERENCE, _DEPTH_PENALTY = 400.0, 4.0
 """Squared picture differences: cap of a pair's cost (the point is hidden or gone), and cost added to every depth other
 than a point's own."""
 
@@ -67,7 +67,7 @@ class Look:
         self.sharpness = float(sum(np.mean(step * step) for step in steps))
         """Mean squared difference of neighbouring points."""
 
-    def unlike(self, values: Map, at: tuple[Map, Map], gain: tuple[float, float]) -> Map:
+    def difference(self, values: Map, at: tuple[Map, Map], gain: tuple[float, float]) -> Map:
         """Mean squared difference around each point between `values` and this picture at `at`, after `gain` (factor,
         offset)."""
         half = np.float32(0.5)
@@ -121,7 +121,7 @@ class Pair:
     ray: Ray
     limit: float
     """Distance of a match from the projected still point above which it may show motion, in flow pixels."""
-    other: Look
+    neighbour: Look
     """Picture of the other key frame."""
     gain: tuple[float, float] = (1.0, 0.0)
     """Factor and offset that fit the other picture's brightness to the key's."""
@@ -153,9 +153,9 @@ class Pair:
 class Evidence:
     """Evidence from a key frame's matches, on the grid."""
 
-    on: Map
+    still: Map
     """Weight of the evidence that a point stands still."""
-    off: Map
+    moving: Map
     """Weight of the evidence that a point moves."""
     inverse: Map
     """Inverse depth of the still point that fits the matches best, in 1 / solve units."""
@@ -186,9 +186,9 @@ def evidence(test: StillTest, key: int, seen: list[Seen], depth: float, config: 
         agree += pair.seen.found & (length <= pair.limit)
     depths = _surroundings(inverse, agree >= 3)
     inverse = _best_depth(look, pairs, depths)
-    on, off, agree, parallax = _counted(key, look, texture, pairs, inverse, config)
+    still, moving, agree, parallax = _counted(key, look, texture, pairs, inverse, config)
     doubt = config.doubt * (1.0 + config.outline * outlines(depths[0]))
-    return Evidence(on, np.maximum(off - doubt, 0.0), inverse, agree, parallax)
+    return Evidence(still, np.maximum(moving - doubt, 0.0), inverse, agree, parallax)
 
 
 def outlines(inverse: Map) -> Map:
@@ -201,8 +201,8 @@ def outlines(inverse: Map) -> Map:
 def _pair(test: StillTest, key: int, seen: Seen, texture: Texture, config: FlowConfig) -> Pair:
     """The pair of `key` and `seen.key`, with the comparison of their pictures."""
     look, pair = test.look(key), Pair.between(test, key, seen, config)
-    pair.gain = brightness(look.grid, sample(pair.other.grid, seen.at), seen.found)
-    pair.matched = pair.other.unlike(look.grid, seen.at, pair.gain)
+    pair.gain = brightness(look.grid, sample(pair.neighbour.grid, seen.at), seen.found)
+    pair.matched = pair.neighbour.difference(look.grid, seen.at, pair.gain)
     pair.right = pair.matched - texture.nearly < _like(pair.matched, seen.found & texture.telling, config)
     return pair
 
@@ -233,36 +233,38 @@ def still_points(pairs: list[Pair], start: Map, depth: float, unit: float, turns
 def _counted(
     key: int, look: Look, texture: Texture, pairs: list[Pair], inverse: Map, config: FlowConfig
 ) -> tuple[Map, Map, Map, Map]:
-    """(on, off, agree, parallax) of still points at inverse depths, as in `Evidence`."""
-    on, off, agree, parallax = (np.zeros_like(inverse) for _ in range(4))
-    gone: dict[int, Mask] = {}
+    """(still, moving, agree, parallax) of still points at inverse depths, as in `Evidence`."""
+    still, moving, agree, parallax = (np.zeros_like(inverse) for _ in range(4))
+    lost: dict[int, Mask] = {}
     for pair in pairs:
         found, after = pair.seen.found, pair.seen.key - key
         at, x, y, length = pair.miss(inverse)
-        difference = pair.other.unlike(look.grid, at, pair.gain)
-        away = found & (length > pair.limit)
+        difference = pair.neighbour.difference(look.grid, at, pair.gain)
+        displaced = found & (length > pair.limit)
         fits = found & (length <= _AGREES * pair.limit)
         slope = pair.ray.slope(*pair.ray.project(inverse))
         agree += fits
         parallax = np.maximum(parallax, fits * np.hypot(*slope) * inverse)
-        alike = difference - texture.nearly < _like(difference, found & ~away & texture.telling, config)
+        similar = difference - texture.nearly < _like(difference, found & ~displaced & texture.telling, config)
         within = inside(at, look.grid.shape)
         better = pair.right & (difference > config.better * pair.matched + config.contrast**2)
-        off += away & better & (texture.change(x, y, length) > config.contrast**2)
+        moving += displaced & better & (texture.change(x, y, length) > config.contrast**2)
         weight = min(1.0, abs(after) / config.baselines[-1]) ** config.haste
         # On a plain wall, flow follows the objects in front of it. A match whose pictures differ is no evidence there.
-        smeared = found & ~away & ~alike & ~pair.right
-        on += weight * ((found & ~away & ~smeared) + 0.5 * ((away & ~better) | (within & alike & ~found)))
+        smeared = found & ~displaced & ~similar & ~pair.right
+        still += weight * (
+            (found & ~displaced & ~smeared) + 0.5 * ((displaced & ~better) | (within & similar & ~found))
+        )
         # A blurred picture matches no picture far from it in time, even where the scene stands still, so it is no
         # evidence.
-        if abs(after) <= _NEAR or look.sharpness >= config.blurred * pair.other.sharpness:
-            gone[after] = within & ~alike & (~found | smeared)
+        if abs(after) <= _NEAR or look.sharpness >= config.blurred * pair.neighbour.sharpness:
+            lost[after] = within & ~similar & (~found | smeared)
     for step in config.baselines[:3]:
         # A point missing both before and after moves too fast for flow. A hidden point is usually hidden on one side.
-        if step in gone and -step in gone:
+        if step in lost and -step in lost:
             far = config.gone_far if step > _NEAR else 1.0
-            off += far * (gone[step] & gone[-step])
-    return on, off, agree, parallax
+            moving += far * (lost[step] & lost[-step])
+    return still, moving, agree, parallax
 
 
 def _smoothed(values: Map, weight: Map) -> Map:
@@ -270,12 +272,12 @@ def _smoothed(values: Map, weight: Map) -> Map:
     return cv2.blur(values * weight, (5, 5)) / np.maximum(cv2.blur(weight, (5, 5)), 1e-3)
 
 
-def _like(unlike: Map, still: Mask, config: FlowConfig) -> float:
+def _like(difference: Map, still: Mask, config: FlowConfig) -> float:
     """Threshold of the squared difference below which pictures show the same surface.
 
     It rises with the median difference at `still` points, which differ if only one of the two pictures is sharp.
     """
-    usual = float(np.median(unlike[still])) if np.count_nonzero(still) >= FEW else 0.0
+    usual = float(np.median(difference[still])) if np.count_nonzero(still) >= FEW else 0.0
     return max(config.likeness**2, config.noise**2 * usual)
 
 
@@ -288,9 +290,9 @@ def _best_depth(look: Look, pairs: list[Pair], depths: list[Map]) -> Map:
             if pair.seen.links == 1:
                 at, _ = pair.ray.project(inverse)
                 within = inside(at, inverse.shape)
-                cost += within * np.minimum(pair.other.unlike(look.grid, at, pair.gain), _MOST_UNLIKE)
+                cost += within * np.minimum(pair.neighbour.difference(look.grid, at, pair.gain), _MAX_DIFFERENCE)
                 count += within
-        cost = cost / count + (_OTHER_DEPTH if number else 0.0)
+        cost = cost / count + (_DEPTH_PENALTY if number else 0.0)
         better = cost < least if number else np.ones(cost.shape, bool)
         best, least = np.where(better, inverse, best), np.where(better, cost, least)
     return best
@@ -301,9 +303,9 @@ def inside(at: tuple[Map, Map], shape: tuple[int, ...]) -> Mask:
     return (at[0] >= 0) & (at[1] >= 0) & (at[0] < 2 * shape[1]) & (at[1] < 2 * shape[0])
 
 
-def brightness(values: Map, others: Map, found: Mask) -> tuple[float, float]:
-    """Factor and offset that fit `others` to `values` at the `found` points, because exposure drifts in a clip."""
-    return fitted_brightness(values[::4, ::4][found[::4, ::4]], others[::4, ::4][found[::4, ::4]])
+def brightness(values: Map, target: Map, found: Mask) -> tuple[float, float]:
+    """Factor and offset that fit `target` to `values` at the `found` points, because exposure drifts in a clip."""
+    return fitted_brightness(values[::4, ::4][found[::4, ::4]], target[::4, ::4][found[::4, ::4]])
 
 
 def fitted_brightness(a: Map, b: Map) -> tuple[float, float]:
@@ -322,15 +324,15 @@ def _surroundings(inverse: Map, sure: Mask) -> list[Map]:
 
     The neighbours' depths are candidates because flow smears foreground motion over the background.
     """
-    own = np.where(sure, cv2.medianBlur(inverse, 5), 0.0).astype(np.float32)
-    total, weight = own, sure.astype(np.float32)
-    filled, certain = np.zeros_like(own), np.zeros_like(own)
+    known = np.where(sure, cv2.medianBlur(inverse, 5), 0.0).astype(np.float32)
+    total, weight = known, sure.astype(np.float32)
+    filled, certain = np.zeros_like(known), np.zeros_like(known)
     for radius in (2, 6, 18, 54):  # the nearest sure points count most
         size = (2 * radius + 1, 2 * radius + 1)
         share = (1.0 - certain) * np.minimum(1.0, cv2.blur(weight, size) * radius)
         filled += share * cv2.blur(total, size) / np.maximum(cv2.blur(weight, size), 1e-6)
         certain += share
     filled = np.where(certain > 1e-3, filled / np.maximum(certain, 1e-3), inverse).astype(np.float32)
-    filled[sure] = own[sure]
+    filled[sure] = known[sure]
     block = np.ones((17, 17), np.uint8)
     return [filled, cv2.erode(filled, block), cv2.dilate(filled, block)]

@@ -24,9 +24,9 @@ LEAST_AGREEING = 3
 LEAST_PARALLAX = 5.0
 """Smallest parallax of a kept point: its shift in another frame if its depth halved, in pixels of a picture 640 wide. A
 match error of one pixel then changes the depth by at most a fifth."""
-MOST_OFF = 0.5
+MAX_MOVING = 0.5
 """Largest weight of moving evidence for a still point, relative to its still evidence."""
-AWAY = 6.0
+BORDER_DISTANCE = 6.0
 """Smallest distance of a kept point from pixels not labelled still, in pixels of a picture 640 wide."""
 PER_KEY = 2048
 """Largest number of points kept per key frame."""
@@ -71,7 +71,7 @@ def surface_points(
     """
     found, sight = key.evidence, key.sight
     known = (found.agree >= LEAST_AGREEING) & (found.parallax >= LEAST_PARALLAX * unit) & (found.inverse > 1e-6)
-    known &= found.off <= MOST_OFF * found.on
+    known &= found.moving <= MAX_MOVING * found.still
     known &= cv2.resize(excluded.astype(np.uint8), known.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT) == 0
     places = np.flatnonzero(known)
     if len(places) > PER_KEY:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..contract import POINTS_FILE
 from ..lens.zoom import focal_change
 from . import colmap_types as colmap
-from .mapping import first_camera, posed
+from .mapping import first_camera, registered_images
 from .request import Request
 
 WIDEST_ZOOM = 16.0
@@ -45,10 +45,10 @@ def focal_changes(model: pycolmap.Reconstruction) -> dict[str, float | None]:
     """Maps the name of each posed image to its `zoom.focal_change`, or to None where that is unknown."""
     xyz, found = {number: p.xyz for number, p in colmap.points(model).items()}, dict[str, float | None]()
     camera = first_camera(model)
-    for image in posed(model):
-        sighted = [p for p in image.points2D if p.has_point3D()]
-        seen = np.array(camera.cam_from_img(np.array([p.xy for p in sighted], np.float64).reshape(-1, 2)), np.float64)
-        points = np.array([xyz[p.point3D_id] for p in sighted], np.float64).reshape(-1, 3)
+    for image in registered_images(model):
+        observed = [p for p in image.points2D if p.has_point3D()]
+        seen = np.array(camera.cam_from_img(np.array([p.xy for p in observed], np.float64).reshape(-1, 2)), np.float64)
+        points = np.array([xyz[p.point3D_id] for p in observed], np.float64).reshape(-1, 3)
         change = focal_change(seen, points, colmap.pose(image), camera.mean_focal_length())
         found[image.name] = change if np.isfinite(change) else None
     return found
@@ -63,7 +63,7 @@ def write_undistortion(request: Request, camera: pycolmap.Camera, number: int) -
 
 def smallest_depths(model: pycolmap.Reconstruction, points: list[pycolmap.Point3D]) -> NDArray[np.float32]:
     """[P]: smallest depth of each point over the images that see it, in solve units."""
-    rows = {image.image_id: colmap.pose(image)[2] for image in posed(model)}
+    rows = {image.image_id: colmap.pose(image)[2] for image in registered_images(model)}
     return np.array(
         [min(float(rows[e.image_id] @ np.append(p.xyz, 1.0)) for e in p.track.elements) for p in points], np.float32
     )

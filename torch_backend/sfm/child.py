@@ -89,23 +89,23 @@ def _listen(process: subprocess.Popen[bytes], log: Path, start: int, report: Rep
                 return answer
             counts = _COUNT.findall(tail.read())
             if counts:
-                _tell(report, stage, int(counts[-1][0]), int(counts[-1][1]))
+                _report(report, stage, int(counts[-1][0]), int(counts[-1][1]))
             if not line.startswith(b"{"):
                 continue
             message = json.loads(line)
             if "stage" in message:
                 stage = message["stage"]
-                _tell(report, stage, message.get("done", 0), message.get("total", 1))
+                _report(report, stage, message.get("done", 0), message.get("total", 1))
             else:
                 answer = message
 
 
-def _tell(report: Reporter, stage: str, done: int, total: int) -> None:
+def _report(report: Reporter, stage: str, done: int, total: int) -> None:
     report.progress(f"solve: {stage}", done, total, f"{done} of {total}" if done else "")
 
 
 def _tail(log: Path, start: int) -> str:
     text = log.read_bytes()[start:].decode("utf-8", errors="replace")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    wanted = [line for line in lines if line.startswith(("F2", "E2")) or "Error" in line] or lines
-    return " ".join(wanted[-_LAST_LINES:]) or "it left no message."
+    errors = [line for line in lines if line.startswith(("F2", "E2")) or "Error" in line] or lines
+    return " ".join(errors[-_LAST_LINES:]) or "it left no message."

@@ -54,7 +54,12 @@ def prepare(frames: dict[str, Any], cameras: str, report: Reporter) -> ImportedC
 
 
 def take_over(
-    shot: Shot, frames: dict[str, Any], taken: ImportedCameras, options: dict[str, Any], scratch: Path, report: Reporter
+    shot: Shot,
+    frames: dict[str, Any],
+    cameras: ImportedCameras,
+    options: dict[str, Any],
+    scratch: Path,
+    report: Reporter,
 ) -> dict[str, Any]:
     """Runs the worker on imported cameras: it undistorts the lenses and triangulates points if needed.
 
@@ -64,7 +69,7 @@ def take_over(
     Args:
         shot: an imported shot.
         frames: its frames.json.
-        taken: result of `prepare`.
+        cameras: result of `prepare`.
         options: the worker's overlap and features.
         scratch: folder that receives poses.json, points.npz, undistort_N.npz and model/, as after a solve.
         report: receives progress.
@@ -76,7 +81,7 @@ def take_over(
     Raises:
         JobError: the worker crashed, or no point agrees with the cameras.
     """
-    source, matched = taken.solve, taken.matched
+    source, matched = cameras.solve, cameras.matched
     size = (frames["width"], frames["height"])
     used = sorted({camera.lens for camera in matched.cameras.values()})
     lenses = [source.lenses[n].scaled(*size) for n in used]
@@ -86,7 +91,7 @@ def take_over(
         for n, camera in matched.cameras.items()
     }
     registered = [f["frame"] for f in frames["frames"] if f["solve"] and f["frame"] in matched.cameras]
-    points = _own_points(taken, size)
+    points = _stored_points(cameras, size)
     known = {
         "lenses": [vars(lens) for lens in lenses],
         "images": {name: {"lens": p["lens"], "pose": p["pose"]} for name, p in poses.items()},
@@ -96,7 +101,7 @@ def take_over(
     answer = run_worker(scratch / REQUEST_FILE, shot.colmap_log, report)["result"]
     (scratch / "poses.json").write_text(json.dumps(poses), encoding="utf-8")
     if points is not None:
-        answer = _keep_own(points, scratch, lenses, poses)
+        answer = _keep_stored(points, scratch, lenses, poses)
     if not answer["points"]:  # the worker wrote no files
         refuse_misfit(answer, 0)
     fx, fy, _, _, *bend = lenses[0].params
@@ -111,11 +116,11 @@ def take_over(
     }
 
 
-def _own_points(taken: ImportedCameras, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
-    """`imported.own_points` for pictures of `size` (width, height); None if they are too few to train from."""
-    points = imported.own_points(taken.solve, taken.matched, size)
-    centres = np.array([camera_centre(camera.pose) for camera in taken.matched.cameras.values()])
-    return points if points is not None and _enough(points, centres) else None
+def _stored_points(cameras: ImportedCameras, size: tuple[int, int]) -> dict[str, NDArray[Any]] | None:
+    """`imported.stored_points` for pictures of `size` (width, height); None if they are too few to train from."""
+    points = imported.stored_points(cameras.solve, cameras.matched, size)
+    centres = np.array([camera_centre(camera.pose) for camera in cameras.matched.cameras.values()])
+    return points if points is not None and _is_sufficient(points, centres) else None
 
 
 def _request(shot: Shot, solved: list[str], known: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
@@ -132,7 +137,7 @@ def _request(shot: Shot, solved: list[str], known: dict[str, Any], options: dict
     }
 
 
-def _keep_own(
+def _keep_stored(
     points: dict[str, NDArray[Any]], scratch: Path, lenses: list[imported.Lens], poses: dict[str, dict[str, Any]]
 ) -> dict[str, Any]:
     """Writes the file's points and their model into `scratch`; returns the figures that the worker would report."""
@@ -173,7 +178,7 @@ def doubts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _enough(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> bool:
+def _is_sufficient(points: dict[str, NDArray[Any]], centres: NDArray[Any]) -> bool:
     """True if the points of a file have measured errors and are enough to train from."""
     table = {name: points[name] for name in ("xyz", "rgb", "error", "track", "depth")}
     return bool((points["error"] > 0).any()) and len(filter_points(table, centres)["xyz"]) >= LEAST_POINTS

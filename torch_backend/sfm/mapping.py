@@ -11,7 +11,7 @@ from . import colmap_types as colmap
 from .matching import extract, match
 from .request import SEED, Request, closing_database, say
 
-HELD_SHARE, HELD_WORSE, HELD_ERROR_PX = 0.9, 1.25, 1.0
+FIXED_SHARE, FIXED_WORSE, FIXED_ERROR_PX = 0.9, 1.25, 1.0
 """A usual lens replaces an implausible one if it registers the first value's share of the frames. Its error must also
 be at most the second value times as large, or at most the third value in pixels."""
 MASKED_INLIERS = (50, 15)
@@ -113,7 +113,7 @@ def left_bend(model: pycolmap.Reconstruction) -> float:
     return float(camera.params[camera.extra_params_idxs()[0]])
 
 
-def posed(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """The images that have a pose in the model."""
     return [image for image in colmap.images(model).values() if image.has_pose]
 
@@ -128,17 +128,17 @@ def lens_doubt(request: Request, model: pycolmap.Reconstruction) -> str:
     return doubt_of(*lens_of(first_camera(model)), request.focal)
 
 
-def as_good(held: pycolmap.Reconstruction, free: pycolmap.Reconstruction) -> bool:
-    """True if `held`, a model with a usual lens, explains the clip about as well as `free`, with an estimated lens."""
-    if held.num_reg_images() < HELD_SHARE * free.num_reg_images():
+def is_as_good(fixed: pycolmap.Reconstruction, free: pycolmap.Reconstruction) -> bool:
+    """True if `fixed`, a model with a usual lens, explains the clip about as well as `free`, with an estimated lens."""
+    if fixed.num_reg_images() < FIXED_SHARE * free.num_reg_images():
         return False
-    error = held.compute_mean_reprojection_error()
-    return error <= max(HELD_WORSE * free.compute_mean_reprojection_error(), HELD_ERROR_PX)
+    error = fixed.compute_mean_reprojection_error()
+    return error <= max(FIXED_WORSE * free.compute_mean_reprojection_error(), FIXED_ERROR_PX)
 
 
 def triangulation_angle(model: pycolmap.Reconstruction) -> float:
     """Median, over at most 4000 points, of the widest angle in degrees between two rays to a point."""
-    centres = {image.image_id: image.projection_center() for image in posed(model)}
+    centres = {image.image_id: image.projection_center() for image in registered_images(model)}
     points = sorted(colmap.points(model).items())
     angles: list[float] = []
     for _, point in points[:: max(1, len(points) // 2000)]:

@@ -59,7 +59,7 @@ def more_features(masks: dict[str, Mask]) -> float:
     return min(_MOST_FEATURES, 1.0 / max(1.0 - _covered(masks), 1e-3))
 
 
-def wants_wide(masks: dict[str, Mask]) -> bool:
+def needs_wide(masks: dict[str, Mask]) -> bool:
     """True if so much is masked that more pairs of frames must be matched than the usual overlap."""
     return _covered(masks) >= _WIDE_SHARE
 
@@ -98,7 +98,7 @@ def facts_of(masks: dict[str, Mask], sources: dict[str, str]) -> dict[str, Any]:
     }
 
 
-def given_masks(shot: Shot) -> dict[str, dict[str, Any]]:
+def recorded_masks(shot: Shot) -> dict[str, dict[str, Any]]:
     """`facts_of` the masks that the shot was solved with; {} without masks or if solve.json is unreadable."""
     try:
         facts = read_json(shot.solve_record).get("masks")
@@ -111,7 +111,7 @@ def given_masks(shot: Shot) -> dict[str, dict[str, Any]]:
 
 def masks_key(shot: Shot, *kinds: str) -> list[Any]:
     """Key that changes with the solve's masks of the given kinds (all kinds if none are given); empty without masks."""
-    return [[kind, facts.get("key")] for kind, facts in given_masks(shot).items() if not kinds or kind in kinds]
+    return [[kind, facts.get("key")] for kind, facts in recorded_masks(shot).items() if not kinds or kind in kinds]
 
 
 def load_mask(shot: Shot, kind: str, frame: int) -> NDArray[np.bool_] | None:
@@ -119,7 +119,7 @@ def load_mask(shot: Shot, kind: str, frame: int) -> NDArray[np.bool_] | None:
 
     Raises JobError (SOLVE) if the shot has the mask but its file is missing or damaged.
     """
-    if kind not in given_masks(shot):
+    if kind not in recorded_masks(shot):
         return None
     path = shot.mask(kind, frame)
     try:
@@ -154,8 +154,8 @@ def limited(labels: NDArray[np.uint8], ignored: NDArray[np.bool_] | None, people
 def _wider(covered: NDArray[np.bool_], by: float) -> NDArray[np.uint8]:
     """`covered` dilated by `by` pixels of a picture 640 wide: [H, W], 1 or 0."""
     reach = round(by * covered.shape[1] / 640)
-    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return np.asarray(cv2.dilate(covered.astype(np.uint8), around), np.uint8)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray(cv2.dilate(covered.astype(np.uint8), kernel), np.uint8)
 
 
 def _damaged(path: Path) -> JobError:

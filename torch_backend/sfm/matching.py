@@ -77,7 +77,7 @@ def match(request: Request) -> None:
     if request.reuse or request.wide:
         match_anew(request)
         return
-    match_pairs(request, _apart(request.solved, [2**n for n in range(request.overlap)]), "matches")
+    match_pairs(request, _pairs_at(request.solved, [2**n for n in range(request.overlap)]), "matches")
 
 
 def match_anew(request: Request) -> None:
@@ -125,10 +125,10 @@ def wide_pairs(names: Sequence[str]) -> dict[str, list[str]]:
     distances = list(range(1, len(names) if len(names) <= ALL_PAIRS else 9))
     while distances[-1:] and distances[-1] < len(names):
         distances.append(round(distances[-1] * 2**0.5))
-    return _apart(names, distances)
+    return _pairs_at(names, distances)
 
 
-def _apart(names: Sequence[str], distances: Sequence[int]) -> dict[str, list[str]]:
+def _pairs_at(names: Sequence[str], distances: Sequence[int]) -> dict[str, list[str]]:
     """Maps each name to the names that follow it at the given distances."""
     return {name: [names[at + d] for d in distances if at + d < len(names)] for at, name in enumerate(names)}
 

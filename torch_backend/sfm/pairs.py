@@ -35,7 +35,7 @@ BLOCK = 64
 def match_pairs(request: Request, pairs: Mapping[str, Sequence[str]], stage: str = "other matches") -> None:
     """Matches each image with its listed images. Matches that are already in the database are kept."""
     say(stage=stage)
-    lines = [f"{name} {other}" for name, others in pairs.items() for other in others]
+    lines = [f"{name} {partner}" for name, partners in pairs.items() for partner in partners]
     count = max(1, min(request.threads, MOST_PROCESSES, len(lines) // LEAST_PAIRS))
     parts = [lines[len(lines) * n // count : len(lines) * (n + 1) // count] for n in range(count)]
     if not lines:  # a single frame
@@ -96,7 +96,7 @@ class _Helper:
         if self._process.wait() != 0:
             return False
         ids = _ids(self._request.database)
-        pairs = [(ids[one], ids[other]) for one, other in (line.split(" ") for line in self.lines)]
+        pairs = [(ids[one], ids[second]) for one, second in (line.split(" ") for line in self.lines)]
         part = colmap.open_database(self._folder / self._request.database.name)
         with closing_database(self._request) as database, pycolmap.DatabaseTransaction(database):
             for pair in pairs:

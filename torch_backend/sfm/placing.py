@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from . import colmap_types as colmap
-from .mapping import first_camera, posed
+from .mapping import first_camera, registered_images
 from .matching import extract
 from .pairs import match_pairs
 from .request import SEED, Request, closing_database
@@ -27,21 +27,21 @@ def localise(request: Request, model: pycolmap.Reconstruction) -> dict[str, dict
     """
     poses: dict[str, dict[str, Any]] = {}
     ids: dict[str, int] = {}
-    for image in posed(model):
+    for image in registered_images(model):
         ids[image.name] = image.image_id
         poses[image.name] = {"pose": colmap.pose(image).tolist(), "source": "registered"}
     missing = [name for name in request.order if name not in ids]
     if not missing or request.neighbours < 1:
         return poses
     pairs = _nearest_registered(request, missing, ids)
-    new = [name for name in request.others if name in pairs]
+    new = [name for name in request.unsolved if name in pairs]
     if new:
         extract(request, new, next(iter(colmap.cameras(model))))
     match_pairs(request, pairs)
     camera = first_camera(model)
     with closing_database(request) as database:
         for name in missing:
-            found = _place(database, model, camera, name, [ids[other] for other in pairs[name]])
+            found = _place(database, model, camera, name, [ids[neighbour] for neighbour in pairs[name]])
             if found is not None:
                 poses[name] = found
     return poses
@@ -60,7 +60,11 @@ def _nearest_registered(request: Request, missing: list[str], ids: dict[str, int
 
 
 def _place(
-    database: pycolmap.Database, model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str, others: list[int]
+    database: pycolmap.Database,
+    model: pycolmap.Reconstruction,
+    camera: pycolmap.Camera,
+    name: str,
+    neighbours: list[int],
 ) -> dict[str, Any] | None:
     """The pose of one image from its matches with registered images, or None."""
     image = database.read_image_with_name(name)
@@ -68,18 +72,18 @@ def _place(
         return None
     keypoints = database.read_keypoints(image.image_id)[:, :2]
     links: dict[tuple[int, int], None] = {}
-    for other in others:
-        if not database.exists_matches(image.image_id, other):
+    for neighbour in neighbours:
+        if not database.exists_matches(image.image_id, neighbour):
             continue
-        matches = database.read_two_view_geometry(image.image_id, other).inlier_matches
-        points = colmap.images(model)[other].points2D
-        for own, theirs in matches:
-            point = points[int(theirs)]
+        matches = database.read_two_view_geometry(image.image_id, neighbour).inlier_matches
+        points = colmap.images(model)[neighbour].points2D
+        for keypoint, reference in matches:
+            point = points[int(reference)]
             if point.has_point3D():
-                links[int(own), int(point.point3D_id)] = None
+                links[int(keypoint), int(point.point3D_id)] = None
     if len(links) < LOCALISE_LEAST_INLIERS:
         return None
-    xy = np.array([keypoints[own] for own, _ in links], np.float64)
+    xy = np.array([keypoints[keypoint] for keypoint, _ in links], np.float64)
     xyz = np.array([colmap.points(model)[point].xyz for _, point in links], np.float64)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = LOCALISE_MAX_ERROR_PX

@@ -29,7 +29,7 @@ _PIXELS = 640 * 480
 """Size of the frames that the weights were measured with."""
 _LEAST_SHARE, _LEAST_SECONDS = 0.03, 3.0
 """Share of the bar and seconds before the first estimate of the remaining time; an earlier one would be a guess."""
-_EVERY = 2.0
+_INTERVAL = 2.0
 """Seconds between two estimates."""
 
 
@@ -39,9 +39,9 @@ def weights_of(frames: Mapping[str, Any]) -> dict[str, float]:
     Only the ratios count. They were measured on the bundled clip (74 frames of 640 x 480, all of them solved).
     """
     listed = frames["frames"]
-    every, solved = len(listed), sum(bool(row["solve"]) for row in listed)
+    total, solved = len(listed), sum(bool(row["solve"]) for row in listed)
     size = float(frames["width"]) * float(frames["height"]) / _PIXELS
-    others = every - solved
+    unsolved = total - solved
     return {
         "start": 0.0,
         "masks": 0.0,
@@ -49,11 +49,11 @@ def weights_of(frames: Mapping[str, Any]) -> dict[str, float]:
         "features": 0.27 * size * solved,
         "matches": 0.15 * solved,
         "cameras": 0.32 * solved,
-        "other features": 0.27 * size * others,
-        "other matches": 0.1 * others,
-        "undistort": 0.04 * size * every,
-        "still world": 0.03 * max(400.0, 2.0 * every),  # seconds per training step, times the number of steps
-        "motion": 0.26 * every,  # without the optical flow that runs during "still world"
+        "other features": 0.27 * size * unsolved,
+        "other matches": 0.1 * unsolved,
+        "undistort": 0.04 * size * total,
+        "still world": 0.03 * max(400.0, 2.0 * total),  # seconds per training step, times the number of steps
+        "motion": 0.26 * total,  # without the optical flow that runs during "still world"
     }
 
 
@@ -81,7 +81,7 @@ class OneBar:
         self._worked = 0.0
         """Weight of all work before this stage, including failed attempts."""
         self._began = clock()
-        self._told = self._began
+        self._reported = self._began
 
     def progress(self, stage: str, done: float, total: float, message: str = "") -> None:
         """Reports a stage's progress as progress of the solve. A stage not in `weights` changes only the message."""
@@ -100,7 +100,7 @@ class OneBar:
         remaining = self._work_in_stage() + left
         if remaining > 0.0:
             self._bar = max(self._bar, 1.0 - (1.0 - self._entered[0]) * left / remaining)
-        self._tell(left, begins)
+        self._forecast(left, begins)
         self._report.progress(WHOLE, self._bar, 1.0, WORDS[name].format(message or "begins"))
 
     def _work_in_stage(self) -> float:
@@ -112,13 +112,13 @@ class OneBar:
         after = self._order[self._order.index(self._stage) + 1 :]
         return self._weights[self._stage] * (1.0 - self._share) + sum(self._weights[name] for name in after)
 
-    def _tell(self, left: float, at_once: bool) -> None:
+    def _forecast(self, left: float, is_due: bool) -> None:
         """Reports the remaining time, extrapolated from the pace so far."""
         now, worked = self._clock(), self._worked + self._work_in_stage()
         if worked < _LEAST_SHARE * (worked + left) or now - self._began < _LEAST_SECONDS:
             return
-        if at_once or now - self._told >= _EVERY:
-            self._told = now
+        if is_due or now - self._reported >= _INTERVAL:
+            self._reported = now
             self.metric(FORECAST, {"of": WHOLE, "seconds_left": round((now - self._began) / worked * left, 1)})
 
     def metric(self, stage: str, values: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 FOCALS = (0.4, 2.5)
 """Range of focal lengths that are tried, as shares of the picture's width: views 103 to 23 degrees wide."""
-GIVEN = 1.2
+FOCAL_TOLERANCE = 1.2
 """Factor by which a known focal length is varied in both directions, which compensates for lens distortion."""
 _STEPS = 48
 WIDEST = 0.25
@@ -37,7 +37,7 @@ def is_pure_rotation(
         return False
     order = np.argsort(shifts)[-max(1, round(WIDEST * len(shifts))) :]
     shift = float(np.median(shifts[order]))
-    ends = (focal / GIVEN, focal * GIVEN) if focal else (FOCALS[0] * size[0], FOCALS[1] * size[0])
+    ends = (focal / FOCAL_TOLERANCE, focal * FOCAL_TOLERANCE) if focal else (FOCALS[0] * size[0], FOCALS[1] * size[0])
     for value in np.geomspace(*ends, _STEPS).tolist():
         lens = np.array([[value, 0.0, 0.5 * size[0]], [0.0, value, 0.5 * size[1]], [0.0, 0.0, 1.0]])
         singular = np.linalg.svd(np.linalg.inv(lens) @ homographies[order] @ lens, compute_uv=False)

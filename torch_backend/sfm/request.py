@@ -27,8 +27,8 @@ class Request:
         self.database = self.scratch / "database.db"
         self.images = Path(data["images"])
         self.solved: list[str] = data["solved"]
-        self.others: list[str] = data["others"]
-        self.order: list[str] = sorted(self.solved + self.others, key=lambda name: int(Path(name).stem))
+        self.unsolved: list[str] = data["others"]
+        self.order: list[str] = sorted(self.solved + self.unsolved, key=lambda name: int(Path(name).stem))
         self.camera_model: str = data["camera_model"]
         self.overlap: int = data["overlap"]
         self.features: int = data["features"]

@@ -71,7 +71,7 @@ class SolveResult(TypedDict):
 
 
 @dataclass(frozen=True)
-class Asked:
+class SolveInputs:
     """Inputs of a solve."""
 
     shot: Shot
@@ -82,13 +82,15 @@ class Asked:
     """Part of solve.json that records the solve's settings."""
 
 
-def write_results(asked: Asked, answer: dict[str, Any], scratch: Path, staged: Staged, report: Reporter) -> SolveResult:
+def write_results(
+    inputs: SolveInputs, answer: dict[str, Any], scratch: Path, staged: Staged, report: Reporter
+) -> SolveResult:
     """Writes the solve's files into `staged`, from the worker's files in `scratch`.
 
     Args:
         answer: answer of the worker; for imported cameras, that of `imported_cameras.take_over`.
     """
-    frames = asked.frames
+    frames = inputs.frames
     solved = sum(f["solve"] for f in frames["frames"])
     poses = json.loads((scratch / "poses.json").read_text(encoding="utf-8"))
     maps = [scratch / f"undistort_{n}.npz" for n in range(1 + max(p.get("lens", 0) for p in poses.values()))]
@@ -97,7 +99,7 @@ def write_results(asked: Asked, answer: dict[str, Any], scratch: Path, staged: S
         points = filter_points({name: data[name] for name in data.files}, _centres(path))
     if "given" in answer:
         refuse_misfit(answer, len(points["xyz"]))
-    _undistort_all(asked, lenses, maps, staged, report)
+    _undistort_all(inputs, lenses, maps, staged, report)
     with atomic_path(staged.solve / POINTS_FILE) as partial:
         save_arrays(partial, points)
     replace_file(scratch / "model", staged.solve / COLMAP_FOLDER)
@@ -116,7 +118,7 @@ def write_results(asked: Asked, answer: dict[str, Any], scratch: Path, staged: S
         {
             "version": SOLVE_VERSION,
             **_record(answer, result),
-            **asked.facts,
+            **inputs.facts,
             "solved_frames": solved,
             "lenses": [_lens(file) for file in maps],
             "lens_of_frame": lenses,
@@ -184,41 +186,46 @@ def _camera_path(
 def _nearest(known: list[int], count: int) -> list[int]:
     """For each of 0 to `count` - 1 the nearest of the ascending indices `known`; the lower one of two equally near."""
     spots = np.array(known)
-    every = np.arange(count)
-    above = np.searchsorted(spots, every).clip(0, len(spots) - 1)
+    indices = np.arange(count)
+    above = np.searchsorted(spots, indices).clip(0, len(spots) - 1)
     below = (above - 1).clip(0)
-    return np.where(every - spots[below] <= spots[above] - every, spots[below], spots[above]).tolist()
+    return np.where(indices - spots[below] <= spots[above] - indices, spots[below], spots[above]).tolist()
 
 
 def _centres(path: CameraPath) -> NDArray[np.float64]:
     return np.array([camera_centre(np.reshape(f.viewmat, (4, 4))) for f in path.frames])
 
 
-def _undistort_all(asked: Asked, lenses: list[int], maps: list[Path], into: Staged, report: Reporter) -> None:
+def _undistort_all(inputs: SolveInputs, lenses: list[int], maps: list[Path], into: Staged, report: Reporter) -> None:
     """Writes the undistorted frames and masks, one lens at a time, because a map takes 128 bytes per pixel."""
     done = 0
     for number, file in enumerate(maps):
-        rows = [frame for frame, lens in zip(asked.frames["frames"], lenses, strict=True) if lens == number]
+        rows = [frame for frame, lens in zip(inputs.frames["frames"], lenses, strict=True) if lens == number]
         if rows:
-            _undistort(asked, rows, file, into, (done, len(lenses)), report)
+            _undistort(inputs, rows, file, into, (done, len(lenses)), report)
         done += len(rows)
 
 
 def _undistort(
-    asked: Asked, listed: list[dict[str, Any]], file: Path, into: Staged, counts: tuple[int, int], report: Reporter
+    inputs: SolveInputs,
+    listed: list[dict[str, Any]],
+    file: Path,
+    into: Staged,
+    counts: tuple[int, int],
+    report: Reporter,
 ) -> None:
     """Writes the frames of one lens. `counts` holds the number of frames done before, and of all frames."""
     before, total = counts
     with np.load(file, allow_pickle=False) as data:
         where = data["where"]
     undistort = Undistorter(where)
-    of_frame = of_frames(undistort, where, display_of(load_frames(asked.shot)))
+    of_frame = of_frames(undistort, where, display_of(load_frames(inputs.shot)))
 
     def one(frame: dict[str, Any]) -> int:
-        pixels = read_frame(asked.shot.frames / frame["file"])
+        pixels = read_frame(inputs.shot.frames / frame["file"])
         write_png(into.frames / frame_file(frame["frame"], PICTURE), of_frame(pixels))
-        if asked.masks:
-            write_undistorted(asked.masks, frame["frame"], undistort, into.solve)
+        if inputs.masks:
+            write_undistorted(inputs.masks, frame["frame"], undistort, into.solve)
         return frame["frame"]
 
     with ThreadPoolExecutor(_WRITERS) as pool:
@@ -252,7 +259,7 @@ def _result(
 
 
 def _warnings(
-    frames: dict[str, Any], path: CameraPath, result: SolveResult, given: bool = False
+    frames: dict[str, Any], path: CameraPath, result: SolveResult, is_imported: bool = False
 ) -> list[tuple[str, str]]:
     warnings: list[tuple[str, str]] = []
     lost = [
@@ -260,7 +267,7 @@ def _warnings(
         for camera, frame in zip(path.frames, frames["frames"], strict=True)
         if frame["solve"] and camera.source != "registered"
     ]
-    if lost and not given:  # missing imported cameras were reported when the file was matched
+    if lost and not is_imported:  # missing imported cameras were reported when the file was matched
         warnings.append(
             (
                 f"The mapper did not register {len(lost)} solved frames: {frame_words(lost)}.",
@@ -269,15 +276,15 @@ def _warnings(
         )
     guessed = [i for i, camera in enumerate(path.frames) if camera.source == "interpolated"]
     placed = [i for i, camera in enumerate(path.frames) if camera.source != "interpolated"]
-    held = [path.frames[i].frame for i in guessed if i < placed[0] or i > placed[-1]]
-    if held:
+    clamped = [path.frames[i].frame for i in guessed if i < placed[0] or i > placed[-1]]
+    if clamped:
         warnings.append(
             (
-                f"The camera holds its pose in {frame_words(held)}, beyond the last frame that was placed.",
+                f"The camera holds its pose in {frame_words(clamped)}, beyond the last frame that was placed.",
                 "Cut them off.",
             )
         )
     if result["reprojection_error_px"] > FAIR_ERROR_PX:
-        hint = "Are they of this clip and its lens?" if given else "Try the OPENCV camera model."
+        hint = "Are they of this clip and its lens?" if is_imported else "Try the OPENCV camera model."
         warnings.append(("The reprojection error is high: the picture will be soft.", hint))
     return warnings

@@ -132,38 +132,38 @@ def solve_with_retries(
     return RetriedSolve(best, tries)
 
 
-def next_strategy(best: Attempt, asked: dict[str, Any], done: set[str]) -> Strategy | None:
+def next_strategy(best: Attempt, request: dict[str, Any], done: set[str]) -> Strategy | None:
     """The strategy to try after the `best` attempt so far, or None if none can help.
 
-    `asked` is the last request, `done` the names of the strategies that were tried.
+    `request` is the last request, `done` the names of the strategies that were tried.
     """
     fault = best.fault
     if fault is None or fault.kind in ("still", "turning", "narrow"):
         return None
-    more = round(MORE_FEATURES * asked["features"])
+    more = round(MORE_FEATURES * request["features"])
     features = Strategy(
         "features", f"up to {more} features a frame, faint ones too", {"features": more, "peak": FAINT_PEAK}
     )
-    pairs = None if asked.get("wide") else Strategy("pairs", "more frames matched with each other", {"wide": True})
+    pairs = None if request.get("wide") else Strategy("pairs", "more frames matched with each other", {"wide": True})
     mapper = Strategy("global", "all cameras placed at once (global mapper)", {"mapper": "global"})
     free: list[Strategy | None] = [None]
-    if asked.get("start_focal_px") and not asked.get("focal_px"):
+    if request.get("start_focal_px") and not request.get("focal_px"):
         free = [Strategy("focal", "no focal length to begin with (the file's may be of the whole sensor)", NO_FOCAL)]
     if "failure" in best.answer:
         strategies = [*free, features, pairs]
     elif fault.kind == "bent":
-        strategies = [*free, _other_lens(best, asked)]
+        strategies = [*free, _lens_strategy(best, request)]
     elif fault.kind == "lens" or best.share >= FAIR_SHARE:
-        strategies = [*free, _other_lens(best, asked), pairs]
+        strategies = [*free, _lens_strategy(best, request), pairs]
     else:
-        strategies = [*free, features, pairs, _other_lens(best, asked), mapper]
+        strategies = [*free, features, pairs, _lens_strategy(best, request), mapper]
     return next((strategy for strategy in strategies if strategy is not None and strategy.name not in done), None)
 
 
-def _other_lens(best: Attempt, asked: dict[str, Any]) -> Strategy | None:
+def _lens_strategy(best: Attempt, request: dict[str, Any]) -> Strategy | None:
     """Strategy with another lens model; a fisheye only if the solve looks like one."""
-    model = asked["camera_model"]
-    if model == FISHEYE or asked.get("hold_bend") or "failure" in best.answer:
+    model = request["camera_model"]
+    if model == FISHEYE or request.get("hold_bend") or "failure" in best.answer:
         return None
     if like_a_fisheye(best.answer["result"]):
         return Strategy("lens", "the lens of a fisheye (OPENCV_FISHEYE)", {"camera_model": FISHEYE}, stays=False)

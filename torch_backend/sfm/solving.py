@@ -36,8 +36,8 @@ from ..lens.undistort_first import UndistortedFrames
 from ..replacing import replacing_solve, settle_solve
 from ..shot import Shot, content_key, make_folder, need_disk, write_json
 from .imported_cameras import prepare, take_over
-from .masks import facts_of, given_masks, more_features, wants_wide, write_matching
-from .results import SOLVE_VERSION, Asked, SolveResult, write_results
+from .masks import facts_of, more_features, needs_wide, recorded_masks, write_matching
+from .results import SOLVE_VERSION, SolveInputs, SolveResult, write_results
 from .retries import solve_with_retries
 
 _LOG_END_BYTES = 16_384
@@ -109,14 +109,16 @@ def solve_shot(shot: Shot, config: SolveConfig, report: Reporter, cameras: str =
         report.progress("solve", 1, 1, "already solved")
         result = SolveResult(**done["result"])
     else:
-        result = _solved_anew(Asked(shot, frames, masks, _facts(shot, config, masks, key)), config, cameras, report)
+        result = _solved_anew(
+            SolveInputs(shot, frames, masks, _facts(shot, config, masks, key)), config, cameras, report
+        )
     report.metric(CAMERAS_KNOWN, dict(result))
     return result
 
 
-def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Reporter) -> SolveResult:
+def _solved_anew(inputs: SolveInputs, config: SolveConfig, cameras: str, report: Reporter) -> SolveResult:
     """Solves, and replaces the files of the earlier solve."""
-    shot, frames = asked.shot, asked.frames
+    shot, frames = inputs.shot, inputs.frames
     imported_cameras = prepare(frames, cameras, report) if cameras else None
     lens = _lens_of_map(config, frames, report)
     _refuse_damaged(shot, frames)
@@ -129,13 +131,13 @@ def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Report
     make_folder(scratch)
     try:
         if imported_cameras is None:
-            answer, left = _mapped(asked, config, lens, scratch, report)
+            answer, left = _mapped(inputs, config, lens, scratch, report)
         else:
-            options = _matching(frames, config, asked.masks, scratch)
+            options = _matching(frames, config, inputs.masks, scratch)
             answer, left = take_over(shot, frames, imported_cameras, options, scratch, report), scratch
         had_maps = any((shot.solve / name).is_file() for name in STMAP_FILES)
         with replacing_solve(shot) as staged:
-            result = write_results(asked, answer, left, staged, report)
+            result = write_results(inputs, answer, left, staged, report)
             _mark_motion_unfinished(shot)
     except JobError as error:
         error.add_note(_log_end(shot.colmap_log))
@@ -148,12 +150,12 @@ def _solved_anew(asked: Asked, config: SolveConfig, cameras: str, report: Report
 
 
 def _mapped(
-    asked: Asked, config: SolveConfig, lens: MapLens | None, scratch: Path, report: Reporter
+    inputs: SolveInputs, config: SolveConfig, lens: MapLens | None, scratch: Path, report: Reporter
 ) -> tuple[dict[str, Any], Path]:
     """COLMAP's answer, and the folder of its files."""
-    shot, frames = asked.shot, asked.frames
+    shot, frames = inputs.shot, inputs.frames
     undistorted = None if lens is None else UndistortedFrames(shot, frames, lens, scratch / "straight", report)
-    request = _request(shot, frames, config, asked.masks, scratch, undistorted)
+    request = _request(shot, frames, config, inputs.masks, scratch, undistorted)
     outcome = solve_with_retries(request, frames, config.retry, scratch, shot.colmap_log, report)
     answer = {**outcome.best.answer["result"], "rung": outcome.best.strategy, "tries": outcome.tries}
     if undistorted is not None:
@@ -251,16 +253,16 @@ def _finished(shot: Shot, frames: dict[str, Any], key: str) -> dict[str, Any] | 
         return None
     numbers = [f["frame"] for f in frames["frames"]]
     plates = [shot.plate(n) for n in numbers]
-    plates += [shot.mask(kind, n) for kind in given_masks(shot) for n in numbers]
+    plates += [shot.mask(kind, n) for kind in recorded_masks(shot) for n in numbers]
     return record if all(is_whole_png(p) for p in plates) else None
 
 
 def _refuse_damaged(shot: Shot, frames: dict[str, Any]) -> None:
     """Raises JobError (FOOTAGE) if a frame cannot be read: COLMAP would skip it and report that only in its log."""
-    bad = [f["frame"] for f in frames["frames"] if not is_whole_png(shot.frames / f["file"])]
-    if bad:
+    damaged = [f["frame"] for f in frames["frames"] if not is_whole_png(shot.frames / f["file"])]
+    if damaged:
         raise JobError(
-            f"Damaged or missing in {shot.raw}: {frame_words(bad)}.",
+            f"Damaged or missing in {shot.raw}: {frame_words(damaged)}.",
             "Import the clip again.",
             ExitCode.FOOTAGE,
         )
@@ -280,7 +282,7 @@ def _matching(
     folder = scratch / "not_matched"
     write_matching(masks, {f["frame"]: Path(f["file"]).name for f in frames["frames"]}, folder, undistort)
     options |= {"features": round(config.features * more_features(masks)), "masks": str(folder)}
-    return {**options, "wide": True} if wants_wide(masks) else options
+    return {**options, "wide": True} if needs_wide(masks) else options
 
 
 def _focal_of_file(frames: dict[str, Any]) -> float:

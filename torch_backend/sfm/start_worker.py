@@ -18,8 +18,8 @@ def main(path: str) -> int:
     try:
         from . import worker
     except Exception as error:  # a half-written package can raise any exception
-        ours = isinstance(error, ImportError) and (error.name or "").startswith("torch_backend")
-        if ours or isinstance(error, MemoryError):
+        is_ours = isinstance(error, ImportError) and (error.name or "").startswith("torch_backend")
+        if is_ours or isinstance(error, MemoryError):
             raise
         traceback.print_exc()
         message = str(error) if isinstance(error, ImportError) else f"{type(error).__name__}: {error}"

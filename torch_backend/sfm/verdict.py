@@ -97,11 +97,13 @@ def fault_of(answer: dict[str, Any], frames: dict[str, Any]) -> Fault | None:
     return None
 
 
-def quality_words(registered: int, solved: int, error_px: float, given: bool = False, misled: bool = False) -> str:
+def quality_words(
+    registered: int, solved: int, error_px: float, is_imported: bool = False, misled: bool = False
+) -> str:
     """One sentence: Good, Fair or Poor, and the figures.
 
-    `given` means imported cameras, which the sentence mentions. `misled` means a flat scene or a zooming lens: the
-    solve is Poor however well its points fit.
+    `is_imported` means imported cameras, which the sentence mentions. `misled` means a flat scene or a zooming lens:
+    the solve is Poor however well its points fit.
     """
     share = registered / max(1, solved)
     if misled:
@@ -110,7 +112,7 @@ def quality_words(registered: int, solved: int, error_px: float, given: bool = F
         word = "Good"
     else:
         word = "Fair" if share >= FAIR_SHARE and error_px <= FAIR_ERROR_PX else "Poor"
-    if given:
+    if is_imported:
         return f"{word}: cameras given for {registered} of {solved} frames, {error_px:.2f} px."
     return f"{word}: {registered} of {solved} frames registered, {error_px:.2f} px."
 
@@ -161,12 +163,12 @@ def _too_few(found: dict[str, Any], solved: list[dict[str, Any]], step: int) -> 
     numbers = [f["frame"] for f in solved]
     parts = [_spans(numbers, part) for part in found["parts"] if len(part) >= LEAST_REGISTERED]
     worked = f": {_span_words(parts[0])}" if parts else ""
-    apart = f"; {len(parts)} parts of the clip do not connect" if len(parts) > 1 else ""
+    split = f"; {len(parts)} parts of the clip do not connect" if len(parts) > 1 else ""
     why = _smeared_words(solved, {int(Path(name).stem) for part in found["parts"] for name in part})
     shaken = f"; {why}" if why else ""
     return _fault(
         "few",
-        f"Cameras were found for only {found['registered']} of {len(solved)} frames{worked}{apart}{shaken}.",
+        f"Cameras were found for only {found['registered']} of {len(solved)} frames{worked}{split}{shaken}.",
         _range_hint(parts, numbers, step),
     )
 

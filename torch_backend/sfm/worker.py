@@ -26,19 +26,19 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from ..contract import own_input
+from ..contract import detach_standard_input
 from ..lens.lens_verdict import angle_deg, bends_of, impossible
 from . import colmap_types as colmap
 from .answers import focal_changes, write_answers, write_points, write_undistortion
 from .mapping import (
     agreement,
-    as_good,
     build,
     first_camera,
+    is_as_good,
     left_bend,
     lens_doubt,
     lens_of,
-    posed,
+    registered_images,
     triangulate,
     triangulation_angle,
 )
@@ -50,7 +50,7 @@ from .request import SEED, Request, say
 
 def main(path: str) -> int:
     """Runs the request and returns 0. A failed solve is reported with `say`; any other error raises."""
-    threading.Thread(target=_die_with_parent, args=(own_input(),), daemon=True).start()
+    threading.Thread(target=_die_with_parent, args=(detach_standard_input(),), daemon=True).start()
     request = Request(Path(path))
     pycolmap.set_random_seed(SEED)
     if request.match:
@@ -73,14 +73,14 @@ def main(path: str) -> int:
         say(failure="turning" if only_rotates(request) else "no_pair", **vars(shared))
         return 0
     doubt = lens_doubt(request, models[0])
-    first, held = first_camera(models[0]), False
+    first, is_fixed = first_camera(models[0]), False
     if doubt:
-        again = build(request, hold_lens=True)
-        held = bool(again) and as_good(again[0], models[0])
-        models = again if held else models
+        retried = build(request, hold_lens=True)
+        is_fixed = bool(retried) and is_as_good(retried[0], models[0])
+        models = retried if is_fixed else models
     poses = localise(request, models[0])
     write_answers(request, models[0], poses)
-    lens = {"doubt": doubt, "held": held, **_found(request, first, models[0])}
+    lens = {"doubt": doubt, "held": is_fixed, **_found(request, first, models[0])}
     result = _result(models, len(poses))
     say(result={**result, "flow_px": shared.flow_px, "turning": only_rotates(request), "lens": lens})
     return 0
@@ -91,7 +91,7 @@ def _result(models: list[pycolmap.Reconstruction], placed: int) -> dict[str, Any
     model, camera = models[0], first_camera(models[0])
     return {
         "registered": model.num_reg_images(),
-        "parts": [sorted(image.name for image in posed(m)) for m in models],
+        "parts": [sorted(image.name for image in registered_images(m)) for m in models],
         "reprojection_error_px": model.compute_mean_reprojection_error(),
         "points": model.num_points3D(),
         "triangulation_angle_deg": triangulation_angle(model),
@@ -152,8 +152,8 @@ def take_over(request: Request, known: dict[str, Any]) -> int:
     return 0
 
 
-def _die_with_parent(told: int) -> None:
+def _die_with_parent(pipe: int) -> None:
     # Unbuffered, because at exit the interpreter cannot close a buffer that a thread is still reading.
-    while os.read(told, 64):
+    while os.read(pipe, 64):
         pass
     os._exit(1)

@@ -27,7 +27,7 @@ from ..motion.mattes import load_motion, motion_key
 from ..native import default_threads
 from ..raster import cpu as raster_cpu
 from ..raster import ssim
-from ..scene import HELD_BYTES, Scene, load_scene, split_frames
+from ..scene import IMAGE_MEMORY_BYTES, Scene, load_scene, split_frames
 from ..sfm.masks import IGNORE, load_mask
 from ..shot import Shot, need_disk, remove_file, write_json
 from . import adam
@@ -261,7 +261,7 @@ def place_images(images: Tensor, device: torch.device, plan: MemoryPlan | None) 
         return images
     if plan.on_card:
         return images.to(device)
-    return images.pin_memory() if images.nbytes <= HELD_BYTES else images
+    return images.pin_memory() if images.nbytes <= IMAGE_MEMORY_BYTES else images
 
 
 def checkpoint_bytes(config: TrainConfig) -> float:

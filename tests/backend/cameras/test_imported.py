@@ -281,16 +281,16 @@ def test_points_without_tracks_count_the_pictures_they_lie_in():
         "seen": [np.zeros(0, np.int64)] * 3,
     }
     matched = imported.Matched({n: c for n, c in enumerate(solve.cameras)}, [])
-    points = imported.own_points(solve, matched, (200, 200))
+    points = imported.stored_points(solve, matched, (200, 200))
     assert points is not None
     assert points["track"].tolist() == [2, 0, 2]
     assert points["depth"].tolist() == [4.0, -np.inf, 3.0]
     assert points["error"].tolist() == [2.0, 4.0, 0.0]
     solve.points["seen"] = [np.array([0, 2]), np.array([1]), np.zeros(0, np.int64)]
-    told = imported.own_points(solve, matched, (200, 200))
+    told = imported.stored_points(solve, matched, (200, 200))
     assert told is not None and told["track"].tolist() == [2, 1, 0]
     assert float(told["angle"]) == pytest.approx(math.degrees(math.atan(0.75)))
-    assert imported.own_points(fake_solve(3), matched, (200, 200)) is None
+    assert imported.stored_points(fake_solve(3), matched, (200, 200)) is None
 
 
 def test_what_blender_says_of_a_camera_of_its_scene_is_believed(tmp_path):

@@ -216,5 +216,5 @@ def test_a_camera_path_comes_in_by_its_frame_numbers(tmp_path):
     file.write_text(json.dumps(CameraPath(640, 480, frames).to_json()))
     solve = imported.read(file)
     matched = imported.match(solve, Counted(list(range(2, 13))), (320, 240))
-    assert solve.kind == "camera path" and matched.missing == [12] and not matched.said
+    assert solve.kind == "camera path" and matched.missing == [12] and not matched.notes
     assert solve.lenses[0].scaled(320, 240).params == (200.0, 200.0, 160.0, 120.0)

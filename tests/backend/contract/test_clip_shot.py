@@ -4,12 +4,12 @@ import pytest
 
 from torch_backend.contract import (
     JobError,
+    default_shot_folder,
     is_imported_from,
     readable_stem,
-    shot_beside,
     write_json,
 )
-from torch_backend.contract.clip_shot import refuse_anothers
+from torch_backend.contract.clip_shot import check_same_clip
 
 
 def imported(folder, source, beside=None):
@@ -23,13 +23,13 @@ def test_clips_of_one_stem_have_shots_of_their_own_whatever_was_imported_before(
     found = {}
     for clip in clips:
         clip.touch()
-        found[clip] = shot_beside(clip)
+        found[clip] = default_shot_folder(clip)
         imported(found[clip], clip, f"../{clip.name}")
     assert len(set(found.values())) == len(clips) and found[clips[0]] == tmp_path / "a.splannequin"
-    assert {clip: shot_beside(clip) for clip in reversed(clips)} == {c: found[c] for c in clips}
+    assert {clip: default_shot_folder(clip) for clip in reversed(clips)} == {c: found[c] for c in clips}
     imported(tmp_path / "a.mov.splannequin", tmp_path / "elsewhere.mov")
     imported(tmp_path / "a.splannequin", clips[1], "../a.mp4")
-    assert shot_beside(clips[0]) not in [tmp_path / "a.splannequin", tmp_path / "a.mov.splannequin"]
+    assert default_shot_folder(clips[0]) not in [tmp_path / "a.splannequin", tmp_path / "a.mov.splannequin"]
 
 
 def test_a_shot_that_was_moved_with_its_clip_is_of_the_clip_and_one_beside_a_namesake_is_not(tmp_path):
@@ -48,10 +48,10 @@ def test_a_shot_that_was_moved_with_its_clip_is_of_the_clip_and_one_beside_a_nam
 def test_a_shot_of_another_clip_is_refused_in_words(tmp_path):
     imported(tmp_path / "shot.splannequin", tmp_path / "a.mp4")
     (tmp_path / "a.mp4").touch()
-    refuse_anothers(tmp_path / "shot.splannequin", tmp_path / "a.mp4")
-    refuse_anothers(tmp_path / "none.splannequin", tmp_path / "a.mp4")
+    check_same_clip(tmp_path / "shot.splannequin", tmp_path / "a.mp4")
+    check_same_clip(tmp_path / "none.splannequin", tmp_path / "a.mp4")
     with pytest.raises(JobError, match="is the shot of another clip: .*a.mp4"):
-        refuse_anothers(tmp_path / "shot.splannequin", tmp_path / "b.mp4")
+        check_same_clip(tmp_path / "shot.splannequin", tmp_path / "b.mp4")
 
 
 @pytest.mark.parametrize(

@@ -129,8 +129,8 @@ def test_who_runs_from_a_folder_is_told_by_its_command(tmp_path):
 
 READER = """
 import os, subprocess, sys
-from torch_backend.contract import own_input
-taken = own_input()
+from torch_backend.contract import detach_standard_input
+taken = detach_standard_input()
 child = subprocess.run([sys.executable, "-c", "import os; print(os.read(0, 3))"], stdout=subprocess.PIPE, text=True)
 print(os.read(0, 3), child.stdout.strip(), os.read(taken, 3))
 """

@@ -34,7 +34,7 @@ def test_the_number_is_the_one_that_counts_the_frames(template, pattern):
     (found,) = numbered_files(reversed(names))
     assert (found.pattern, found.twice) == (pattern, None)
     assert list(found.files.items()) == list(zip(FRAMES, names))
-    assert found.others_vary == ("*" in pattern)
+    assert found.has_second_number == ("*" in pattern)
 
 
 def test_endings_of_one_format_make_one_sequence():

@@ -125,13 +125,13 @@ def test_words_that_are_handed_on_are_read_as_they_were_said(tmp_path):
         session_tasks=2,
     )  # fmt: skip
     for whole in (words, contract.FarmWords(shots=["/one"], output="/out", t_star=None)):
-        said = contract.said_of(whole)
+        said = contract.arguments_of(whole)
         assert contract.words_of(cli.parser().parse_args(["farm", *said])) == whole
     assert said == ["export", "/one", "--output=/out"], "what is as by default is not said"
     words_of_export = contract.ExportWords(
         shot="/a b.splannequin", format="usd", text=True, take="late", placement="/p.json", output="/out"
     )
-    read = contract.words_of(cli.parser().parse_args(["export", *contract.said_of(words_of_export)]))
+    read = contract.words_of(cli.parser().parse_args(["export", *contract.arguments_of(words_of_export)]))
     assert read == words_of_export
     unchanged = [one.name for one in dataclasses.fields(read) if getattr(read, one.name) == one.default]
     assert unchanged == [], "each of them was asked about"

@@ -9,8 +9,8 @@ from torch_backend.contract import (
     ShotFolder,
     ShotSize,
     SolveParams,
+    TotalProgress,
     TrainParams,
-    WholeWay,
     duration,
     expected_seconds,
     learn_pace,
@@ -106,7 +106,7 @@ def run(way, jobs, step=1.0):
 
 
 def test_jobs_as_expected_make_an_even_bar_with_a_true_estimate():
-    way = WholeWay({"solve": 50.0, "train": 60.0, "freeze": 40.0}, spent=10.0)
+    way = TotalProgress({"solve": 50.0, "train": 60.0, "freeze": 40.0}, spent=10.0)
     jobs = [("solve", 50.0, True), ("train", 60.0, False), ("freeze", 40.0, True)]
     for clock, share, left in run(way, jobs):
         assert left == pytest.approx(150.0 - clock, abs=8.0)  # a job without an estimate does not announce its end
@@ -114,7 +114,7 @@ def test_jobs_as_expected_make_an_even_bar_with_a_true_estimate():
 
 
 def test_on_a_machine_that_is_twice_as_slow_the_estimate_comes_right_with_the_first_job():
-    way = WholeWay({"solve": 50.0, "train": 60.0, "freeze": 40.0})
+    way = TotalProgress({"solve": 50.0, "train": 60.0, "freeze": 40.0})
     shares = []
     for clock, share, left in run(way, [("solve", 100.0, True), ("train", 120.0, False), ("freeze", 80.0, True)]):
         shares.append(share)
@@ -123,7 +123,7 @@ def test_on_a_machine_that_is_twice_as_slow_the_estimate_comes_right_with_the_fi
 
 
 def test_work_that_was_done_before_does_not_make_what_follows_look_short():
-    way = WholeWay({"solve": 50.0, "train": 60.0, "freeze": 40.0})
+    way = TotalProgress({"solve": 50.0, "train": 60.0, "freeze": 40.0})
     assert way.at("solve", 0.1, None)[1] == pytest.approx(49.9 + 100.0)
     assert way.at("train", 0.0, None)[1] == pytest.approx(100.0)
     assert way.at("train", 2.0, 3.0)[1] == pytest.approx(43.0)  # it continues near its end
@@ -132,7 +132,7 @@ def test_work_that_was_done_before_does_not_make_what_follows_look_short():
 
 
 def test_a_job_that_outlasts_its_estimate_is_never_said_to_be_over():
-    way = WholeWay({"freeze": 40.0})
+    way = TotalProgress({"freeze": 40.0})
     last = 0.0
     for spent in range(0, 200, 10):
         share, left = way.at("freeze", float(spent), None)

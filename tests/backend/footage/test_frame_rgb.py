@@ -17,7 +17,7 @@ from torch_backend import contract
 from torch_backend.footage.frame_rgb import MATRIX_OVERRIDES, RANGE_OVERRIDES
 from torch_backend.footage.opening import open_source
 from torch_backend.footage.plate_encoding import display
-from torch_backend.footage.sources import Told
+from torch_backend.footage.sources import Overrides
 
 SHARES = {
     1: (0.2126, 0.0722),
@@ -315,7 +315,7 @@ def test_a_person_outdoes_the_file(tmp_path, frame_of_planes):
     true = Clip("ffv1", "yuv422p10le", 1, 2)
     codes, says = patch_codes(true), Clip("ffv1", "yuv422p10le", 6, 1)
     written(tmp_path / "a.mkv", says, frame_of_planes, codes)
-    source = open_source(str(tmp_path / "a.mkv"), told=Told("bt709", "full", Fraction(2)))
+    source = open_source(str(tmp_path / "a.mkv"), overrides=Overrides("bt709", "full", Fraction(2)))
     got = next(iter(source.frames(None, None))).pixels[8::16, 16::32] / 65535
     assert np.abs(got - reference(codes, true)).max() < 1 / 1023
     told = [source.info.reading[name] for name in ("matrix", "matrix_told", "range", "range_told", "pixel_aspect")]

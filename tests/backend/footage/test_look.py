@@ -9,7 +9,7 @@ from torch_backend.footage import plate_encoding
 from torch_backend.footage.images import read_png
 from torch_backend.footage.importing import FootageConfig, import_footage, load_frames
 from torch_backend.footage.opening import open_source
-from torch_backend.footage.sources import Known, told_in
+from torch_backend.footage.sources import Known, overrides_of
 from torch_backend.shot import Shot
 
 CURVE = np.linspace(0.0, 1.0, 33) ** 0.5
@@ -55,7 +55,7 @@ def test_frames_and_plates_are_seen_through_the_look(tmp_path, pan, write_video,
     working = read_png(shot.frames / record["frames"][3]["file"])
     assert working.dtype == (np.uint16 if kind == "pictures" else np.uint8)
     assert np.abs(working / np.iinfo(working.dtype).max - wanted).mean() < 0.01
-    opened = open_source(str(source), told=told_in(config))
+    opened = open_source(str(source), overrides=overrides_of(config))
     reader = opened.plates(Known({n: (n - 1) / 24 for n in range(1, 11)}, 0.0, lambda *_: True))
     assert np.abs(plate_encoding.display(reader.plate(4)) - wanted).mean() < 0.01
     reader.close()
@@ -66,8 +66,8 @@ def test_another_content_of_the_look_is_another_import(tmp_path, pan, write_vide
     write_video(tmp_path / "a.mp4", pan(8))
     keys = []
     for write in (write_1d, write_3d):
-        told = told_in(FootageConfig(lut=str(write(tmp_path / "look.cube"))))
-        keys.append(open_source(str(tmp_path / "a.mp4"), told=told).info.key)
+        told = overrides_of(FootageConfig(lut=str(write(tmp_path / "look.cube"))))
+        keys.append(open_source(str(tmp_path / "a.mp4"), overrides=told).info.key)
     assert keys[0] != keys[1]
 
 
@@ -87,11 +87,11 @@ def test_what_is_no_look_is_refused_in_one_sentence(tmp_path, pan, write_video, 
     if content is not None:
         (tmp_path / name).write_text(content)
     with pytest.raises(JobError) as caught:
-        open_source(str(tmp_path / "a.mp4"), told=told_in(FootageConfig(lut=str(tmp_path / name))))
+        open_source(str(tmp_path / "a.mp4"), overrides=overrides_of(FootageConfig(lut=str(tmp_path / name))))
     assert words in caught.value.message and "\n" not in caught.value.message
     assert caught.value.exit_code == ExitCode.FOOTAGE
 
 
 def test_a_look_and_a_colour_space_are_one_too_many():
     with pytest.raises(JobError, match="are both given"):
-        told_in(FootageConfig(lut="a.cube", colour_space="ACEScg"))
+        overrides_of(FootageConfig(lut="a.cube", colour_space="ACEScg"))

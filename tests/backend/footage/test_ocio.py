@@ -220,7 +220,7 @@ def test_plates_keep_to_the_configuration_of_the_import(tmp_path, monkeypatch, r
 
 def test_an_ocio_space_is_light():
     space = OcioSpace("lin", "", space="ACEScg", config=BUILT_IN)
-    assert space.is_light and not space.as_it_stands
+    assert space.is_light and not space.is_passthrough
     ap1 = np.array([[[0.3, 0.25, 0.2]]], np.float32)
     assert off(space.to_linear(ap1), InputSpace("lin", "ap1").to_linear(ap1)) < 1e-4
     assert PRIMARIES["ap1"][0] == "ACEScg (AP1)"

@@ -79,7 +79,7 @@ def test_a_matrix_that_is_none_of_the_eight_is_told_and_shows_the_picture_as_it_
         64,
         48,
     )
-    assert any("as they are stored" in message for message, _ in source.warnings) and source.info.unlike
+    assert any("as they are stored" in message for message, _ in source.warnings) and source.info.mismatch
 
 
 def test_a_matrix_that_only_enlarges_changes_nothing(tmp_path, pan, write_video):
@@ -126,7 +126,7 @@ def test_pictures_are_shown_by_their_exif_orientation(tmp_path, pan, code, suffi
     near = 6 if suffix == "jpg" else 1
     for pixels in [got[2].pixels, source.plates(Known({}, None, lambda *_: True)).plate(3)]:
         assert pixels.shape == wanted[2].shape and np.abs(pixels.astype(int) - wanted[2]).mean() < near
-    assert bool(source.info.unlike) == (code != 1)
+    assert bool(source.info.mismatch) == (code != 1)
 
 
 @pytest.mark.parametrize(("other", "words"), [(3, "turned by 180 degrees"), (6, "turned clockwise"), (2, "mirrored")])

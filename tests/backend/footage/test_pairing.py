@@ -74,7 +74,7 @@ def test_numbers_that_are_right_for_most_frames_are_not_pushed_onto_the_others(n
 def test_pictures_that_were_counted_anew_over_a_gap_are_taken_in_order():
     frames = [n for n in range(1, 102) if n != 50]
     paired = pair(range(1, 101), Counted(frames, (1, 101)), needs_all=True)
-    assert list(paired.numbers.values()) == list(range(1, 101)) and not paired.by_own_number
+    assert list(paired.numbers.values()) == list(range(1, 101)) and not paired.by_frame_number
 
 
 def test_numbers_that_no_count_explains_are_not_pushed_onto_the_frames():

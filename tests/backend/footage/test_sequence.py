@@ -120,7 +120,7 @@ def test_frames_come_in_their_order_whatever_stands_around_the_number(tmp_path, 
     asked = {"folder": folder, "file": folder / template.format(9), "pattern": folder / pattern}[how]
     source = open_source(str(asked))
     assert shades_of(source) == [(n + 5, n) for n in range(10)]
-    assert (source.info.reading["files"], source.warnings, source.info.unlike) == (pattern, [], "")
+    assert (source.info.reading["files"], source.warnings, source.info.mismatch) == (pattern, [], "")
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_endings_of_one_format_are_one_sequence_that_blender_does_not_find(tmp_p
     write_shades(tmp_path, [f"f_{n:04d}.{'tif' if n % 2 else 'TIFF'}" for n in range(10)])
     source = open_source(str(tmp_path))
     assert shades_of(source) == [(n, n) for n in range(10)]
-    assert source.info.unlike
+    assert source.info.mismatch
 
 
 @pytest.mark.parametrize(("first", "second"), [("left_{:04d}", "right_{:04d}"), ("s_v1_{:04d}", "s_v2_{:04d}")])
@@ -159,7 +159,7 @@ def test_a_second_number_that_varies_is_told_and_keeps_the_plate_out_of_blender(
     write_shades(tmp_path, [f"f_{n:04d}_t{n * 41}.png" for n in range(1, 9)])
     source = open_source(str(tmp_path))
     assert shades_of(source) == [(n + 1, n) for n in range(8)]
-    assert "read where # stands in f_####_t*.png." in said(source)[0] and source.info.unlike
+    assert "read where # stands in f_####_t*.png." in said(source)[0] and source.info.mismatch
 
 
 def test_numbers_of_which_either_may_count_the_frames_are_refused(tmp_path):
@@ -186,7 +186,7 @@ def test_whatever_openimageio_reads_is_a_sequence(tmp_path, pan, suffix):
         assert [f.number for f in frames] == [0, 1, 2]
         off = [np.abs(f.pixels.astype(int) - pixels).mean() for f, pixels in zip(frames, pictures)]
         assert max(off) < 3
-    assert bool(open_source(str(tmp_path)).info.unlike) == (suffix != "webp")
+    assert bool(open_source(str(tmp_path)).info.mismatch) == (suffix != "webp")
 
 
 def test_pictures_that_are_not_read_are_named_with_what_to_do(tmp_path, pan):
@@ -234,7 +234,7 @@ def test_animated_pictures_are_clips(tmp_path, pan, suffix):
         (tmp_path / "a1.apng").rename(tmp_path / "a1.png")
         write(tmp_path / "a2.png", flat(1, 2, 3, kind=np.uint8))
     source = open_source(str(tmp_path / f"a1.{suffix[-3:]}"))
-    assert source.info.unlike
+    assert source.info.mismatch
     assert [f.number for f in source.frames(None, None)] == [1, 2, 3, 4, 5, 6]
 
 

@@ -113,7 +113,7 @@ def test_interlaced_clips_become_whole_pictures_and_say_so(interlaced, top_first
         "The clip is interlaced: each frame becomes a whole picture of its first field."
     ]
     assert source.info.reading["interlaced"] and "deinterlaced" in source.info.key
-    assert source.info.unlike.startswith("it is interlaced")
+    assert source.info.mismatch.startswith("it is interlaced")
 
 
 def woven(frames, top_first=True):
@@ -134,7 +134,7 @@ def test_a_clip_that_is_interlaced_without_saying_so_becomes_whole_pictures(tmp_
     assert [w[0] for w in source.warnings] == [
         "The clip is interlaced, though it does not say so: each frame becomes a whole picture of its first field."
     ]
-    assert source.info.reading["interlaced"] and source.info.unlike.startswith("it is interlaced")
+    assert source.info.reading["interlaced"] and source.info.mismatch.startswith("it is interlaced")
     off = [np.abs(one.pixels.astype(int) - first)[4:-4].mean() for one, first in zip(got, frames[::2], strict=True)]
     assert max(off) < 1.0, max(off)
     reader = source.plates(Known({f.number: f.seconds for f in got}, 0.0, lambda number, plate: True))
@@ -352,11 +352,11 @@ def test_which_of_two_streams_is_read_is_said_and_the_other_can_be_named(two_str
             "Name another by its number (--layer): 1 (64x48), 2 (64x48).",
         )
     ]
-    assert close(got[0].pixels, firsts[0], 2) and not source.info.unlike
+    assert close(got[0].pixels, firsts[0], 2) and not source.info.mismatch
     other = open_source(str(path), layer="2")
     assert close(next(other.frames(None, None)).pixels, firsts[1], 2) and not other.warnings
     reader = other.plates(Known({n: (n - 1) / 24 for n in range(1, 9)}, 0.0, lambda *_: True))
-    assert close(reader.plate(1), firsts[1], 2) and "several video streams" in other.info.unlike
+    assert close(reader.plate(1), firsts[1], 2) and "several video streams" in other.info.mismatch
     reader.close()
     with pytest.raises(JobError, match="a.mov has no video stream '3'"):
         open_source(str(path), layer="3")

@@ -8,7 +8,7 @@ import pytest
 
 from tests.backend.footage.test_video import decoded
 from torch_backend.footage.opening import open_source
-from torch_backend.footage.sources import Told
+from torch_backend.footage.sources import Overrides
 
 PATCHES = np.array([[0.2, 0.2, 0.2], [0.5, 0.4, 0.3], [0.35, 0.5, 0.45], [0.3, 0.35, 0.55]])
 """R'G'B' of four vertical stripes."""
@@ -162,4 +162,4 @@ def test_what_other_programs_would_show_otherwise_is_known(tmp_path, write_video
     write_video(
         tmp_path / "a.mp4", frames, **made, **({"x264-params": "colormatrix=bt709"} if "colorspace" in tags else {})
     )
-    assert open_source(str(tmp_path / "a.mp4"), told=Told(**told)).info.unlike == unlike
+    assert open_source(str(tmp_path / "a.mp4"), overrides=Overrides(**told)).info.mismatch == unlike

@@ -42,8 +42,8 @@ def disc(radius: float) -> np.ndarray:
 
 def moving(frame: np.ndarray, shown: np.ndarray, others: list[Sight]) -> np.ndarray:
     config = MisfitConfig()
-    unlike = misfit(sight(frame), INVERSE, shown, others, GRID, UNIT, config)
-    return seeded(unlike > config.weak, unlike > config.strong, 12)
+    difference = misfit(sight(frame), INVERSE, shown, others, GRID, UNIT, config)
+    return seeded(difference > config.weak, difference > config.strong, 12)
 
 
 def around(sigma: float = 0.0, gain: float = 1.0) -> list[Sight]:

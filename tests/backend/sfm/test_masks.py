@@ -16,11 +16,11 @@ from torch_backend.replacing import replacing_solve
 from torch_backend.sfm.masks import (
     IGNORE,
     PEOPLE,
-    given_masks,
     limited,
     load_mask,
     masks_key,
     painted_over,
+    recorded_masks,
     write_matching,
 )
 from torch_backend.sfm.solving import SolveConfig, _matching, solve_shot
@@ -117,7 +117,7 @@ def test_a_solve_without_masks_leaves_none_behind(masked, tmp_path):
     assert copy.mask(PEOPLE, 101).is_file()
     with replacing_solve(copy) as staged:
         (staged.solve / "solve.json").write_text("{}")
-    assert not copy.mask(PEOPLE, 101).is_file() and given_masks(copy) == {} and masks_key(copy) == []
+    assert not copy.mask(PEOPLE, 101).is_file() and recorded_masks(copy) == {} and masks_key(copy) == []
 
 
 def test_a_mask_that_went_missing_is_named(masked, tmp_path):

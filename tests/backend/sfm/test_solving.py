@@ -382,8 +382,8 @@ def test_a_worker_that_is_stopped_with_its_job_is_no_failure(tmp_path, tools, mo
 
 
 def test_a_worker_ends_with_its_parent(tmp_path):
-    code = "import time\nfrom torch_backend.sfm.worker import _die_with_parent, own_input\n"
-    code += "_die_with_parent(own_input())\ntime.sleep(60)"
+    code = "import time\nfrom torch_backend.sfm.worker import _die_with_parent, detach_standard_input\n"
+    code += "_die_with_parent(detach_standard_input())\ntime.sleep(60)"
     worker = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, cwd=ROOT)
     assert worker.poll() is None
     worker.stdin.close()

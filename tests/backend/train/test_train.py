@@ -49,13 +49,13 @@ def short(world, name, **changes):
 
 def test_frames_too_many_for_the_memory_train_the_same_run_from_a_file_that_nobody_sees(world, quiet, monkeypatch):
     train_shot(world.shot, short(world, "held"), quiet())
-    monkeypatch.setattr(torch_backend.scene, "HELD_BYTES", 0)
+    monkeypatch.setattr(torch_backend.scene, "IMAGE_MEMORY_BYTES", 0)
     scene, folder = load_scene(world.shot), world.shot.run("mapped")
     train_shot(world.shot, short(world, "mapped"), quiet())
     held, _ = load_checkpoint(world.shot.run("held") / "checkpoint.safetensors")
     mapped, _ = load_checkpoint(folder / "checkpoint.safetensors")
     assert all(torch.equal(value, mapped[name]) for name, value in held.items())
-    images = load_images(scene, scene.solved, 64, 48, beside=folder)
+    images = load_images(scene, scene.solved, 64, 48, folder=folder)
     assert torch.equal(images, load_images(scene, scene.solved, 64, 48))
     assert {path.name for path in folder.iterdir()} == {path.name for path in world.shot.run("held").iterdir()}
     maps = Path("/proc/self/maps")
@@ -64,10 +64,10 @@ def test_frames_too_many_for_the_memory_train_the_same_run_from_a_file_that_nobo
 
 
 def test_frames_that_no_disk_holds_are_refused_in_a_sentence(world, monkeypatch):
-    monkeypatch.setattr(torch_backend.scene, "HELD_BYTES", 0)
+    monkeypatch.setattr(torch_backend.scene, "IMAGE_MEMORY_BYTES", 0)
     scene = load_scene(world.shot)
     with pytest.raises(JobError, match=r"No space left in .*Frames for the training.* needs about \d+ MB"):
-        load_images(scene, scene.solved, 1_000_000, 1_000_000, beside=world.shot.root)
+        load_images(scene, scene.solved, 1_000_000, 1_000_000, folder=world.shot.root)
 
 
 def test_cancel_and_resume_end_exactly_where_an_unbroken_run_does(world, quiet):

@@ -35,7 +35,7 @@ def footage_facts(shot: Shot, take: Path) -> dict[str, Any]:
     info, lens = plates.original(), plates.lens()
     if info is None:
         return {}
-    reason = info.unlike or _unsteady(shot, info.fps) or ("its lens changes between frames" if lens is None else "")
+    reason = info.mismatch or _unsteady(shot, info.fps) or ("its lens changes between frames" if lens is None else "")
     shift = recorded_shift(load_frames(shot))
     facts = {
         "file": os.path.abspath(info.file),

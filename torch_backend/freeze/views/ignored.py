@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from ...sfm.masks import IGNORE, given_masks, load_mask
+from ...sfm.masks import IGNORE, load_mask, recorded_masks
 from ...shot import Shot
 from ...torch_types import from_numpy
 
@@ -16,7 +16,7 @@ IgnoredOf = Callable[[int], "Tensor | None"]
 
 def ignore_mattes(shot: Shot) -> IgnoredOf:
     """The ignored pixels of a shot's plates, as an `IgnoredOf`."""
-    if IGNORE not in given_masks(shot):
+    if IGNORE not in recorded_masks(shot):
         return lambda frame: None
 
     def ignored(frame: int) -> Tensor | None:
