@@ -200,8 +200,8 @@ def load_images(
 ) -> Tensor:
     """Working frames `indices` at a training size, [I, height, width, 3] float16 in [0, 1] of the scene's display.
 
-    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `IMAGE_MEMORY_BYTES` of images
-    are mapped from an unnamed file in `folder`, unless that is None. The file vanishes with the process.
+    float16 keeps more than 8 bits over [0, 1] and halves the memory of a long clip. More than `IMAGE_MEMORY_BYTES` of
+    images are mapped from an unnamed file in `folder`, unless that is None. The file vanishes with the process.
     JobError if the disk has no room for it.
 
     Several frames are decoded at a time. `read` replaces the decoder: index into `Scene.frames` -> [height, width, 3]

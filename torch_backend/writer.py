@@ -224,7 +224,7 @@ def _take_over(path: Path, dead: Writer, writer: Writer) -> bool:
 
 
 def _release(root: Path, writer: Writer, folder: int | None) -> None:
-    """Removes the lock if it is `writer`. `folder`, a handle of the shot folder, finds a lock even in a renamed shot."""
+    """Removes the lock if it is `writer`. `folder`, a handle of the shot folder, finds it even in a renamed shot."""
     path = Path(contract.WRITER_FILE) if folder is not None else root / contract.WRITER_FILE
     for _ in range(40):
         try:

@@ -28,7 +28,7 @@ def is_imported_from(
     Args:
         folder: shot folder.
         clip: absolute path.
-        told: (file, name, most bytes) -> value under a name in a JSON file; empty if the file cannot be read.
+        read_field: (file, name, most bytes) -> value under a name in a JSON file; empty if the file cannot be read.
     """
     read_field = read_field or json_field
     source = read_field(ShotFolder(folder).info_path, "source", SHORT_JSON)

@@ -176,8 +176,8 @@ def _rule(text: str) -> str:
 
 
 def _marked_rule(stem: str, marks: list[re.Match[str]], number: re.Match[str], wildcard: str | None) -> re.Pattern[str]:
-    """Regular expression for stems of names, with `number` as a group. `wildcard`: expression for the other placeholders,
-    None: literal."""
+    """Regular expression for stems of names, with `number` as a group. `wildcard`: expression for the remaining
+    placeholders, None: literal."""
     parts: list[str] = []
     at = 0
     for mark in marks:

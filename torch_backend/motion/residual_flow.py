@@ -95,7 +95,7 @@ class ResidualFlow:
         return float(np.clip(self._config.unusual * noise, least, self._config.most_left * least))
 
     def _left(self, key: int, neighbour: int, at: tuple[Map, Map], within: Mask) -> Map:
-        """[h, w, 2] flow from a key frame to `neighbour` warped onto it. `at` are the key's still points in `neighbour`."""
+        """[h, w, 2] flow from a key frame to `neighbour` warped onto it. `at` are the key's still points in it."""
         one = self._picture(key)
         x, y = (cv2.resize(p, one.shape[::-1], interpolation=cv2.INTER_LINEAR) - np.float32(0.5) for p in at)
         brought = cv2.remap(self._picture(neighbour), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
