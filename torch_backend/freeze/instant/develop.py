@@ -161,7 +161,7 @@ class _FineTuning:
             self._step(frame)
             if n >= steps // 2:
                 mean.add(self.params)
-        mean.put_into(self.params)
+        mean.copy_into(self.params)
 
     def _movers_alone(self, check: Callable[[int], None]) -> dict[str, Tensor]:
         """The state before training, except for movers, which are trained on plate t* alone.

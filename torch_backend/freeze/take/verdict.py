@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...contract import VERDICT_WORDS, Verdict
-from ...train.verdict import EXPLAINED, spans_of, where_words
+from ...train.verdict import EXPLAINED, span_text, spans_of
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def judge_take(
         word = "fair" if invented > limits.good_invented or places else "good"
     plate = _percent(float(detail["plate_share"]))
     sentences = [f"{plate} % of the picture is plate, {100 - plate} % is a guess."]
-    sentences += [f"Mostly a guess in {where_words(place)}." for place in places]
+    sentences += [f"Mostly a guess in {span_text(place)}." for place in places]
     worst = min(rows, key=lambda row: float(row["plate_share"]))
     if not places and 1.0 - float(worst["plate_share"]) >= limits.named:
         sentences.append(f"Most of it in frame {worst['frame']}: {_percent(1.0 - float(worst['plate_share']))} %.")

@@ -28,7 +28,7 @@ def world(tmp_path_factory, quiet):
 class Stays(Deformation):
     """No motion: the board stays at its position at T_STAR."""
 
-    def forward(self, means, times, own=None):
+    def forward(self, means, times, host_params=None):
         return Deltas(torch.tensor([board_at(T_STAR), 0.0, 0.0]).expand(len(means), 3))
 
 
