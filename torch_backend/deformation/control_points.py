@@ -228,7 +228,7 @@ class ControlPoints(Deformation):
         if times.shape[0] == 1:
             return self.places, self.node_motion(self.places, times), index
         if index.device.type != "cpu":
-            # Removing duplicates would synchronise with the GPU. `has_separate_calls` keeps the number of these rows small.
+            # Removing duplicates would synchronise with the GPU. `has_separate_calls` keeps these rows few.
             rows = torch.arange(index.numel(), device=index.device).view_as(index)
             places = self.places[index.flatten()]
             return places, self.node_motion(places, times.repeat_interleave(index.shape[1])), rows
@@ -239,7 +239,7 @@ class ControlPoints(Deformation):
 
     def node_motion(self, places: Tensor, times: Tensor) -> _Motion:
         """Motion of nodes at places [R, 3] (detached) and times [R] or [1], by the network."""
-        positions, times = places.detach(), times
+        positions = places.detach()
         if not self.config.published:
             positions = 2.0 * (positions - self.box[0]) / (self.box[1] - self.box[0]) - 1.0
             times = 2.0 * times - 1.0

@@ -143,8 +143,9 @@ def _inspect_frame(
     still = None if matte is None else _resized(matte == STILL, is_unexplained.shape)
     unexplained_share = None if still is None or not still.any() else float(is_unexplained[still].float().mean())
     return FrameEvidence(
-        trainer.scene.frames[index], held_out, psnr(rendered, plate, ignored), shares(is_unexplained.float()), _cells(travels, 0.97),
-        moving.numpy(), unexplained_share, None if matte is None else float((matte == MOVING).mean()),
+        trainer.scene.frames[index], held_out, psnr(rendered, plate, ignored), shares(is_unexplained.float()),
+        _cells(travels, 0.97), moving.numpy(), unexplained_share,
+        None if matte is None else float((matte == MOVING).mean()),
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from ...contract import CRYPTOMATTE, layers_of
-from ..exr import Made, linear_spec, set_margin, write_exr
+from ..exr import LazyLayer, linear_spec, set_margin, write_exr
 
 LAYERS = layers_of(CRYPTOMATTE)
 PAIRS = 2 * len(LAYERS)
@@ -108,4 +108,4 @@ def write_cryptomatte(
     def rows(of: slice) -> NDArray[np.float32]:
         return ranked({name: matte[of] for name, matte in mattes.items()})
 
-    return write_exr(Path(path), spec, [Made((*shape, 2 * PAIRS), rows)])
+    return write_exr(Path(path), spec, [LazyLayer((*shape, 2 * PAIRS), rows)])

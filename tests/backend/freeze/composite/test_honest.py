@@ -50,7 +50,7 @@ def make(world, mattes, source_views=None, masked=None, **config):
     compositor = Compositor(world.run, world.scene, world.plates(), settings, moving)
     if masked is not None:
         at_t = torch.from_numpy(masked).float()
-        compositor.seen.ignored = lambda frame: at_t if frame == T_STAR else None
+        compositor.source_views.ignored = lambda frame: at_t if frame == T_STAR else None
     return world.make(world.output(FRAME, T_STAR), compositor)
 
 
