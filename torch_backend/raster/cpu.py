@@ -113,7 +113,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
     block.x_low, block.x_high, block.y_low, block.y_high = limits
     block.near = scene.settings.near
     slots = block.chunks * source.CHUNK
-    for name, each in (
+    for name, per_slot in (
         ("record", block.record_stride),
         ("aux", 4),
         ("index", 1),
@@ -126,7 +126,7 @@ def _set_up(workspace: _Workspace, scene: Scene, camera: int, image_channels: in
         ("span_start", 1),
         ("span_count", 1),
     ):
-        workspace.need(name, slots * each)
+        workspace.need(name, slots * per_slot)
     tiles = block.tiles_x * block.tiles_y
     workspace.need("span", 2 * source.SPANS * block.chunks)
     for name, count in (

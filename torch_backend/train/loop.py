@@ -89,7 +89,7 @@ class TrainingLoop:
         """Runs repeatable `work` between steps. If GPU memory runs out, frees recordings or caches, and retries."""
         with contextlib.suppress(torch.OutOfMemoryError):
             return work()
-        if self.trainer.recorder is None or not self.trainer.recorder.switch_off():
+        if self.trainer.recorder is None or not self.trainer.recorder.disable():
             torch.cuda.empty_cache()
         return work()
 
@@ -141,7 +141,7 @@ class TrainingLoop:
         if len(trainer.densifier.seen) != before:  # memory ran out within a round of growth
             trainer.densifier.reset(before)
         forget_demands()
-        has_freed = trainer.recorder is not None and trainer.recorder.switch_off()
+        has_freed = trainer.recorder is not None and trainer.recorder.disable()
         torch.cuda.empty_cache()
         if has_freed:
             return

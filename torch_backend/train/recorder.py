@@ -122,7 +122,7 @@ class Recorder:
             self._recorded.clear()
             self.recording.drop()
 
-    def switch_off(self) -> bool:
+    def disable(self) -> bool:
         """Switches recording off after GPU memory ran out. Returns True if this freed the memory of a recording."""
         has_recordings, self.refused = bool(self._recorded), "the memory of the graphics card ended"
         self.forget()

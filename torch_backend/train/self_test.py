@@ -282,10 +282,10 @@ def _loss(device: torch.device) -> list[Check]:
             value = body(leaf, target.to(run_device), *inputs)
             backward(value)
             found.append((value, _gradient(leaf)))
-        (value, gradient), (here, gradient_here) = found
+        (value, gradient), (device_value, device_gradient) = found
         return [
-            Check(name, _relative(here, value), _EXACT),
-            Check(f"the gradient of {name}", _relative(gradient_here, gradient), _EXACT),
+            Check(name, _relative(device_value, value), _EXACT),
+            Check(f"the gradient of {name}", _relative(device_gradient, gradient), _EXACT),
         ]
 
     checks = compared("SSIM", (ssim.ssim, ssim_cuda.ssim))

@@ -86,7 +86,7 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int) -> RunFig
     kept = [row for row in known if row.held_out]
     values = [row.psnr_db for row in kept or known] or [0.0]  # clips that are masked entirely are rejected earlier
     moving = np.concatenate([row.moving for row in seen])
-    whole = len(seen) * pixels / 16  # `moving` has every 16th pixel
+    sampled = len(seen) * pixels / 16  # `moving` has every 16th pixel
     still = [row.still_unexplained for row in seen if row.still_unexplained is not None]
     mattes = [row.matte_moving for row in seen if row.matte_moving is not None]
     return RunFigures(
@@ -95,7 +95,7 @@ def figures_of(seen: Sequence[FrameEvidence], width: int, pixels: int) -> RunFig
         np.stack([row.unexplained for row in seen]),
         np.stack([row.travel for row in seen]),
         float(np.percentile(moving, 95)) if len(moving) else 0.0,
-        float((moving > RunLimits.far).sum()) / whole,
+        float((moving > RunLimits.far).sum()) / sampled,
         float(np.percentile(moving, 99)) if len(moving) else 0.0,
         float(np.percentile(values, 50)),
         float(np.percentile(values, 10)),

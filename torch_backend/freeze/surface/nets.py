@@ -41,8 +41,8 @@ def extract(volume: Volume) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         rows = np.flatnonzero((ends[0] < 0) != (ends[1] < 0))
         around = [_find(keys, cells[rows] - offset) for offset in (0 * second, second, second + third, third)]
         quads = np.stack(around, 1)
-        is_whole = (quads >= 0).all(1)
-        quads, rises = quads[is_whole], (ends[0][rows] < 0)[is_whole]
+        is_complete = (quads >= 0).all(1)
+        quads, rises = quads[is_complete], (ends[0][rows] < 0)[is_complete]
         quads[~rises] = quads[~rises, ::-1]
         found += [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
     return vertices.astype(np.float32), np.concatenate(found).astype(np.int32)

@@ -109,10 +109,10 @@ def deep_samples(
             continue
         image = render_frozen(part, output.viewmat, K, width, height, exposure, exposed_at, beyond)
         at = (image.depth > between).long()[None]
-        shown = from_numpy(display.premultiplied_to_light(torch.cat([image.color, image.alpha[..., None]], 2).numpy()))
+        rgba = from_numpy(display.premultiplied_to_light(torch.cat([image.color, image.alpha[..., None]], 2).numpy()))
         weight.scatter_add_(0, at, (transmittance * image.alpha)[None])
         light.scatter_add_(
-            0, at[..., None].expand(1, height, width, 3), (transmittance[..., None] * shown[..., :3])[None]
+            0, at[..., None].expand(1, height, width, 3), (transmittance[..., None] * rgba[..., :3])[None]
         )
         transmittance *= 1.0 - image.alpha
     total = weight.sum(0)

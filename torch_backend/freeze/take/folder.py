@@ -171,7 +171,7 @@ def frames_of(folder: TakeFolder) -> list[int]:
 def _numbers(folder: TakeFolder) -> list[int]:
     """Numbers of all frames of which any file exists, ascending."""
     folders = folder.root, folder.warps, folder.deeps
-    files = [folder.previews.glob("*" + PICTURE), *(each.glob("*" + LAYERS) for each in folders)]
+    files = [folder.previews.glob("*" + PICTURE), *(inner.glob("*" + LAYERS) for inner in folders)]
     return sorted({n for found in files for n in _frames_in(found)})
 
 

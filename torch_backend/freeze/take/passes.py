@@ -43,7 +43,7 @@ class Passes:
 
     def facts(self, output: OutputFrame) -> list[Any]:
         """Inputs of a frame's passes for its key, in addition to the inputs of its picture."""
-        near = [floats(each.viewmat.flatten()) for each in self._adjacent(output) if each is not None]
+        near = [floats(frame.viewmat.flatten()) for frame in self._adjacent(output) if frame is not None]
         return [self.to_scene.matrix.flatten().tolist(), near]
 
     def of(self, output: OutputFrame, K: Tensor, depth: Tensor) -> dict[str, LazyLayer]:

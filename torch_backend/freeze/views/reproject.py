@@ -138,6 +138,6 @@ def look_up_near(picture: Tensor, pixels: Tensor) -> Tensor:
 
 
 def beyond(picture: Tensor, reference: Tensor, reach: int) -> Tensor:
-    """[h, w] distance of a picture [h, w, 3] from the range of `reference` within `reach` pixels, maximum of channels."""
+    """[h, w] distance of `picture` [h, w, 3] from the range of `reference` within `reach` pixels, largest channel."""
     least, most = (torch.stack([of(channel, reach) for channel in reference.unbind(-1)], -1) for of in (erode, dilate))
     return torch.maximum(least - picture, picture - most).clamp_min(0.0).amax(-1)
